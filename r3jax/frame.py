@@ -1,0 +1,81 @@
+"""A posed RGB-D image: all that a simulator, a recording or a robot hands over."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r3jax.geometry.cameras import Camera, is_traced, rigid_error
+
+
+class Frame(eqx.Module):
+    """One posed RGB-D image. A frame that is malformed cannot be constructed.
+
+    Raises:
+        ValueError: shapes that do not fit the camera, integer images (divide by 255 first),
+            colours outside [0, 1] or not finite, depth that is NaN or negative, a pose that is
+            not finite or not rigid. Values are checked where they are known (outside jit).
+    """
+
+    rgb: Float[Array, "H W 3"] = eqx.field(converter=jnp.asarray)
+    """Colour in [0, 1]."""
+
+    depth: Float[Array, "H W"] = eqx.field(converter=jnp.asarray)
+    """z-depth [m]. 0: no measurement. inf: nothing within the sensor's range."""
+
+    T_world_camera: Float[Array, "4 4"] = eqx.field(converter=jnp.asarray)
+    """Camera-to-world pose; OpenCV axes, world z up [m]."""
+
+    camera: Camera
+    """Intrinsics of both images."""
+
+    def __check_init__(self) -> None:
+        """Refuses what would become a NaN or a silent error later."""
+        if isinstance(self.rgb, jax.ShapeDtypeStruct):
+            return
+        self._check_structure()
+        if not is_traced(self.rgb, self.depth, self.T_world_camera):
+            self._check_values()
+
+    def _check_structure(self) -> None:
+        height, width = self.camera.height, self.camera.width
+        if self.rgb.shape != (height, width, 3):
+            raise ValueError(
+                f"rgb has shape {self.rgb.shape}, but the camera's image is {(height, width, 3)}"
+            )
+        if self.depth.shape != (height, width):
+            raise ValueError(
+                f"depth has shape {self.depth.shape}, but the camera's image is {(height, width)}"
+            )
+        if self.T_world_camera.shape != (4, 4):
+            raise ValueError(
+                f"T_world_camera is a 4x4 matrix, got shape {self.T_world_camera.shape}"
+            )
+        for name, array in (("rgb", self.rgb), ("depth", self.depth)):
+            if not jnp.issubdtype(array.dtype, jnp.floating):
+                raise ValueError(
+                    f"{name} must be float32, got {array.dtype}: convert it first "
+                    "(8-bit colour / 255, depth to metres)"
+                )
+
+    def _check_values(self) -> None:
+        rgb, depth = np.asarray(self.rgb), np.asarray(self.depth)
+        low, high = float(rgb.min()), float(rgb.max())  # NaN makes the comparison false
+        if not (low >= 0.0 and high <= 1.0):
+            raise ValueError(f"rgb must lie in [0, 1], got values from {low:.4g} to {high:.4g}")
+        if not float(depth.min()) >= 0.0:
+            bad = np.argwhere(~(depth >= 0.0))
+            row, column = (int(i) for i in bad[0])
+            raise ValueError(
+                f"depth must be >= 0 and not NaN; {len(bad)} pixels are not, the first at row "
+                f"{row}, column {column}: {depth[row, column]} (use 0 for no measurement)"
+            )
+        problem = rigid_error(np.asarray(self.T_world_camera))
+        if problem is not None:
+            raise ValueError(f"T_world_camera: {problem}")
+
+    @property
+    def position(self) -> Float[Array, " 3"]:
+        """Camera centre in the world [m]."""
+        return self.T_world_camera[:3, 3]

@@ -1,0 +1,173 @@
+"""The pinhole camera and its pose.
+
+World: right-handed, z up, metres. Camera: OpenCV axes (x right, y down, z forward). A pose is
+the 4x4 matrix `T_world_camera` that takes points from the camera to the world. Pixel centres
+lie at +0.5.
+
+Shape symbols: H, W image size; n points.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r3jax.geometry.numerics import safe_norm
+
+
+def _as_float32(value: float | Array) -> Float[Array, ""]:
+    return jnp.asarray(value, dtype=jnp.float32)
+
+
+class Camera(eqx.Module):
+    """Intrinsics of a pinhole camera. The image size is static, the rest is traced."""
+
+    width: int = eqx.field(static=True)
+    """Columns [px]."""
+
+    height: int = eqx.field(static=True)
+    """Rows [px]."""
+
+    fx: Float[Array, ""] = eqx.field(converter=_as_float32)
+    """Horizontal focal length [px]."""
+
+    fy: Float[Array, ""] = eqx.field(converter=_as_float32)
+    """Vertical focal length [px]."""
+
+    cx: Float[Array, ""] = eqx.field(converter=_as_float32)
+    """Principal point, column [px]; the left edge of the image is 0."""
+
+    cy: Float[Array, ""] = eqx.field(converter=_as_float32)
+    """Principal point, row [px]; the top edge of the image is 0."""
+
+    @staticmethod
+    def from_fov(width: int, height: int, horizontal_fov_deg: float = 60.0) -> "Camera":
+        """A camera with square pixels, centred, with the given horizontal field of view [deg]."""
+        if not 0.0 < horizontal_fov_deg < 180.0:
+            raise ValueError(
+                f"horizontal_fov_deg must lie between 0 and 180, got {horizontal_fov_deg}"
+            )
+        focal = 0.5 * width / np.tan(0.5 * np.deg2rad(horizontal_fov_deg))
+        return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
+
+    @property
+    def focal(self) -> Float[Array, ""]:
+        """Geometric mean of the two focal lengths [px]."""
+        return jnp.sqrt(self.fx * self.fy)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same field of view sampled by another number of pixels."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
+
+
+def project(
+    camera: Camera, points_camera: Float[Array, "*n 3"]
+) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
+    """Projects points in the camera's frame.
+
+    Args:
+        camera: the intrinsics.
+        points_camera: points in the camera's frame [m].
+
+    Returns:
+        Pixel coordinates (column, row) and z-depth [m]. Points with depth <= 0 are behind the
+        camera; their pixel coordinates are finite but mean nothing.
+    """
+    x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
+    z_safe = jnp.where(z > 0.0, z, 1.0)
+    pixels = jnp.stack(
+        [camera.fx * x / z_safe + camera.cx, camera.fy * y / z_safe + camera.cy], axis=-1
+    )
+    return pixels, z
+
+
+def pixel_rays(camera: Camera) -> Float[Array, "H W 3"]:
+    """Rays through the pixel centres in the camera's frame, scaled to z = 1 (not to length 1)."""
+    u = (jnp.arange(camera.width, dtype=jnp.float32) + 0.5 - camera.cx) / camera.fx
+    v = (jnp.arange(camera.height, dtype=jnp.float32) + 0.5 - camera.cy) / camera.fy
+    shape = (camera.height, camera.width)
+    return jnp.stack(
+        [
+            jnp.broadcast_to(u[None, :], shape),
+            jnp.broadcast_to(v[:, None], shape),
+            jnp.ones(shape, dtype=jnp.float32),
+        ],
+        axis=-1,
+    )
+
+
+def unproject(camera: Camera, depth: Float[Array, "H W"]) -> Float[Array, "H W 3"]:
+    """Points in the camera's frame [m] of a z-depth image [m]."""
+    return pixel_rays(camera) * depth[..., None]
+
+
+def transform(T: Float[Array, "4 4"], points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """Applies a rigid transform to points."""
+    return jnp.einsum("ij,...j->...i", T[:3, :3], points) + T[:3, 3].reshape(
+        (1,) * (points.ndim - 1) + (3,)
+    )
+
+
+def invert_pose(T: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+    """Inverse of a rigid transform, by transposing its rotation."""
+    R_inverse = T[:3, :3].T
+    t_inverse = -R_inverse @ T[:3, 3]
+    top = jnp.concatenate([R_inverse, t_inverse[:, None]], axis=1)
+    return jnp.concatenate([top, jnp.array([[0.0, 0.0, 0.0, 1.0]], dtype=T.dtype)], axis=0)
+
+
+def pose_along(position: Float[Array, " 3"], direction: Float[Array, " 3"]) -> Float[Array, "4 4"]:
+    """The roll-free pose at `position` that looks along `direction`.
+
+    The image's x axis stays level. Looking straight up or down, level is ambiguous: the x axis
+    is then the world's x axis.
+
+    Args:
+        position: camera centre in the world [m].
+        direction: viewing direction in the world, any length but 0.
+
+    Returns:
+        `T_world_camera`.
+    """
+    forward = direction / jnp.maximum(safe_norm(direction), 1e-12)
+    right = jnp.stack([forward[1], -forward[0], jnp.zeros_like(forward[0])])
+    length = safe_norm(right)
+    is_vertical = length < 1e-6
+    length_safe = jnp.where(is_vertical, 1.0, length)
+    right = jnp.where(is_vertical, jnp.array([1.0, 0.0, 0.0]), right / length_safe)
+    down = jnp.cross(forward, right)
+    R = jnp.stack([right, down, forward], axis=1)
+    top = jnp.concatenate([R, position[:, None]], axis=1)
+    return jnp.concatenate([top, jnp.array([[0.0, 0.0, 0.0, 1.0]])], axis=0)
+
+
+def look_at(position: Float[Array, " 3"], target: Float[Array, " 3"]) -> Float[Array, "4 4"]:
+    """The roll-free pose at `position` that looks at the point `target` (both [m], world)."""
+    return pose_along(position, target - position)
+
+
+def rigid_error(T: np.ndarray) -> str | None:
+    """Says what is wrong with a 4x4 pose, or None if it is rigid and finite. On the host."""
+    if T.shape != (4, 4):
+        return f"a pose is a 4x4 matrix, got shape {T.shape}"
+    if not np.all(np.isfinite(T)):
+        return "the pose has entries that are not finite"
+    R = T[:3, :3].astype(np.float64)
+    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
+    if deviation > 1e-3:
+        return (
+            f"the pose is not rigid: its rotation deviates from orthonormal by {deviation:.3g} "
+            "(is a scale mixed in, or is it transposed?)"
+        )
+    if np.linalg.det(R) < 0:
+        return "the pose mirrors (its rotation has determinant -1): check the axes convention"
+    if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
+        return f"the pose's last row must be 0 0 0 1, got {T[3].tolist()}"
+    return None
+
+
+def is_traced(*arrays: object) -> bool:
+    """True if any of the arrays is a tracer, so that its values cannot be looked at."""
+    return any(isinstance(x, jax.core.Tracer) for x in arrays)

@@ -1,0 +1,35 @@
+"""Arithmetic whose gradient stays finite where the plain form's does not."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
+    """Euclidean length along `axis`; the gradient at the zero vector is 0, not NaN."""
+    squared = jnp.sum(x * x, axis=axis)
+    is_zero = squared == 0.0
+    squared_safe = jnp.where(is_zero, 1.0, squared)
+    return jnp.where(is_zero, 0.0, jnp.sqrt(squared_safe))
+
+
+def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`base ** exponent` for `base >= 0` and `exponent >= 0`, with `0 ** 0 = 1`.
+
+    At base 0 the plain gradient is infinite for exponents below 1 (and for the exponent's own
+    `log(0)`). Here both gradients are 0 there: the value is the constant 0 (or 1) nearby in
+    every direction that the callers can move.
+    """
+    is_zero = base <= 0.0
+    base_safe = jnp.where(is_zero, 1.0, base)
+    power = jnp.exp(exponent * jnp.log(base_safe))
+    at_zero = jnp.where(exponent == 0.0, 1.0, 0.0)
+    return jnp.where(is_zero, at_zero, power)
+
+
+def safe_divide(
+    numerator: Float[Array, "..."], denominator: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """`numerator / denominator`, and 0 where the denominator is 0."""
+    is_zero = denominator == 0.0
+    denominator_safe = jnp.where(is_zero, 1.0, denominator)
+    return jnp.where(is_zero, 0.0, numerator / denominator_safe)

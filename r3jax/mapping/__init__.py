@@ -1,0 +1,1 @@
+"""What has been seen: the hashed voxel map and the coarse occupancy grid."""

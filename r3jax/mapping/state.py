@@ -1,0 +1,102 @@
+"""The direction-aware voxel map: what has been seen, from where, and how consistently.
+
+The map is a fixed-capacity hash table; row `i` describes one occupied voxel. Arrays keep the
+long axis last, which is what XLA vectorises on a CPU.
+
+Shape symbols used throughout the package:
+    N  capacity of the table       M  observations of one frame
+    B  direction bins              W  32-bit words that hold B bits
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from r3jax.geometry.voxels import EMPTY_WORD
+
+
+class MapState(eqx.Module):
+    """Everything the map remembers between frames: 40 bytes a row.
+
+    Invariants: `m2 >= 0`; a bin once visited stays visited; `dropped` never decreases; a key
+    occurs once.
+    """
+
+    key: UInt32[Array, "2 N"]
+    """Packed voxel index (`geometry.voxels.pack`); all ones where the row is empty."""
+
+    visited: UInt32[Array, "W N"]
+    """Bit `k % 32` of word `k // 32` is set once the voxel was seen from direction bin k."""
+
+    count: Float[Array, " N"]
+    """Observations merged into the voxel: frames that saw it."""
+
+    mean: Float[Array, "3 N"]
+    """Mean RGB over the observations, in [0, 1]."""
+
+    m2: Float[Array, " N"]
+    """Sum over the observations and the channels of squared deviations from `mean`: tr(M)."""
+
+    resolution: Float[Array, " N"]
+    """Best resolution so far, focal length over distance [px/m]."""
+
+    voxel_size: Float[Array, ""]
+    """Edge of a voxel [m]."""
+
+    dropped: Int[Array, ""]
+    """Observations that found no row because the table was full. Sticky."""
+
+    num_bins: int = eqx.field(static=True)
+    """Direction bins B."""
+
+    @property
+    def capacity(self) -> int:
+        """Number of rows N."""
+        return self.count.shape[-1]
+
+    @property
+    def occupied(self) -> Bool[Array, " N"]:
+        """True for rows that describe a voxel."""
+        return self.key[1] != jnp.uint32(EMPTY_WORD)
+
+    @property
+    def num_occupied(self) -> Int[Array, ""]:
+        """Number of rows in use."""
+        return jnp.sum(self.occupied, dtype=jnp.int32)
+
+    @property
+    def bytes_per_row(self) -> int:
+        """Memory of one row [bytes]."""
+        rows = (self.key, self.visited, self.count, self.mean, self.m2, self.resolution)
+        return sum(x.nbytes for x in rows) // self.capacity
+
+
+def empty_map(capacity: int = 1 << 17, voxel_size: float = 0.05, num_bins: int = 64) -> MapState:
+    """A map that has seen nothing.
+
+    Args:
+        capacity: rows of the table; a power of two.
+        voxel_size: edge of a voxel [m].
+        num_bins: direction bins per voxel.
+
+    Raises:
+        ValueError: a capacity that is not a power of two, a size that is not positive.
+    """
+    if capacity < 2 or capacity & (capacity - 1):
+        raise ValueError(f"capacity must be a power of two >= 2, got {capacity}")
+    if not voxel_size > 0.0:
+        raise ValueError(f"voxel_size must be positive [m], got {voxel_size}")
+    if num_bins < 1:
+        raise ValueError(f"num_bins must be at least 1, got {num_bins}")
+    num_words = -(-num_bins // 32)
+    return MapState(
+        key=jnp.full((2, capacity), EMPTY_WORD, dtype=jnp.uint32),
+        visited=jnp.zeros((num_words, capacity), dtype=jnp.uint32),
+        count=jnp.zeros(capacity, dtype=jnp.float32),
+        mean=jnp.zeros((3, capacity), dtype=jnp.float32),
+        m2=jnp.zeros(capacity, dtype=jnp.float32),
+        resolution=jnp.zeros(capacity, dtype=jnp.float32),
+        voxel_size=jnp.asarray(voxel_size, dtype=jnp.float32),
+        dropped=jnp.zeros((), dtype=jnp.int32),
+        num_bins=num_bins,
+    )

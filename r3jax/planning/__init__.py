@@ -1,0 +1,1 @@
+"""Where to go: candidates, travel over known free space, policies."""

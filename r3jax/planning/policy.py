@@ -1,0 +1,86 @@
+"""The plug point of the loop: what a policy is asked and what it answers."""
+
+import enum
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Array
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+
+
+class Outcome(enum.Enum):
+    """How a decision ended. Anything but MOVED ends the run, with the reason in the trace."""
+
+    MOVED = "moved"
+    """A candidate was chosen."""
+
+    NO_CANDIDATE = "no-candidate"
+    """No candidate could be drawn: no free cell in reach."""
+
+    NO_REACHABLE_CANDIDATE = "no-reachable-candidate"
+    """Candidates were drawn, but no safe path leads to any of them."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Where to go next, how, and what else was on offer. On the host: NumPy."""
+
+    T_world_camera: np.ndarray
+    """The chosen pose, [4, 4] float64."""
+
+    waypoints: np.ndarray
+    """Path of the camera centre [m], [K, 3]; first the present position, last the chosen one."""
+
+    length: float
+    """Length of that path [m]."""
+
+    score: float
+    """U_view of the chosen pose."""
+
+    candidates: np.ndarray
+    """Every pose that was scored, [C, 4, 4]."""
+
+    utilities: dict[str, np.ndarray] = field(default_factory=dict)
+    """Per candidate, [C] each: `exploration`, `rendering`, `path` [m], `total`."""
+
+
+@dataclass(frozen=True)
+class PlanInfo:
+    """What happened while deciding."""
+
+    outcome: Outcome
+    num_candidates: int = 0
+    num_reachable: int = 0
+    stage_seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time per part of the decision (`candidates`, `travel`, `scoring`) [s]."""
+
+
+class Policy(Protocol):
+    """Chooses the next view. Pure: what it remembers travels in `state`."""
+
+    name: str
+
+    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Any:
+        """The state before the first frame."""
+        ...
+
+    def observe(self, state: Any, map_state: MapState, frame: Frame) -> Any:
+        """Takes note of a frame that has just been integrated into the map."""
+        ...
+
+    def decide(
+        self,
+        state: Any,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, Any, PlanInfo]:
+        """The next view, or None with the reason in the info."""
+        ...
