@@ -8,9 +8,9 @@ Shape symbols: H, W image size; n points.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from r3jax.geometry.numerics import safe_norm
@@ -170,4 +170,4 @@ def rigid_error(T: np.ndarray) -> str | None:
 
 def is_traced(*arrays: object) -> bool:
     """True if any of the arrays is a tracer, so that its values cannot be looked at."""
-    return any(isinstance(x, jax.core.Tracer) for x in arrays)
+    return any(isinstance(x, Tracer) for x in arrays)
