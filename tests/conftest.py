@@ -1,0 +1,37 @@
+"""Strict JAX, one hypothesis profile, and the shared data that some tests compare with."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+from hypothesis import settings
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Compilation dominates these tests: keep what was compiled, also the small pieces.
+_cache = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+if _cache:
+    jax.config.update("jax_compilation_cache_dir", _cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+settings.register_profile("jax", deadline=None, max_examples=30, derandomize=True)
+settings.load_profile("jax")
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+"""Golden values, scenes and recordings: a folder beside the repository, absent elsewhere."""
+
+
+def shared_path(*parts: str) -> Path:
+    """A file or folder of the shared data; skips the calling test where it is absent."""
+    path = SHARED.joinpath(*parts)
+    if not path.exists():
+        pytest.skip(f"needs ../shared/{'/'.join(parts)}, which is not here")
+    return path
+
+
+@pytest.fixture(scope="session")
+def shared():
+    """`shared("golden", "file.npz")` is the path of shared data, or skips the test."""
+    return shared_path
