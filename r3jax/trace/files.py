@@ -1,0 +1,51 @@
+"""Writes that are either complete or not there."""
+
+import os
+from pathlib import Path
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Writes a file under a temporary name, flushes it to the disk, then renames it.
+
+    A reader sees the old file or the new one, never a part.
+
+    Raises:
+        OSError: the disk is full, not writable, ...; nothing is left behind then.
+    """
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def append_line(path: Path, line: str) -> None:
+    """Appends one line and flushes it to the disk; a failed append is taken back.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    with open(path, "ab") as file:
+        before = file.tell()
+        try:
+            file.write(line.encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            # A torn line would hide behind the next one; readers skip only the last line.
+            os.truncate(path, before)
+            raise
+
+
+def sync_folder(path: Path) -> None:
+    """Makes the names in a folder survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,110 @@
+"""run.json: everything that fixes a run before its first view."""
+
+import dataclasses
+import importlib.metadata
+import json
+import platform
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from r3jax.geometry.cameras import Camera
+from r3jax.trace.errors import RunError
+
+FORMAT = "r3jax-run"
+"""What run.json says it is."""
+
+VERSION = 1
+"""Format version that this package writes and reads."""
+
+_PACKAGES = ("r3jax", "jax", "jaxlib", "numpy", "equinox", "scikit-image", "orbax-checkpoint")
+
+
+@dataclass(frozen=True)
+class RunHeader:
+    """What was asked for, in which world, by which software."""
+
+    scene: dict[str, Any]
+    """`name` as given, `hash` of the world's content, and how it was opened."""
+
+    policy: dict[str, Any]
+    """`name` and `settings`."""
+
+    budget: str
+    """For example `views:100`."""
+
+    seed: int
+    """All randomness of the run follows from it."""
+
+    config: dict[str, Any]
+    """Settings of the loop: `exploration.config.ExplorationConfig`."""
+
+    camera: dict[str, int | float]
+    """`width`, `height`, `fx`, `fy`, `cx`, `cy` [px]."""
+
+    bounds: list[list[float]]
+    """Lower and upper corner of the scene's box [m], world."""
+
+    packages: dict[str, str] = field(default_factory=dict)
+    """Versions of the packages that shape the result, of Python, and the device."""
+
+    @property
+    def intrinsics(self) -> Camera:
+        """The camera of every frame."""
+        size = {name: int(self.camera[name]) for name in ("width", "height")}
+        return Camera(**size, **{name: self.camera[name] for name in ("fx", "fy", "cx", "cy")})  # pyright: ignore[reportArgumentType]
+
+
+def camera_fields(camera: Camera) -> dict[str, int | float]:
+    """A camera as plain numbers."""
+    traced = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    return {"width": camera.width, "height": camera.height, **traced}
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of what shapes the result on this machine."""
+    import jax
+
+    versions = {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed as a package"
+    return versions
+
+
+def header_to_json(header: RunHeader) -> str:
+    """The text of run.json."""
+    plain = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(header)}
+    return json.dumps(plain, indent=2, allow_nan=False) + "\n"
+
+
+def read_header(path: Path) -> RunHeader:
+    """Reads run.json.
+
+    Raises:
+        RunError: missing, not JSON, of another format or version, or with fields missing.
+    """
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RunError(path, "the file is missing: this folder is not a run") from None
+    except (OSError, ValueError) as error:
+        raise RunError(path, f"the file cannot be read ({error})") from None
+    if not isinstance(plain, dict) or plain.pop("format", None) != FORMAT:
+        raise RunError(path, f"the file does not describe a run (no format {FORMAT!r})")
+    version = plain.pop("version", None)
+    if version != VERSION:
+        age = "newer" if isinstance(version, int) and version > VERSION else "other"
+        raise RunError(
+            path,
+            f"the run has format version {version}, this package reads version {VERSION}: "
+            f"use the {age} r3jax that wrote it",
+        )
+    try:
+        header = RunHeader(**plain)
+        _ = header.intrinsics
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(path, f"a setting is missing or malformed ({error})") from None
+    return header

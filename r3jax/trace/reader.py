@@ -1,0 +1,127 @@
+"""Reads a run folder: settings and rows at once, images when asked for."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.trace.checkpoints import read_checkpoint
+from r3jax.trace.errors import RunError
+from r3jax.trace.header import RunHeader, read_header
+from r3jax.trace.images import content_hash, from_integers, read_png
+from r3jax.trace.rows import EndRow, StepRow, from_json
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run as it lies on disk. It may have been cut off at any moment."""
+
+    path: Path
+    header: RunHeader
+    rows: tuple[StepRow, ...]
+    """One per view, in order."""
+
+    end: EndRow | None
+    """How the run ended; None if it was killed (or is still going on)."""
+
+    timings: tuple[dict[str, float], ...]
+    """Seconds per stage, one per view as far as they were written."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of every frame."""
+        return self.header.intrinsics
+
+    @property
+    def outcome(self) -> str:
+        """How the run ended, in a sentence."""
+        if self.end is None:
+            return "cut off: the run has no final row (killed, or still going on)"
+        return f"{self.end.outcome}: {self.end.message}"
+
+    def image_path(self, step: int) -> Path:
+        """Where the colour image of a view lies."""
+        return self.path / "frames" / f"{step:06d}.png"
+
+    def depth_path(self, step: int) -> Path:
+        """Where the depth image of a view lies."""
+        return self.path / "frames" / f"{step:06d}.depth.png"
+
+    def frame(self, step: int) -> Frame:
+        """The frame of one view, as it entered the map.
+
+        Raises:
+            RunError: an image is missing, broken, or not the one that was recorded.
+        """
+        row = self.rows[step]
+        camera = self.camera
+        size = (camera.width, camera.height)
+        rgb = read_png(self.image_path(step), *size, is_depth=False)
+        depth = read_png(self.depth_path(step), *size, is_depth=True)
+        if content_hash(rgb, depth) != row.sha256:
+            raise RunError(self.image_path(step), "the pixels differ from those recorded")
+        return from_integers(rgb, depth, row.pose, camera)
+
+    def frames(self) -> Iterator[Frame]:
+        """Every frame in order, read one by one."""
+        return (self.frame(row.step) for row in self.rows)
+
+    def checkpoint(self) -> tuple[int, MapState, OccupancyGrid]:
+        """The newest stored map and grid, and the view after which they were stored."""
+        return read_checkpoint(self.path / "checkpoints")
+
+
+def read_run(path: Path | str) -> Run:
+    """Reads a run folder; a run that was cut off reads up to its last complete row.
+
+    Raises:
+        RunError: not a run, another format version, or a row that is damaged.
+    """
+    path = Path(path)
+    header = read_header(path / "run.json")
+    rows: list[StepRow] = []
+    end: EndRow | None = None
+    for number, line in enumerate(_complete_lines(path / "trace.jsonl"), start=1):
+        try:
+            row = from_json(line)
+        except (ValueError, RecursionError) as error:
+            raise RunError(path / "trace.jsonl", f"line {number}: {error}") from None
+        if isinstance(row, EndRow):
+            end = row
+        elif row.step != len(rows):
+            raise RunError(
+                path / "trace.jsonl",
+                f"line {number}: expected view {len(rows)}, found view {row.step}",
+            )
+        else:
+            rows.append(row)
+    return Run(path, header, tuple(rows), end, _read_timings(path / "timings.jsonl"))
+
+
+def _complete_lines(path: Path) -> list[str]:
+    """Lines that end in a newline: a power cut may have torn the last one."""
+    try:
+        text = path.read_bytes().decode("utf-8", errors="replace")
+    except FileNotFoundError:
+        raise RunError(path, "the file is missing") from None
+    except OSError as error:
+        raise RunError(path, f"the file cannot be read ({error.strerror})") from None
+    return text.split("\n")[:-1]
+
+
+def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
+    """Timings are a by-product: what cannot be read of them is left out."""
+    if not path.exists():
+        return ()
+    timings = []
+    for line in _complete_lines(path):
+        try:
+            plain = json.loads(line)
+            timings.append({str(k): float(v) for k, v in plain.items()})
+        except (ValueError, TypeError, AttributeError):
+            continue
+    return tuple(timings)

@@ -1,0 +1,199 @@
+"""The rows of trace.jsonl: one per view, and one that says how the run ended."""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from r3jax.planning.policy import Decision, PlanInfo
+
+TOP_CANDIDATES = 10
+"""Candidates of a decision that a row keeps, the best ones by total utility."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The decision that led to a view."""
+
+    pose: np.ndarray
+    """Chosen `T_world_camera`, [4, 4]."""
+
+    score: float
+    """Its utility."""
+
+    waypoints: np.ndarray
+    """Path of the camera centre [m], [K, 3]."""
+
+    length: float
+    """Length of that path [m]."""
+
+    num_candidates: int
+    """Poses that were drawn."""
+
+    num_reachable: int
+    """Poses that a safe path leads to."""
+
+    top: dict[str, list[float | None]] = field(default_factory=dict)
+    """Utilities of the best candidates, best first; None where one has no finite value."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the map and the grid know after a view. Not on the mission clock."""
+
+    voxels: int
+    """Occupied voxels of the map."""
+
+    map_bytes: int
+    """Memory of the map's rows, empty ones included [bytes]."""
+
+    dropped: int
+    """Observations lost so far because the table was full and might not grow."""
+
+    known_cells: int
+    """Coarse cells known to be free or occupied."""
+
+    known_share: float
+    """Known cells over all cells of the scene's box. The insides of walls and of furniture and
+    what lies outside can never be seen, so it stays below 1."""
+
+    frontier_cells: int
+    """Unexplored cells that share a face with a free one: what is left to see."""
+
+    mean_renderability: float
+    """Mean renderability of a fixed sequence of probe views inside known free space."""
+
+    arrival_renderability: float
+    """Renderability of this very view just before it was integrated: how much it repeated."""
+
+
+@dataclass(frozen=True)
+class StepRow:
+    """One view: where, why, at what cost, and what is known since."""
+
+    step: int
+    """Number of the view, from 0; names its images."""
+
+    pose: np.ndarray
+    """`T_world_camera`, [4, 4] float32."""
+
+    sha256: str
+    """Hash of the stored pixels."""
+
+    choice: Choice | None
+    """How the view was chosen; None for the start pose."""
+
+    seconds: float
+    """Mission clock after the view: planning, mapping and flight [s]."""
+
+    metres: float
+    """Path flown so far [m]."""
+
+    radians: float
+    """Angle turned so far, along the shortest rotations [rad]."""
+
+    charged: dict[str, float]
+    """What this view added to the mission clock: `planning`, `mapping`, `flight` [s]."""
+
+    coverage: Coverage
+
+
+@dataclass(frozen=True)
+class EndRow:
+    """How the run ended."""
+
+    outcome: str
+    """`budget`, `no-reachable-candidate`, `interrupted`, ...: `exploration.loop.StopReason`."""
+
+    message: str
+    """The same in a sentence."""
+
+    views: int
+    """Views recorded."""
+
+
+def make_choice(decision: Decision, info: PlanInfo) -> Choice:
+    """What the trace keeps of a decision."""
+    total = np.asarray(decision.utilities.get("total", np.zeros(0)), dtype=np.float64)
+    best = np.argsort(-np.where(np.isfinite(total), total, -np.inf), kind="stable")
+    best = best[:TOP_CANDIDATES]
+    top = {
+        name: [finite_or_none(value) for value in np.asarray(values)[best]]
+        for name, values in decision.utilities.items()
+    }
+    return Choice(
+        pose=np.asarray(decision.T_world_camera, dtype=np.float32),
+        score=float(decision.score),
+        waypoints=np.asarray(decision.waypoints, dtype=np.float32),
+        length=float(decision.length),
+        num_candidates=info.num_candidates,
+        num_reachable=info.num_reachable,
+        top=top,
+    )
+
+
+def finite_or_none(value: float) -> float | None:
+    """JSON knows neither inf nor NaN."""
+    return float(value) if math.isfinite(value) else None
+
+
+def to_json(row: StepRow | EndRow) -> str:
+    """One line of trace.jsonl, keys in a fixed order."""
+    kind = "step" if isinstance(row, StepRow) else "end"
+    plain = {"kind": kind, **dataclasses.asdict(row, dict_factory=_plain_dict)}
+    return json.dumps(plain, allow_nan=False, separators=(",", ":"))
+
+
+def from_json(line: str) -> StepRow | EndRow:
+    """Inverse of `to_json`.
+
+    Raises:
+        ValueError: the line is not a row.
+    """
+    plain = json.loads(line)
+    if not isinstance(plain, dict) or plain.get("kind") not in ("step", "end"):
+        raise ValueError("a row is an object with the kind `step` or `end`")
+    kind = plain.pop("kind")
+    try:
+        if kind == "end":
+            return EndRow(**plain)
+        choice = plain.pop("choice")
+        if choice is not None:
+            choice = Choice(
+                **choice
+                | {
+                    "pose": _matrix(choice["pose"], (4, 4)),
+                    "waypoints": _matrix(choice["waypoints"], (-1, 3)),
+                }
+            )
+        return StepRow(
+            **plain
+            | {
+                "choice": choice,
+                "pose": _matrix(plain["pose"], (4, 4)),
+                "coverage": Coverage(**plain["coverage"]),
+            }
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"the row lacks a field or has an unknown one ({error})") from None
+
+
+def _matrix(values: Any, shape: tuple[int, int]) -> np.ndarray:
+    return np.asarray(values, dtype=np.float32).reshape(shape)
+
+
+def shortest_floats(array: np.ndarray) -> list:
+    """Nested lists of the shortest decimals that read back as the same float32 numbers."""
+    if array.ndim > 1:
+        return [shortest_floats(part) for part in array]
+    return [float(str(value)) for value in array.astype(np.float32)]
+
+
+def _plain_dict(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {
+        name: shortest_floats(value) if isinstance(value, np.ndarray) else value
+        for name, value in items
+    }

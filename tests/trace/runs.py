@@ -1,0 +1,67 @@
+"""Small runs for the tests of the trace."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.trace.header import RunHeader, camera_fields
+from r3jax.trace.images import frame_hash, stored_form
+from r3jax.trace.rows import Choice, Coverage, StepRow
+
+CAMERA = Camera.from_fov(8, 6, 70.0)
+
+
+def make_header(**changes) -> RunHeader:
+    fields = {
+        "scene": {"name": "toy", "hash": "abc"},
+        "policy": {"name": "ours", "settings": {"num_candidates": 7}},
+        "budget": "views:4",
+        "seed": 3,
+        "config": {"voxel_size": 0.05, "max_range": 5.0},
+        "camera": camera_fields(CAMERA),
+        "bounds": [[0.0, 0.0, 0.0], [4.0, 3.0, 2.5]],
+        "packages": {"r3jax": "0"},
+    }
+    return RunHeader(**fields | changes)
+
+
+def make_pose(step: int) -> np.ndarray:
+    angle = 0.3 * step
+    pose = np.eye(4, dtype=np.float32)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    pose[:3, 3] = [0.1 * step, 1.0 / 3.0, 1.5]
+    return pose
+
+
+def make_view(step: int) -> tuple[StepRow, Frame]:
+    rng = np.random.default_rng(step)
+    depth = rng.uniform(0.5, 4.0, (6, 8)).astype(np.float32)
+    depth[0, 0], depth[0, 1] = 0.0, np.inf
+    rgb = rng.random((6, 8, 3), dtype=np.float32)
+    frame = stored_form(
+        Frame(jnp.asarray(rgb), jnp.asarray(depth), jnp.asarray(make_pose(step)), CAMERA)
+    )
+    choice = None
+    if step > 0:
+        choice = Choice(
+            pose=make_pose(step),
+            score=1.0 / 7.0,
+            waypoints=np.stack([make_pose(step - 1)[:3, 3], make_pose(step)[:3, 3]]),
+            length=0.1,
+            num_candidates=100,
+            num_reachable=60,
+            top={"total": [0.5, None], "path": [0.1, 0.3]},
+        )
+    row = StepRow(
+        step=step,
+        pose=np.asarray(frame.T_world_camera),
+        sha256=frame_hash(frame),
+        choice=choice,
+        seconds=0.1 * step,
+        metres=0.1 * step,
+        radians=0.3 * step,
+        charged={"planning": 0.1, "mapping": 1.0 / 3.0, "flight": 0.1},
+        coverage=Coverage(10 * step, 4096, 0, 5 * step, 0.01 * step, 9, 0.5, 0.25),
+    )
+    return row, frame

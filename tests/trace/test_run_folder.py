@@ -1,0 +1,228 @@
+"""A run folder: written, read back, damaged, full, locked, overwritten."""
+
+import errno
+import json
+import os
+
+import jax
+import numpy as np
+import pytest
+
+from r3jax.mapping.occupancy import empty_grid
+from r3jax.mapping.state import empty_map
+from r3jax.trace.errors import RecordingStopped, RunError
+from r3jax.trace.reader import read_run
+from r3jax.trace.rows import from_json, to_json
+from r3jax.trace.writer import RunWriter
+from tests.trace.runs import make_header, make_view
+
+
+def write_run(path, views=3, end=True, **kwargs):
+    with RunWriter(path, make_header(), **kwargs) as writer:
+        for step in range(views):
+            writer.add(*make_view(step))
+            writer.add_timings(step, {"plan": 0.5, "render": 0.25})
+        if end:
+            writer.finish("budget", "enough")
+    return path
+
+
+def assert_trees_equal(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_what_is_written_is_read_back_bit_for_bit(tmp_path):
+    run = read_run(write_run(tmp_path / "run"))
+    assert run.header == make_header()
+    assert run.end is not None
+    assert (run.end.outcome, run.end.views) == ("budget", 3)
+    for step, frame in enumerate(run.frames()):
+        row, original = make_view(step)
+        assert to_json(run.rows[step]) == to_json(row)
+        assert_trees_equal(frame, original)
+    assert [t["plan"] for t in run.timings] == [0.5] * 3
+
+
+def test_a_row_survives_json_exactly():
+    row, _ = make_view(2)
+    read = from_json(to_json(row))
+    np.testing.assert_array_equal(read.pose, row.pose)
+    np.testing.assert_array_equal(read.choice.waypoints, row.choice.waypoints)
+    assert read.charged == row.charged
+    assert read.coverage == row.coverage
+    assert read.choice.top == row.choice.top
+
+
+def test_a_run_is_complete_after_every_view(tmp_path):
+    with RunWriter(tmp_path / "run", make_header()) as writer:
+        for step in range(2):
+            writer.add(*make_view(step))
+            run = read_run(tmp_path / "run")  # while the writer is still at it
+            assert len(run.rows) == step + 1
+            assert_trees_equal(run.frame(step), make_view(step)[1])
+            assert run.end is None
+            assert "cut off" in run.outcome
+
+
+@pytest.mark.parametrize("cut", [1, 30, 200])
+def test_a_torn_last_row_is_left_out(tmp_path, cut):
+    trace = write_run(tmp_path / "run", end=False) / "trace.jsonl"
+    os.truncate(trace, trace.stat().st_size - cut)
+    assert len(read_run(tmp_path / "run").rows) == 2
+
+
+def test_a_damaged_row_in_the_middle_is_named(tmp_path):
+    trace = write_run(tmp_path / "run") / "trace.jsonl"
+    lines = trace.read_text().splitlines(keepends=True)
+    lines[1] = lines[1][:50] + "\n"
+    trace.write_text("".join(lines))
+    with pytest.raises(RunError, match=r"trace\.jsonl: line 2"):
+        read_run(tmp_path / "run")
+
+
+def test_a_missing_row_is_named(tmp_path):
+    trace = write_run(tmp_path / "run") / "trace.jsonl"
+    lines = trace.read_text().splitlines(keepends=True)
+    trace.write_text(lines[0] + lines[2])
+    with pytest.raises(RunError, match="expected view 1, found view 2"):
+        read_run(tmp_path / "run")
+
+
+def test_an_image_that_was_swapped_is_found(tmp_path):
+    run = read_run(write_run(tmp_path / "run"))
+    run.image_path(1).write_bytes(run.image_path(2).read_bytes())
+    run.frame(0)
+    with pytest.raises(RunError, match=r"000001\.png: the pixels differ"):
+        run.frame(1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 2}, "newer r3jax"),
+        ({"version": 0}, "format version 0"),
+        ({"format": "other"}, "does not describe a run"),
+        ({"camera": {"width": 8}}, "missing or malformed"),
+        ({"surprise": 1}, "missing or malformed"),
+    ],
+)
+def test_another_header_gets_a_clear_message(tmp_path, change, message):
+    path = write_run(tmp_path / "run") / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(RunError, match=message):
+        read_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize(("text", "message"), [("{", "cannot be read"), ("[]", "not describe")])
+def test_a_broken_header_is_named(tmp_path, text, message):
+    path = write_run(tmp_path / "run") / "run.json"
+    path.write_text(text)
+    with pytest.raises(RunError, match=message):
+        read_run(tmp_path / "run")
+
+
+def test_a_folder_that_is_no_run_is_said_so(tmp_path):
+    with pytest.raises(RunError, match="not a run"):
+        read_run(tmp_path)
+
+
+def test_an_existing_run_is_kept_unless_overwritten(tmp_path):
+    write_run(tmp_path / "run")
+    with pytest.raises(RunError, match="--overwrite"):
+        RunWriter(tmp_path / "run", make_header())
+    assert len(read_run(tmp_path / "run").rows) == 3
+    write_run(tmp_path / "run", views=1, overwrite=True)
+    run = read_run(tmp_path / "run")
+    assert len(run.rows) == 1
+    assert not run.image_path(2).exists()
+
+
+def test_a_folder_of_the_user_is_never_overwritten(tmp_path):
+    precious = tmp_path / "photos" / "holiday.jpg"
+    precious.parent.mkdir()
+    precious.write_bytes(b"sea")
+    with pytest.raises(RunError, match="not a run"):
+        RunWriter(precious.parent, make_header(), overwrite=True)
+    with pytest.raises(RunError, match="is a file"):
+        RunWriter(precious, make_header(), overwrite=True)
+    assert precious.read_bytes() == b"sea"
+
+
+def test_files_of_the_user_inside_a_run_survive_overwriting(tmp_path):
+    note = write_run(tmp_path / "run") / "notes.txt"
+    note.write_text("mine")
+    write_run(tmp_path / "run", overwrite=True)
+    assert note.read_text() == "mine"
+
+
+def test_two_writers_cannot_share_a_run(tmp_path):
+    with (
+        RunWriter(tmp_path / "run", make_header()) as writer,
+        pytest.raises(RunError, match="another process is writing"),
+    ):
+        writer.add(*make_view(0))
+        RunWriter(tmp_path / "run", make_header(), overwrite=True)
+    assert len(read_run(tmp_path / "run").rows) == 1
+    write_run(tmp_path / "run", overwrite=True)  # the lock died with its writer
+
+
+@pytest.mark.parametrize("failing_call", range(6))
+def test_a_full_disk_stops_the_recording_and_spares_what_is_there(
+    tmp_path, monkeypatch, failing_call
+):
+    with RunWriter(tmp_path / "run", make_header()) as writer:
+        writer.add(*make_view(0))
+        calls = iter(range(1000))
+        real_fsync, real_replace = os.fsync, os.replace
+
+        def fail_at(real):
+            def call(*args):
+                if next(calls) == failing_call:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                return real(*args)
+
+            return call
+
+        monkeypatch.setattr(os, "fsync", fail_at(real_fsync))
+        monkeypatch.setattr(os, "replace", fail_at(real_replace))
+        with pytest.raises(RecordingStopped, match="No space left on device"):
+            writer.add(*make_view(1))
+        monkeypatch.undo()
+        run = read_run(tmp_path / "run")
+        assert len(run.rows) == 1
+        assert_trees_equal(run.frame(0), make_view(0)[1])
+        assert not list((tmp_path / "run" / "frames").glob("*.partial"))
+        writer.add(*make_view(1))  # space again: the folder goes on where it was
+    assert len(read_run(tmp_path / "run").rows) == 2
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="cannot make the run folder"):
+        RunWriter(tmp_path / "file" / "run", make_header())
+
+
+def test_checkpoints_come_back_exactly_and_only_three_are_kept(tmp_path):
+    map_state = empty_map(64)
+    map_state = jax.tree.map(lambda x: x + np.ones((), x.dtype), map_state)
+    grid = empty_grid(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]))
+    with RunWriter(tmp_path / "run", make_header()) as writer:
+        for step in (0, 1, 2, 3, 4):
+            writer.checkpoint(step, map_state, grid)
+    run = read_run(tmp_path / "run")
+    step, read_map, read_grid = run.checkpoint()
+    assert step == 4
+    assert_trees_equal(read_map, map_state)
+    assert_trees_equal(read_grid, grid)
+    assert sorted(p.name for p in (run.path / "checkpoints").iterdir()) == [
+        "000002",
+        "000003",
+        "000004",
+    ]
+
+
+def test_a_run_without_checkpoint_says_so(tmp_path):
+    run = read_run(write_run(tmp_path / "run"))
+    with pytest.raises(RunError, match="no checkpoint"):
+        run.checkpoint()
