@@ -1,0 +1,218 @@
+"""Mesh files as worlds: GLB, glTF, PLY, OBJ and whatever else trimesh reads.
+
+glTF is y-up by its standard and is turned to z-up, (x, y, z) -> (x, -z, y); other formats are
+taken as z-up unless told otherwise. Colours are used as stored, as Habitat does without lights.
+Transparency is ignored: a surface is there or it is not.
+
+Shape symbols: V vertices; F faces.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from r3jax.simulators.world import Material, World
+
+_GLTF_SUFFIXES = (".glb", ".gltf")
+_Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_PLAIN = Material(color=(0.7, 0.7, 0.7))
+"""What a surface without any colour looks like."""
+
+_MAX_EXTENT = 1e5
+"""Worlds larger than this are not in metres [m]."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One mesh of a file, in its place."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray  # [F, 3, 2]
+    colors: np.ndarray | None  # [F, 3, 3] in [0, 1]
+    material: Material
+
+
+def load_world(path: str | Path, up: Literal["y", "z"] | None = None) -> World:
+    """Reads a mesh file.
+
+    Textures, vertex colours, face colours, plain colours and mixtures of them are kept; the nodes
+    of a scene graph are put in their places; polygons become triangles; texture coordinates
+    outside [0, 1] repeat the texture.
+
+    Args:
+        path: the file.
+        up: the file's vertical axis; None: y for glTF, z for everything else.
+
+    Returns:
+        The world, z up, named `mesh:<path>`.
+
+    Raises:
+        ValueError: the file is missing or cannot be read, holds no mesh or only points, has
+            vertices that are not finite, or has no extent.
+    """
+    path = Path(path)
+    if up not in (None, "y", "z"):
+        raise ValueError(f"up must be 'y' or 'z', got {up!r}")
+    if not path.is_file():
+        raise ValueError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
+    scene = _read(path)
+    parts = [part for node in scene.graph.nodes_geometry if (part := _part_of(scene, node))]
+    if not parts:
+        _refuse_empty(path, scene)
+    is_y_up = up == "y" or (up is None and path.suffix.lower() in _GLTF_SUFFIXES)
+    turn = _Z_UP_FROM_Y_UP if is_y_up else np.eye(3)
+    world = _assemble(path, parts, turn)
+    _check(path, world)
+    return world
+
+
+def _read(path: Path) -> Any:
+    """The file as a trimesh scene."""
+    import trimesh
+
+    try:
+        # `process=False`: merging vertices would tear texture seams.
+        return trimesh.load_scene(path, process=False)
+    except Exception as error:  # every reader fails in its own way
+        raise ValueError(
+            f"cannot read the mesh file {path}: {error or type(error).__name__} (is it damaged, "
+            "or a format other than GLB, glTF, PLY, OBJ?)"
+        ) from error
+
+
+def _refuse_empty(path: Path, scene: Any) -> None:
+    """Says why a scene has nothing to look at."""
+    points = sum(len(getattr(g, "vertices", ())) for g in scene.geometry.values())
+    if points:
+        raise ValueError(
+            f"{path} has {points} points but no faces: a point cloud cannot be ray cast; "
+            "reconstruct a surface first (for example Poisson reconstruction)"
+        )
+    raise ValueError(f"{path} holds an empty mesh: no vertices, no faces; export it again")
+
+
+def _part_of(scene: Any, node: str) -> _Part | None:
+    """The mesh at a node of the scene graph; None for points, lines and empty meshes."""
+    T_world_node, name = scene.graph[node]
+    mesh = scene.geometry[name]
+    faces = np.asarray(getattr(mesh, "faces", ()), dtype=np.int64).reshape(-1, 3)
+    if len(faces) == 0:
+        return None
+    T = np.asarray(T_world_node, dtype=np.float64)
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+    uv, colors, material = _appearance(mesh, faces)
+    if np.linalg.det(T[:3, :3]) < 0.0:  # a mirrored node: keep the front faces in front
+        faces, uv = faces[:, ::-1], uv[:, ::-1]
+        colors = None if colors is None else colors[:, ::-1]
+    return _Part(vertices, faces, uv, colors, material)
+
+
+def _appearance(mesh: Any, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, Material]:
+    """Texture coordinates and colours per corner, and the material."""
+    visual = mesh.visual
+    no_uv = np.zeros((len(faces), 3, 2), np.float32)
+    kind = getattr(visual, "kind", None)
+    if kind == "vertex":
+        return no_uv, _as_unit(visual.vertex_colors)[faces], Material()
+    if kind == "face":
+        per_face = _as_unit(visual.face_colors)
+        return no_uv, np.repeat(per_face[:, None], 3, axis=1), Material()
+    if kind != "texture" and not hasattr(visual, "material"):
+        return no_uv, None, _PLAIN
+    uv = getattr(visual, "uv", None)
+    has_uv = uv is not None and len(uv) == len(mesh.vertices)
+    material = _material(visual.material, has_uv=has_uv)
+    colors = getattr(visual, "vertex_attributes", {}).get("color")
+    if colors is not None and len(colors) == len(mesh.vertices):
+        colors = _as_unit(colors)[faces]
+    else:
+        colors = None
+    corner_uv = np.asarray(uv, dtype=np.float32)[faces] if has_uv else no_uv
+    return corner_uv, colors, material
+
+
+def _material(source: Any, *, has_uv: bool) -> Material:
+    """A trimesh material as ours. The texture keeps its size."""
+    if hasattr(source, "baseColorFactor"):
+        image, factor = source.baseColorTexture, source.baseColorFactor
+    else:
+        image, factor = getattr(source, "image", None), getattr(source, "diffuse", None)
+        if image is not None and has_uv:
+            # Exporters write any diffuse colour beside a texture; viewers show the texture.
+            factor = None
+    texture = None
+    if image is not None and has_uv:
+        texture = np.array(image.convert("RGB"), dtype=np.uint8)
+    if factor is None:
+        return Material(texture=texture)
+    red, green, blue = (float(x) for x in _as_unit(np.asarray(factor).reshape(1, -1))[0])
+    return Material(texture=texture, color=(red, green, blue))
+
+
+def _as_unit(colors: np.ndarray) -> np.ndarray:
+    """Colours [n, 3 or 4] of any type as float32 [n, 3] in [0, 1]."""
+    colors = np.asarray(colors)[:, :3]
+    if np.issubdtype(colors.dtype, np.integer):
+        return (colors / np.iinfo(colors.dtype).max).astype(np.float32)
+    return np.clip(colors, 0.0, 1.0).astype(np.float32)
+
+
+def _assemble(path: Path, parts: list[_Part], turn: np.ndarray) -> World:
+    """Joins the parts into one world."""
+    sizes = [len(part.vertices) for part in parts]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    materials: list[Material] = []
+    index: dict[int, int] = {}
+    face_material = []
+    for part in parts:
+        k = index.setdefault(id(part.material), len(materials))
+        if k == len(materials):
+            materials.append(part.material)
+        face_material.append(np.full(len(part.faces), k, dtype=np.int32))
+    colors = None
+    if any(part.colors is not None for part in parts):
+        white = lambda part: np.ones((len(part.faces), 3, 3), np.float32)
+        colors = np.concatenate([white(p) if p.colors is None else p.colors for p in parts])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
+    return World(
+        name=f"mesh:{path}",
+        vertices=np.concatenate([part.vertices for part in parts]) @ turn.T,
+        faces=np.concatenate(faces).astype(np.int32),
+        materials=tuple(materials),
+        face_material=np.concatenate(face_material),
+        face_uv=np.concatenate([part.uv for part in parts]).astype(np.float32),
+        face_color=colors,
+        notes={"source": str(path)},
+    )
+
+
+def _check(path: Path, world: World) -> None:
+    """Refuses geometry that no ray can meet."""
+    if world.faces.min() < 0 or world.faces.max() >= len(world.vertices):
+        raise ValueError(
+            f"{path}: a face names vertex {world.faces.max()}, but there are "
+            f"{len(world.vertices)} vertices; the file is damaged, export it again"
+        )
+    bad = np.flatnonzero(~np.isfinite(world.vertices).all(axis=1))
+    if len(bad):
+        raise ValueError(
+            f"{path}: {len(bad)} of {len(world.vertices)} vertices are not finite, the first is "
+            f"number {bad[0]}: {world.vertices[bad[0]].tolist()}; repair the mesh first"
+        )
+    if not np.isfinite(world.face_uv).all():
+        raise ValueError(f"{path}: texture coordinates are not finite; repair the mesh first")
+    extent = world.bounds[1] - world.bounds[0]
+    corners = world.vertices[world.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if not np.linalg.norm(cross, axis=1).max() > 0.0:
+        raise ValueError(
+            f"{path}: every face has zero area (the mesh extends {extent.tolist()} m); "
+            "there is no surface to see"
+        )
+    if extent.max() > _MAX_EXTENT:
+        raise ValueError(
+            f"{path} extends {extent.max():.3g} m; the unit is metres: scale the mesh first"
+        )

@@ -1,0 +1,378 @@
+"""Colours of ray hits: textures, lamps, highlights. One jitted kernel over chunks of rays.
+
+The colour c of a hit with surface colour a (texture x material colour x vertex colour), normal n
+turned towards the viewer, lamps i at distance d_i in direction l_i with half vector h_i
+(Blinn, "Models of light reflection", 1977) is
+
+    light_i = color_i / (1 + (d_i / reach_i)^2)
+    c = a (e + (1 - e) (ambient + (1 - ambient) sum_i light_i max(0, n l_i)))
+        + specular sum_i light_i max(0, n h_i)^shininess
+
+with the emission e. A world without lamps shows a.
+
+Textures are filtered trilinearly, with PROBES samples along the longer axis of the pixel's
+footprint: isotropic mip maps would blur floors and walls seen at a low angle.
+
+Shape symbols: n rays of a chunk; F faces; K materials; T textures; L lamps; S texels.
+"""
+
+import hashlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt32
+
+from r3jax.simulators.rays import Hits
+from r3jax.simulators.textures import MAX_LEVELS, build_atlas, round_up
+from r3jax.simulators.world import World
+
+CHUNK = 1 << 16
+"""Rays per call of the kernel."""
+
+PROBES = 2
+"""Trilinear samples along the longer axis of a footprint."""
+
+LEVEL_BIAS = -0.25
+"""Added to the mip level: a little sharper than the box that GL assumes."""
+
+
+class Surface(eqx.Module):
+    """What the kernel needs to know of a world, as tables."""
+
+    faces: Float[Array, "F 16"]
+    """Texel coordinates of corner 0 and of the edges to corners 1 and 2 (6 numbers); gradients
+    of the texel coordinates [1/m] (6); unit normal (3); index of the material (1)."""
+
+    corner_colors: Float[Array, "F_or_1 9"]
+    """Vertex colours; one row of ones where the world has none."""
+
+    materials: Float[Array, "K 8"]
+    """Colour (3), specular, shininess, emission, index of the texture (-1: none), 0."""
+
+    texels: UInt32[Array, " S"]
+    """See `TextureAtlas`."""
+
+    sizes: Int[Array, "T 2"]
+    """Width and height of the textures."""
+
+    offsets: Int[Array, "T levels"]
+    """First texel of each level."""
+
+    lamps: Float[Array, "L 7"]
+    """Position (3), colour (3), reach."""
+
+    ambient: Float[Array, ""]
+    """Share of the surface colour that shows without any lamp."""
+
+
+class Rays(eqx.Module):
+    """A chunk of ray hits."""
+
+    face: Int[Array, " n"]
+    """Index of the face, -1: nothing was hit."""
+
+    u: Float[Array, " n"]
+    """Barycentric weight of corner 1."""
+
+    v: Float[Array, " n"]
+    """Barycentric weight of corner 2."""
+
+    path: Float[Array, " n"]
+    """Ray parameter from the camera to the hit, over all bounces."""
+
+    position: Float[Array, "n 3"]
+    """The hit [m]."""
+
+    direction: Float[Array, "n 3"]
+    """Direction of the (last) ray; not of unit length."""
+
+    mirror: Float[Array, "n_or_1 3"]
+    """Unit normal of the mirror that the ray came by; one row of 0 for rays straight from the
+    camera."""
+
+
+def build_surface(world: World, *, lighting: bool) -> Surface:
+    """Turns a world into the kernel's tables.
+
+    Args:
+        world: triangles and materials.
+        lighting: False leaves out lamps, highlights and emission: every surface shows its colour.
+    """
+    images, texture_of = _unique_textures(world)
+    atlas = build_atlas(images)
+    material_size = np.ones((len(world.materials), 2))
+    rows = np.zeros((len(world.materials), 8), np.float32)
+    for k, material in enumerate(world.materials):
+        if texture_of[k] >= 0:
+            material_size[k] = atlas.sizes[texture_of[k]]
+        look = (material.specular, material.shininess, material.emission)
+        rows[k] = (*material.color, *look, texture_of[k], 0.0)
+    faces = _face_table(world, material_size)
+    colors = world.face_color
+    corner_colors = np.ones((1, 9)) if colors is None else _padded(colors.reshape(-1, 9))
+    lamps = [(*lamp.position, *lamp.color, lamp.reach) for lamp in world.lamps if lighting]
+    as_float = lambda x: jnp.asarray(np.asarray(x, dtype=np.float32))
+    return Surface(
+        faces=as_float(_padded(faces)),
+        corner_colors=as_float(corner_colors),
+        materials=as_float(rows),
+        texels=jnp.asarray(atlas.texels),
+        sizes=jnp.asarray(atlas.sizes),
+        offsets=jnp.asarray(atlas.offsets),
+        lamps=as_float(np.reshape(lamps, (-1, 7))),
+        ambient=as_float(world.ambient),
+    )
+
+
+def _unique_textures(world: World) -> tuple[list[np.ndarray], list[int]]:
+    """Distinct images, and each material's index into them (-1: none)."""
+    images: list[np.ndarray] = []
+    index: dict[bytes, int] = {}
+    texture_of: list[int] = []
+    for material in world.materials:
+        if material.texture is None:
+            texture_of.append(-1)
+            continue
+        texels = np.ascontiguousarray(material.texture)
+        key = hashlib.sha256(texels.data).digest() + repr(texels.shape).encode()
+        if key not in index:
+            index[key] = len(images)
+            images.append(material.texture)
+        texture_of.append(index[key])
+    return images, texture_of
+
+
+def _padded(table: np.ndarray) -> np.ndarray:
+    """Adds rows of zeros up to a round number, so that worlds share compiled kernels."""
+    extra = round_up(len(table)) - len(table)
+    return np.concatenate([table, np.zeros((extra, table.shape[1]), table.dtype)])
+
+
+def _face_table(world: World, material_size: np.ndarray) -> np.ndarray:
+    """`Surface.faces`, [F, 16] float64."""
+    corners = world.vertices[world.faces]
+    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    cross = np.cross(edge1, edge2)
+    area2 = np.linalg.norm(cross, axis=1)
+    is_flat = area2 < 1e-14  # no ray meets such a face with a footprint that matters
+    area2 = np.where(is_flat, 1.0, area2)
+    normal = cross / area2[:, None]
+
+    uv = world.face_uv.astype(np.float64)
+    uv = uv - np.floor(uv.min(axis=1, keepdims=True))  # textures repeat; small numbers are exact
+    size = material_size[world.face_material][:, None, :]
+    texel = np.stack([uv[..., 0], -uv[..., 1]], axis=-1) * size
+    texel0, texel1, texel2 = texel[:, 0], texel[:, 1] - texel[:, 0], texel[:, 2] - texel[:, 0]
+    # Gradients of the barycentric weights over the plane of the face.
+    gradient_u = np.cross(edge2, normal) / area2[:, None]
+    gradient_v = np.cross(normal, edge1) / area2[:, None]
+    gradient = texel1[:, :, None] * gradient_u[:, None] + texel2[:, :, None] * gradient_v[:, None]
+    gradient[is_flat] = 0.0
+    return np.concatenate(
+        [texel0, texel1, texel2, gradient.reshape(-1, 6), normal, world.face_material[:, None]],
+        axis=1,
+    )
+
+
+def _dot(a: Array, b: Array) -> Float[Array, " n"]:
+    """Scalar products of the columns of two [3, n] arrays."""
+    # Written out: XLA's reductions over such a short axis are many times slower on a CPU.
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _footprint(
+    gradient: Float[Array, "6 n"],
+    normal: Float[Array, "3 n"],
+    rays: Rays,
+    pixel_steps: Float[Array, "2 3"],
+) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"]]:
+    """How far, in texels, the hit moves when the pixel moves by one column and by one row.
+
+    With the plane's normal n and direction d, a change e of the direction moves the hit by
+    t (e - d (n e) / (n d)) (Igehy, "Tracing ray differentials", 1999). A mirror reflects e.
+    """
+    direction, mirror = rays.direction.T, rays.mirror.T
+    along = _dot(normal, direction)
+    along = jnp.where(jnp.abs(along) < 1e-6, 1e-6, along)
+
+    def moved(step: Float[Array, " 3"]) -> Float[Array, "2 n"]:
+        reflected = step[:, None] - 2.0 * mirror * _dot(mirror, step)[None, :]
+        reflected = jnp.broadcast_to(reflected, direction.shape)
+        slide = _dot(normal, reflected) / along
+        move = rays.path[None, :] * (reflected - direction * slide[None, :])
+        return jnp.stack([_dot(gradient[:3], move), _dot(gradient[3:], move)])
+
+    return moved(pixel_steps[0]), moved(pixel_steps[1])
+
+
+def _texture_color(
+    surface: Surface,
+    texture: Int[Array, " n"],
+    texel: Float[Array, "2 n"],
+    moves: tuple[Float[Array, "2 n"], Float[Array, "2 n"]],
+) -> Float[Array, "3 n"]:
+    """Filtered texture colours in [0, 1]."""
+    size = _rows(surface.sizes, texture).T  # [2, n]
+    lengths = [jnp.sqrt(move[0] ** 2 + move[1] ** 2) for move in moves]
+    is_first_longer = lengths[0] >= lengths[1]
+    long_axis = jnp.where(is_first_longer[None, :], moves[0], moves[1])
+    longer, shorter = jnp.maximum(*lengths), jnp.minimum(*lengths)
+    width = jnp.maximum(longer / PROBES, shorter)
+    level = jnp.clip(jnp.log2(jnp.maximum(width, 1e-6)) + LEVEL_BIAS, 0.0, MAX_LEVELS - 1.0)
+    fine = jnp.floor(level)
+    blend = level - fine
+    # Probes spread only as far as the footprint is longer than wide.
+    spread = 1.0 - jnp.minimum(shorter / jnp.maximum(longer, 1e-6), 1.0)
+
+    indices, weights = [], []
+    for coarser in range(2):
+        k = jnp.minimum(fine.astype(jnp.int32) + coarser, MAX_LEVELS - 1)
+        size_k = jnp.maximum(size >> k[None, :], 1)
+        start = _rows(surface.offsets.reshape(-1), texture * MAX_LEVELS + k)
+        scale = size_k.astype(jnp.float32) / size.astype(jnp.float32)
+        share = (blend if coarser else 1.0 - blend) / PROBES
+        for probe in range(PROBES):
+            shift = ((probe + 0.5) / PROBES - 0.5) * spread
+            x, y = (texel + shift[None, :] * long_axis) * scale - 0.5
+            columns, fx = _wrapped_pair(x, size_k[0])
+            rows, fy = _wrapped_pair(y, size_k[1])
+            for i, wy in enumerate((1.0 - fy, fy)):
+                for j, wx in enumerate((1.0 - fx, fx)):
+                    indices.append(start + rows[i] * size_k[0] + columns[j])
+                    weights.append(share * wx * wy)
+    # One gather of whole texels, kept apart from what follows: fused, XLA would fetch every
+    # texel once per channel.
+    packed = jax.lax.optimization_barrier(_rows(surface.texels, jnp.stack(indices)))
+    channels = []
+    for shift in (0, 8, 16):
+        values = [((texels >> shift) & jnp.uint32(255)).astype(jnp.float32) for texels in packed]
+        channels.append(sum(w * value for w, value in zip(weights, values, strict=True)))
+    return jnp.stack(channels) / 255.0
+
+
+def _rows(table: Array, index: Int[Array, "..."]) -> Array:
+    """`table[index]` for indices known to be inside: the check would cost more than the fetch."""
+    return table.at[index].get(mode="promise_in_bounds")
+
+
+def _wrapped_pair(
+    x: Float[Array, " n"], size: Int[Array, " n"]
+) -> tuple[list[Int[Array, " n"]], Float[Array, " n"]]:
+    """The two texels next to x of a texture that repeats, and the second one's weight."""
+    # In floating point: integer remainders do not vectorise, and cost more than the fetches.
+    limit = size.astype(jnp.float32)
+    low = jnp.floor(x)
+    first = low - limit * jnp.floor(low / limit)
+    first = jnp.where(first >= limit, 0.0, first)
+    second = jnp.where(first + 1.0 >= limit, 0.0, first + 1.0)
+    return [first.astype(jnp.int32), second.astype(jnp.int32)], x - low
+
+
+def _lit(
+    surface: Surface,
+    albedo: Float[Array, "3 n"],
+    look: Float[Array, "8 n"],
+    normal: Float[Array, "3 n"],
+    rays: Rays,
+) -> Float[Array, "3 n"]:
+    """The module's formula for a world with lamps."""
+    unit = lambda x: x / jnp.maximum(jnp.sqrt(_dot(x, x)), 1e-6)[None, :]
+    view = unit(-rays.direction.T)
+    facing = jnp.where((_dot(normal, view) < 0.0)[None, :], -normal, normal)
+    position = rays.position.T
+    specular, shininess, emission = look[3], look[4], look[5]
+    diffuse = jnp.zeros_like(albedo)
+    highlight = jnp.zeros_like(albedo)
+    for lamp in surface.lamps:
+        to_lamp = lamp[:3, None] - position
+        fall = 1.0 / (1.0 + _dot(to_lamp, to_lamp) / lamp[6] ** 2)
+        light = lamp[3:6, None] * fall[None, :]
+        to_lamp = unit(to_lamp)
+        incidence = _dot(facing, to_lamp)
+        gloss = jnp.maximum(_dot(facing, unit(to_lamp + view)), 1e-6) ** shininess
+        gloss = jnp.where(incidence > 0.0, gloss, 0.0)
+        diffuse = diffuse + light * jnp.maximum(incidence, 0.0)[None, :]
+        highlight = highlight + light * gloss[None, :]
+    received = surface.ambient + (1.0 - surface.ambient) * diffuse
+    lit = emission[None, :] + (1.0 - emission)[None, :] * received
+    return albedo * lit + specular[None, :] * highlight
+
+
+@jax.jit
+def shade(surface: Surface, rays: Rays, pixel_steps: Float[Array, "2 3"]) -> Float[Array, "3 n"]:
+    """Colours of a chunk of hits, in [0, 1]; black where nothing was hit.
+
+    Args:
+        surface: the world's tables.
+        rays: the hits.
+        pixel_steps: by how much the camera's ray direction changes from one column (row 0) and
+            from one row (row 1) of pixels to the next.
+    """
+    face = jnp.maximum(rays.face, 0)
+    # One row of 64 bytes per ray; without the barrier each use would fetch it again.
+    row = jax.lax.optimization_barrier(_rows(surface.faces, face)).T
+    look = jax.lax.optimization_barrier(_rows(surface.materials, row[15].astype(jnp.int32))).T
+    normal = row[12:15]
+    texel = row[0:2] + rays.u[None, :] * row[2:4] + rays.v[None, :] * row[4:6]
+    moves = _footprint(row[6:12], normal, rays, pixel_steps)
+    texture = look[6].astype(jnp.int32)
+    sampled = _texture_color(surface, jnp.maximum(texture, 0), texel, moves)
+    albedo = look[:3] * jnp.where(texture[None, :] >= 0, sampled, 1.0)
+    if surface.corner_colors.shape[0] > 1:
+        corner = jax.lax.optimization_barrier(_rows(surface.corner_colors, face)).T
+        w0 = (1.0 - rays.u - rays.v)[None, :]
+        mixed = w0 * corner[:3] + rays.u[None, :] * corner[3:6] + rays.v[None, :] * corner[6:]
+        albedo = albedo * mixed
+    color = albedo if surface.lamps.shape[0] == 0 else _lit(surface, albedo, look, normal, rays)
+    return jnp.where(rays.face[None, :] >= 0, jnp.clip(color, 0.0, 1.0), 0.0)
+
+
+def shade_hits(
+    surface: Surface,
+    hits: Hits,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    pixel_steps: Float[Array, "2 3"],
+    *,
+    path_before: np.ndarray | None = None,
+    mirror: np.ndarray | None = None,
+) -> np.ndarray:
+    """Colours of any number of hits, [n, 3] float32: `shade` chunk by chunk.
+
+    Args:
+        surface: the world's tables.
+        hits: of n rays.
+        origins: where the rays start [n, 3] [m].
+        directions: of the rays [n, 3].
+        pixel_steps: see `shade`.
+        path_before: length of the way to `origins`, in the same unit as the hits' distances [n].
+        mirror: normals of the mirrors that the rays come by [n, 3].
+    """
+    count = len(hits.face)
+    colors = np.empty((count, 3), np.float32)
+    distance = np.where(hits.face >= 0, hits.distance, np.float32(1.0))
+    position = origins + distance[:, None] * directions
+    path = distance if path_before is None else distance + path_before
+    mirror = np.zeros((1, 3), np.float32) if mirror is None else mirror
+    pending = []
+    for begin in range(0, count, CHUNK):
+        part = slice(begin, begin + CHUNK)
+        columns = (hits.face, hits.u, hits.v, path, position, directions)
+        rays = Rays(
+            *(jnp.asarray(_filled(column[part])) for column in columns),
+            mirror=jnp.asarray(mirror if len(mirror) == 1 else _filled(mirror[part])),
+        )
+        pending.append((part, shade(surface, rays, pixel_steps)))
+    for part, color in pending:
+        colors[part] = np.asarray(color).T[: count - part.start]
+    return colors
+
+
+def _filled(column: np.ndarray) -> np.ndarray:
+    """The column, extended to CHUNK rows."""
+    missing = CHUNK - len(column)
+    if missing == 0:
+        return column
+    return np.concatenate([column, np.zeros((missing, *column.shape[1:]), column.dtype)])
