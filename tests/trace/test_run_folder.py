@@ -157,12 +157,10 @@ def test_files_of_the_user_inside_a_run_survive_overwriting(tmp_path):
 
 
 def test_two_writers_cannot_share_a_run(tmp_path):
-    with (
-        RunWriter(tmp_path / "run", make_header()) as writer,
-        pytest.raises(RunError, match="another process is writing"),
-    ):
+    with RunWriter(tmp_path / "run", make_header()) as writer:
         writer.add(*make_view(0))
-        RunWriter(tmp_path / "run", make_header(), overwrite=True)
+        with pytest.raises(RunError, match="another process is writing"):
+            RunWriter(tmp_path / "run", make_header(), overwrite=True)
     assert len(read_run(tmp_path / "run").rows) == 1
     write_run(tmp_path / "run", overwrite=True)  # the lock died with its writer
 

@@ -1,0 +1,196 @@
+"""Reads an RGB-D recording: a folder of images, depth images and poses.
+
+    images/*.png     8-bit RGB (or anything Pillow turns into RGB)
+    depth/*.png      uint16, millimetres, 0 = no measurement
+    K.txt            3x3 intrinsics, OpenCV's convention: pixel centers at whole numbers
+    poses.txt        one camera-to-world matrix per line, 16 numbers row by row, OpenCV axes
+
+Images, depth images and poses belong together in the order of the sorted file names.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.formats.errors import FormatError
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera, rigid_error
+
+Up = Literal["y", "z"]
+
+_Z_UP_FROM_Y_UP = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""(x, y, z) becomes (x, -z, y): right-handed stays right-handed."""
+
+_MAX_DRIFT = 0.02
+"""Rotations off by at most this (text with few digits, long chains of products) are mended."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording whose poses have been checked; images are read when asked for."""
+
+    path: Path
+    camera: Camera
+    image_paths: tuple[Path, ...]
+    depth_paths: tuple[Path, ...]
+
+    poses: np.ndarray
+    """`T_world_camera`, [n, 4, 4] float64: OpenCV axes, world z up [m]."""
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.image_paths)
+
+    def frame(self, index: int) -> Frame:
+        """One frame.
+
+        Raises:
+            FormatError: an image that is missing, broken, or of another size or kind.
+        """
+        rgb = _read_image(self.image_paths[index], self.camera, is_depth=False)
+        depth = _read_image(self.depth_paths[index], self.camera, is_depth=True)
+        return Frame(
+            rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
+            depth=jnp.asarray(depth.astype(np.float32) / np.float32(1000.0)),
+            T_world_camera=jnp.asarray(self.poses[index], dtype=jnp.float32),
+            camera=self.camera,
+        )
+
+    def frames(self) -> Iterator[Frame]:
+        """Every frame in order, read one by one."""
+        return (self.frame(index) for index in range(len(self)))
+
+
+def is_recording(path: Path) -> bool:
+    """True if the folder looks like a recording."""
+    return (path / "poses.txt").exists() and (path / "images").is_dir()
+
+
+def read_recording(path: Path | str, up: Up = "y") -> Recording:
+    """Opens a recording and checks everything but the pixels.
+
+    Args:
+        path: the folder.
+        up: axis of the recording's world that points up; the poses are turned to z up.
+
+    Raises:
+        FormatError: files that are missing, numbers of images, depth images and poses that
+            differ, intrinsics that make no sense, poses that are not finite or not rigid.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise FormatError(path, "there is no such folder")
+    image_paths = _list_images(path / "images")
+    depth_paths = _list_images(path / "depth")
+    poses = _read_numbers(path / "poses.txt", columns=16).reshape(-1, 4, 4)
+    counts = {"images": len(image_paths), "depth images": len(depth_paths), "poses": len(poses)}
+    if len(set(counts.values())) != 1:
+        listed = ", ".join(f"{count} {what}" for what, count in counts.items())
+        raise FormatError(path, f"the numbers must be equal, found {listed}")
+    for image, depth in zip(image_paths, depth_paths, strict=True):
+        if image.stem != depth.stem:
+            raise FormatError(depth, f"the depth image of {image.name} should be here")
+    poses = np.stack([_mend_pose(path / "poses.txt", i, pose) for i, pose in enumerate(poses)])
+    if up == "y":
+        poses = _Z_UP_FROM_Y_UP @ poses
+    camera = _read_camera(path / "K.txt", image_paths[0])
+    return Recording(path, camera, image_paths, depth_paths, poses)
+
+
+def _list_images(folder: Path) -> tuple[Path, ...]:
+    if not folder.is_dir():
+        raise FormatError(folder, "the folder is missing")
+    found = tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")))
+    if not found:
+        raise FormatError(folder, "the folder holds no image (*.png, *.jpg)")
+    return found
+
+
+def _read_numbers(path: Path, columns: int) -> np.ndarray:
+    """A table of numbers, [n, columns] float64; comments start with #."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise FormatError(path, "the file is missing") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(path, f"the file cannot be read ({error})") from None
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        if len(words) != columns:
+            raise FormatError(path, f"line {number} has {len(words)} numbers, not {columns}")
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError as error:
+            raise FormatError(path, f"line {number}: {error}") from None
+    if not rows:
+        raise FormatError(path, "the file holds no numbers")
+    return np.asarray(rows)
+
+
+def _mend_pose(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
+    """Removes a small drift from a rotation (nearest rotation, by SVD); refuses a large one."""
+    if np.all(np.isfinite(pose)) and np.linalg.det(pose[:3, :3]) > 0.0:
+        u, _, vt = np.linalg.svd(pose[:3, :3])
+        nearest = u @ vt
+        if np.abs(nearest - pose[:3, :3]).max() <= _MAX_DRIFT:
+            pose = pose.copy()
+            pose[:3, :3] = nearest
+    problem = rigid_error(pose)
+    if problem is not None:
+        raise FormatError(path, f"pose {index} (line {index + 1}): {problem}")
+    return pose
+
+
+def _read_camera(path: Path, first_image: Path) -> Camera:
+    """Intrinsics from K.txt, the size from the first image."""
+    K = _read_numbers(path, columns=3)
+    if K.shape != (3, 3) or not np.all(np.isfinite(K)):
+        raise FormatError(path, "expected a finite 3x3 matrix")
+    width, height = _image_size(first_image)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    if not (fx > 0.0 and fy > 0.0):
+        raise FormatError(path, f"focal lengths must be positive, got {fx:g} and {fy:g}")
+    if not (0.0 <= cx < width and 0.0 <= cy < height):
+        raise FormatError(
+            path,
+            f"the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} images: "
+            "is K for another resolution?",
+        )
+    return Camera(width, height, float(fx), float(fy), float(cx) + 0.5, float(cy) + 0.5)
+
+
+def _image_size(path: Path) -> tuple[int, int]:
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, SyntaxError) as error:
+        raise FormatError(path, f"the image cannot be read ({error})") from None
+
+
+def _read_image(path: Path, camera: Camera, *, is_depth: bool) -> np.ndarray:
+    """[H, W, 3] uint8 or [H, W] uint16."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            if image.size != (camera.width, camera.height):
+                raise FormatError(
+                    path, f"the size is {image.size}, others are {(camera.width, camera.height)}"
+                )
+            if is_depth and image.mode not in ("I;16", "I;16B", "I"):
+                raise FormatError(path, f"depth must be 16-bit, the image's mode is {image.mode}")
+            pixels = np.asarray(image if is_depth else image.convert("RGB"))
+    except (OSError, SyntaxError) as error:
+        raise FormatError(path, f"the image cannot be read ({error})") from None
+    return pixels.astype(np.uint16) if is_depth else pixels

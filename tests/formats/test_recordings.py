@@ -1,0 +1,165 @@
+"""Recordings: a folder of pictures becomes frames in a world whose z is up."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from r3jax.formats.errors import FormatError
+from r3jax.formats.recordings import is_recording, read_recording
+from r3jax.geometry.cameras import rigid_error
+
+SIZE = (10, 8)
+
+
+def turn_about_y(angle: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [np.cos(angle), 0, np.sin(angle)],
+        [0, 1, 0],
+        [-np.sin(angle), 0, np.cos(angle)],
+    ]
+    return pose
+
+
+def make_poses(num: int = 3) -> np.ndarray:
+    # In a y-up world a level OpenCV camera has its y axis (down) along -y.
+    level = np.diag([1.0, -1.0, -1.0, 1.0])
+    poses = np.stack([turn_about_y(0.4 * i) @ level for i in range(num)])
+    poses[:, :3, 3] = np.arange(3 * num).reshape(num, 3) * 0.1
+    return poses
+
+
+@pytest.fixture
+def folder(tmp_path):
+    path = tmp_path / "capture"
+    for name in ("images", "depth"):
+        (path / name).mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for i in range(3):
+        rgb = rng.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+        Image.fromarray(rgb).save(path / "images" / f"{i:03d}.png")
+        depth = rng.integers(1, 5000, SIZE[::-1]).astype(np.uint16)
+        depth[0, 0] = 0
+        Image.fromarray(depth).save(path / "depth" / f"{i:03d}.png")
+    np.savetxt(path / "K.txt", [[8.0, 0, 4.5], [0, 8.0, 3.5], [0, 0, 1]])
+    np.savetxt(path / "poses.txt", make_poses().reshape(3, 16))
+    return path
+
+
+def test_pixels_metres_and_intrinsics(folder):
+    recording = read_recording(folder)
+    assert len(recording) == 3
+    frame = recording.frame(1)
+    rgb = np.asarray(Image.open(folder / "images" / "001.png"))
+    depth = np.asarray(Image.open(folder / "depth" / "001.png"))
+    np.testing.assert_array_equal(np.rint(np.asarray(frame.rgb) * 255), rgb)
+    np.testing.assert_allclose(frame.depth, depth / 1000.0, rtol=1e-6)
+    assert frame.depth[0, 0] == 0.0
+    assert (frame.camera.width, frame.camera.height) == SIZE
+    assert float(frame.camera.cx) == 5.0  # OpenCV counts from the first pixel's center
+
+
+def test_the_world_is_turned_so_that_z_is_up(folder):
+    recording = read_recording(folder, up="y")
+    original = make_poses()
+    for pose, before in zip(recording.poses, original, strict=True):
+        assert rigid_error(pose) is None
+        np.testing.assert_allclose(pose[:3, 1], [0, 0, -1], atol=1e-12)  # image rows go down
+        x, y, z = before[:3, 3]
+        np.testing.assert_allclose(pose[:3, 3], [x, -z, y])
+    np.testing.assert_allclose(read_recording(folder, up="z").poses, original, atol=1e-12)
+
+
+def test_a_small_drift_of_a_rotation_is_mended(folder):
+    poses = make_poses()
+    poses[1, :3, :3] *= 1.004
+    np.savetxt(folder / "poses.txt", poses.reshape(3, 16))
+    recording = read_recording(folder, up="z")
+    assert rigid_error(recording.poses[1]) is None
+    np.testing.assert_allclose(recording.poses[1], make_poses()[1], atol=1e-9)
+
+
+def replace_pose(folder, change):
+    poses = make_poses()
+    change(poses)
+    np.savetxt(folder / "poses.txt", poses.reshape(-1, 16))
+
+
+DAMAGES = {
+    "no poses": (lambda f: (f / "poses.txt").unlink(), r"poses\.txt: the file is missing"),
+    "no intrinsics": (lambda f: (f / "K.txt").unlink(), r"K\.txt: the file is missing"),
+    "fewer images": (
+        lambda f: (f / "images" / "001.png").unlink(),
+        "2 images, 3 depth images, 3 poses",
+    ),
+    "other names": (
+        lambda f: (f / "depth" / "001.png").rename(f / "depth" / "0015.png"),
+        r"the depth image of 001\.png",
+    ),
+    "fewer poses": (
+        lambda f: np.savetxt(f / "poses.txt", make_poses(2).reshape(2, 16)),
+        "3 images, 3 depth images, 2 poses",
+    ),
+    "NaN": (lambda f: replace_pose(f, lambda p: p[1].fill(np.nan)), r"pose 1 .*not finite"),
+    "scale": (lambda f: replace_pose(f, _scale), r"pose 2 .*not rigid"),
+    "mirror": (lambda f: replace_pose(f, _mirror), r"pose 0 .*mirrors"),
+    "words": (lambda f: (f / "poses.txt").write_text("one two\n"), "line 1 has 2 numbers, not 16"),
+    "text": (lambda f: (f / "K.txt").write_text("8 0 x\n0 8 4\n0 0 1\n"), "line 1: could not"),
+    "other size": (
+        lambda f: (f / "K.txt").write_text("80 0 45\n0 80 35\n0 0 1\n"),
+        "outside the 10x8 images",
+    ),
+    "empty": (lambda f: (f / "K.txt").write_text(""), "no numbers"),
+    "not an image": (
+        lambda f: (f / "images" / "000.png").write_bytes(b"?"),
+        r"000\.png: the image cannot be read",
+    ),
+}
+
+
+def _scale(poses):
+    poses[2, :3, :3] *= 1.5
+
+
+def _mirror(poses):
+    poses[0, :3, 0] *= -1.0
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_recording_is_named(folder, damage):
+    break_it, message = DAMAGES[damage]
+    break_it(folder)
+    with pytest.raises(FormatError, match=message):
+        read_recording(folder)
+
+
+def test_an_image_of_another_size_is_named_when_it_is_read(folder):
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(folder / "images" / "002.png")
+    recording = read_recording(folder)
+    recording.frame(0)
+    with pytest.raises(FormatError, match=r"002\.png: the size is \(4, 4\)"):
+        recording.frame(2)
+
+
+def test_8_bit_depth_is_refused(folder):
+    Image.fromarray(np.zeros(SIZE[::-1], np.uint8)).save(folder / "depth" / "000.png")
+    with pytest.raises(FormatError, match="depth must be 16-bit"):
+        read_recording(folder).frame(0)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FormatError, match="no such folder"):
+        read_recording(tmp_path / "nowhere")
+    assert not is_recording(tmp_path)
+
+
+def test_the_real_recording_is_upright(shared):
+    recording = read_recording(shared("recordings", "hololens_lounge"), up="y")
+    assert len(recording) == 48
+    assert is_recording(recording.path)
+    assert (recording.camera.width, recording.camera.height) == (540, 360)
+    # Carried by hand: on average the image's rows point down and the eye stays at one height.
+    assert recording.poses[:, 2, 1].mean() < -0.8
+    assert np.ptp(recording.poses[:, 2, 3]) < 0.5 < np.ptp(recording.poses[:, 0, 3])
+    holes = [float((np.asarray(recording.frame(i).depth) == 0).mean()) for i in (0, 20, 40)]
+    assert 0.2 < np.mean(holes) < 0.6
