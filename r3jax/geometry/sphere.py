@@ -1,19 +1,23 @@
-"""Directions on the unit sphere: the Fibonacci lattice and what lies inside a field of view.
+"""Directions on the unit sphere: the Fibonacci lattice, nearest bins, fields of view.
 
-Shape symbols: B directions of a lattice; n query directions.
+Shape symbols: B directions of a lattice; n query directions; S cells along an octahedral map.
 """
 
 import functools
 import math
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
+
+GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 
 
 @functools.cache
 def _lattice(num: int) -> np.ndarray:
     k = np.arange(num, dtype=np.float64)
     z = 1.0 - 2.0 * (k + 0.5) / num
-    azimuth = 2.0 * np.pi * k / ((1.0 + math.sqrt(5.0)) / 2.0)
+    azimuth = 2.0 * np.pi * k / GOLDEN_RATIO
     radius = np.sqrt(1.0 - z * z)
     points = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
     points.flags.writeable = False
@@ -36,5 +40,81 @@ def bins_for_angle(angle_deg: float) -> int:
 
     A = 2 pi (1 - cos(angle / 2)), num = ceil(4 pi / A); 10 degrees give 526.
     """
+    if not 0.0 < angle_deg <= 360.0:
+        raise ValueError(f"angle_deg must lie in (0, 360], got {angle_deg}")
     cap = 2.0 * math.pi * (1.0 - math.cos(0.5 * math.radians(angle_deg)))
     return math.ceil(4.0 * math.pi / cap)
+
+
+def octahedral_cell(directions: Float[Array, "3 n"], size: int) -> Int[Array, " n"]:
+    """Cell (row * size + column) of each direction on the octahedral map of the sphere.
+
+    The octahedron |x| + |y| + |z| = 1 is unfolded into a square: the upper half is its middle,
+    the lower half its four corners (Cigolle et al. 2014). Directions need not have length 1.
+    """
+    x, y, z = directions
+    inverse = 1.0 / jnp.maximum(jnp.abs(x) + jnp.abs(y) + jnp.abs(z), 1e-20)
+    u, v = x * inverse, y * inverse
+    sign = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
+    u_folded = jnp.where(z < 0.0, (1.0 - jnp.abs(v)) * sign(u), u)
+    v_folded = jnp.where(z < 0.0, (1.0 - jnp.abs(u)) * sign(v), v)
+    place = lambda value: jnp.clip(((value * 0.5 + 0.5) * size).astype(jnp.int32), 0, size - 1)
+    return place(v_folded) * size + place(u_folded)
+
+
+def octahedral_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Unit directions, [..., 3], of points (u, v) in [-1, 1]^2 of the octahedral map."""
+    z = 1.0 - np.abs(u) - np.abs(v)
+    fold = np.maximum(-z, 0.0)
+    x = u - np.where(u >= 0.0, fold, -fold)
+    y = v - np.where(v >= 0.0, fold, -fold)
+    points = np.stack([x, y, z], axis=-1)
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+_MAP_SIZE = 128
+
+
+@functools.cache
+def _nearest_candidates(num: int) -> np.ndarray:
+    """Per octahedral cell the bins that can be nearest somewhere in it, [K, S * S] int32.
+
+    Exact, not sampled: if c is the cell's center, r the angle to its farthest corner and d the
+    angle from c to its nearest bin, then no bin farther than d + 2 r from c can be nearest.
+    """
+    edges = np.linspace(-1.0, 1.0, _MAP_SIZE + 1)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    center = octahedral_direction(*np.meshgrid(middles, middles)).reshape(-1, 3)
+    corner = octahedral_direction(*np.meshgrid(edges, edges))
+    corners = [
+        corner[i:, j:][:_MAP_SIZE, :_MAP_SIZE].reshape(-1, 3) for i in (0, 1) for j in (0, 1)
+    ]
+    cosines = np.stack([np.sum(center * c, axis=1) for c in corners])
+    radius = np.arccos(np.clip(cosines.min(axis=0), -1.0, 1.0)) + 1e-4
+    angle = np.arccos(np.clip(center @ fibonacci_lattice(num).T, -1.0, 1.0))
+    is_candidate = angle <= (angle.min(axis=1) + 2.0 * radius)[:, None]
+    order = np.argsort(np.where(is_candidate, angle, np.inf), axis=1)
+    width = int(is_candidate.sum(axis=1).max())
+    best = order[:, :1]
+    table = np.where(np.take_along_axis(is_candidate, order, axis=1), order, best)[:, :width]
+    return np.ascontiguousarray(table.T.astype(np.int32))
+
+
+def nearest_bin(directions: Float[Array, "3 n"], num: int) -> Int[Array, " n"]:
+    """Index of the lattice direction nearest to each unit direction; ties go to either.
+
+    A table over the octahedral map leaves a few candidates per direction, so that the cost does
+    not grow with `num`.
+    """
+    table = jnp.asarray(_nearest_candidates(num))
+    lattice = jnp.asarray(fibonacci_lattice(num).T, dtype=jnp.float32)
+    cell = octahedral_cell(directions, _MAP_SIZE)
+    best = jnp.full(cell.shape, -2.0, dtype=jnp.float32)
+    chosen = jnp.zeros(cell.shape, dtype=jnp.int32)
+    for k in range(table.shape[0]):
+        candidate = table[k, cell]
+        cosine = sum(lattice[axis, candidate] * directions[axis] for axis in range(3))
+        is_better = cosine > best
+        best = jnp.where(is_better, cosine, best)
+        chosen = jnp.where(is_better, candidate, chosen)
+    return chosen

@@ -15,16 +15,16 @@ EMPTY_WORD = 0xFFFFFFFF
 
 
 def voxel_index(
-    points_world: Float[Array, "*n 3"], voxel_size: Float[Array, ""]
-) -> Int[Array, "*n 3"]:
-    """The voxel that holds each point: floor(p / size), voxel 0 spanning [0, size)."""
-    index = jnp.floor(points_world / voxel_size)
+    coordinates: Float[Array, "..."], voxel_size: Float[Array, ""]
+) -> Int[Array, "..."]:
+    """Index of the voxel along each coordinate: floor(p / size), voxel 0 spanning [0, size)."""
+    index = jnp.floor(coordinates / voxel_size)
     limit = float(INDEX_LIMIT)
     return jnp.clip(index, -limit, limit - 1.0).astype(jnp.int32)
 
 
-def voxel_center(index: Int[Array, "*n 3"], voxel_size: Float[Array, ""]) -> Float[Array, "*n 3"]:
-    """Centre of a voxel [m]."""
+def voxel_center(index: Int[Array, "..."], voxel_size: Float[Array, ""]) -> Float[Array, "..."]:
+    """Center of the voxel along each coordinate [m]."""
     return (index.astype(jnp.float32) + 0.5) * voxel_size
 
 

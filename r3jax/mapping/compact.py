@@ -1,0 +1,44 @@
+"""Running counts and compaction of masks, as small matrix products.
+
+XLA's `cumsum` on a CPU takes 1.5 ms for the pixels of a 512x512 image; a product with a
+triangular matrix of ones takes a quarter of that and is exact below 2^24.
+
+Shape symbols: n flags; M places.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+_BLOCK = 64
+
+
+def running_count(flags: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """Number of set flags up to and including each place. n < 2^24."""
+    if flags.shape[0] >= 1 << 24:
+        raise ValueError(f"running_count is exact below 2^24 flags, got {flags.shape[0]}")
+    return _inclusive_sum(flags.astype(jnp.float32)).astype(jnp.int32)
+
+
+def _inclusive_sum(x: Array) -> Array:
+    n = x.shape[0]
+    if n <= _BLOCK:
+        return jnp.cumsum(x)
+    rows = -(-n // _BLOCK)
+    blocks = jnp.pad(x, (0, rows * _BLOCK - n)).reshape(rows, _BLOCK)
+    triangle = jnp.asarray(np.triu(np.ones((_BLOCK, _BLOCK), dtype=np.float32)))
+    # "highest": a GPU's reduced-precision products would count wrongly.
+    within = jnp.matmul(blocks, triangle, precision="highest")
+    before = _inclusive_sum(within[:, -1]) - within[:, -1]
+    return (within + before[:, None]).reshape(-1)[:n]
+
+
+def positions_of_set(flags: Bool[Array, " n"], size: int) -> Int[Array, " M"]:
+    """Indices of the first `size` set flags, in order; n pads.
+
+    Like `jnp.nonzero(flags, size=size, fill_value=n)`, but quick.
+    """
+    n = flags.shape[0]
+    target = jnp.where(flags, running_count(flags) - 1, size)
+    empty = jnp.full(size, n, dtype=jnp.int32)
+    return empty.at[target].min(jnp.arange(n, dtype=jnp.int32), mode="drop")

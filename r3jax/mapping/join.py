@@ -1,0 +1,139 @@
+"""Statistics per voxel join the map: bins unite, moments add up, the best resolution wins.
+
+A frame, another map, a smaller table: all are statistics per voxel, and one rule merges them.
+
+Shape symbols: N capacity; M rows of new statistics; W words of bins.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from r3jax.geometry.cameras import is_traced
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.table import find_or_insert
+
+CHUNK = 1 << 13
+"""Voxels that join the map at once. A frame rarely touches more; one that does takes turns."""
+
+
+class Statistics(eqx.Module):
+    """What is known of some voxels, each at most once: to be joined into a map."""
+
+    key: UInt32[Array, "2 M"]
+    """Packed voxel index."""
+
+    valid: Bool[Array, " M"]
+    """False for padding."""
+
+    count: Float[Array, " M"]
+    """Observations."""
+
+    mean: Float[Array, "3 M"]
+    """Mean RGB of the observations."""
+
+    m2: Float[Array, " M"]
+    """Sum of squared deviations over observations and channels."""
+
+    visited: UInt32[Array, "W M"]
+    """Direction bins."""
+
+    resolution: Float[Array, " M"]
+    """Best resolution [px/m]."""
+
+
+def join(state: MapState, new: Statistics) -> MapState:
+    """Merges statistics into the map (arXiv 2601.07484, Algorithms 1 and 2).
+
+    Bins unite, the best resolution wins, and the moments follow Chan, Golub & LeVeque (1983):
+
+        d    = mean_b - mean_a
+        n    = n_a + n_b
+        mean = mean_a + d n_b / n
+        M2   = M2_a + M2_b + |d|^2 n_a n_b / n
+
+    For a single observation (n_b = 1, M2_b = 0) this is Welford's update, the paper's
+    Algorithm 2. The result does not depend on the order of joins beyond rounding.
+    """
+    key, row = find_or_insert(state.key, new.key, new.valid)
+    at = lambda x: x.at[..., row].get(mode="fill", fill_value=0)
+    put = lambda x, value: x.at[..., row].set(value, mode="drop")  # rows are distinct
+    n_a, mean_a = at(state.count), at(state.mean)
+    n = n_a + new.count
+    weight = new.count / jnp.maximum(n, 1.0)
+    d = new.mean - mean_a
+    m2 = at(state.m2) + new.m2 + jnp.sum(d * d, axis=0) * n_a * weight
+    is_lost = new.valid & (row >= state.capacity)
+    return MapState(
+        key=key,
+        visited=put(state.visited, at(state.visited) | new.visited),
+        count=put(state.count, n),
+        mean=put(state.mean, mean_a + d * weight[None, :]),
+        m2=put(state.m2, m2),
+        resolution=put(state.resolution, jnp.maximum(at(state.resolution), new.resolution)),
+        voxel_size=state.voxel_size,
+        dropped=state.dropped + jnp.sum(is_lost, dtype=jnp.int32),
+        num_bins=state.num_bins,
+    )
+
+
+def bin_words(bins: Int[Array, " M"], num_words: int) -> UInt32[Array, "W M"]:
+    """One bit per direction bin, as words of 32."""
+    word = jnp.arange(num_words, dtype=jnp.int32)[:, None]
+    bit = jnp.uint32(1) << (bins % 32).astype(jnp.uint32)
+    return jnp.where(word == (bins // 32)[None, :], bit[None, :], jnp.uint32(0))
+
+
+@jax.jit
+def _join_map(state: MapState, other: MapState) -> MapState:
+    """Joins every row of `other`, in chunks: scratch memory does not grow with the map."""
+    size = min(CHUNK, other.capacity)
+
+    def join_chunk(i, state):
+        rows = lambda x: jax.lax.dynamic_slice_in_dim(x, i * size, size, axis=-1)
+        return join(
+            state,
+            Statistics(
+                key=rows(other.key),
+                valid=rows(other.occupied),
+                count=rows(other.count),
+                mean=rows(other.mean),
+                m2=rows(other.m2),
+                visited=rows(other.visited),
+                resolution=rows(other.resolution),
+            ),
+        )
+
+    state = jax.lax.fori_loop(0, other.capacity // size, join_chunk, state)
+    return eqx.tree_at(lambda m: m.dropped, state, state.dropped + other.dropped)
+
+
+def merge(a: MapState, b: MapState) -> MapState:
+    """The map that has seen what `a` and `b` have seen, in a table of `a`'s capacity.
+
+    Exact: equal to integrating both sequences into one map, beyond rounding and row order.
+    Voxels that find no row are counted in `dropped`; grow `a` first if both are large.
+
+    Raises:
+        ValueError: voxel sizes or numbers of bins that differ.
+    """
+    if a.num_bins != b.num_bins:
+        raise ValueError(f"the maps have {a.num_bins} and {b.num_bins} direction bins")
+    sizes = (a.voxel_size, b.voxel_size)
+    if not is_traced(*sizes) and float(sizes[0]) != float(sizes[1]):
+        raise ValueError(f"the maps have voxels of {float(sizes[0])} m and {float(sizes[1])} m")
+    return _join_map(a, b)
+
+
+def grow(state: MapState, capacity: int) -> MapState:
+    """The same map in a larger table. Outside jit: shapes change.
+
+    Raises:
+        ValueError: a capacity that is not a power of two or smaller than the present one.
+    """
+    if capacity < state.capacity:
+        raise ValueError(f"cannot shrink a map of {state.capacity} rows to {capacity}")
+    larger = empty_map(capacity, float(state.voxel_size), state.num_bins)
+    larger = eqx.tree_at(lambda m: m.voxel_size, larger, state.voxel_size)
+    return _join_map(larger, state)

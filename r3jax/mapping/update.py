@@ -1,0 +1,174 @@
+"""Frames and points become observations, one per touched voxel, and join the map.
+
+Shape symbols: P points of a frame; M observations that join at once; H W image size.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, UInt32
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import is_traced
+from r3jax.geometry.numerics import safe_norm
+from r3jax.geometry.sphere import nearest_bin
+from r3jax.geometry.voxels import unpack, voxel_center
+from r3jax.mapping.associate import Groups, edge_pixels, group_by_voxel, points_of_pixels
+from r3jax.mapping.compact import positions_of_set
+from r3jax.mapping.join import CHUNK, Statistics, bin_words, join
+from r3jax.mapping.state import MapState
+
+
+def observe_voxels(
+    state: MapState,
+    key: UInt32[Array, "2 M"],
+    valid: Bool[Array, " M"],
+    rgb: Float[Array, "3 M"],
+    camera_position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+) -> Statistics:
+    """One observation of each voxel from a camera: direction bin, distance, mean colour."""
+    center = voxel_center(jnp.stack(unpack(key[0], key[1])), state.voxel_size)
+    offset = camera_position[:, None] - center
+    distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
+    bins = nearest_bin(offset / distance[None, :], state.num_bins)
+    return Statistics(
+        key=key,
+        valid=valid,
+        count=valid.astype(jnp.float32),
+        mean=jnp.where(valid[None, :], rgb, 0.0),
+        m2=jnp.zeros(valid.shape, dtype=jnp.float32),
+        visited=bin_words(bins, state.visited.shape[0]),
+        resolution=focal / distance,
+    )
+
+
+def integrate_groups(
+    state: MapState,
+    groups: Groups,
+    camera_position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+) -> MapState:
+    """One observation per touched voxel joins the map, `CHUNK` voxels at a time."""
+    num = groups.is_leader.shape[0]
+    size = min(num, CHUNK)
+    leaders = positions_of_set(groups.is_leader, -(-num // size) * size)
+    num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
+
+    def join_chunk(carry):
+        first, state = carry
+        index = jax.lax.dynamic_slice_in_dim(leaders, first, size)
+        valid = index < num
+        index = jnp.minimum(index, num - 1)
+        sums = groups.rgb_sum[index].T
+        rgb = sums[:3] / jnp.maximum(sums[3:], 1.0)
+        seen = observe_voxels(state, groups.key[:, index], valid, rgb, camera_position, focal)
+        return first + size, join(state, seen)
+
+    start = (jnp.zeros((), jnp.int32), state)
+    return jax.lax.while_loop(lambda c: c[0] < num_voxels, join_chunk, start)[1]
+
+
+def _integrate(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    depth = frame.depth
+    is_measured = (depth > 0.0) & jnp.isfinite(depth) & (depth <= max_range)
+    # A branch, not a select: XLA would compute the medians again in each of their consumers.
+    valid = jax.lax.cond(
+        drop_edges,
+        lambda: is_measured & ~edge_pixels(depth, state.voxel_size),
+        lambda: is_measured,
+    )
+    points = points_of_pixels(frame, jnp.where(is_measured, depth, 1.0))
+    groups = group_by_voxel(points, frame.rgb.reshape(-1, 3), valid.reshape(-1), state.voxel_size)
+    return integrate_groups(state, groups, frame.position, frame.camera.focal)
+
+
+_integrate_jitted = jax.jit(_integrate)
+
+
+def integrate(
+    state: MapState,
+    frame: Frame,
+    max_range: float | Float[Array, ""] = np.inf,
+    drop_edges: bool | Bool[Array, ""] = True,
+) -> MapState:
+    """One posed RGB-D frame joins the map: one observation per voxel that it touches.
+
+    Pixels on depth edges take no part: their color mixes two surfaces. Compiled on first use
+    for each image size and capacity. `MapState.dropped` counts what found no row.
+
+    Args:
+        state: the map before the frame.
+        frame: the frame. Depth 0 (no measurement) and inf (out of range) are ignored.
+        max_range: measurements beyond this z-depth are ignored [m].
+        drop_edges: False lets pixels on depth edges in.
+    """
+    max_range = jnp.asarray(max_range, dtype=jnp.float32)
+    return _integrate_jitted(state, frame, max_range, jnp.asarray(drop_edges))
+
+
+@jax.jit
+def _integrate_points(state, points_world, rgb, camera_position, focal):
+    valid = jnp.all(jnp.isfinite(points_world), axis=1)
+    points = jnp.where(valid[:, None], points_world, 0.0)
+    groups = group_by_voxel(points.T, rgb, valid, state.voxel_size)
+    return integrate_groups(state, groups, camera_position, focal)
+
+
+def integrate_points(
+    state: MapState,
+    points_world: Float[Array, "P 3"],
+    rgb: Float[Array, "P 3"],
+    camera_position: Float[Array, " 3"],
+    focal: float | Float[Array, ""] = 1.0,
+) -> MapState:
+    """Points seen by one camera join the map: like `integrate`, from points.
+
+    Args:
+        state: the map before.
+        points_world: points [m], world.
+        rgb: their colours in [0, 1].
+        camera_position: center of the camera that saw them [m].
+        focal: its focal length [px]; with 1.0 the resolution is the paper's 1 / distance.
+
+    Raises:
+        ValueError: shapes that do not fit; values that are not finite or colours outside [0, 1]
+            (where they are known, that is outside jit).
+    """
+    points_world, rgb = jnp.asarray(points_world), jnp.asarray(rgb)
+    camera_position = jnp.asarray(camera_position, dtype=jnp.float32)
+    focal = jnp.asarray(focal, dtype=jnp.float32)
+    _check_points(points_world, rgb, camera_position, focal)
+    if points_world.shape[0] == 0:
+        return state
+    return _integrate_points(state, points_world, rgb, camera_position, focal)
+
+
+def _check_points(points: Array, rgb: Array, camera_position: Array, focal: Array) -> None:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points_world must have shape [M, 3], got {points.shape}")
+    if rgb.shape != points.shape:
+        raise ValueError(f"rgb must have the points' shape {points.shape}, got {rgb.shape}")
+    if not jnp.issubdtype(rgb.dtype, jnp.floating):
+        raise ValueError(f"rgb must be float32 in [0, 1], got {rgb.dtype}: divide by 255 first")
+    if camera_position.shape != (3,):
+        raise ValueError(f"camera_position must have shape [3], got {camera_position.shape}")
+    if is_traced(points, rgb, camera_position, focal):
+        return
+    is_bad = np.asarray(~np.isfinite(np.asarray(points)).all(axis=1))
+    if is_bad.any():
+        raise ValueError(
+            f"{is_bad.sum()} of {len(is_bad)} points are not finite, the first is number "
+            f"{int(is_bad.argmax())}: leave out points without a measurement"
+        )
+    colors = np.asarray(rgb)
+    if colors.size and not (colors.min() >= 0.0 and colors.max() <= 1.0):
+        raise ValueError(
+            f"rgb must lie in [0, 1], got values from {colors.min():.4g} to {colors.max():.4g}"
+        )
+    if not np.isfinite(np.asarray(camera_position)).all():
+        raise ValueError(f"camera_position is not finite: {np.asarray(camera_position)}")
+    if not (np.isfinite(float(focal)) and float(focal) > 0.0):
+        raise ValueError(f"focal must be positive [px], got {float(focal)}")
