@@ -16,7 +16,7 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.simulators import shading, start
 from r3jax.simulators.clearance import SurfaceDistance
-from r3jax.simulators.rays import Hits, TriangleScene
+from r3jax.simulators.rays import Hits, TriangleScene, join
 from r3jax.simulators.world import World
 
 # A rotated grid: nearly level and nearly upright edges, the ones that show, get four steps.
@@ -192,39 +192,49 @@ class RaycastSimulator:
     def _look(self, T: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, Hits]:
         """Colours [n, 3] and hits of rays `directions` [n, 3] from the camera."""
         steps = self._pixel_steps(T)
-        origins = np.empty_like(directions)
-        origins[:] = T[:3, 3]
-        hits = self._scene.cast(origins, directions, cull_back_faces=self._cull)
-        colors = shading.shade_hits(self._surface, hits, origins, directions, steps)
+        origin = T[None, :3, 3].astype(np.float32)
+        parts = []
+        # While embree works on one chunk, the kernel colours the one before it.
+        for begin in range(0, len(directions), shading.CHUNK):
+            chunk = directions[begin : begin + shading.CHUNK]
+            hits = self._scene.cast(
+                np.repeat(origin, len(chunk), axis=0), chunk, cull_back_faces=self._cull
+            )
+            parts.append((hits, shading.start_shading(self._surface, hits, origin, chunk, steps)))
+        hits = join([hits for hits, _ in parts])
+        colors = [np.asarray(color)[:, : len(part.face)].T for part, color in parts]
+        colors = np.ascontiguousarray(np.concatenate(colors))
         if self._face_mirror is not None:
-            share = np.where(hits.face >= 0, self._face_mirror[hits.face], 0.0)
-            rays = np.flatnonzero(share)
-            if len(rays):
-                seen = self._reflect(hits, rays, origins, directions, steps)
+            share = np.where(hits.face >= 0, self._face_mirror[hits.face], np.float32(0.0))
+            mirrored = np.flatnonzero(share)
+            for begin in range(0, len(mirrored), shading.CHUNK):
+                rays = mirrored[begin : begin + shading.CHUNK]
+                seen = self._reflect(hits, rays, origin, directions, steps)
                 weight = share[rays, None]
-                colors[rays] = (1.0 - weight) * colors[rays] + weight * seen
+                colors[rays] = (np.float32(1.0) - weight) * colors[rays] + weight * seen
         return colors, hits
 
     def _reflect(
         self,
         hits: Hits,
         rays: np.ndarray,
-        origins: np.ndarray,
+        origin: np.ndarray,
         directions: np.ndarray,
         steps: jnp.ndarray,
     ) -> np.ndarray:
-        """What the mirrors hit by `rays` show, one bounce deep."""
+        """What the mirrors hit by `rays` (at most CHUNK indices) show, one bounce deep, [n, 3]."""
         normal = self._face_normals[hits.face[rays]]
         incoming, path = directions[rays], hits.distance[rays]
         along = np.einsum("ij,ij->i", normal, incoming)
         outgoing = incoming - 2.0 * along[:, None] * normal
         # Off the mirror by a tenth of a millimetre, to the side that the ray came from.
         side = -np.sign(along)[:, None] * normal * np.float32(1e-4)
-        points = origins[rays] + path[:, None] * incoming + side
+        points = origin + path[:, None] * incoming + side
         onward = self._scene.cast(points, outgoing, cull_back_faces=self._cull)
-        return shading.shade_hits(
+        colors = shading.start_shading(
             self._surface, onward, points, outgoing, steps, path_before=path, mirror=normal
         )
+        return np.asarray(colors)[:, : len(rays)].T
 
     @functools.cached_property
     def _face_normals(self) -> np.ndarray:

@@ -79,18 +79,20 @@ class Rays(eqx.Module):
     v: Float[Array, " n"]
     """Barycentric weight of corner 2."""
 
-    path: Float[Array, " n"]
-    """Ray parameter from the camera to the hit, over all bounces."""
-
-    position: Float[Array, "n 3"]
-    """The hit [m]."""
+    distance: Float[Array, " n"]
+    """Ray parameter of the hit, in lengths of the direction; anything where nothing was hit."""
 
     direction: Float[Array, "n 3"]
     """Direction of the (last) ray; not of unit length."""
 
+    origin: Float[Array, "n_or_1 3"]
+    """Where the ray starts [m]."""
+
     mirror: Float[Array, "n_or_1 3"]
-    """Unit normal of the mirror that the ray came by; one row of 0 for rays straight from the
-    camera."""
+    """Unit normal of the mirror that the ray came by, 0 for rays straight from the camera."""
+
+    path_before: Float[Array, " n_or_1"]
+    """Way from the camera to `origin`, in the unit of `distance`."""
 
 
 def build_surface(world: World, *, lighting: bool) -> Surface:
@@ -186,6 +188,7 @@ def _footprint(
     gradient: Float[Array, "6 n"],
     normal: Float[Array, "3 n"],
     rays: Rays,
+    distance: Float[Array, " n"],
     pixel_steps: Float[Array, "2 3"],
 ) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"]]:
     """How far, in texels, the hit moves when the pixel moves by one column and by one row.
@@ -194,6 +197,7 @@ def _footprint(
     t (e - d (n e) / (n d)) (Igehy, "Tracing ray differentials", 1999). A mirror reflects e.
     """
     direction, mirror = rays.direction.T, rays.mirror.T
+    path = distance + rays.path_before
     along = _dot(normal, direction)
     along = jnp.where(jnp.abs(along) < 1e-6, 1e-6, along)
 
@@ -201,7 +205,7 @@ def _footprint(
         reflected = step[:, None] - 2.0 * mirror * _dot(mirror, step)[None, :]
         reflected = jnp.broadcast_to(reflected, direction.shape)
         slide = _dot(normal, reflected) / along
-        move = rays.path[None, :] * (reflected - direction * slide[None, :])
+        move = path[None, :] * (reflected - direction * slide[None, :])
         return jnp.stack([_dot(gradient[:3], move), _dot(gradient[3:], move)])
 
     return moved(pixel_steps[0]), moved(pixel_steps[1])
@@ -242,9 +246,10 @@ def _texture_color(
                 for j, wx in enumerate((1.0 - fx, fx)):
                     indices.append(start + rows[i] * size_k[0] + columns[j])
                     weights.append(share * wx * wy)
+    index = jnp.clip(jnp.stack(indices), 0, surface.texels.shape[0] - 1)
     # One gather of whole texels, kept apart from what follows: fused, XLA would fetch every
     # texel once per channel.
-    packed = jax.lax.optimization_barrier(_rows(surface.texels, jnp.stack(indices)))
+    packed = jax.lax.optimization_barrier(_rows(surface.texels, index))
     channels = []
     for shift in (0, 8, 16):
         values = [((texels >> shift) & jnp.uint32(255)).astype(jnp.float32) for texels in packed]
@@ -276,12 +281,13 @@ def _lit(
     look: Float[Array, "8 n"],
     normal: Float[Array, "3 n"],
     rays: Rays,
+    distance: Float[Array, " n"],
 ) -> Float[Array, "3 n"]:
     """The module's formula for a world with lamps."""
     unit = lambda x: x / jnp.maximum(jnp.sqrt(_dot(x, x)), 1e-6)[None, :]
     view = unit(-rays.direction.T)
     facing = jnp.where((_dot(normal, view) < 0.0)[None, :], -normal, normal)
-    position = rays.position.T
+    position = rays.origin.T + distance[None, :] * rays.direction.T
     specular, shininess, emission = look[3], look[4], look[5]
     diffuse = jnp.zeros_like(albedo)
     highlight = jnp.zeros_like(albedo)
@@ -311,12 +317,13 @@ def shade(surface: Surface, rays: Rays, pixel_steps: Float[Array, "2 3"]) -> Flo
             from one row (row 1) of pixels to the next.
     """
     face = jnp.maximum(rays.face, 0)
+    distance = jnp.where(rays.face >= 0, rays.distance, 1.0)
     # One row of 64 bytes per ray; without the barrier each use would fetch it again.
     row = jax.lax.optimization_barrier(_rows(surface.faces, face)).T
     look = jax.lax.optimization_barrier(_rows(surface.materials, row[15].astype(jnp.int32))).T
     normal = row[12:15]
     texel = row[0:2] + rays.u[None, :] * row[2:4] + rays.v[None, :] * row[4:6]
-    moves = _footprint(row[6:12], normal, rays, pixel_steps)
+    moves = _footprint(row[6:12], normal, rays, distance, pixel_steps)
     texture = look[6].astype(jnp.int32)
     sampled = _texture_color(surface, jnp.maximum(texture, 0), texel, moves)
     albedo = look[:3] * jnp.where(texture[None, :] >= 0, sampled, 1.0)
@@ -325,11 +332,13 @@ def shade(surface: Surface, rays: Rays, pixel_steps: Float[Array, "2 3"]) -> Flo
         w0 = (1.0 - rays.u - rays.v)[None, :]
         mixed = w0 * corner[:3] + rays.u[None, :] * corner[3:6] + rays.v[None, :] * corner[6:]
         albedo = albedo * mixed
-    color = albedo if surface.lamps.shape[0] == 0 else _lit(surface, albedo, look, normal, rays)
+    color = albedo
+    if surface.lamps.shape[0] > 0:
+        color = _lit(surface, albedo, look, normal, rays, distance)
     return jnp.where(rays.face[None, :] >= 0, jnp.clip(color, 0.0, 1.0), 0.0)
 
 
-def shade_hits(
+def start_shading(
     surface: Surface,
     hits: Hits,
     origins: np.ndarray,
@@ -338,41 +347,29 @@ def shade_hits(
     *,
     path_before: np.ndarray | None = None,
     mirror: np.ndarray | None = None,
-) -> np.ndarray:
-    """Colours of any number of hits, [n, 3] float32: `shade` chunk by chunk.
+) -> Float[Array, "3 chunk"]:
+    """Colours of at most CHUNK hits, of which the first n columns count.
+
+    Returns at once: the kernel runs in the background until the result is read.
 
     Args:
         surface: the world's tables.
         hits: of n rays.
-        origins: where the rays start [n, 3] [m].
+        origins: where the rays start, [n, 3], or [1, 3] if all start there [m].
         directions: of the rays [n, 3].
         pixel_steps: see `shade`.
         path_before: length of the way to `origins`, in the same unit as the hits' distances [n].
         mirror: normals of the mirrors that the rays come by [n, 3].
     """
-    count = len(hits.face)
-    colors = np.empty((count, 3), np.float32)
-    distance = np.where(hits.face >= 0, hits.distance, np.float32(1.0))
-    position = origins + distance[:, None] * directions
-    path = distance if path_before is None else distance + path_before
+    path_before = np.zeros(1, np.float32) if path_before is None else path_before
     mirror = np.zeros((1, 3), np.float32) if mirror is None else mirror
-    pending = []
-    for begin in range(0, count, CHUNK):
-        part = slice(begin, begin + CHUNK)
-        columns = (hits.face, hits.u, hits.v, path, position, directions)
-        rays = Rays(
-            *(jnp.asarray(_filled(column[part])) for column in columns),
-            mirror=jnp.asarray(mirror if len(mirror) == 1 else _filled(mirror[part])),
-        )
-        pending.append((part, shade(surface, rays, pixel_steps)))
-    for part, color in pending:
-        colors[part] = np.asarray(color).T[: count - part.start]
-    return colors
+    columns = (hits.face, hits.u, hits.v, hits.distance, directions, origins, mirror, path_before)
+    return shade(surface, Rays(*(jnp.asarray(_filled(c)) for c in columns)), pixel_steps)
 
 
 def _filled(column: np.ndarray) -> np.ndarray:
-    """The column, extended to CHUNK rows."""
+    """The column extended to CHUNK rows, unless it is a single row that serves all."""
     missing = CHUNK - len(column)
-    if missing == 0:
+    if missing == 0 or len(column) == 1:
         return column
     return np.concatenate([column, np.zeros((missing, *column.shape[1:]), column.dtype)])
