@@ -2,7 +2,7 @@
 
 import enum
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array
@@ -60,6 +60,7 @@ class PlanInfo:
     """Wall time per part of the decision (`candidates`, `travel`, `scoring`) [s]."""
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Chooses the next view. Pure: what it remembers travels in `state`."""
 
