@@ -1,0 +1,50 @@
+"""How long a run may last: views, seconds of the mission clock, or metres."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, cast, get_args
+
+Unit = Literal["views", "seconds", "metres"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """A limit in one unit."""
+
+    unit: Unit
+    amount: float
+
+    def allows(self, *, views: int, seconds: float, metres: float) -> bool:
+        """True if a mission of that size lies within the budget."""
+        spent = {"views": views, "seconds": seconds, "metres": metres}[self.unit]
+        return spent <= self.amount
+
+    def spent_share(self, *, views: int, seconds: float, metres: float) -> float:
+        """Share of the budget that such a mission has used, in [0, 1]."""
+        spent = {"views": views, "seconds": seconds, "metres": metres}[self.unit]
+        return min(1.0, spent / self.amount)
+
+    def __str__(self) -> str:
+        """As `parse_budget` reads it."""
+        return f"{self.unit}:{self.amount:g}"
+
+
+def parse_budget(text: str) -> Budget:
+    """Reads `views:N`, `seconds:S` or `metres:M`.
+
+    Raises:
+        ValueError: anything else, an amount that is not positive, views that are not whole.
+    """
+    example = "use views:100, seconds:300 or metres:25"
+    unit, separator, amount_text = text.strip().partition(":")
+    if not separator or unit not in get_args(Unit):
+        raise ValueError(f"budget {text!r} is not understood: {example}")
+    try:
+        amount = float(amount_text)
+    except ValueError:
+        raise ValueError(f"budget {text!r}: {amount_text!r} is not a number; {example}") from None
+    if not (math.isfinite(amount) and amount > 0.0):
+        raise ValueError(f"budget {text!r}: the amount must be positive and finite; {example}")
+    if unit == "views" and amount != int(amount):
+        raise ValueError(f"budget {text!r}: views are counted in whole numbers; {example}")
+    return Budget(cast(Unit, unit), amount)

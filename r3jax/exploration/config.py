@@ -1,0 +1,60 @@
+"""Settings of the loop. Plain numbers: they go into run.json as they are."""
+
+from dataclasses import dataclass
+
+from r3jax.exploration.clock import ClockName
+
+
+@dataclass(frozen=True)
+class ExplorationConfig:
+    """What the loop itself decides; the policy has its own settings."""
+
+    voxel_size: float = 0.05
+    """Edge of a voxel of the map [m]."""
+
+    num_bins: int = 64
+    """Direction bins per voxel."""
+
+    capacity: int = 1 << 17
+    """Rows of the map at the start; a power of two."""
+
+    allow_growth: bool = True
+    """Double the table before it is 70 % full. If not, what finds no row is counted."""
+
+    cell_size: float = 0.2
+    """Edge of a cell of the coarse grid [m]."""
+
+    max_range: float = 5.0
+    """Range of the depth sensor [m]."""
+
+    body_radius: float = 0.3
+    """Where the camera has been, this ball is free [m]."""
+
+    start_radius: float = 0.5
+    """The ball round the start that the operator vouches for [m]."""
+
+    speed: float = 1.0
+    """Flight speed [m/s]; turning on the spot takes no time."""
+
+    clock: ClockName = "wall"
+    """`wall`: measured planning and mapping. `model`: fixed costs, the same run every time."""
+
+    num_probes: int = 32
+    """Views that mean renderability is averaged over."""
+
+    checkpoint_every: int = 25
+    """Views between two stored maps; the last one is always stored."""
+
+    max_still_views: int = 100
+    """So many views in a row without moving end the run: the policy is stuck."""
+
+    def __post_init__(self) -> None:
+        """Refuses what cannot work."""
+        for name in ("voxel_size", "cell_size", "max_range", "speed"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("num_probes", "checkpoint_every", "max_still_views"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.clock not in ("wall", "model"):
+            raise ValueError(f"clock must be `wall` or `model`, got {self.clock!r}")

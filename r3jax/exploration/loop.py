@@ -1,0 +1,125 @@
+"""The exploration loop: step until the budget is spent, and record every view.
+
+A run that is interrupted, or whose disk is full, ends like any other: with the reason, and with
+everything recorded before complete.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+
+from r3jax.exploration.budget import Budget, parse_budget
+from r3jax.exploration.clock import make_clock
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
+from r3jax.exploration.step import start_state, step
+from r3jax.planning.policy import Policy
+from r3jax.simulators.base import Simulator
+from r3jax.trace.errors import RecordingStopped
+from r3jax.trace.rows import StepRow
+from r3jax.trace.writer import RunWriter
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished exploration."""
+
+    state: LoopState
+    rows: tuple[StepRow, ...]
+    reason: StopReason
+    message: str
+
+
+def explore(
+    simulator: Simulator,
+    policy: Policy,
+    *,
+    budget: Budget | str,
+    seed: int = 0,
+    config: ExplorationConfig | None = None,
+    recorder: RunWriter | None = None,
+    on_step: Callable[[StepRow], None] | None = None,
+    on_stage: Callable[[str], None] | None = None,
+) -> Result:
+    """Explores an unknown scene until the budget is spent or no view is left.
+
+    Args:
+        simulator: the world; all that is asked of it is the picture where the camera is.
+        policy: chooses the views.
+        budget: a limit, or its text such as `views:100`.
+        seed: all randomness follows from it: step k uses `fold_in(key, k)`.
+        config: settings of the loop.
+        recorder: where the run is written; None keeps nothing.
+        on_step: called with the row of every view.
+        on_stage: called with the name of what happens next.
+
+    Returns:
+        The last state, the rows, and why it ended. An interrupt (Ctrl-C) and a disk that
+        refuses to be written end the run too; what was recorded before is complete.
+
+    Raises:
+        ValueError: a budget that is not understood, a start outside the scene's box.
+    """
+    config = config or ExplorationConfig()
+    budget = parse_budget(budget) if isinstance(budget, str) else budget
+    init_key, key = jax.random.split(jax.random.key(seed))
+    mission = Mission(
+        simulator,
+        policy,
+        budget,
+        key,
+        config,
+        make_clock(config.clock),
+        on_stage or (lambda stage: None),
+    )
+    state = start_state(mission, init_key)
+    rows: list[StepRow] = []
+    try:
+        stop: Stop | None = None
+        while stop is None:
+            after, output = step(state, mission)
+            if isinstance(output, Stop):
+                stop = output
+                continue
+            if recorder is not None:
+                mission.on_stage("record")
+                _record(recorder, output, after, config)
+            state = after
+            rows.append(output.row)
+            if on_step is not None:
+                on_step(output.row)
+    except KeyboardInterrupt:
+        stop = Stop(StopReason.INTERRUPTED, f"interrupted by the user after {len(rows)} views")
+    except RecordingStopped as error:
+        stop = Stop(StopReason.RECORDING_STOPPED, str(error))
+    except Exception as error:
+        if recorder is not None:
+            _finish(recorder, state, Stop(StopReason.FAILED, f"{type(error).__name__}: {error}"))
+        raise
+    if recorder is not None:
+        stop = _finish(recorder, state, stop)
+    return Result(state, tuple(rows), stop.reason, stop.message)
+
+
+def _record(recorder: RunWriter, view: View, state: LoopState, config: ExplorationConfig) -> None:
+    """Writes one view; the map follows every few views."""
+    begin = time.perf_counter()
+    recorder.add(view.row, view.frame)
+    if state.views % config.checkpoint_every == 0:
+        recorder.checkpoint(view.row.step, state.map_state, state.grid)
+    seconds = time.perf_counter() - begin
+    recorder.add_timings(view.row.step, view.stages | {"record": seconds})
+
+
+def _finish(recorder: RunWriter, state: LoopState, stop: Stop) -> Stop:
+    """Writes the last map and how the run ended; a full disk may refuse even that."""
+    try:
+        if state.views > 0:
+            recorder.checkpoint(state.views - 1, state.map_state, state.grid)
+        recorder.finish(stop.reason.value, stop.message)
+    except RecordingStopped as error:
+        unsaid = f"{stop.message}; the end could not be recorded ({error.reason})"
+        return Stop(stop.reason, unsaid)
+    return stop

@@ -1,0 +1,108 @@
+"""What a run carries from view to view, and what it leaves behind."""
+
+import enum
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+
+from r3jax.exploration.budget import Budget
+from r3jax.exploration.clock import Clock
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.frame import Frame
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.policy import Policy
+from r3jax.simulators.base import Simulator
+from r3jax.trace.rows import StepRow
+
+
+class StopReason(enum.Enum):
+    """Why a run ended."""
+
+    BUDGET = "budget"
+    """The next view would exceed the budget."""
+
+    NO_CANDIDATE = "no-candidate"
+    """The policy found no place to look from."""
+
+    NO_REACHABLE_CANDIDATE = "no-reachable-candidate"
+    """The policy found places, but no safe way to any of them."""
+
+    STUCK = "stuck"
+    """The policy has not moved for many views."""
+
+    INTERRUPTED = "interrupted"
+    """Ctrl-C."""
+
+    RECORDING_STOPPED = "recording-stopped"
+    """The run folder could not be written: disk full, permissions."""
+
+    FAILED = "failed"
+    """A simulator or a policy raised an error."""
+
+
+@dataclass(frozen=True)
+class LoopState:
+    """Everything that the next step depends on."""
+
+    views: int
+    """Frames in the map."""
+
+    map_state: MapState
+    grid: OccupancyGrid
+
+    policy_state: Any
+    """What the policy remembers."""
+
+    T_world_camera: np.ndarray
+    """Pose of the last view (before the first: the start pose), [4, 4] float64."""
+
+    seconds: float = 0.0
+    """Mission clock [s]."""
+
+    metres: float = 0.0
+    """Path flown [m]."""
+
+    radians: float = 0.0
+    """Angle turned [rad]."""
+
+    still_views: int = 0
+    """Views in a row that were taken without moving."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A view that was taken: what to record beside the state."""
+
+    row: StepRow
+    frame: Frame
+    """In stored form."""
+
+    stages: dict[str, float] = field(default_factory=dict)
+    """Seconds that the stages really took, those off the mission clock included."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """No view was taken: the run ends."""
+
+    reason: StopReason
+    message: str
+    """The reason in a sentence."""
+
+
+@dataclass(frozen=True)
+class Mission:
+    """What stays the same over a run: `explore` makes it, `step` reads it."""
+
+    simulator: Simulator
+    policy: Policy
+    budget: Budget
+    key: jax.Array
+    config: ExplorationConfig
+    clock: Clock
+    on_stage: Callable[[str], None] = lambda stage: None
+    """Told what happens next: `plan`, `render`, `map`, `measure`, `record`."""

@@ -1,0 +1,208 @@
+"""One step of the loop: decide, fly, look, map. On the host, round jitted parts.
+
+Only the frame at the end of a path enters the map. What the simulator and the bookkeeping take
+is not on the mission clock.
+"""
+
+import time
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.exploration.clock import timed
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.coverage import measure_coverage, view_renderability
+from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
+from r3jax.frame import Frame
+from r3jax.mapping.join import grow
+from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.update import integrate
+from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.trace.images import frame_hash, stored_form
+from r3jax.trace.rows import StepRow, make_choice
+
+_MAX_LOAD = 0.7
+"""The table grows before more than this share of its rows is in use."""
+
+_integrate_depth = jax.jit(integrate_depth)
+_mark_free_ball = jax.jit(mark_free_ball)
+
+
+def start_state(mission: Mission, init_key: jax.Array) -> LoopState:
+    """The state before the first view.
+
+    Raises:
+        ValueError: a start pose outside the world's box.
+    """
+    simulator, config = mission.simulator, mission.config
+    pose = np.asarray(simulator.start_pose, dtype=np.float64)
+    lower, upper = np.asarray(simulator.bounds, dtype=np.float64)
+    if not np.all((pose[:3, 3] >= lower) & (pose[:3, 3] <= upper)):
+        raise ValueError(
+            f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
+            f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
+        )
+    grid = empty_grid(np.stack([lower, upper]), config.cell_size)
+    position = jnp.asarray(pose[:3, 3], dtype=jnp.float32)
+    grid = _mark_free_ball(grid, position, config.start_radius)
+    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
+    policy_state = mission.policy.init(simulator.camera, grid, key=init_key)
+    return LoopState(0, map_state, grid, policy_state, pose)
+
+
+def integrate_growing(map_state: MapState, frame: Frame, config: ExplorationConfig) -> MapState:
+    """Integrates a frame; a table that would pass 70 % is doubled first, outside jit."""
+    after = integrate(map_state, frame, config.max_range)
+    while config.allow_growth and (
+        int(after.num_occupied) > _MAX_LOAD * after.capacity
+        or int(after.dropped) > int(map_state.dropped)
+    ):
+        map_state = grow(map_state, 2 * map_state.capacity)
+        after = integrate(map_state, frame, config.max_range)
+    return after
+
+
+def step(state: LoopState, mission: Mission) -> tuple[LoopState, View | Stop]:
+    """One view: decide where to go (the first view is taken at the start), fly, look, map.
+
+    Returns:
+        The state after the view and what to record; or, if the run ends here, the state as it
+        was and the reason.
+    """
+    if state.views == 0:
+        return _look(state, mission, state.T_world_camera, None, {}, 0.0)
+    stop = _spent(state, mission, seconds=0.0, metres=0.0)
+    if stop is not None:
+        return state, stop
+    mission.on_stage("plan")
+    key = jax.random.fold_in(mission.key, state.views)
+    (decision, policy_state, info), measured = timed(
+        mission.policy.decide,
+        state.policy_state,
+        state.map_state,
+        state.grid,
+        state.T_world_camera,
+        key=key,
+        repeat_compiled=mission.clock.measures,
+    )
+    stages = {"plan": measured} | {f"plan.{k}": v for k, v in info.stage_seconds.items()}
+    state = replace(state, policy_state=policy_state)
+    if decision is None:
+        return state, _no_decision(state, mission, info)
+    planning = mission.clock.charge("planning", measured)
+    flight = decision.length / mission.config.speed
+    stop = _spent(state, mission, seconds=planning + flight, metres=decision.length)
+    if stop is not None:
+        return state, stop
+    return _look(state, mission, decision.T_world_camera, (decision, info), stages, planning)
+
+
+def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
+    """The policy's reason, in words."""
+    return Stop(
+        StopReason(info.outcome.value),
+        f"after {state.views} views the policy {mission.policy.name!r} drew "
+        f"{info.num_candidates} candidates, {info.num_reachable} of them reachable through "
+        "known free space",
+    )
+
+
+def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float) -> Stop | None:
+    """Why a view that costs so much more must not be taken: it must arrive within the budget."""
+    spent = f"{state.views} views, {state.seconds:.1f} s, {state.metres:.1f} m"
+    if not mission.budget.allows(
+        views=state.views + 1, seconds=state.seconds + seconds, metres=state.metres + metres
+    ):
+        return Stop(StopReason.BUDGET, f"{spent}: the next view would exceed {mission.budget}")
+    if state.still_views >= mission.config.max_still_views:
+        return Stop(
+            StopReason.STUCK, f"{spent}: the last {state.still_views} views were taken on one spot"
+        )
+    return None
+
+
+def _look(
+    state: LoopState,
+    mission: Mission,
+    T_world_camera: np.ndarray,
+    choice: tuple[Decision, PlanInfo] | None,
+    stages: dict[str, float],
+    planning: float,
+) -> tuple[LoopState, View]:
+    """Takes the view at a pose, integrates it and measures what is known now."""
+    mission.on_stage("render")
+    begin = time.perf_counter()
+    frame = stored_form(mission.simulator.render(np.asarray(T_world_camera, dtype=np.float64)))
+    rendered = time.perf_counter()
+    arrival = view_renderability(state.map_state, frame.camera, frame.T_world_camera)
+    stages = stages | {"render": rendered - begin}
+
+    mission.on_stage("map")
+    state, mapping_stages = _map_frame(state, mission, frame)
+    mapping = mission.clock.charge("mapping", sum(mapping_stages.values()))
+    length = 0.0 if choice is None else choice[0].length
+    charged = {"planning": planning, "mapping": mapping, "flight": length / mission.config.speed}
+    # The recorded pose (float32) is the pose from here on: a run read back goes on the same way.
+    pose = np.asarray(frame.T_world_camera, dtype=np.float64)
+    state = replace(
+        state,
+        views=state.views + 1,
+        T_world_camera=pose,
+        seconds=state.seconds + sum(charged.values()),
+        metres=state.metres + length,
+        radians=state.radians + _angle_between(state.T_world_camera, pose),
+        still_views=state.still_views + 1 if length < 0.01 else 0,
+    )
+    mission.on_stage("measure")
+    begin = time.perf_counter()
+    coverage = measure_coverage(
+        state.map_state,
+        state.grid,
+        frame.camera,
+        arrival_renderability=arrival,
+        num_probes=mission.config.num_probes,
+    )
+    row = StepRow(
+        step=state.views - 1,
+        pose=np.asarray(frame.T_world_camera),
+        sha256=frame_hash(frame),
+        choice=None if choice is None else make_choice(*choice),
+        seconds=state.seconds,
+        metres=state.metres,
+        radians=state.radians,
+        charged=charged,
+        coverage=coverage,
+    )
+    stages = stages | mapping_stages | {"measure": time.perf_counter() - begin}
+    return state, View(row, frame, stages)
+
+
+def _map_frame(
+    state: LoopState, mission: Mission, frame: Frame
+) -> tuple[LoopState, dict[str, float]]:
+    """The frame joins the map and the grid, and the policy is told."""
+    config, repeat = mission.config, mission.clock.measures
+    map_state, integrating = timed(
+        integrate_growing, state.map_state, frame, config, repeat_compiled=repeat
+    )
+
+    def update_grid() -> OccupancyGrid:
+        grid = _integrate_depth(state.grid, frame, config.max_range)
+        return _mark_free_ball(grid, frame.position, config.body_radius)
+
+    grid, gridding = timed(update_grid, repeat_compiled=repeat)
+    policy_state, observing = timed(
+        mission.policy.observe, state.policy_state, map_state, frame, repeat_compiled=repeat
+    )
+    state = replace(state, map_state=map_state, grid=grid, policy_state=policy_state)
+    stages = {"map.voxels": integrating, "map.grid": gridding, "map.policy": observing}
+    return state, stages
+
+
+def _angle_between(first: np.ndarray, second: np.ndarray) -> float:
+    """Angle of the rotation between two poses [rad]."""
+    cosine = 0.5 * (np.trace(first[:3, :3].T @ second[:3, :3]) - 1.0)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
