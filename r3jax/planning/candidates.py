@@ -1,0 +1,151 @@
+"""Where the next view could be taken from. On the host: NumPy.
+
+Positions lie in cells where the robot may stop (`Travel.goals`), away from the cell's faces: at
+most a quarter of a cell from its centre.
+
+Shape symbols: X Y Z cells along the axes; n candidates.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.spatial import KDTree
+
+from r3jax.geometry.cameras import pose_along
+from r3jax.planning.travel import Travel, segment_is_inside
+
+_JITTER = 0.25
+"""Positions lie at most this far from their cell's centre, along each axis [cells]."""
+
+_NEIGHBORS = 256
+"""A region of interest is looked at from one of this many nearest cells."""
+
+VIEW_DISTANCE = (0.3, 2.0)
+"""A region of interest is looked at from between these distances [m] (Active-GS)."""
+
+
+def host_generator(key: Array) -> np.random.Generator:
+    """NumPy's generator, seeded by a JAX key: host code draws many small arrays of odd sizes."""
+    is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return np.random.default_rng(np.asarray(jax.random.key_data(key) if is_typed else key))
+
+
+def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -> np.ndarray:
+    """`num` positions uniform over the safe, reachable cells within `radius` of the robot.
+
+    The cells are those with their centre within the radius, and the robot's own (if it is known
+    to be free). Several positions may share a cell. If the robot's own cell does not keep the
+    safety margin, the only position in it is the present one.
+
+    Returns:
+        [num, 3] float64 [m]; [0, 3] if there is no such cell.
+    """
+    rng = host_generator(key)
+    cells = np.argwhere(travel.goals)
+    is_own = np.all(cells == np.array(travel.start_cell), axis=1)
+    offset = travel.centers(cells) - travel.start
+    is_near = is_own | (np.linalg.norm(offset, axis=1) <= radius)
+    cells, is_own = cells[is_near], is_own[is_near]
+    if len(cells) == 0:
+        return np.zeros((0, 3))
+    chosen = rng.integers(len(cells), size=num)
+    centers = travel.centers(cells[chosen])
+    positions = _jitter(centers, travel.cell_size, rng)
+    is_far = np.linalg.norm(positions - travel.start, axis=1) > radius
+    positions[is_far] = centers[is_far]
+    if not travel.safe[travel.start_cell]:
+        positions[is_own[chosen]] = travel.start
+    return positions
+
+
+def region_of_interest(
+    travel: Travel, targets: np.ndarray, num: int, *, key: Array
+) -> tuple[np.ndarray, np.ndarray]:
+    """Up to `num` positions from which randomly drawn target cells are in plain view.
+
+    For every draw a target is taken at random, and one of the nearest cells where the robot may
+    stop that lie 0.3 to 2 m from it; the straight line between them must be known free. Large
+    target regions are drawn more often.
+
+    Args:
+        travel: where the robot may stop.
+        targets: free cells worth looking at, such as the frontier, [X, Y, Z] bool.
+        num: positions wanted.
+        key: source of randomness.
+
+    Returns:
+        Positions and the targets' centres, [n, 3] float64 each [m], n <= num.
+    """
+    rng = host_generator(key)
+    stops, goals = np.argwhere(travel.goals), np.argwhere(targets)
+    if num == 0 or len(stops) == 0 or len(goals) == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    # Some draws end behind a corner: twice as many as wanted.
+    drawn = travel.centers(goals[rng.integers(len(goals), size=2 * num)])
+    closest, farthest = VIEW_DISTANCE
+    tree = KDTree(travel.centers(stops))
+    count = min(_NEIGHBORS, len(stops))
+    distance, index = tree.query(drawn, k=count, distance_upper_bound=farthest)
+    distance, index = distance.reshape(-1, count), index.reshape(-1, count)
+    # The largest of random weights over the allowed neighbours: a uniform choice.
+    weight = np.where((distance >= closest) & (distance <= farthest), rng.random(index.shape), -1.0)
+    best = weight.argmax(axis=1)
+    is_possible = weight.max(axis=1) >= 0.0
+    stop = stops[index[np.arange(2 * num), best][is_possible]]
+    aim = drawn[is_possible]
+    positions = _jitter(travel.centers(stop), travel.cell_size, rng)
+    is_visible = [in_plain_view(travel, a, b) for a, b in zip(positions, aim, strict=True)]
+    keep = np.flatnonzero(is_visible)[:num]
+    return positions[keep], aim[keep]
+
+
+def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.75)) -> np.ndarray:
+    """Positions on a regular lattice that fall into cells where the robot may stop.
+
+    Args:
+        travel: where the robot may stop.
+        spacing: distance between lattice points along x, y and z [m].
+
+    Returns:
+        [n, 3] float64 [m], each at its cell's centre, no cell twice.
+    """
+    shape = travel.usable.shape
+    axes = [
+        np.arange(0.5 * step, n * travel.cell_size, step)
+        for n, step in zip(shape, spacing, strict=True)
+    ]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.unique(np.floor(points / travel.cell_size).astype(np.int64), axis=0)
+    cells = cells[np.all(cells < np.array(shape), axis=1)]
+    return travel.centers(cells[travel.goals[tuple(cells.T)]])
+
+
+def in_plain_view(travel: Travel, a: np.ndarray, b: np.ndarray) -> bool:
+    """True if the straight line between two positions [m] runs through known free space."""
+    scale = travel.cell_size
+    return segment_is_inside(travel.free, (a - travel.origin) / scale, (b - travel.origin) / scale)
+
+
+def random_directions(num: int, *, key: Array) -> np.ndarray:
+    """`num` directions uniform on the sphere, [num, 3] float64.
+
+    Not bounded in elevation: floors and ceilings are part of the scene, and test views look
+    straight up and down too.
+    """
+    directions = host_generator(key).normal(size=(num, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Roll-free poses at positions [n, 3] that look along directions [n, 3]; [n, 4, 4] float64."""
+    poses = jax.vmap(pose_along)(
+        jnp.asarray(positions, dtype=jnp.float32), jnp.asarray(directions, dtype=jnp.float32)
+    )
+    exact = np.array(poses, dtype=np.float64)
+    exact[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
+    return exact
+
+
+def _jitter(centers: np.ndarray, cell_size: float, rng: np.random.Generator) -> np.ndarray:
+    return centers + rng.uniform(-_JITTER, _JITTER, size=centers.shape) * cell_size

@@ -1,0 +1,55 @@
+"""Which unexplored cells are worth a look: those that a robot could ever look at.
+
+The inside of walls, the ground below the floor and whatever lies outside the building stay
+unexplored for ever. A planner that counts them is drawn to them for ever.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy import ndimage
+
+from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid
+
+_FACES = ndimage.generate_binary_structure(3, 1)
+
+
+def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarray) -> np.ndarray:
+    """Unexplored cells that connect, through unexplored cells, to space the robot can enter.
+
+    A region of unexplored cells (connected over faces) counts as a whole if one of its cells
+    has a face neighbour in the *known-free reachable space*: the free cells that connect over
+    faces to a cell of `reached`.
+
+    Args:
+        free: cells known to be free, [X, Y, Z] bool.
+        unexplored: cells neither free nor occupied, [X, Y, Z] bool.
+        reached: cells the robot can come to, [X, Y, Z] bool; those not free are ignored.
+
+    Returns:
+        The unexplored cells that count, [X, Y, Z] bool.
+    """
+    open_space = _regions_that_touch(free, reached)
+    return _regions_that_touch(unexplored, ndimage.binary_dilation(open_space, _FACES))
+
+
+def mask_unexplorable(grid: OccupancyGrid, reached: np.ndarray) -> OccupancyGrid:
+    """A copy of the grid for scoring, in which only explorable cells are left unexplored.
+
+    The other unexplored cells are marked as occupied, so that the exploration utility, which
+    counts visible unexplored cells, ignores them. Not for travel.
+    """
+    free, unexplored = np.asarray(grid.free), np.asarray(grid.unexplored)
+    is_hopeless = unexplored & ~explorable_cells(free, unexplored, reached)
+    log_odds = np.where(is_hopeless, np.float32(LOG_ODDS_LIMIT), np.asarray(grid.log_odds))
+    return eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(log_odds))
+
+
+def _regions_that_touch(mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The regions of a mask, connected over faces, that hold at least one seed."""
+    labels = np.zeros(mask.shape, dtype=np.int32)
+    ndimage.label(mask, _FACES, output=labels)
+    is_wanted = np.zeros(int(labels.max()) + 1, dtype=bool)
+    is_wanted[labels[seeds]] = True
+    is_wanted[0] = False  # the label of everything that is not in the mask
+    return is_wanted[labels]

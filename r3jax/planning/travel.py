@@ -1,0 +1,282 @@
+"""Path lengths and waypoints over known free space. On the host: NumPy and SciPy.
+
+A cell is *safe* if the ball of the safety margin round its centre touches known free cells only;
+unknown space is an obstacle. With 0.2 m cells and 0.3 m margin these are the cells whose 26
+neighbours are free, so that every point of a path keeps at least one cell's width from
+anything that is not known to be free. The cell in which the robot stands is always usable.
+
+Paths run over the 26-connected graph of usable cells. A diagonal step needs every cell of the
+block it crosses, so that it cannot squeeze between two corners. For that rule the graph is
+spelled out for SciPy's Dijkstra: `skimage.graph.MCP_Geometric` takes as long and cannot express
+it (tests compare the two).
+
+Shape symbols: X Y Z cells along the axes; n cells or points; K waypoints.
+"""
+
+import functools
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from r3jax.mapping.occupancy import OccupancyGrid
+
+_BORDER = 1e-3
+"""A segment that passes a corner closer than this counts as touching it [cells]."""
+
+_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * _BORDER
+
+_STEPS = [d for d in itertools.product((-1, 0, 1), repeat=3) if d > (0, 0, 0)]
+"""One of each pair of opposite steps to the 26 neighbours."""
+
+
+@dataclass(frozen=True)
+class Travel:
+    """What can be reached from one position, how far it is, and the way. Made by `plan_travel`."""
+
+    start: np.ndarray
+    """The robot's position, [3] float64 [m]."""
+
+    start_cell: tuple[int, int, int]
+    """The cell that holds it."""
+
+    origin: np.ndarray
+    """Lower corner of cell (0, 0, 0), [3] float64 [m]."""
+
+    cell_size: float
+    """Edge of a cell [m]."""
+
+    free: np.ndarray
+    """Cells known to be free, [X, Y, Z] bool."""
+
+    safe: np.ndarray
+    """Cells that keep the margin, [X, Y, Z] bool."""
+
+    usable: np.ndarray
+    """Cells that paths may cross: the safe ones, the robot's own, [X, Y, Z] bool."""
+
+    cost: np.ndarray
+    """Length of the shortest way between the centres of the robot's cell and of each cell [m],
+    [X, Y, Z] float64; inf where there is none."""
+
+    previous: np.ndarray
+    """Flat index of the cell before each on that way, [X, Y, Z] int64; -1 at its start."""
+
+    @functools.cached_property
+    def reachable(self) -> np.ndarray:
+        """Cells to which a way leads, [X, Y, Z] bool."""
+        return np.isfinite(self.cost)
+
+    @functools.cached_property
+    def goals(self) -> np.ndarray:
+        """Cells where the robot may stop: safe and reachable, and its own if that is free."""
+        goals = self.reachable & self.safe
+        if self.contains(self.start_cell) and self.free[self.start_cell]:
+            goals[self.start_cell] = True
+        return goals
+
+    def contains(self, cell: tuple[int, int, int]) -> bool:
+        """True if the grid has that cell."""
+        return all(0 <= i < n for i, n in zip(cell, self.usable.shape, strict=True))
+
+    def cell_of(self, position: np.ndarray) -> tuple[int, int, int]:
+        """The cell that holds a position [m]; it may lie outside the grid."""
+        x, y, z = np.floor((np.asarray(position, np.float64) - self.origin) / self.cell_size)
+        return int(x), int(y), int(z)
+
+    def centers(self, cells: np.ndarray) -> np.ndarray:
+        """Centres [m] of cells given by index, [n, 3]."""
+        return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
+
+    def distance(self, cell: tuple[int, int, int]) -> float:
+        """Length of the way from the robot to the centre of a cell [m]; inf if there is none."""
+        if not self.contains(cell):
+            return float("inf")
+        first = self.centers(np.array(self.start_cell))
+        return float(np.linalg.norm(first - self.start) + self.cost[cell])
+
+    def lengths(self, positions: np.ndarray) -> np.ndarray:
+        """Path lengths [m] to positions [n, 3]; inf where there is no way.
+
+        The straight line where it is safe, else the way over the cells' centres: no shorter
+        than what `path` returns.
+        """
+        return np.array([self._length(position) for position in positions])
+
+    def _length(self, position: np.ndarray) -> float:
+        cell = self.cell_of(position)
+        if not (self.contains(cell) and self.reachable[cell]):
+            return float("inf")
+        if segment_is_inside(self.usable, *self._in_cells(self.start, position)):
+            return float(np.linalg.norm(position - self.start))
+        last = float(np.linalg.norm(position - self.centers(np.array(cell))))
+        return self.distance(cell) + last
+
+    def path(self, position: np.ndarray) -> np.ndarray:
+        """Waypoints [K, 3] [m] from the robot to a position; every segment is safe throughout.
+
+        Raises:
+            ValueError: there is no way; ask `lengths` first.
+        """
+        goal = np.asarray(position, dtype=np.float64)
+        cell = self.cell_of(goal)
+        if not (self.contains(cell) and self.reachable[cell]):
+            raise ValueError(f"no safe path leads from {self.start} to {goal} (cell {cell})")
+        way = [int(np.ravel_multi_index(cell, self.usable.shape))]
+        previous = self.previous.reshape(-1)
+        while previous[way[-1]] >= 0:
+            way.append(int(previous[way[-1]]))
+        cells = np.stack(np.unravel_index(way[::-1], self.usable.shape), axis=1)
+        return self._shortcut(np.concatenate([self.start[None], self.centers(cells), goal[None]]))
+
+    def _shortcut(self, points: np.ndarray) -> np.ndarray:
+        """Drops waypoints wherever the straight line past them is safe."""
+        last = len(points) - 1
+        kept = [0]
+        while kept[-1] < last:
+            here = kept[-1]
+            if self._sees(points[here], points[last]):
+                kept.append(last)
+                break
+            ahead = here + 1  # neighbours on the way always see each other
+            while ahead + 1 < last and self._sees(points[here], points[ahead + 1]):
+                ahead += 1
+            kept.append(ahead)
+        return points[kept]
+
+    def _sees(self, a: np.ndarray, b: np.ndarray) -> bool:
+        return segment_is_inside(self.usable, *self._in_cells(a, b))
+
+    def _in_cells(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (a - self.origin) / self.cell_size, (b - self.origin) / self.cell_size
+
+
+def plan_travel(
+    grid: OccupancyGrid,
+    position: np.ndarray,
+    safety_margin: float = 0.3,
+    trail: np.ndarray | None = None,
+) -> Travel:
+    """Shortest ways from a position to everywhere that is safe. Once per decision.
+
+    Args:
+        grid: what is known.
+        position: the robot's position in the world [m]. Outside the grid nothing is reachable.
+        safety_margin: radius of the ball that must be known free [m].
+        trail: cells that the robot has come through, [X, Y, Z] bool. If its present cell is
+            not safe (a closer look found something in the margin), it may go back through them
+            unless they turned out to be occupied; otherwise they change nothing.
+    """
+    free = np.asarray(grid.free)
+    cell_size = float(grid.cell_size)
+    origin = np.asarray(grid.origin, dtype=np.float64)
+    start = np.asarray(position, dtype=np.float64)
+    if start.shape != (3,) or not np.all(np.isfinite(start)):
+        raise ValueError(f"the position must be three finite numbers [m], got {start}")
+    safe = safe_cells(free, cell_size, safety_margin)
+    cell = tuple(int(i) for i in np.floor((start - origin) / cell_size))
+    is_inside = all(0 <= i < n for i, n in zip(cell, free.shape, strict=True))
+    usable = safe
+    if is_inside and not safe[cell]:
+        usable = safe.copy()
+        if trail is not None:
+            usable |= trail & ~np.asarray(grid.occupied)
+        usable[cell] = True
+    cost, previous = _shortest_ways(usable, cell if is_inside else None)
+    return Travel(
+        start=start,
+        start_cell=(cell[0], cell[1], cell[2]),
+        origin=origin,
+        cell_size=cell_size,
+        free=free,
+        safe=safe,
+        usable=usable,
+        cost=cost * cell_size,
+        previous=previous,
+    )
+
+
+def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
+    """Cells round whose centre a ball of radius `margin` [m] touches free cells only.
+
+    Args:
+        free: cells known to be free, [X, Y, Z] bool; beyond the array nothing is.
+        cell_size: edge of a cell [m].
+        margin: radius of the ball [m].
+    """
+    reach = max(0, int(np.ceil(margin / cell_size + 0.5)) - 1)
+    padded = np.pad(free, reach)
+    safe = free.copy()
+    for offset in itertools.product(range(-reach, reach + 1), repeat=3):
+        gap = np.maximum(np.abs(offset) - 0.5, 0.0) * cell_size
+        # Touching is not overlapping: with 0.2 m cells, 0.3 m ends where the next cell begins.
+        if np.linalg.norm(gap) < margin - 1e-6:
+            window = tuple(
+                slice(reach + o, reach + o + n) for o, n in zip(offset, free.shape, strict=True)
+            )
+            safe &= padded[window]
+    return safe
+
+
+def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
+    """True if a segment runs through cells of the mask only, corners it touches included.
+
+    Args:
+        mask: [X, Y, Z] bool; beyond the array nothing is in the mask.
+        a: one end, in cells (cell (0, 0, 0) spans 0 to 1), [3].
+        b: the other end.
+    """
+    points = [np.stack([a, b])]
+    for axis in range(3):
+        low, high = sorted((a[axis], b[axis]))
+        planes = np.arange(np.floor(low) + 1.0, np.ceil(high))
+        if planes.size:
+            t = (planes - a[axis]) / (b[axis] - a[axis])
+            crossing = a + t[:, None] * (b - a)
+            # On both sides of the plane, and of any other plane that is as good as touched.
+            points.append((crossing[:, None, :] + _CORNERS).reshape(-1, 3))
+    cells = np.floor(np.concatenate(points)).astype(np.int64)
+    if np.any(cells < 0) or np.any(cells >= mask.shape):
+        return False
+    return bool(mask[cells[:, 0], cells[:, 1], cells[:, 2]].all())
+
+
+def _shortest_ways(
+    usable: np.ndarray, start: tuple[int, ...] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Length of the shortest way from `start` [cells] to each cell, and the cell before it."""
+    cost = np.full(usable.shape, np.inf)
+    previous = np.full(usable.shape, -1, dtype=np.int64)
+    if start is None:
+        return cost, previous
+    flat = np.flatnonzero(usable)
+    node = np.full(usable.shape, -1, dtype=np.int32)
+    node[usable] = np.arange(flat.size, dtype=np.int32)
+    ends, lengths = [], []
+    for step in _STEPS:
+        tails = node[_overlap(usable.shape, step, (0, 0, 0))]
+        heads = node[_overlap(usable.shape, step, step)]
+        is_open = np.ones(tails.shape, dtype=bool)
+        for corner in itertools.product(*({0, d} for d in step)):
+            is_open &= usable[_overlap(usable.shape, step, corner)]
+        ends.append(np.stack([tails[is_open], heads[is_open]]))
+        lengths.append(np.full(ends[-1].shape[1], np.linalg.norm(step)))
+    graph = csr_matrix(
+        (np.concatenate(lengths), tuple(np.concatenate(ends, axis=1))),
+        shape=(flat.size, flat.size),
+    )
+    length, before = dijkstra(
+        graph, directed=False, indices=int(node[start]), return_predecessors=True
+    )
+    cost[usable] = length
+    previous[usable] = np.where(before >= 0, flat[np.maximum(before, 0)], -1)
+    return cost, previous
+
+
+def _overlap(shape: tuple[int, ...], step: tuple[int, ...], shift: tuple[int, ...]) -> tuple:
+    """The cells from which `step` stays in the grid, as a slice moved by `shift`."""
+    return tuple(
+        slice(max(0, -d) + s, n - max(0, d) + s) for n, d, s in zip(shape, step, shift, strict=True)
+    )
