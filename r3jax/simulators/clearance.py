@@ -21,7 +21,7 @@ class SurfaceDistance:
         """Cuts the mesh `vertices` [V, 3] [m], `faces` [F, 3] and builds the tree."""
         corners = vertices[faces].astype(np.float64)
         extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
-        self._pieces = _cut(corners, max(0.15, extent / 100.0))
+        self._pieces = _cut(corners, max(0.25, extent / 80.0))
         centers = self._pieces.mean(axis=1)
         self._radius = float(np.linalg.norm(self._pieces - centers[:, None], axis=2).max())
         self._tree = KDTree(centers)

@@ -34,8 +34,9 @@ CHUNK = 1 << 16
 PROBES = 2
 """Trilinear samples along the longer axis of a footprint."""
 
-LEVEL_BIAS = -0.25
-"""Added to the mip level: a little sharper than the box that GL assumes."""
+LEVEL_BIAS = -0.5
+"""Added to the mip level. Measured against 64 rays a pixel on a furnished house: with two probes
+and this bias the images are nearest (37.8 dB; 37.4 without bias, 36.2 with one probe)."""
 
 
 class Surface(eqx.Module):
@@ -119,7 +120,7 @@ def build_surface(world: World, *, lighting: bool) -> Surface:
     return Surface(
         faces=as_float(_padded(faces)),
         corner_colors=as_float(corner_colors),
-        materials=as_float(rows),
+        materials=as_float(_padded(rows, least=16)),
         texels=jnp.asarray(atlas.texels),
         sizes=jnp.asarray(atlas.sizes),
         offsets=jnp.asarray(atlas.offsets),
@@ -146,9 +147,9 @@ def _unique_textures(world: World) -> tuple[list[np.ndarray], list[int]]:
     return images, texture_of
 
 
-def _padded(table: np.ndarray) -> np.ndarray:
+def _padded(table: np.ndarray, least: int = 1024) -> np.ndarray:
     """Adds rows of zeros up to a round number, so that worlds share compiled kernels."""
-    extra = round_up(len(table)) - len(table)
+    extra = round_up(len(table), least) - len(table)
     return np.concatenate([table, np.zeros((extra, table.shape[1]), table.dtype)])
 
 

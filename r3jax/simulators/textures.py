@@ -22,7 +22,7 @@ class TextureAtlas:
     """red + 256 green + 65536 blue, [S] uint32."""
 
     sizes: np.ndarray
-    """Width and height of level 0, [T, 2] int32."""
+    """Width and height of level 0, [T, 2] int32; 1 in the rows beyond the last texture."""
 
     offsets: np.ndarray
     """Index of each level's first texel, [T, MAX_LEVELS] int32; the last level repeats."""
@@ -35,15 +35,15 @@ def build_atlas(images: list[np.ndarray]) -> TextureAtlas:
         images: textures [h, w, 3] uint8 of any size.
 
     Returns:
-        The atlas. Its length is rounded up, so that worlds of about the same size share one
-        compiled kernel.
+        The atlas. Its tables are rounded up in size (see `round_up`).
 
     Raises:
         ValueError: the textures together are too large to be indexed with 31 bits.
     """
     pieces: list[np.ndarray] = []
-    sizes = np.ones((max(len(images), 1), 2), dtype=np.int32)
-    offsets = np.zeros((max(len(images), 1), MAX_LEVELS), dtype=np.int64)
+    rows = round_up(len(images), least=16)
+    sizes = np.ones((rows, 2), dtype=np.int32)
+    offsets = np.zeros((rows, MAX_LEVELS), dtype=np.int64)
     total = 0
     for i, image in enumerate(images):
         sizes[i] = image.shape[1], image.shape[0]
@@ -55,7 +55,7 @@ def build_atlas(images: list[np.ndarray]) -> TextureAtlas:
                 total += len(pieces[-1])
             else:
                 offsets[i, k] = offsets[i, k - 1]
-    length = round_up(max(total, 1))
+    length = round_up(total)
     if length >= 2**31:
         raise ValueError(
             f"the world's textures hold {total:.3g} texels, more than the 2^31 that can be "
@@ -92,7 +92,11 @@ def _pack(image: np.ndarray) -> np.ndarray:
     return quads.reshape(-1, 4).view("<u4")[:, 0]
 
 
-def round_up(count: int) -> int:
-    """The next number with two significant bits after the leading one: at most 25 % more."""
+def round_up(count: int, least: int = 1024) -> int:
+    """A size of at least `count` and `least` with only two bits after the leading one.
+
+    Tables of such sizes waste at most a quarter, and most worlds share the compiled kernels.
+    """
+    count = max(count, least)
     step = 1 << max(count.bit_length() - 3, 0)
     return -(-count // step) * step
