@@ -5,7 +5,59 @@
 
 Every scene is closed (a camera inside sees surfaces only), has image-like textures, glossy and
 mirror-like materials, windows on which depth sensors fail, and doorways that a robot of 0.3 m
-radius passes.
+radius passes. World: z up, metres; one room's floor has a corner at the origin.
 """
-from r3jax.scenes.procedural.homes import flat
-def build(name): return flat()
+
+from r3jax.scenes.procedural.catalog import (
+    apartment,
+    classroom,
+    corridor,
+    flat,
+    gallery,
+    kitchen_diner,
+    library,
+    loft,
+    office,
+)
+from r3jax.simulators.world import World
+
+_SCENES = {
+    "flat": flat,
+    "kitchen": kitchen_diner,
+    "loft": loft,
+    "apartment": apartment,
+    "office": office,
+    "gallery": gallery,
+    "corridor": corridor,
+    "classroom": classroom,
+    "library": library,
+}
+
+
+def names() -> tuple[str, ...]:
+    """The nine names, from the demo's scene on."""
+    return tuple(_SCENES)
+
+
+def _scene(name: str):
+    if name not in _SCENES:
+        raise ValueError(f"unknown procedural scene {name!r}; known: {', '.join(_SCENES)}")
+    return _SCENES[name]
+
+
+def build(name: str) -> World:
+    """Makes the scene of that name; the first in a process takes one to two seconds.
+
+    Raises:
+        ValueError: no scene has that name.
+    """
+    return _scene(name).build()
+
+
+def describe(name: str) -> str:
+    """One line about the scene of that name.
+
+    Raises:
+        ValueError: no scene has that name.
+    """
+    return _scene(name).SUMMARY

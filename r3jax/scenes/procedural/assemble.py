@@ -23,7 +23,7 @@ def assemble(
     start: tuple[float, float, float],
     yaw_deg: float,
     description: str,
-    ambient: float = 0.5,
+    ambient: float = 0.72,
 ) -> World:
     """The world of a furnished model.
 
@@ -89,7 +89,7 @@ def ambient_occlusion(corners: np.ndarray) -> np.ndarray:
         corners: [F, 3, 3] [m].
 
     Returns:
-        [F, 3], from 0.35 (deep in a corner) to 1 (open).
+        [F, 3], from 0.4 (deep in a corner) to 1 (open).
     """
     origin = corners.min(axis=(0, 1)) - 3 * _VOXEL
     size = np.ceil((corners.max(axis=(0, 1)) - origin) / _VOXEL).astype(int) + 4
@@ -99,15 +99,15 @@ def ambient_occlusion(corners: np.ndarray) -> np.ndarray:
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     middle = corners.mean(axis=1, keepdims=True)
     light = np.ones(corners.shape[:2])
-    # A flat wall fills about `open` of the blurred ball in front of it; more is occlusion.
-    for sigma, offset, open_share, strength in ((1.2, 0.12, 0.16, 0.8), (3.5, 0.3, 0.075, 1.3)):
+    # A lone wall fills `open_share` of the blurred ball in front of it; more is occlusion.
+    for sigma, offset, open_share, strength in ((1.2, 0.12, 0.24, 0.28), (3.5, 0.3, 0.15, 0.6)):
         density = ndimage.gaussian_filter(filled, sigma, mode="nearest")
         inward = 0.9 * corners + 0.1 * middle
         at = (inward + offset * normal[:, None] - origin) / _VOXEL - 0.5
         here = ndimage.map_coordinates(density, at.reshape(-1, 3).T, order=1, mode="nearest")
         excess = np.maximum(here.reshape(light.shape) - open_share, 0.0)
         light *= np.exp(-strength * excess / 0.25)
-    return np.clip(light, 0.35, 1.0)
+    return np.clip(light, 0.4, 1.0)
 
 
 def _splat(corners: np.ndarray, origin: np.ndarray, size: tuple[int, int, int]) -> np.ndarray:

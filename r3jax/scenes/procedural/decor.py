@@ -7,10 +7,12 @@ import numpy as np
 
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.model import Finish, Model
-from r3jax.scenes.procedural.shapes import box, combine, curtain, cylinder, panel, quad, tube
+from r3jax.scenes.procedural.shapes import box, combine, curtain, cylinder, disc, panel, quad, tube
 
 
-def picture(kind: str, seed: int, width: float, height: float, z: float = 1.55, frame: Finish | None = None) -> Model:
+def picture(
+    kind: str, seed: int, width: float, height: float, z: float = 1.55, frame: Finish | None = None
+) -> Model:
     """A framed picture, its middle at height z."""
     finish = frame or f.wood(f.EBONY, 1)
     w, h, t = width / 2, height / 2, 0.035
@@ -52,7 +54,10 @@ def radiator(width: float = 1.0, height: float = 0.55) -> Model:
     ]
     model = Model().add(combine(columns), white)
     model.add(box((-width / 2, 0.06, 0.16), (width / 2, 0.11, 0.2)), white)
-    pipe = tube([(width / 2 + 0.07, 0.08, 0.0), (width / 2 + 0.07, 0.08, 0.18), (width / 2, 0.08, 0.18)], 0.011)
+    pipe = tube(
+        [(width / 2 + 0.07, 0.08, 0.0), (width / 2 + 0.07, 0.08, 0.18), (width / 2, 0.08, 0.18)],
+        0.011,
+    )
     return model.add(pipe, f.metal((0.72, 0.5, 0.36), 2))
 
 
@@ -67,8 +72,7 @@ def clock(seed: int, z: float = 2.0, radius: float = 0.17) -> Model:
     """A round wall clock, its middle at height z."""
     case = cylinder(radius, 0.0, 0.035, 24).turned(-90.0, "x").moved(z=z)
     model = Model().add(case, f.enamel(f.CHARCOAL, 1))
-    side = radius * 1.36
-    return model.add(panel(0, z - side / 2, side, side, 0.037), f.clock_face(seed))
+    return model.add(disc(0.92 * radius, 0.037).moved(z=z), f.clock_face(seed))
 
 
 def board(kind: str, width: float, height: float, z: float, seed: int) -> Model:
@@ -84,7 +88,13 @@ def picture_group(seed: int, z: float = 1.6) -> Model:
     """Five small pictures hung as a cloud, about 1.7 m wide."""
     model = Model()
     kinds = ("poster", "landscape", "abstract", "sunset", "abstract")
-    spots = ((-0.6, 0.05, 0.36, 0.48), (-0.1, 0.26, 0.5, 0.36), (-0.12, -0.2, 0.3, 0.38), (0.55, 0.24, 0.46, 0.34), (0.45, -0.2, 0.34, 0.42))
+    spots = (
+        (-0.6, 0.05, 0.36, 0.48),
+        (-0.1, 0.26, 0.5, 0.36),
+        (-0.12, -0.2, 0.3, 0.38),
+        (0.55, 0.24, 0.46, 0.34),
+        (0.45, -0.2, 0.34, 0.42),
+    )
     for k, (x, dz, w, h) in enumerate(spots):
         frame = (f.wood(f.EBONY, 1), f.wood(f.OAK, 1), f.enamel(f.WHITE, 3, 0.2))[k % 3]
         model.put(picture(kinds[k], seed + k, w, h, z + dz, frame), x)
@@ -95,7 +105,9 @@ def wall_shelf(width: float, z: float, things: list[Model]) -> Model:
     """A board on brackets with things spread over it."""
     model = Model().add(box((-width / 2, 0, z - 0.03), (width / 2, 0.24, z)), f.wood(f.OAK, 2))
     for x in (-width / 2 + 0.15, width / 2 - 0.15):
-        model.add(box((x - 0.012, 0, z - 0.2), (x + 0.012, 0.2, z - 0.03)), f.metal((0.25, 0.25, 0.26), 1))
+        model.add(
+            box((x - 0.012, 0, z - 0.2), (x + 0.012, 0.2, z - 0.03)), f.metal((0.25, 0.25, 0.26), 1)
+        )
     for k, thing in enumerate(things):
         model.put(thing, -width / 2 + (k + 0.5) * width / len(things), 0.12, z)
     return model
@@ -104,7 +116,11 @@ def wall_shelf(width: float, z: float, things: list[Model]) -> Model:
 def coat_rack(seed: int) -> Model:
     """Hooks on a board with two coats and a scarf."""
     model = Model().add(box((-0.5, 0, 1.62), (0.5, 0.025, 1.74)), f.wood(f.WALNUT, 3))
-    cloths = (f.fabric(f.NAVY, 2), f.plaid((0.5, 0.4, 0.3), (0.2, 0.15, 0.12), (0.85, 0.75, 0.5), 4), f.fabric(f.MUSTARD, 3))
+    cloths = (
+        f.fabric(f.NAVY, 2),
+        f.plaid((0.5, 0.4, 0.3), (0.2, 0.15, 0.12), (0.85, 0.75, 0.5), 4),
+        f.fabric(f.MUSTARD, 3),
+    )
     for k, x in enumerate((-0.35, -0.05, 0.28)):
         model.add(tube([(x, 0.02, 1.68), (x, 0.08, 1.66), (x, 0.1, 1.7)], 0.008), f.metal())
         length = (0.95, 0.75, 0.6)[(k + seed) % 3]

@@ -129,7 +129,9 @@ def metal(color: Color = (0.68, 0.69, 0.7), seed: int = 0, mirror: float = 0.15)
 def enamel(color: Color, seed: int = 0, gloss: float = 0.4) -> Finish:
     """Lacquer, ceramic, plastic."""
     texture = textures.enamel(color, seed)
-    return Finish(Material(texture, specular=gloss, shininess=60.0, mirror=0.06 * gloss), (0.9, 0.9))
+    return Finish(
+        Material(texture, specular=gloss, shininess=60.0, mirror=0.06 * gloss), (0.9, 0.9)
+    )
 
 
 @functools.cache
@@ -240,7 +242,9 @@ def picture(kind: str, seed: int, wide: bool = False) -> Finish:
 @functools.cache
 def screen(seed: int) -> Finish:
     """A computer screen that is on."""
-    material = Material(screens.desktop(seed), emission=0.85, specular=0.3, shininess=80.0, mirror=0.05)
+    material = Material(
+        screens.desktop(seed), emission=0.85, specular=0.3, shininess=80.0, mirror=0.05
+    )
     return Finish(material)
 
 

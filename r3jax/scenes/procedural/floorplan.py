@@ -104,7 +104,9 @@ class Plan:
                 (hi, hi + casing, 0.0, height + casing),
                 (lo, hi, height, height + casing),
             ):
-                bar = box((a, s0, z0), (b, s1, z1)) if axis == "x" else box((s0, a, z0), (s1, b, z1))
+                bar = (
+                    box((a, s0, z0), (b, s1, z1)) if axis == "x" else box((s0, a, z0), (s1, b, z1))
+                )
                 self.model.add(bar, finish)
 
     def window(
@@ -143,7 +145,9 @@ class Plan:
         ]
         for x in np.linspace(-width / 2 + 0.025, width / 2 - 0.025, max(2, round(width / 0.6) + 1)):
             bars.append(box((x - 0.025, 0, sill + 0.05), (x + 0.025, 0.06, top - 0.05)))
-        board = box((-width / 2 - 0.06, depth - 0.01, sill - 0.04), (width / 2 + 0.06, depth + 0.07, sill))
+        board = box(
+            (-width / 2 - 0.06, depth - 0.01, sill - 0.04), (width / 2 + 0.06, depth + 0.07, sill)
+        )
         pane.add(combine(bars), white).add(board, f.marble((0.86, 0.85, 0.82), (0.5, 0.5, 0.5), 21))
         inward = {"n": "s", "s": "n", "e": "w", "w": "e"}[side]
         x, y = (face + out * depth, center) if axis == "x" else (center, face + out * depth)
@@ -153,7 +157,9 @@ class Plan:
         """Walls, floors, ceilings, skirtings and the outer shell, with all openings cut."""
         for room in self.rooms.values():
             self._room_surfaces(room)
-        corners = np.array([[(r.x0, r.y0, 0.0), (r.x1, r.y1, r.height)] for r in self.rooms.values()])
+        corners = np.array(
+            [[(r.x0, r.y0, 0.0), (r.x1, r.y1, r.height)] for r in self.rooms.values()]
+        )
         low, high = corners[:, 0].min(axis=0) - OUTER_WALL, corners[:, 1].max(axis=0) + OUTER_WALL
         shell = box(tuple(low), tuple(high), upright=True, step=2.0)
         self.model.add(shell, f.concrete((0.7, 0.69, 0.66), 90))
@@ -175,12 +181,18 @@ class Plan:
             if r.skirting is not None:
                 self._strip(r, side, (0.0, 0.09), 0.015, holes, r.skirting)
 
-    def _rail(self, r: Room, side: str, z: float, holes: list[tuple[float, float, float, float]]) -> None:
+    def _rail(
+        self, r: Room, side: str, z: float, holes: list[tuple[float, float, float, float]]
+    ) -> None:
         finish = r.skirting or f.enamel(f.WHITE, 3, 0.2)
-        blocking = [(a, b, 0.0 if c < z + 0.02 and d > z - 0.02 else 9.0, d) for a, b, c, d in holes]
+        blocking = [
+            (a, b, 0.0 if c < z + 0.02 and d > z - 0.02 else 9.0, d) for a, b, c, d in holes
+        ]
         self._strip(r, side, (z - 0.02, z + 0.02), 0.018, blocking, finish)
 
-    def _strip(self, r: Room, side: str, z: tuple[float, float], depth: float, holes, finish: Finish) -> None:
+    def _strip(
+        self, r: Room, side: str, z: tuple[float, float], depth: float, holes, finish: Finish
+    ) -> None:
         """A bar along a wall, interrupted by the openings that reach down to it."""
         lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
         # Casings stand 0.07 m beside their opening.
@@ -225,7 +237,9 @@ def _wall(r: Room, side: str, z0: float, z1: float, holes) -> Shape:
     s = s if along[0] + along[1] > 0 else s[::-1]
     ss, tt = np.meshgrid(s, t)
     zero = np.zeros_like(ss)
-    points = np.stack([ss, zero + origin[1], tt] if side in "ns" else [zero + origin[0], ss, tt], axis=-1)
+    points = np.stack(
+        [ss, zero + origin[1], tt] if side in "ns" else [zero + origin[0], ss, tt], axis=-1
+    )
     shape = grid(points, s if along[0] + along[1] > 0 else -s, t)
     if not holes:
         return shape

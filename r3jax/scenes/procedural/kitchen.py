@@ -5,10 +5,23 @@ import numpy as np
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural import objects
 from r3jax.scenes.procedural.model import Finish, Model
-from r3jax.scenes.procedural.shapes import ball, box, combine, curtain, cushion, cylinder, lathe, panel, quad, tube
+from r3jax.scenes.procedural.shapes import (
+    ball,
+    box,
+    combine,
+    curtain,
+    cushion,
+    cylinder,
+    lathe,
+    panel,
+    quad,
+    tube,
+)
 
 
-def _front(model: Model, x0: float, x1: float, z0: float, z1: float, y: float, finish: Finish) -> None:
+def _front(
+    model: Model, x0: float, x1: float, z0: float, z1: float, y: float, finish: Finish
+) -> None:
     """A cupboard door or drawer front with a frame and a bar handle."""
     model.add(box((x0 + 0.003, y, z0 + 0.003), (x1 - 0.003, y + 0.018, z1 - 0.003)), finish)
     t = 0.06
@@ -16,11 +29,18 @@ def _front(model: Model, x0: float, x1: float, z0: float, z1: float, y: float, f
         inner = box((x0 + t, y + 0.018, z0 + t), (x1 - t, y + 0.024, z1 - t))
         model.add(inner, finish, (0.94, 0.94, 0.94))
     x, z = (x0 + x1) / 2, z1 - 0.05
-    bar = [(x - 0.07, y + 0.018, z), (x - 0.07, y + 0.05, z), (x + 0.07, y + 0.05, z), (x + 0.07, y + 0.018, z)]
+    bar = [
+        (x - 0.07, y + 0.018, z),
+        (x - 0.07, y + 0.05, z),
+        (x + 0.07, y + 0.05, z),
+        (x + 0.07, y + 0.018, z),
+    ]
     model.add(tube([(float(a), float(b), float(c)) for a, b, c in bar], 0.006), f.metal())
 
 
-def kitchen_run(width: float, front: Finish, top: Finish, splash: Finish, seed: int, uppers: bool = True) -> Model:
+def kitchen_run(
+    width: float, front: Finish, top: Finish, splash: Finish, seed: int, uppers: bool = True
+) -> Model:
     """A kitchen along a wall: units, worktop, sink, hob and oven, splashback, wall cupboards."""
     w, model = width / 2, Model()
     model.add(box((-w, 0, 0.1), (w, 0.56, 0.87)), front)
@@ -54,12 +74,32 @@ def _oven(model: Model, x0: float, x1: float) -> None:
     model.add(tube([(x0 + 0.07, 0.63, 0.67), (x1 - 0.07, 0.63, 0.67)], 0.01), steel)
     for k in range(5):
         knob = cylinder(0.02, 0, 0.025, 10).turned(-90.0, "x")
-        model.add(knob.moved(x0 + 0.1 + k * (x1 - x0 - 0.2) / 4, 0.585, 0.78), f.enamel(f.CHARCOAL, 1))
+        model.add(
+            knob.moved(x0 + 0.1 + k * (x1 - x0 - 0.2) / 4, 0.585, 0.78), f.enamel(f.CHARCOAL, 1)
+        )
     model.add(box((x0 + 0.03, 0.05, 0.911), (x1 - 0.03, 0.55, 0.918)), dark)
     middle = (x0 + x1) / 2
-    for dx, dy, r in ((-0.13, 0.18, 0.08), (0.13, 0.18, 0.1), (-0.13, 0.42, 0.1), (0.13, 0.42, 0.07)):
-        model.add(cylinder(r, 0.918, 0.922, 18).moved(middle + dx, dy), f.metal((0.3, 0.3, 0.31), 1))
-    pot = lathe([(0.0, 0.0), (0.1, 0.0), (0.1, 0.13), (0.105, 0.13), (0.1, 0.14), (0.03, 0.16), (0.0, 0.18)], 18)
+    for dx, dy, r in (
+        (-0.13, 0.18, 0.08),
+        (0.13, 0.18, 0.1),
+        (-0.13, 0.42, 0.1),
+        (0.13, 0.42, 0.07),
+    ):
+        model.add(
+            cylinder(r, 0.918, 0.922, 18).moved(middle + dx, dy), f.metal((0.3, 0.3, 0.31), 1)
+        )
+    pot = lathe(
+        [
+            (0.0, 0.0),
+            (0.1, 0.0),
+            (0.1, 0.13),
+            (0.105, 0.13),
+            (0.1, 0.14),
+            (0.03, 0.16),
+            (0.0, 0.18),
+        ],
+        18,
+    )
     model.add(pot.moved(middle - 0.13, 0.42, 0.922), f.enamel(f.TERRACOTTA, 3, 0.7))
     model.add(pot.moved(middle + 0.13, 0.18, 0.922), steel)
 
@@ -73,7 +113,9 @@ def _hood(model: Model, x: float) -> None:
 def _sink(model: Model, x: float) -> None:
     steel = f.metal((0.74, 0.75, 0.76), 1, 0.25)
     model.add(box((x - 0.25, 0.1, 0.911), (x + 0.25, 0.52, 0.917)), steel)
-    model.add(quad((x - 0.2, 0.14, 0.919), (0.4, 0, 0), (0, 0.34, 0)), f.metal((0.45, 0.46, 0.47), 2, 0.1))
+    model.add(
+        quad((x - 0.2, 0.14, 0.919), (0.4, 0, 0), (0, 0.34, 0)), f.metal((0.45, 0.46, 0.47), 2, 0.1)
+    )
     tap = [(x, 0.07, 0.91), (x, 0.07, 1.16), (x, 0.11, 1.22), (x, 0.2, 1.21), (x, 0.22, 1.14)]
     model.add(tube(tap, 0.013, 8), steel)
 
@@ -86,7 +128,13 @@ def _worktop_things(model: Model, width: float, pitch: float, seed: int) -> None
     model.put(objects.jar(seed), -w + 0.1, 0.34, 0.91)
     free = np.arange(-w + 2 * pitch + 0.12, w - 0.1, 0.22)
     for k, x in enumerate(free):
-        thing = (objects.jar(seed + k), objects.carton(seed + k), objects.crockery(k), objects.bottle(seed + k), objects.jar(seed + 3 + k, 0.055, 0.22))
+        thing = (
+            objects.jar(seed + k),
+            objects.carton(seed + k),
+            objects.crockery(k),
+            objects.bottle(seed + k),
+            objects.jar(seed + 3 + k, 0.055, 0.22),
+        )
         model.put(thing[k % 5], float(x), 0.15 + 0.05 * (k % 3), 0.92, 14.0 * k)
 
 
@@ -97,7 +145,18 @@ def fridge(seed: int) -> Model:
     for z0, z1 in ((0.06, 0.66), (0.68, 1.84)):
         model.add(box((-0.295, 0.6, z0), (0.295, 0.64, z1)), steel)
         z = z1 - 0.12 if z0 < 0.5 else z0 + 0.2
-        model.add(tube([(0.24, 0.64, z - 0.12), (0.24, 0.68, z - 0.1), (0.24, 0.68, z + 0.1), (0.24, 0.64, z + 0.12)], 0.009), f.metal())
+        model.add(
+            tube(
+                [
+                    (0.24, 0.64, z - 0.12),
+                    (0.24, 0.68, z - 0.1),
+                    (0.24, 0.68, z + 0.1),
+                    (0.24, 0.64, z + 0.12),
+                ],
+                0.009,
+            ),
+            f.metal(),
+        )
     for k, (x, z) in enumerate(((-0.13, 1.5), (0.03, 1.62), (-0.05, 1.25), (-0.18, 1.12))):
         note = panel(x, z, 0.13, 0.17, 0.643)
         model.add(note, f.picture(("poster", "landscape", "abstract", "sunset")[k], 70 + k))
@@ -113,7 +172,9 @@ def island(width: float, front: Finish, top: Finish, seed: int) -> Model:
     for k in range(units):
         _front(model, -w + k * width / units, -w + (k + 1) * width / units, 0.08, 0.86, 0.35, front)
     model.put(objects.bowl_of_fruit(seed), -0.2 * width, 0.05, 0.92)
-    model.put(objects.bottle(seed), 0.15 * width, -0.1, 0.92).put(objects.bottle(seed + 1), 0.22 * width, 0.02, 0.92)
+    model.put(objects.bottle(seed), 0.15 * width, -0.1, 0.92).put(
+        objects.bottle(seed + 1), 0.22 * width, 0.02, 0.92
+    )
     return model.put(objects.leafy_plant(0.42, seed, 24), 0.38 * width, 0.0, 0.92)
 
 
@@ -141,10 +202,16 @@ def washbasin(width: float, front: Finish, seed: int) -> Model:
     model = Model().add(box((-w, 0, 0.3), (w, 0.44, 0.78)), front)
     for x0, x1 in ((-w, 0.0), (0.0, w)):
         _front(model, x0, x1, 0.3, 0.78, 0.44, front)
-    model.add(box((-w - 0.02, 0, 0.78), (w + 0.02, 0.48, 0.82)), f.marble((0.9, 0.89, 0.87), (0.5, 0.5, 0.52), 22))
+    model.add(
+        box((-w - 0.02, 0, 0.78), (w + 0.02, 0.48, 0.82)),
+        f.marble((0.9, 0.89, 0.87), (0.5, 0.5, 0.52), 22),
+    )
     basin = lathe([(0.1, 0.82), (0.19, 0.94), (0.175, 0.94), (0.08, 0.84), (0.0, 0.835)], 22)
     model.add(basin.moved(0, 0.25), white)
-    model.add(tube([(0, 0.04, 0.82), (0, 0.04, 1.02), (0, 0.14, 1.04), (0, 0.16, 1.0)], 0.012, 8), f.metal())
+    model.add(
+        tube([(0, 0.04, 0.82), (0, 0.04, 1.02), (0, 0.14, 1.04), (0, 0.16, 1.0)], 0.012, 8),
+        f.metal(),
+    )
     model.add(box((-w - 0.02, 0, 1.16), (w + 0.02, 0.024, 1.96)), f.wood(f.OAK, 2))
     model.add(panel(0, 1.18, width, 0.76, 0.028), f.mirror())
     model.add(box((-0.25, 0.03, 2.0), (0.25, 0.09, 2.06)), f.glow((1.0, 0.97, 0.88), 5, 1.0))
@@ -157,8 +224,16 @@ def washbasin(width: float, front: Finish, seed: int) -> Model:
 def bathtub(length: float = 1.7) -> Model:
     """A tub along the wall with a printed shower curtain half drawn."""
     white, w = f.enamel((0.93, 0.93, 0.92), 6, 0.8), length / 2
-    model = Model().add(box((-w, 0.7, 0), (w, 0.75, 0.56), upright=True), f.tiled(((0.85, 0.88, 0.88), (0.5, 0.62, 0.64)), 31, 12, 12, 0.1))
-    rim = ((-w, 0.0, w, 0.07), (-w, 0.68, w, 0.76), (-w, 0.07, -w + 0.08, 0.68), (w - 0.08, 0.07, w, 0.68))
+    model = Model().add(
+        box((-w, 0.7, 0), (w, 0.75, 0.56), upright=True),
+        f.tiled(((0.85, 0.88, 0.88), (0.5, 0.62, 0.64)), 31, 12, 12, 0.1),
+    )
+    rim = (
+        (-w, 0.0, w, 0.07),
+        (-w, 0.68, w, 0.76),
+        (-w, 0.07, -w + 0.08, 0.68),
+        (w - 0.08, 0.07, w, 0.68),
+    )
     for x0, y0, x1, y1 in rim:
         model.add(box((x0, y0, 0.54), (x1, y1, 0.58)), white)
     model.add(quad((-w + 0.08, 0.07, 0.2), (length - 0.16, 0, 0), (0, 0.61, 0), 0.3), white)
@@ -172,8 +247,13 @@ def bathtub(length: float = 1.7) -> Model:
     model.add(tube([(-w, 0.74, 2.02), (w, 0.74, 2.02)], 0.012, 8), f.metal())
     cloth = f.printed((0.9, 0.93, 0.92), (f.TEAL, f.SAGE, f.MUSTARD), "botanical", 33)
     model.add(curtain(0.55, 0.25, 2.0, 6, 0.04).moved(-w + 0.35, 0.74), cloth)
-    model.add(tube([(w - 0.3, 0.02, 0.75), (w - 0.3, 0.16, 0.75), (w - 0.3, 0.2, 0.7)], 0.018, 8), f.metal())
-    return model.add(tube([(w - 0.3, 0.03, 0.8), (w - 0.3, 0.03, 2.05), (w - 0.3, 0.3, 2.08)], 0.011), f.metal())
+    model.add(
+        tube([(w - 0.3, 0.02, 0.75), (w - 0.3, 0.16, 0.75), (w - 0.3, 0.2, 0.7)], 0.018, 8),
+        f.metal(),
+    )
+    return model.add(
+        tube([(w - 0.3, 0.03, 0.8), (w - 0.3, 0.03, 2.05), (w - 0.3, 0.3, 2.08)], 0.011), f.metal()
+    )
 
 
 def towel_rail(seed: int) -> Model:
@@ -183,7 +263,10 @@ def towel_rail(seed: int) -> Model:
         model.add(tube([(x, 0.07, 0.6), (x, 0.07, 1.75)], 0.015, 8), steel)
     for z in np.arange(0.7, 1.75, 0.14):
         model.add(tube([(-0.25, 0.07, float(z)), (0.25, 0.07, float(z))], 0.01), steel)
-    towels = (f.striped((f.WHITE, f.TEAL, f.WHITE), seed, 3), f.plaid(f.BLUSH, f.WHITE, f.TERRACOTTA, seed))
+    towels = (
+        f.striped((f.WHITE, f.TEAL, f.WHITE), seed, 3),
+        f.plaid(f.BLUSH, f.WHITE, f.TERRACOTTA, seed),
+    )
     for towel, z0, z1 in zip(towels, (0.72, 1.22), (1.14, 1.6), strict=True):
         model.add(curtain(0.4, z0, z1, 2, 0.012).moved(0, 0.105), towel)
     return model

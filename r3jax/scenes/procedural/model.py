@@ -79,7 +79,12 @@ class Model:
         return self
 
     def put(
-        self, other: "Model", x: float = 0.0, y: float = 0.0, z: float = 0.0, heading: str | float = 0.0
+        self,
+        other: "Model",
+        x: float = 0.0,
+        y: float = 0.0,
+        z: float = 0.0,
+        heading: str | float = 0.0,
     ) -> "Model":
         """Places another model in this one.
 

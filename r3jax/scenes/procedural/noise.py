@@ -10,6 +10,22 @@ from scipy import fft
 
 
 @functools.lru_cache(maxsize=64)
+def _field(
+    height: int, width: int, seed: int, slope: float, stretch_x: float, lowest: float
+) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    spectrum = fft.rfft2(rng.standard_normal((height, width), dtype=np.float32))
+    fy = np.fft.fftfreq(height, 1.0 / height)[:, None] * (width / height)
+    fx = np.fft.rfftfreq(width, 1.0 / width)[None, :]
+    squared = ((fx * stretch_x) ** 2 + fy**2).astype(np.float32)
+    gain = np.maximum(squared, 1.0) ** np.float32(-0.5 * slope)
+    gain[squared < lowest**2] = 0.0
+    field = fft.irfft2(spectrum * gain, s=(height, width))
+    field = (field - field.mean()) / field.std()
+    field.flags.writeable = False
+    return field
+
+
 def cloud(
     height: int,
     width: int,
@@ -20,6 +36,9 @@ def cloud(
 ) -> np.ndarray:
     """A periodic random field with the amplitude spectrum 1 / f ** slope.
 
+    Fields are drawn from a small pool and shifted by the seed: a Fourier transform per field
+    would make a scene take seconds, and a shifted field under another colour looks new.
+
     Args:
         height: rows [texels].
         width: columns [texels].
@@ -29,19 +48,13 @@ def cloud(
         lowest: frequencies below this many cycles per tile are left out.
 
     Returns:
-        [h, w] float32, read-only, mean 0, standard deviation 1.
+        [h, w] float32, mean 0, standard deviation 1.
     """
-    rng = np.random.default_rng(seed)
-    spectrum = fft.rfft2(rng.standard_normal((height, width), dtype=np.float32))
-    fy = np.fft.fftfreq(height, 1.0 / height)[:, None] * (width / height)
-    fx = np.fft.rfftfreq(width, 1.0 / width)[None, :]
-    frequency = np.sqrt((fx * stretch_x) ** 2 + fy**2)
-    gain = np.where(frequency < lowest, 0.0, np.maximum(frequency, 1.0) ** -slope)
-    field = fft.irfft2(spectrum * gain.astype(np.float32), s=(height, width))
-    field = (field - field.mean()) / field.std()
-    field = field.astype(np.float32)
-    field.flags.writeable = False
-    return field
+    field = _field(height, width, seed % 2, slope, stretch_x, lowest)
+    if seed < 2:
+        return field
+    shift = np.random.default_rng(seed).integers(0, (height, width))
+    return np.roll(field, tuple(int(n) for n in shift), axis=(0, 1))
 
 
 def ridge(num: int, seed: int, slope: float = 1.5) -> np.ndarray:
@@ -62,12 +75,11 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
 
 def blend(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Mixes two colour images (or colours [3]) by a weight [h, w]: 0 gives a, 1 gives b."""
-    w = weight[..., None]
-    return a * (1.0 - w) + b * w
+    return a + (b - a) * weight[..., None].astype(np.float32)
 
 
 def texels(image: np.ndarray) -> np.ndarray:
     """Rounds a colour image in [0, 1] to read-only bytes, [h, w, 3] uint8."""
-    out = np.clip(np.rint(image * 255.0), 0, 255).astype(np.uint8)
+    out = np.clip(image * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
     out.flags.writeable = False
     return out

@@ -8,7 +8,18 @@ import numpy as np
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.model import Model
 from r3jax.scenes.procedural.screens import SPINES
-from r3jax.scenes.procedural.shapes import Shape, ball, box, combine, cylinder, grid, lathe, panel, quad, tube
+from r3jax.scenes.procedural.shapes import (
+    Shape,
+    ball,
+    box,
+    combine,
+    cylinder,
+    grid,
+    lathe,
+    panel,
+    quad,
+    tube,
+)
 
 _BRIGHT = (f.TERRACOTTA, f.MUSTARD, f.TEAL, f.NAVY, f.BLUSH, f.SAGE, f.CREAM, f.CHARCOAL)
 
@@ -40,7 +51,9 @@ def book_row(length: float, height: float, depth: float, seed: int) -> Model:
         front = panel(x + thick / 2, 0.0, thick - 0.002, tall, deep)
         sides = box((x + 0.001, 0.0, 0.0), (x + thick - 0.001, deep - 0.001, tall - 0.003))
         covers += [_on_spine(front, spine), _on_spine(sides, spine, 0.12, 0.2)]
-        pages.append(quad((x + 0.003, 0.004, tall - 0.002), (thick - 0.006, 0, 0), (0, deep - 0.01, 0)))
+        pages.append(
+            quad((x + 0.003, 0.004, tall - 0.002), (thick - 0.006, 0, 0), (0, deep - 0.01, 0))
+        )
         x += thick
     model = Model()
     if covers:
@@ -71,16 +84,24 @@ def vase(seed: int, height: float = 0.28) -> Model:
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 1.0, 12)
     belly = 0.3 + 0.22 * np.sin(np.pi * (t * (0.8 + 0.5 * rng.random())) + 0.6 * rng.random())
-    profile = [(0.0, 0.0), *((float(b) * 0.75 * height, float(a) * height) for a, b in zip(t, belly, strict=True))]
+    profile = [
+        (0.0, 0.0),
+        *((float(b) * 0.75 * height, float(a) * height) for a, b in zip(t, belly, strict=True)),
+    ]
     color = _BRIGHT[seed % len(_BRIGHT)]
-    finish = f.striped((color, f.CREAM, color), seed % 5) if seed % 2 else f.enamel(color, seed % 5, 0.6)
+    finish = (
+        f.striped((color, f.CREAM, color), seed % 5) if seed % 2 else f.enamel(color, seed % 5, 0.6)
+    )
     return Model().add(lathe(profile, 16), finish)
 
 
 def bowl_of_fruit(seed: int) -> Model:
     """A wooden bowl of oranges, apples and lemons."""
     rng = np.random.default_rng(seed)
-    bowl = lathe([(0.0, 0.0), (0.06, 0.0), (0.14, 0.06), (0.16, 0.09), (0.15, 0.09), (0.1, 0.04), (0, 0.03)], 18)
+    bowl = lathe(
+        [(0.0, 0.0), (0.06, 0.0), (0.14, 0.06), (0.16, 0.09), (0.15, 0.09), (0.1, 0.04), (0, 0.03)],
+        18,
+    )
     model = Model().add(bowl, f.wood(f.WALNUT, 2))
     peel = f.leather((0.95, 0.92, 0.85), 9)
     for k in range(9):
@@ -89,7 +110,9 @@ def bowl_of_fruit(seed: int) -> Model:
         r = 0.033 + 0.008 * rng.random()
         fruit = ball((r, r, r * 0.93), 9, 6)
         model.add(
-            fruit.moved(reach * np.cos(angle), reach * np.sin(angle), 0.085 + 0.03 * (k < 4)), peel, tint
+            fruit.moved(reach * np.cos(angle), reach * np.sin(angle), 0.085 + 0.03 * (k < 4)),
+            peel,
+            tint,
         )
     return model
 
@@ -102,7 +125,10 @@ def leafy_plant(height: float, seed: int, leaves: int = 34, broad: float = 0.3) 
     rim = [(r * pot, z * pot) for r, z in outside]
     color = _BRIGHT[seed % len(_BRIGHT)]
     model = Model().add(lathe(rim, 16), f.enamel(color, seed % 4, 0.3))
-    model.add(lathe([(0.92 * pot, 1.45 * pot), (0.0, 1.46 * pot)], 12), f.carpet((0.25, 0.18, 0.13), (0.4, 0.32, 0.25), 2))
+    model.add(
+        lathe([(0.92 * pot, 1.45 * pot), (0.0, 1.46 * pot)], 12),
+        f.carpet((0.25, 0.18, 0.13), (0.4, 0.32, 0.25), 2),
+    )
     blades = {0: [], 1: []}
     for k in range(leaves):
         angle = 2.39996 * k + 0.3 * rng.random()
@@ -114,7 +140,10 @@ def leafy_plant(height: float, seed: int, leaves: int = 34, broad: float = 0.3) 
         green = ((0.22, 0.42, 0.16), (0.33, 0.5, 0.2), (0.16, 0.36, 0.22))[(seed + k) % 3]
         model.add(combine(shapes), f.leaf(green, k), atlas=True)
     if broad > 0.2:
-        model.add(tube([(0, 0, pot), (0.02, 0.01, 0.5 * height), (0, 0.02, 0.75 * height)], 0.012), f.wood(f.EBONY, 1))
+        model.add(
+            tube([(0, 0, pot), (0.02, 0.01, 0.5 * height), (0, 0.02, 0.75 * height)], 0.012),
+            f.wood(f.EBONY, 1),
+        )
     return model
 
 
@@ -137,7 +166,10 @@ def _blade(length: float, broad: float, lift: float) -> Shape:
 def table_lamp(seed: int, height: float = 0.45) -> Model:
     """A lamp with a cloth shade that glows and lights its surroundings."""
     color = _BRIGHT[seed % len(_BRIGHT)]
-    foot = lathe([(0.0, 0.0), (0.08, 0.0), (0.08, 0.02), (0.025, 0.05), (0.05, 0.14), (0.02, 0.55 * height)], 14)
+    foot = lathe(
+        [(0.0, 0.0), (0.08, 0.0), (0.08, 0.02), (0.025, 0.05), (0.05, 0.14), (0.02, 0.55 * height)],
+        14,
+    )
     model = Model().add(foot, f.enamel(color, 1, 0.6))
     shade = lathe([(0.15, 0.5 * height), (0.1, height)], 18)
     model.add(shade, f.glow((0.98, 0.9, 0.72), 1))
@@ -153,20 +185,35 @@ def floor_lamp(seed: int) -> Model:
     return model.light((0.0, 0.0, 1.45), 1.4, (0.6, 0.5, 0.36))
 
 
-def pendant(ceiling: float, drop: float = 0.55, radius: float = 0.22, seed: int = 0, reach: float = 2.4) -> Model:
+def pendant(
+    ceiling: float, drop: float = 0.55, radius: float = 0.22, seed: int = 0, reach: float = 2.4
+) -> Model:
     """A hanging lamp: cord, dome, glowing bulb. Origin on the floor below it."""
     top = ceiling - drop
-    model = Model().add(tube([(0, 0, ceiling), (0, 0, top + 0.2)], 0.006, 5), f.enamel(f.CHARCOAL, 1))
-    dome = [(radius, top), (0.92 * radius, top + 0.08), (0.55 * radius, top + 0.17), (0.1 * radius, top + 0.21)]
+    model = Model().add(
+        tube([(0, 0, ceiling), (0, 0, top + 0.2)], 0.006, 5), f.enamel(f.CHARCOAL, 1)
+    )
+    dome = [
+        (radius, top),
+        (0.92 * radius, top + 0.08),
+        (0.55 * radius, top + 0.17),
+        (0.1 * radius, top + 0.21),
+    ]
     model.add(lathe(dome, 20), f.enamel(_BRIGHT[seed % len(_BRIGHT)], 2, 0.5))
-    model.add(ball((0.06, 0.06, 0.06), 10, 6).moved(z=top + 0.05), f.glow((1.0, 0.96, 0.84), 3, 1.0))
+    model.add(
+        ball((0.06, 0.06, 0.06), 10, 6).moved(z=top + 0.05), f.glow((1.0, 0.96, 0.84), 3, 1.0)
+    )
     return model.light((0.0, 0.0, top - 0.02), reach, (0.85, 0.75, 0.6))
 
 
-def ceiling_panel(ceiling: float, width: float = 1.2, depth: float = 0.3, reach: float = 2.6) -> Model:
+def ceiling_panel(
+    ceiling: float, width: float = 1.2, depth: float = 0.3, reach: float = 2.6
+) -> Model:
     """A fluorescent panel under the ceiling. Origin on the floor below its middle."""
     w, d = width / 2, depth / 2
-    model = Model().add(box((-w, -d, ceiling - 0.06), (w, d, ceiling)), f.metal((0.8, 0.8, 0.8), 2, 0.05))
+    model = Model().add(
+        box((-w, -d, ceiling - 0.06), (w, d, ceiling)), f.metal((0.8, 0.8, 0.8), 2, 0.05)
+    )
     lens = quad((-w + 0.02, d - 0.02, ceiling - 0.061), (width - 0.04, 0, 0), (0, -depth + 0.04, 0))
     model.add(lens, f.glow((0.99, 0.99, 0.95), 4, 1.0))
     return model.light((0.0, 0.0, ceiling - 0.25), reach, (0.72, 0.72, 0.7))
@@ -195,9 +242,18 @@ def jar(seed: int, radius: float = 0.045, height: float = 0.16) -> Model:
 def bottle(seed: int, height: float = 0.3) -> Model:
     """A glazed bottle with a label."""
     r = 0.13 * height
-    profile = [(0, 0), (r, 0), (r, 0.6 * height), (0.35 * r, 0.78 * height), (0.35 * r, height), (0, height)]
+    profile = [
+        (0, 0),
+        (r, 0),
+        (r, 0.6 * height),
+        (0.35 * r, 0.78 * height),
+        (0.35 * r, height),
+        (0, height),
+    ]
     green = ((0.16, 0.32, 0.2), (0.35, 0.2, 0.1), (0.2, 0.3, 0.42))[seed % 3]
-    model = Model().add(lathe([(float(a), float(b)) for a, b in profile], 12), f.enamel(green, 3, 0.8))
+    model = Model().add(
+        lathe([(float(a), float(b)) for a, b in profile], 12), f.enamel(green, 3, 0.8)
+    )
     label = lathe([(1.02 * r, 0.15 * height), (1.02 * r, 0.48 * height)], 12)
     return model.add(label, f.package((seed + 2) % 12))
 
@@ -207,7 +263,9 @@ def crockery(seed: int) -> Model:
     white, color = f.enamel(f.WHITE, 5, 0.7), f.enamel(_BRIGHT[seed % len(_BRIGHT)], 2, 0.6)
     plate = lathe([(0.0, 0.004), (0.08, 0.004), (0.13, 0.02), (0.13, 0.014), (0.08, 0.0)], 20)
     bowl = lathe([(0.04, 0.012), (0.075, 0.06), (0.07, 0.06), (0.03, 0.02), (0.0, 0.02)], 16)
-    mug = lathe([(0.0, 0.0), (0.038, 0.0), (0.038, 0.09), (0.034, 0.09), (0.034, 0.02), (0.0, 0.02)], 14)
+    mug = lathe(
+        [(0.0, 0.0), (0.038, 0.0), (0.038, 0.09), (0.034, 0.09), (0.034, 0.02), (0.0, 0.02)], 14
+    )
     handle = tube([(0.038, 0, 0.02), (0.065, 0, 0.03), (0.065, 0, 0.06), (0.038, 0, 0.075)], 0.006)
     model = Model().add(plate, white).add(bowl, color)
     return model.put(Model().add(mug + handle, color), 0.2, 0.06, 0.0, 30.0 * seed)
@@ -222,7 +280,10 @@ def clutter(seed: int) -> Model:
         lambda: carton(seed),
         lambda: leafy_plant(0.26, seed, 18),
         lambda: bottle(seed, 0.24),
-        lambda: Model().add(ball((0.07, 0.07, 0.07), 14, 9).moved(z=0.07), f.wallpaper(f.CREAM, (f.TERRACOTTA, f.TEAL), "trellis", 4)),
+        lambda: Model().add(
+            ball((0.07, 0.07, 0.07), 14, 9).moved(z=0.07),
+            f.wallpaper(f.CREAM, (f.TERRACOTTA, f.TEAL), "trellis", 4),
+        ),
         lambda: standing_frame(seed),
     )
     return makers[seed % len(makers)]()
@@ -231,5 +292,8 @@ def clutter(seed: int) -> Model:
 def standing_frame(seed: int) -> Model:
     """A small framed photograph that leans back a little."""
     model = Model().add(box((-0.08, -0.01, 0), (0.08, 0.005, 0.2)), f.wood(f.EBONY, 1))
-    model.add(panel(0, 0.012, 0.136, 0.176, 0.006), f.picture("sunset" if seed % 2 else "landscape", 30 + seed % 4))
+    model.add(
+        panel(0, 0.012, 0.136, 0.176, 0.006),
+        f.picture("sunset" if seed % 2 else "landscape", 30 + seed % 4),
+    )
     return model

@@ -37,7 +37,9 @@ def glass_partition(width: float, height: float) -> Model:
 
 def workstation(seed: int, width: float = 1.5) -> Model:
     """A desk with a chair, monitors and personal things."""
-    model = storage.desk(width, f.wood(f.BEECH if seed % 2 else f.OAK, seed % 3), seed, 1 + seed % 2)
+    model = storage.desk(
+        width, f.wood(f.BEECH if seed % 2 else f.OAK, seed % 3), seed, 1 + seed % 2
+    )
     cloth = f.fabric((f.CHARCOAL, f.TEAL, f.NAVY, f.TERRACOTTA)[seed % 4], seed % 3)
     chair = seating.office_chair(cloth)
     turn = float(np.random.default_rng(seed).normal(0, 25))
@@ -63,9 +65,13 @@ def meeting_table(width: float, depth: float, seats: int, seed: int) -> Model:
         for side, heading in ((-1, 0.0), (1, 180.0)):
             chair = seating.office_chair(f.leather((0.2, 0.19, 0.19), 2))
             model.put(chair, x, side * (depth / 2 + 0.28), 0, heading + 14.0 * ((k + seed) % 3 - 1))
-            paper = Model().add(box((-0.105, -0.148, 0), (0.105, 0.148, 0.005)), f.picture("poster", 60 + k % 4))
+            paper = Model().add(
+                box((-0.105, -0.148, 0), (0.105, 0.148, 0.005)), f.picture("poster", 60 + k % 4)
+            )
             model.put(paper, x, side * (depth / 2 - 0.22), 0.741, heading + 7.0 * k)
-            model.put(objects.crockery(k + seed), x + 0.25, side * (depth / 2 - 0.25), 0.741, heading)
+            model.put(
+                objects.crockery(k + seed), x + 0.25, side * (depth / 2 - 0.25), 0.741, heading
+            )
     phone = cylinder(0.12, 0.0, 0.05, 3, 0.06)
     return model.add(phone.moved(0, 0, 0.74), f.enamel(f.CHARCOAL, 1))
 
@@ -82,7 +88,9 @@ def copier() -> Model:
     """A floor-standing copier."""
     white, dark = f.enamel((0.86, 0.86, 0.84), 5, 0.3), f.enamel(f.CHARCOAL, 2, 0.4)
     model = Model().add(box((-0.3, 0.02, 0.04), (0.3, 0.62, 0.82)), white)
-    model.add(box((-0.32, 0, 0.82), (0.32, 0.6, 0.9)), dark).add(box((-0.3, 0.02, 0.9), (0.3, 0.6, 1.02)), white)
+    model.add(box((-0.32, 0, 0.82), (0.32, 0.6, 0.9)), dark).add(
+        box((-0.3, 0.02, 0.9), (0.3, 0.6, 1.02)), white
+    )
     for z in (0.12, 0.34, 0.56):
         model.add(box((-0.27, 0.62, z), (0.27, 0.64, z + 0.18)), white, (0.9, 0.9, 0.9))
     model.add(box((-0.62, 0.12, 0.7), (-0.3, 0.5, 0.72)), dark)
@@ -106,7 +114,9 @@ def school_desk(seed: int) -> Model:
         model.put(chair, x, 0.42, 0, 180.0 + 8.0 * ((seed + k) % 3 - 1))
         if (seed + k) % 3:
             model.put(objects.book_pile(1 + (seed + k) % 3, seed + k), x, 0.03, 0.72, 14.0 * k)
-        sheet = Model().add(box((-0.1, -0.14, 0), (0.1, 0.14, 0.004)), f.picture("poster", 60 + (seed + k) % 4))
+        sheet = Model().add(
+            box((-0.1, -0.14, 0), (0.1, 0.14, 0.004)), f.picture("poster", 60 + (seed + k) % 4)
+        )
         model.put(sheet, x + 0.16, 0.05, 0.721, -12.0 * seed)
     return model
 
@@ -122,7 +132,9 @@ def globe(seed: int) -> Model:
 def spotlight_rail(length: float, ceiling: float, count: int, reach: float = 2.2) -> Model:
     """A rail along x under the ceiling with spotlights that shine on what is below."""
     dark = f.enamel(f.CHARCOAL, 1)
-    model = Model().add(box((-length / 2, -0.02, ceiling - 0.04), (length / 2, 0.02, ceiling)), dark)
+    model = Model().add(
+        box((-length / 2, -0.02, ceiling - 0.04), (length / 2, 0.02, ceiling)), dark
+    )
     for x in np.linspace(-length / 2 + 0.3, length / 2 - 0.3, count):
         can = cylinder(0.035, -0.16, 0.0, 12, 0.05).turned(18.0, "x")
         model.add(can.moved(float(x), 0.0, ceiling - 0.05), dark)
@@ -136,5 +148,7 @@ def lectern(wood: Finish) -> Model:
     """A teacher's desk with a globe, books and a chair behind it; front towards +y."""
     model = Model().put(storage.drawers(0.45, 0.7, 0.55, wood, 1, 3), -0.5, -0.3)
     model.put(seating.table(1.5, 0.7, wood, 0.76)).put(globe(1), 0.55, 0.1, 0.76)
-    model.put(objects.book_pile(5, 4), -0.5, 0.1, 0.76, 25.0).put(objects.book_pile(3, 9), 0.1, -0.1, 0.76)
+    model.put(objects.book_pile(5, 4), -0.5, 0.1, 0.76, 25.0).put(
+        objects.book_pile(3, 9), 0.1, -0.1, 0.76
+    )
     return model.put(seating.chair(wood, f.leather((0.4, 0.22, 0.15), 1)), 0.0, -0.6, 0, 12.0)

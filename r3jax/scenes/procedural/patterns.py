@@ -144,7 +144,9 @@ def wallpaper(
     image = Image.new("RGB", (2 * size, 2 * size), _bytes(ground))
     draws[motif](ImageDraw.Draw(image), 2 * size, np.random.default_rng(seed), inks)
     printed = np.asarray(image.resize((size, size), Image.Resampling.BOX), dtype=np.float32) / 255
-    emboss = 0.03 * cloud(size, size, seed, 0.5, 1.0, 40.0) + 0.03 * cloud(size, size, seed + 1, 1.6)
+    emboss = 0.03 * cloud(size, size, seed, 0.5, 1.0, 40.0) + 0.03 * cloud(
+        size, size, seed + 1, 1.6
+    )
     fibres = 0.022 * cloud(size, size, seed + 2, 0.8, 0.1, 20.0)
     return texels(printed * (1.0 + emboss + fibres)[..., None])
 

@@ -11,10 +11,22 @@ from PIL import Image, ImageDraw
 from r3jax.scenes.procedural.noise import blend, cloud, ridge, smoothstep, texels
 
 PALETTES = (
-    ((0.91, 0.35, 0.22), (0.16, 0.27, 0.42), (0.95, 0.77, 0.36), (0.3, 0.55, 0.5), (0.93, 0.9, 0.84)),
+    (
+        (0.91, 0.35, 0.22),
+        (0.16, 0.27, 0.42),
+        (0.95, 0.77, 0.36),
+        (0.3, 0.55, 0.5),
+        (0.93, 0.9, 0.84),
+    ),
     ((0.12, 0.2, 0.3), (0.8, 0.52, 0.33), (0.9, 0.86, 0.75), (0.42, 0.53, 0.4), (0.6, 0.2, 0.24)),
     ((0.95, 0.93, 0.88), (0.1, 0.1, 0.12), (0.85, 0.16, 0.14), (0.98, 0.8, 0.1), (0.1, 0.3, 0.6)),
-    ((0.36, 0.22, 0.42), (0.93, 0.62, 0.58), (0.98, 0.89, 0.7), (0.2, 0.42, 0.5), (0.75, 0.35, 0.45)),
+    (
+        (0.36, 0.22, 0.42),
+        (0.93, 0.62, 0.58),
+        (0.98, 0.89, 0.7),
+        (0.2, 0.42, 0.5),
+        (0.75, 0.35, 0.45),
+    ),
 )
 """Colours that go together, five each."""
 
@@ -59,10 +71,14 @@ def _scene(seed: int, height: int, width: int, sunset: float) -> np.ndarray:
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[0:height, 0:width].astype(np.float32)
     y = row / height
-    high = np.array([0.28, 0.5, 0.82]) * (1 - 0.5 * sunset) + np.array([0.2, 0.12, 0.3]) * sunset * 0.5
+    high = (
+        np.array([0.28, 0.5, 0.82]) * (1 - 0.5 * sunset) + np.array([0.2, 0.12, 0.3]) * sunset * 0.5
+    )
     low = np.array([0.82, 0.9, 0.97]) * (1 - sunset) + np.array([0.99, 0.66, 0.4]) * sunset
     image = blend(high.astype(np.float32), low.astype(np.float32), smoothstep(0.0, 0.6, y))
-    clouds = smoothstep(0.3, 1.6, cloud(height, width, seed, 1.5, 2.5)) * (1 - smoothstep(0.3, 0.6, y))
+    clouds = smoothstep(0.3, 1.6, cloud(height, width, seed, 1.5, 2.5)) * (
+        1 - smoothstep(0.3, 0.6, y)
+    )
     image = blend(image, np.array([1.0, 0.97, 0.94], dtype=np.float32), 0.85 * clouds)
     center = (0.2 + 0.6 * rng.random()) * width, (0.2 + 0.15 * rng.random()) * height
     distance = np.hypot(column - center[0], row - center[1]) / height
@@ -72,7 +88,9 @@ def _scene(seed: int, height: int, width: int, sunset: float) -> np.ndarray:
     far, near = np.array([0.55, 0.63, 0.75]), np.array([0.2, 0.3 + 0.12 * rng.random(), 0.14])
     for k in range(5):
         depth = k / 4.0
-        line = 0.42 + 0.11 * k - 0.06 * (1 - 0.5 * depth) * ridge(width, seed + 10 + k, 1.5 - 0.1 * k)
+        line = (
+            0.42 + 0.11 * k - 0.06 * (1 - 0.5 * depth) * ridge(width, seed + 10 + k, 1.5 - 0.1 * k)
+        )
         color = (far * (1 - depth) + near * depth) * (1 - 0.25 * sunset)
         shade = color.astype(np.float32) * (1 + (0.3 + depth) * texture)[..., None]
         image = blend(image, shade, smoothstep(-0.004, 0.004, y - line[None, :]))
@@ -86,7 +104,9 @@ def _trees(image: np.ndarray, seed: int, count: int) -> np.ndarray:
     draw = ImageDraw.Draw(canvas)
     for foot in np.sort(0.72 + 0.26 * rng.random(count)):
         x, size = rng.random() * width, height * (0.06 + 0.5 * (foot - 0.68))
-        draw.rectangle([x - size / 22, foot * height - size / 2, x + size / 22, foot * height], (70, 48, 32))
+        draw.rectangle(
+            [x - size / 22, foot * height - size / 2, x + size / 22, foot * height], (70, 48, 32)
+        )
         for _ in range(60):
             dx, dy = rng.normal(0, 0.17, 2) * size
             r = size * (0.04 + 0.05 * rng.random())
@@ -113,7 +133,9 @@ def window_view(seed: int, height: int = 512, width: int = 512) -> np.ndarray:
     x = -30.0
     while x < width:
         w, top = 50 + 70 * rng.random(), height * (0.42 + 0.25 * rng.random())
-        wall = np.array([0.72, 0.63, 0.53]) * (0.75 + 0.4 * rng.random()) + 0.05 * rng.normal(size=3)
+        wall = np.array([0.72, 0.63, 0.53]) * (0.75 + 0.4 * rng.random()) + 0.05 * rng.normal(
+            size=3
+        )
         draw.rectangle([x, top, x + w, height], ink(wall))
         draw.polygon([(x - 4, top), (x + w / 2, top - 0.3 * w), (x + w + 4, top)], ink(wall * 0.5))
         for wy in np.arange(top + 12, height * 0.93, 30):
@@ -147,7 +169,10 @@ def abstract(seed: int, height: int = 512, width: int = 384) -> np.ndarray:
     for _ in range(26):
         x, y = rng.random() * width, rng.random() * height
         r = min(width, height) * (0.04 + 0.24 * rng.random() ** 2)
-        fill = (*ink(palette[rng.integers(4)], 0.8 + 0.4 * rng.random()), int(150 + 100 * rng.random()))
+        fill = (
+            *ink(palette[rng.integers(4)], 0.8 + 0.4 * rng.random()),
+            int(150 + 100 * rng.random()),
+        )
         kind = rng.integers(4)
         if kind == 0:
             draw.ellipse([x - r, y - r, x + r, y + r], fill)
@@ -158,7 +183,9 @@ def abstract(seed: int, height: int = 512, width: int = 384) -> np.ndarray:
         else:
             for k in range(7):
                 draw.line([x - r, y + 6 * k, x + r, y + 6 * k - 0.4 * r], fill, 2)
-    paint = 1.0 + 0.07 * cloud(height, width, seed, 1.2) + 0.05 * cloud(height, width, seed + 1, 0.4)
+    paint = (
+        1.0 + 0.07 * cloud(height, width, seed, 1.2) + 0.05 * cloud(height, width, seed + 1, 0.4)
+    )
     return texels(to_float(canvas) * paint[..., None])
 
 

@@ -42,20 +42,34 @@ def desktop(seed: int, height: int = 320, width: int = 512) -> np.ndarray:
                 write_lines(draw, (x + 6 + indent, top, x + w - 8, top + 6), 5, rng, color, 0.8)
     draw.rectangle([0, height - 22, width, height], (24, 26, 32))
     for k in range(12):
-        draw.rectangle([10 + 26 * k, height - 19, 26 + 26 * k, height - 4], ink(PALETTES[k % 4][k % 5]))
+        draw.rectangle(
+            [10 + 26 * k, height - 19, 26 + 26 * k, height - 4], ink(PALETTES[k % 4][k % 5])
+        )
     return texels(to_float(canvas))
 
 
 @functools.cache
 def whiteboard(seed: int, height: int = 512, width: int = 1024) -> np.ndarray:
     """A whiteboard with boxes, arrows, curves, notes and half-wiped smears."""
-    return _board(seed, height, width, (0.93, 0.94, 0.94), ((0.1, 0.15, 0.5), (0.7, 0.1, 0.1), (0.05, 0.4, 0.2), (0.1, 0.1, 0.1)))
+    return _board(
+        seed,
+        height,
+        width,
+        (0.93, 0.94, 0.94),
+        ((0.1, 0.15, 0.5), (0.7, 0.1, 0.1), (0.05, 0.4, 0.2), (0.1, 0.1, 0.1)),
+    )
 
 
 @functools.cache
 def blackboard(seed: int, height: int = 512, width: int = 1024) -> np.ndarray:
     """A green chalkboard in use."""
-    return _board(seed, height, width, (0.13, 0.25, 0.2), ((0.9, 0.9, 0.86), (0.95, 0.85, 0.5), (0.9, 0.65, 0.65)))
+    return _board(
+        seed,
+        height,
+        width,
+        (0.13, 0.25, 0.2),
+        ((0.9, 0.9, 0.86), (0.95, 0.85, 0.5), (0.9, 0.65, 0.65)),
+    )
 
 
 def _board(seed: int, height: int, width: int, ground, pens) -> np.ndarray:
@@ -138,7 +152,9 @@ def package(seed: int, height: int = 192, width: int = 128) -> np.ndarray:
     write_lines(draw, (12, 14, width - 8, 60), 18, rng, ink((0.08, 0.08, 0.1)), 0.1)
     write_lines(draw, (12, height * 0.8, width - 8, height - 8), 6, rng, ink((1, 1, 0.95)))
     for k in range(14):
-        draw.line([width - 44 + 3 * k, height - 26, width - 44 + 3 * k, height - 8], (0, 0, 0), 1 + k % 2)
+        draw.line(
+            [width - 44 + 3 * k, height - 26, width - 44 + 3 * k, height - 8], (0, 0, 0), 1 + k % 2
+        )
     return texels(to_float(canvas) * (1.0 + 0.05 * cloud(height, width, seed, 0.9))[..., None])
 
 
@@ -154,7 +170,11 @@ def clock(seed: int, size: int = 256) -> np.ndarray:
         draw.line(ends, (30, 30, 34), 7 if k % 5 == 0 else 2)
     for turn, reach, width in ((seed * 0.61 % 1, 0.24, 9), (seed * 0.37 % 1, 0.38, 5)):
         a = 2 * np.pi * turn
-        draw.line([(c, c), (c + size * reach * np.sin(a), c - size * reach * np.cos(a))], (20, 20, 24), width)
+        draw.line(
+            [(c, c), (c + size * reach * np.sin(a), c - size * reach * np.cos(a))],
+            (20, 20, 24),
+            width,
+        )
     return texels(to_float(canvas) * (1.0 + 0.04 * cloud(size, size, seed, 0.9))[..., None])
 
 

@@ -71,7 +71,10 @@ def stool(wood: Finish, height: float = 0.65) -> Model:
 def table(width: float, depth: float, wood: Finish, height: float = 0.74) -> Model:
     """A four-legged table, origin in its middle."""
     model = Model()
-    model.add(box((-width / 2, -depth / 2, height - 0.035), (width / 2, depth / 2, height), step=0.4), wood)
+    model.add(
+        box((-width / 2, -depth / 2, height - 0.035), (width / 2, depth / 2, height), step=0.4),
+        wood,
+    )
     w, d = width / 2 - 0.06, depth / 2 - 0.06
     model.add(box((-w, -d, height - 0.11), (w, d, height - 0.036)), wood)
     for x in (-w, w):
@@ -144,7 +147,9 @@ def office_chair(cloth: Finish) -> Model:
         cylinder(0.035, 0.0, 0.06, 8).moved(0.3 * np.cos(a), 0.3 * np.sin(a))
         for a in np.linspace(0, 2 * np.pi, 6)[:-1]
     ]
-    model = Model().add(combine(arms + wheels), dark).add(cylinder(0.028, 0.08, 0.43, 10), f.metal())
+    model = (
+        Model().add(combine(arms + wheels), dark).add(cylinder(0.028, 0.08, 0.43, 10), f.metal())
+    )
     model.add(cushion((-0.25, -0.24, 0.42), (0.25, 0.26, 0.52), 0.35), cloth)
     back = cushion((-0.23, -0.04, 0), (0.23, 0.04, 0.56), 0.35).turned(8.0, "x")
     model.add(back.moved(0, -0.24, 0.58), cloth)
@@ -156,7 +161,10 @@ def office_chair(cloth: Finish) -> Model:
 
 def plinth_sculpture(seed: int, stone: Finish) -> Model:
     """A turned or knotted sculpture on a plinth, origin in its middle."""
-    model = Model().add(box((-0.2, -0.2, 0), (0.2, 0.2, 0.95), upright=True, step=0.3), f.concrete((0.82, 0.81, 0.79), 12))
+    model = Model().add(
+        box((-0.2, -0.2, 0), (0.2, 0.2, 0.95), upright=True, step=0.3),
+        f.concrete((0.82, 0.81, 0.79), 12),
+    )
     if seed % 2:
         t = np.linspace(0, 2 * np.pi, 73)
         knot = [
@@ -170,5 +178,9 @@ def plinth_sculpture(seed: int, stone: Finish) -> Model:
         return model.add(tube(knot, 0.045, 10), f.metal((0.72, 0.52, 0.3), 4, 0.25))
     t = np.linspace(0.0, 1.0, 26)
     radius = 0.05 + 0.1 * np.abs(np.sin(2.3 * np.pi * t + seed)) * (1.1 - t)
-    profile = [(0.0, 0.95), *((float(r), 0.95 + 0.7 * float(z)) for r, z in zip(radius, t, strict=True)), (0.0, 1.66)]
+    profile = [
+        (0.0, 0.95),
+        *((float(r), 0.95 + 0.7 * float(z)) for r, z in zip(radius, t, strict=True)),
+        (0.0, 1.66),
+    ]
     return model.add(lathe(profile, 20), stone)

@@ -26,7 +26,9 @@ class Shape:
 
     def __add__(self, other: "Shape") -> "Shape":
         """Both shapes as one."""
-        return Shape(np.concatenate([self.corners, other.corners]), np.concatenate([self.uv, other.uv]))
+        return Shape(
+            np.concatenate([self.corners, other.corners]), np.concatenate([self.uv, other.uv])
+        )
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Shape":
         """The shape shifted by (x, y, z) [m]."""
@@ -126,6 +128,19 @@ def panel(x: float, z: float, width: float, height: float, y: float = 0.0) -> Sh
     return quad((x + width / 2, y, z), (-width, 0, 0), (0, 0, height))
 
 
+def disc(radius: float, y: float = 0.0, segments: int = 24) -> Shape:
+    """An upright disc about the origin whose front faces +y; flat coordinates [m]."""
+    angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
+    angle[-1] = 0.0
+    rim = radius * np.stack([-np.cos(angle), np.sin(angle)], axis=-1)
+    flat = np.stack([np.zeros((segments, 2)), rim[1:], rim[:-1]], axis=1)[:, ::-1]
+    height = np.full((segments, 3), y)
+    corners = np.stack([flat[..., 0], height, flat[..., 1]], axis=-1)
+    return Shape(
+        corners[:, ::-1], np.stack([radius - flat[..., 0], radius + flat[..., 1]], -1)[:, ::-1]
+    )
+
+
 def lathe(profile: list[tuple[float, float]], segments: int = 14) -> Shape:
     """A solid of revolution about z.
 
@@ -192,7 +207,9 @@ def tube(points: list[Point], radius: float, segments: int = 6) -> Shape:
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(tangent, side)
     angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
-    ring = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * other[:, None]
+    ring = (
+        np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * other[:, None]
+    )
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     return grid(path[:, None] + radius * ring, angle * radius, length)
 

@@ -48,7 +48,11 @@ def library_shelf(width: float, height: float, wood: Finish, seed: int) -> Model
 
 
 def _handle(x: float, z: float, y: float, length: float = 0.14, upright: bool = True):
-    a, b = ((x, y, z - length / 2), (x, y, z + length / 2)) if upright else ((x - length / 2, y, z), (x + length / 2, y, z))
+    a, b = (
+        ((x, y, z - length / 2), (x, y, z + length / 2))
+        if upright
+        else ((x - length / 2, y, z), (x + length / 2, y, z))
+    )
     foot_a, foot_b = (a[0], y - 0.03, a[2]), (b[0], y - 0.03, b[2])
     return tube([foot_a, a, b, foot_b], 0.006)
 
@@ -71,7 +75,9 @@ def wardrobe(width: float, height: float, wood: Finish, mirror: bool = True) -> 
     return model
 
 
-def drawers(width: float, height: float, depth: float, finish: Finish, columns: int, rows: int) -> Model:
+def drawers(
+    width: float, height: float, depth: float, finish: Finish, columns: int, rows: int
+) -> Model:
     """A chest of drawers (or a sideboard) on a plinth."""
     w = width / 2
     model = Model().add(box((-w, 0, 0.07), (w, depth, height), step=0.5), finish)
@@ -83,7 +89,10 @@ def drawers(width: float, height: float, depth: float, finish: Finish, columns: 
             z0 = 0.09 + j * (height - 0.13) / rows
             z1 = z0 + (height - 0.13) / rows - 0.012
             model.add(box((x0, depth, z0), (x1, depth + 0.018, z1)), finish, (0.93, 0.93, 0.93))
-            model.add(_handle((x0 + x1) / 2, (z0 + z1) / 2, depth + 0.05, 0.12, False), f.metal((0.66, 0.56, 0.4), 2))
+            model.add(
+                _handle((x0 + x1) / 2, (z0 + z1) / 2, depth + 0.05, 0.12, False),
+                f.metal((0.66, 0.56, 0.4), 2),
+            )
     return model
 
 
@@ -91,7 +100,12 @@ def sideboard(width: float, wood: Finish, seed: int) -> Model:
     """A sideboard with a lamp and things on it."""
     model = Model().put(drawers(width, 0.8, 0.42, wood, max(2, round(width / 0.5)), 3))
     model.put(objects.table_lamp(seed), -width / 2 + 0.25, 0.2, 0.8)
-    things = (objects.vase(seed + 1), objects.book_pile(4, seed), objects.standing_frame(seed), objects.leafy_plant(0.4, seed, 22))
+    things = (
+        objects.vase(seed + 1),
+        objects.book_pile(4, seed),
+        objects.standing_frame(seed),
+        objects.leafy_plant(0.4, seed, 22),
+    )
     for k, thing in enumerate(things):
         model.put(thing, -width / 2 + 0.62 + k * (width - 0.85) / 3, 0.22, 0.8, -8.0 * k)
     return model
@@ -110,7 +124,9 @@ def television_unit(width: float, wood: Finish, seed: int) -> Model:
     dark = f.enamel(f.CHARCOAL, 2, 0.5)
     model.add(box((-0.62, 0.12, 0.55), (0.62, 0.16, 1.27)), dark)
     model.add(panel(0, 0.57, 1.2, 0.68, 0.163), f.picture("sunset", 50 + seed, True))
-    model.add(box((-0.2, 0.06, 0.45), (0.2, 0.26, 0.465)), dark).add(box((-0.03, 0.1, 0.46), (0.03, 0.13, 0.56)), dark)
+    model.add(box((-0.2, 0.06, 0.45), (0.2, 0.26, 0.465)), dark).add(
+        box((-0.03, 0.1, 0.46), (0.03, 0.13, 0.56)), dark
+    )
     for x in (-width / 2 + 0.13, width / 2 - 0.13):
         model.add(box((x - 0.1, 0.05, 0.45), (x + 0.1, 0.27, 0.8)), f.wood(f.WALNUT, 3))
         for z, r in ((0.55, 0.07), (0.7, 0.045)):
@@ -145,7 +161,9 @@ def desk(width: float, wood: Finish, seed: int, monitors: int = 1) -> Model:
     for k in range(3):
         sheet = box((-0.105, -0.148, 0), (0.105, 0.148, 0.004 * (k + 1)))
         paper = Model().add(sheet, f.picture("poster", 60 + (seed + k) % 4))
-        model.put(paper, w - 0.3 + 0.04 * k, 0.35 + 0.05 * k, 0.741 + 0.004 * k, float(rng.normal(0, 25)))
+        model.put(
+            paper, w - 0.3 + 0.04 * k, 0.35 + 0.05 * k, 0.741 + 0.004 * k, float(rng.normal(0, 25))
+        )
     model.put(objects.table_lamp(seed, 0.42), w - 0.16, 0.14, 0.74)
     pot = Model().add(cylinder(0.04, 0, 0.1, 12, 0.042), f.striped((f.TEAL, f.CREAM), 4))
     for k in range(5):
