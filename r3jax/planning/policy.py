@@ -1,7 +1,8 @@
-"""The plug point of the loop: what a policy is asked and what it answers."""
+"""The plug point of the loop: what a policy is asked, what it answers, and which ones exist."""
 
 import enum
-from dataclasses import dataclass, field
+import inspect
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -11,6 +12,7 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.config import PlannerConfig
 
 
 class Outcome(enum.Enum):
@@ -46,7 +48,8 @@ class Decision:
     """Every pose that was scored, [C, 4, 4]."""
 
     utilities: dict[str, np.ndarray] = field(default_factory=dict)
-    """Per candidate, [C] each: `exploration`, `rendering`, `path` [m], `total`."""
+    """Per candidate, [C] each: always `path` [m] and `total`; `utility` where views were scored,
+    and its parts `exploration` and `rendering` where they were told apart."""
 
 
 @dataclass(frozen=True)
@@ -85,3 +88,53 @@ class Policy(Protocol):
     ) -> tuple[Decision | None, Any, PlanInfo]:
         """The next view, or None with the reason in the info."""
         ...
+
+
+def _registry() -> dict[str, Any]:
+    """Every policy by name. Imported late: the policies import this module."""
+    from r3jax.planning.policies.frontier import Frontier
+    from r3jax.planning.policies.random import Random
+    from r3jax.planning.policies.renderability import Ours, OursPano
+
+    return {policy.name: policy for policy in (Ours, OursPano, Frontier, Random)}
+
+
+def policy_names() -> tuple[str, ...]:
+    """Names that `make_policy` knows."""
+    return tuple(_registry())
+
+
+def describe(name: str) -> str:
+    """What a policy does, in one line.
+
+    Raises:
+        ValueError: no policy has that name.
+    """
+    return inspect.cleandoc(_policy_class(name).__doc__).splitlines()[0]
+
+
+def make_policy(name: str, **settings: Any) -> Policy:
+    """A policy by name.
+
+    Args:
+        name: one of `policy_names()`.
+        **settings: fields of `planning.config.PlannerConfig` that differ from their defaults.
+
+    Raises:
+        ValueError: no policy has that name, no setting has that name, or a value is impossible.
+    """
+    policy_class = _policy_class(name)
+    known = [field.name for field in fields(PlannerConfig)]
+    unknown = [setting for setting in settings if setting not in known]
+    if unknown:
+        raise ValueError(
+            f"policy {name!r} has no setting {', '.join(unknown)}; known: {', '.join(known)}"
+        )
+    return policy_class(PlannerConfig(**settings))
+
+
+def _policy_class(name: str) -> Any:
+    registry = _registry()
+    if name not in registry:
+        raise ValueError(f"unknown policy {name!r}; known: {', '.join(registry)}")
+    return registry[name]

@@ -131,6 +131,15 @@ class Travel:
         cells = np.stack(np.unravel_index(way[::-1], self.usable.shape), axis=1)
         return self._shortcut(np.concatenate([self.start[None], self.centers(cells), goal[None]]))
 
+    def cells_along(self, waypoints: np.ndarray) -> np.ndarray:
+        """Cells of the grid that the path over waypoints [K, 3] [m] crosses, [X, Y, Z] bool."""
+        swept = np.zeros(self.usable.shape, dtype=bool)
+        for a, b in itertools.pairwise(waypoints):
+            cells = segment_cells(*self._in_cells(a, b))
+            cells = cells[np.all((cells >= 0) & (cells < swept.shape), axis=1)]
+            swept[tuple(cells.T)] = True
+        return swept
+
     def _shortcut(self, points: np.ndarray) -> np.ndarray:
         """Drops waypoints wherever the straight line past them is safe."""
         last = len(points) - 1
@@ -228,6 +237,14 @@ def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
         a: one end, in cells (cell (0, 0, 0) spans 0 to 1), [3].
         b: the other end.
     """
+    cells = segment_cells(a, b)
+    if np.any(cells < 0) or np.any(cells >= mask.shape):
+        return False
+    return bool(mask[cells[:, 0], cells[:, 1], cells[:, 2]].all())
+
+
+def segment_cells(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cells that a segment between two points [cells] crosses or touches, [n, 3], repeated."""
     points = [np.stack([a, b])]
     for axis in range(3):
         low, high = sorted((a[axis], b[axis]))
@@ -237,10 +254,7 @@ def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
             crossing = a + t[:, None] * (b - a)
             # On both sides of the plane, and of any other plane that is as good as touched.
             points.append((crossing[:, None, :] + _CORNERS).reshape(-1, 3))
-    cells = np.floor(np.concatenate(points)).astype(np.int64)
-    if np.any(cells < 0) or np.any(cells >= mask.shape):
-        return False
-    return bool(mask[cells[:, 0], cells[:, 1], cells[:, 2]].all())
+    return np.floor(np.concatenate(points)).astype(np.int64)
 
 
 def _shortest_ways(

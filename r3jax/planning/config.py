@@ -1,0 +1,52 @@
+"""Settings that all policies share."""
+
+import math
+from dataclasses import dataclass, field
+
+from r3jax.scoring.config import ScoringConfig
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """How candidates are drawn and weighed. The defaults are the paper's where it has one.
+
+    Raises:
+        ValueError: a setting that no decision could be made with.
+    """
+
+    num_candidates: int = 100
+    """Poses (or positions) that are scored per decision."""
+
+    radius: float = 0.5
+    """Local candidates lie within this distance of the robot [m]."""
+
+    num_frontier: int = 30
+    """How many of the candidates are aimed at the reachable frontier instead of being local.
+
+    Local candidates alone keep the robot in a room that is done: whatever lies half a metre
+    away looks as well known as the rest, and no utility tells it that there is a door behind
+    its back. 30 of 100 is the share of Active-GS, whose candidates the paper takes over; 0 is
+    the paper's text to the letter. They compete on equal terms, path length included."""
+
+    lambda2: float = 0.5
+    """Weight of a candidate's share of the path lengths against its share of the utility."""
+
+    safety_margin: float = 0.3
+    """A path keeps its cells' centres this far from anything not known to be free [m]."""
+
+    scoring: ScoringConfig = field(default_factory=ScoringConfig)
+    """Settings of the utilities, lambda1 among them."""
+
+    def __post_init__(self) -> None:
+        """Refuses values that would fail later, and says which."""
+        if self.num_candidates < 1:
+            raise ValueError(f"num_candidates must be at least 1, got {self.num_candidates}")
+        if not 0 <= self.num_frontier <= self.num_candidates:
+            raise ValueError(
+                f"num_frontier must lie between 0 and num_candidates ({self.num_candidates}), "
+                f"got {self.num_frontier}"
+            )
+        for name in ("radius", "lambda2", "safety_margin"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} must be a finite number >= 0, got {value}")

@@ -1,0 +1,118 @@
+"""The frame that every policy's decision is built in: look round, score, choose, remember."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.policy import Decision, Outcome, PlanInfo
+from r3jax.planning.travel import Travel, plan_travel
+
+
+class PlannerState(eqx.Module):
+    """What a policy of this package remembers between decisions."""
+
+    camera: Camera
+    """The camera of every frame to come."""
+
+    trail: Bool[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
+    """Cells that the robot has come through: the way back if it finds itself shut in."""
+
+    attempted: Bool[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
+    """Frontier cells that were looked at on purpose (`frontier` policy)."""
+
+
+@dataclass
+class Stopwatch:
+    """Wall time of the parts of one decision."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Per part [s]."""
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Adds the time spent in a `with` block to a part."""
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def initial_state(camera: Camera, grid: OccupancyGrid) -> PlannerState:
+    """The memory of a robot that has not moved yet."""
+    nowhere = jnp.zeros(grid.log_odds.shape, dtype=bool)
+    return PlannerState(camera=camera, trail=nowhere, attempted=nowhere)
+
+
+def look_round(
+    state: PlannerState, grid: OccupancyGrid, T_world_camera: np.ndarray, config: PlannerConfig
+) -> Travel:
+    """Where the robot can go from here."""
+    position = np.asarray(T_world_camera, dtype=np.float64)[:3, 3]
+    return plan_travel(grid, position, config.safety_margin, np.asarray(state.trail))
+
+
+def no_decision(
+    travel: Travel, config: PlannerConfig, stopwatch: Stopwatch
+) -> tuple[None, PlanInfo]:
+    """The answer of a policy that found no candidate: safe places exist, or not even those."""
+    centers = travel.centers(np.argwhere(travel.safe))
+    near = np.linalg.norm(centers - travel.start, axis=1) <= config.radius
+    reason = Outcome.NO_REACHABLE_CANDIDATE if near.any() else Outcome.NO_CANDIDATE
+    info = PlanInfo(reason, num_candidates=int(near.sum()), stage_seconds=stopwatch.seconds)
+    return None, info
+
+
+def settle(
+    state: PlannerState,
+    travel: Travel,
+    poses: np.ndarray,
+    utilities: dict[str, np.ndarray],
+    stopwatch: Stopwatch,
+) -> tuple[Decision, PlannerState, PlanInfo]:
+    """Takes the candidate of the greatest `total` and finds the way to it.
+
+    Args:
+        state: the policy's memory.
+        travel: what can be reached.
+        poses: the candidates, [C, 4, 4], at least one of them reachable.
+        utilities: per candidate, [C] each; `total` and `path` among them. A candidate whose
+            path is infinite is never taken.
+        stopwatch: what took how long.
+    """
+    with stopwatch.part("travel"):
+        is_reachable = np.isfinite(utilities["path"])
+        best = int(np.argmax(np.where(is_reachable, utilities["total"], -np.inf)))
+        waypoints = travel.path(poses[best, :3, 3])
+    decision = Decision(
+        T_world_camera=poses[best],
+        waypoints=waypoints,
+        length=float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum()),
+        score=float(utilities["total"][best]),
+        candidates=poses,
+        utilities=utilities,
+    )
+    info = PlanInfo(Outcome.MOVED, len(poses), int(is_reachable.sum()), stopwatch.seconds)
+    trail = jnp.asarray(np.asarray(state.trail) | travel.cells_along(waypoints))
+    return decision, eqx.tree_at(lambda s: s.trail, state, trail), info
+
+
+def net_utility(utility: np.ndarray, path: np.ndarray, lambda2: float) -> np.ndarray:
+    """U_view of each candidate, from its utility and path length [C].
+
+    U_view = utility / sum(utility) - lambda2 * path / sum(path), both sums over the reachable
+    candidates (as in Active-GS); a sum of 0 leaves its term out. Unreachable: -inf.
+    """
+    is_reachable = np.isfinite(path)
+    shares = []
+    for values in (utility, path):
+        values = np.where(is_reachable, np.asarray(values, dtype=np.float64), 0.0)
+        shares.append(values / (values.sum() or 1.0))
+    return np.where(is_reachable, shares[0] - lambda2 * shares[1], -np.inf)
