@@ -2,6 +2,7 @@
 
 import hashlib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -54,9 +55,9 @@ class NoisySimulator:
         """`T_world_camera` at the start, [4, 4]."""
         return self.simulator.start_pose
 
-    def render(self, T_world_camera: np.ndarray) -> Frame:
+    def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
         """The frame at a pose, with noise on its depth; 0 and inf keep their meaning."""
-        frame = self.simulator.render(T_world_camera)
+        frame = self.simulator.render(np.asarray(T_world_camera))
         depth = np.asarray(frame.depth)
         noise = self._generator(frame).standard_normal(depth.shape, dtype=np.float32)
         # Cut at 4.5 sigma: a rare outlier must not turn a depth negative.

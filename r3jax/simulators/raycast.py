@@ -9,6 +9,7 @@ Shape symbols: H W image size; n rays; F faces.
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -75,9 +76,7 @@ class RaycastSimulator:
         self._face_mirror = mirror[world.face_material] if mirror.any() else None
         self._face_hole = hole[world.face_material] if hole.any() else None
         self._pixels = self._pixel_directions()
-        given = self._given_start(start_pose)
-        if given is not None:
-            self.__dict__["start_pose"] = given  # the cached property's value
+        self._start = self._given_start(start_pose)
 
     @property
     def camera(self) -> Camera:
@@ -89,25 +88,26 @@ class RaycastSimulator:
         """Axis-aligned box of the mesh, [2, 3] [m]."""
         return self._bounds.copy()
 
-    @functools.cached_property
+    @property
     def start_pose(self) -> np.ndarray:
-        """`T_world_camera` at the start, [4, 4] float64.
+        """`T_world_camera` at the start, [4, 4] float64; searched for when first asked for.
 
         Raises:
             ValueError: no place in the mesh has half a metre free all round.
         """
-        found = start.find_start(self._bounds, self._scene, self._distance, self._seed)
-        if found is None:
+        if self._start is None:
+            self._start = start.find_start(self._bounds, self._scene, self._distance, self._seed)
+        if self._start is None:
             raise ValueError(
                 f"{self.world.name}: found no place with {start.PROMISED_CLEARANCE} m free all "
                 "round to start from; is the scale metres and the up axis right? Otherwise give "
                 "a start_pose"
             )
-        return found
+        return self._start.copy()
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Distances [n] of `points` [n, 3] to the mesh [m]. For tests: the loop never has it."""
-        return self._distance(points)
+        return self._distance(np.asarray(points, dtype=np.float64))
 
     def segment_is_clear(self, a: np.ndarray, b: np.ndarray) -> bool:
         """True if no surface lies on the straight line between the points `a` and `b` [3] [m]."""
@@ -117,7 +117,7 @@ class RaycastSimulator:
         hits = self._scene.cast(a[None].astype(np.float32), (b - a)[None].astype(np.float32))
         return bool(hits.distance[0] > 1.0)
 
-    def render(self, T_world_camera: np.ndarray) -> Frame:
+    def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
         """The RGB-D frame at a pose [4, 4].
 
         Depth is 0 on surfaces that the sensor fails on (`Material.is_hole`), and inf where no

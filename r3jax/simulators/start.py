@@ -144,7 +144,9 @@ def _is_inside_furniture(position: np.ndarray, bounds: np.ndarray, scene: Triang
     """
     directions = fibonacci_lattice(_PROBES)
     hits = _cast(scene, position[None], directions)
-    if not hits.is_back.mean() > 0.98:
+    # Only the sides: a solid's bottom may coincide with the floor that it stands on.
+    is_sideways = np.abs(directions[:, 2]) < 0.6
+    if not hits.is_back[is_sideways].mean() > 0.95:
         return False
     shell = position + hits.distance[:, None] * directions
     shell = shell[np.isfinite(hits.distance)]

@@ -1,0 +1,15 @@
+"""A 512x512 RGB-D frame of a furnished house with 146 000 textured triangles: at most 150 ms."""
+
+import numpy as np
+
+from r3jax.simulators.meshes import load_world
+from r3jax.simulators.raycast import RaycastSimulator
+
+
+def test_frame_of_the_house(benchmark, shared):
+    world = load_world(shared("scenes", "aws_small_house", "aws_small_house.glb"))
+    simulator = RaycastSimulator(world)
+    pose = simulator.start_pose
+    simulator.render(pose)  # compiles
+    frame = benchmark(simulator.render, pose)
+    assert np.isfinite(frame.depth).any()
