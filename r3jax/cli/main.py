@@ -1,0 +1,58 @@
+"""Reads the command line and turns errors into messages and exit codes."""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from r3jax.cli.errors import UserError
+from r3jax.cli.options import Demo, Explore, Info
+
+_COMMANDS = {"demo": Demo, "explore": Explore, "info": Info}
+
+USER_ERROR = 2
+"""Exit code where the user can mend it: an unknown name, a folder that exists, a broken file."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+        args: the words after `r3jax`; None: those of this process.
+
+    Returns:
+        The exit code: 0 done, 1 stopped by the disk, 2 wrong input, 130 interrupted.
+    """
+    command = tyro.extras.subcommand_cli_from_dict(
+        _COMMANDS,
+        prog="r3jax",
+        description="Where to look next for 3D Gaussian splatting: explores a scene with an RGB-D "
+        "camera, chooses every view by closed-form renderability, and leaves a data set.",
+        args=args,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    _keep_compilations()
+    # Imported here, so that --help does not wait for JAX.
+    from r3jax.cli.explore import run_demo, run_explore
+    from r3jax.cli.info import run_info
+
+    try:
+        if isinstance(command, Demo):
+            return run_demo(command)
+        if isinstance(command, Explore):
+            return run_explore(command)
+        return run_info(command)
+    except UserError as error:
+        print(f"r3jax: {error}", file=sys.stderr)
+        return USER_ERROR
+
+
+def _keep_compilations() -> None:
+    """Lets the second start find what the first one compiled, unless JAX is told otherwise."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(base / "r3jax" / "jax")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")

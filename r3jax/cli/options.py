@@ -1,0 +1,106 @@
+"""The options of every command. Light on purpose: `--help` must not wait for JAX."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Explore a small embedded flat with Ours-Pano; takes two to three minutes on two cores."""
+
+    out: Path = Path("runs")
+    """Folder that holds the runs; the demo overwrites `demo` in it and nothing else."""
+
+    views: int = 24
+    """Views to take."""
+
+    resolution: int = 256
+    """Width and height of the images [px]."""
+
+
+@dataclass(frozen=True)
+class Explore:
+    """Explore a scene: choose every view, record images, depth, poses, and write a report."""
+
+    scene: Annotated[str, tyro.conf.arg(metavar="SCENE")]
+    """Embedded scene by name, or `mesh:<file>` (GLB, PLY, OBJ); `r3jax info` lists them."""
+
+    policy: Annotated[str, tyro.conf.arg(metavar="POLICY")] = "ours-pano"
+    """Who chooses the next view; `r3jax info` lists them."""
+
+    budget: Annotated[str, tyro.conf.arg(metavar="BUDGET")] = "views:100"
+    """When to stop: `views:N`, `seconds:S` of the mission clock, or `metres:M`."""
+
+    name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Name of the run; by default made of scene, policy and seed."""
+
+    out: Path = Path("runs")
+    """Folder that holds the runs."""
+
+    overwrite: bool = False
+    """Replace the run of that name if there is one."""
+
+    seed: int = 0
+    """All randomness follows from it."""
+
+    clock: Literal["wall", "model"] = "wall"
+    """`wall`: measured planning and mapping + flight. `model`: fixed costs, repeatable."""
+
+    resolution: int = 512
+    """Width and height of the images [px]."""
+
+    fov: float = 60.0
+    """Field of view [degrees]."""
+
+    up: Literal["y", "z"] | None = None
+    """Vertical axis of a mesh file; by default y for GLB and glTF, z for the others."""
+
+    noise: float = 0.01
+    """Standard deviation of the depth noise as a share of the depth."""
+
+    max_range: float = 5.0
+    """Range of the depth sensor [m]."""
+
+    start: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Start position in the z-up world [m]; by default the scene's own, or a search."""
+
+    voxel_size: float = 0.05
+    """Edge of a voxel of the map [m]."""
+
+    cell_size: float = 0.2
+    """Edge of a cell of the coarse grid [m]."""
+
+    capacity: Annotated[int, tyro.conf.arg(metavar="ROWS")] = 1 << 17
+    """Rows of the map at the start, a power of two."""
+
+    growth: bool = True
+    """Let the map grow; if not, what finds no row is counted as dropped."""
+
+    candidates: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Candidates per decision (policy's default: 100)."""
+
+    lambda1: Annotated[float | None, tyro.conf.arg(metavar="WEIGHT")] = None
+    """Weight of a visible unexplored cell against a voxel that renders badly."""
+
+    lambda2: Annotated[float | None, tyro.conf.arg(metavar="WEIGHT")] = None
+    """Weight of the path length against the utility (policy's default: 0.5)."""
+
+
+@dataclass(frozen=True)
+class Info:
+    """List scenes, policies and versions; or show a run or a recording, given its folder."""
+
+    path: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run folder, or a recording (images/, depth/, poses.txt, K.txt)."""
+
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None
+    """PNG for a recording's renderability, frame by frame."""
+
+    up: Literal["y", "z"] = "y"
+    """Axis of a recording's world that points up."""
+
+    voxel_size: float = 0.05
+    """Edge of a voxel when a recording is mapped [m]."""

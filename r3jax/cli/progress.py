@@ -1,0 +1,87 @@
+"""Tells the user what happens: a bar on a terminal, a few lines in a log."""
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from r3jax.exploration.budget import Budget
+from r3jax.trace.rows import StepRow
+
+_STAGES = {
+    "plan": "planning",
+    "render": "rendering",
+    "map": "mapping",
+    "measure": "measuring coverage",
+    "record": "writing to disk",
+}
+_LOG_LINES = 10
+"""Lines that a run leaves in a log."""
+
+
+class RunProgress:
+    """Follows a run; hand its methods to `explore`."""
+
+    def __init__(self, console: Console, budget: Budget):
+        """Shows nothing before it is entered."""
+        self._console = console
+        self._budget = budget
+        self._views = 0
+        self._logged = -1
+        self._bar = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TextColumn("[dim]{task.fields[facts]}"),
+            TextColumn("[dim]elapsed"),
+            TimeElapsedColumn(),
+            TextColumn("[dim]left"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("starting", total=1.0, facts="")
+
+    def on_stage(self, stage: str) -> None:
+        """A stage begins."""
+        what = _STAGES.get(stage, stage)
+        if self._views < 2 and stage in ("plan", "map", "measure"):
+            what += " (compiling on first use)"
+        total = f"/{self._budget.amount:.0f}" if self._budget.unit == "views" else ""
+        self._bar.update(self._task, description=f"view {self._views + 1}{total}: {what}")
+
+    def on_step(self, row: StepRow) -> None:
+        """A view is done."""
+        self._views = row.step + 1
+        share = self._budget.spent_share(views=self._views, seconds=row.seconds, metres=row.metres)
+        facts = (
+            f"{100 * row.coverage.known_share:.0f} % explored, "
+            f"R {row.coverage.mean_renderability:.2f}, {row.seconds:.0f} s on the clock"
+        )
+        self._bar.update(self._task, completed=share, facts=facts)
+        line = int(share * _LOG_LINES)
+        if not self._console.is_terminal and line > self._logged:
+            self._logged = line
+            self._console.print(f"view {self._views}: {facts}", highlight=False)
+
+    def __enter__(self) -> "RunProgress":
+        """Shows the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Takes the bar down."""
+        self._bar.stop()

@@ -1,0 +1,183 @@
+"""The report of a run: PNG figures and one HTML page that opens from disk."""
+
+import base64
+import html
+import json
+from pathlib import Path
+from string import Template
+
+from matplotlib.figure import Figure
+
+from r3jax.evaluation import figures, style
+from r3jax.evaluation.pictures import panorama_picture
+from r3jax.evaluation.summary import StageTime, stage_times, summary
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.trace.errors import RunError
+from r3jax.trace.files import write_atomic
+from r3jax.trace.reader import Run
+
+_PAGE = Template(
+    """<!doctype html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>r3jax run: $title</title>
+<style>
+ body { font: 15px/1.5 system-ui, sans-serif; color: #1f2937; background: #f3f4f6; margin: 0 }
+ main { max-width: 1020px; margin: 0 auto; padding: 28px 20px 60px }
+ h1 { font-size: 26px; margin: 0 0 2px } h2 { font-size: 17px; margin: 0 0 4px }
+ .lead { color: #4b5563; margin: 0 0 20px }
+ section { background: white; border-radius: 10px; padding: 18px 20px; margin: 16px 0;
+   box-shadow: 0 1px 3px #0001 }
+ .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px }
+ .card { background: white; border-radius: 10px; padding: 12px 16px; box-shadow: 0 1px 3px #0001 }
+ .card b { display: block; font-size: 23px; line-height: 1.3 } .card span { color: #6b7280;
+   font-size: 13px }
+ p.note { color: #6b7280; font-size: 13.5px; margin: 0 0 10px }
+ img { max-width: 100%; display: block; margin: 0 auto }
+ table { border-collapse: collapse; font-size: 14px; width: 100% }
+ th, td { text-align: left; padding: 4px 10px 4px 0; border-bottom: 1px solid #e5e7eb;
+   vertical-align: top }
+ td.n, th.n { text-align: right; font-variant-numeric: tabular-nums }
+ code { font: 13px ui-monospace, monospace; overflow-wrap: anywhere }
+</style></head><body><main>
+<h1>$title</h1>
+<p class="lead">$lead</p>
+<div class="cards">$cards</div>
+$sections
+</main></body></html>
+"""
+)
+
+_NOTES = {
+    "plan": (
+        "Path from above",
+        "Dots are views, ticks their viewing directions. The picture shows what lies below the "
+        "cameras' heads in the map's own colours; white is known to be free, grey is unexplored.",
+    ),
+    "progress": (
+        "Coverage and renderability",
+        "Explored: coarse cells known to be free or occupied, over all cells of the scene's box "
+        "(the insides of walls and furniture can never be seen, so 100 % is out of reach). The "
+        "curve below is the mean renderability of fixed probe views in the free space known at "
+        "that time; dots are the recorded views just before each was mapped: low means new.",
+    ),
+    "panorama": (
+        "Panorama at the last position",
+        "All directions from the last view's position. The cross is the direction it looked in.",
+    ),
+    "views": ("Some of the views", "Evenly spread over the run."),
+    "cost": (
+        "Time and memory",
+        "Measured on this machine. Coloured bars count on the mission clock (with the flight); "
+        "the simulator, the disk and the coverage numbers do not.",
+    ),
+}
+
+
+def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
+    """Writes `report/*.png` and `report/report.html`.
+
+    Args:
+        run: the run, finished or cut off.
+        map_state: its map after the last view.
+        grid: its coarse grid after the last view.
+
+    Returns:
+        The HTML page; the pictures are inside it, so it can be sent as one file.
+
+    Raises:
+        RunError: a run without a view, or images that cannot be read.
+        OSError: the disk is full, not writable, ...
+    """
+    if not run.rows:
+        raise RunError(run.path, "the run has no view, so there is nothing to report")
+    last = run.rows[-1]
+    max_range = float(run.header.config.get("max_range", 5.0))
+    panorama = panorama_picture(map_state, run.camera, last.pose, max_range)
+    drawn: dict[str, Figure] = {
+        "plan": figures.plan_figure(run, map_state, grid),
+        "progress": figures.progress_figure(run),
+        "panorama": figures.panorama_figure(panorama),
+        "views": figures.strip_figure(run),
+        "cost": figures.cost_figure(run),
+    }
+    folder = run.path / "report"
+    folder.mkdir(exist_ok=True)
+    sections = []
+    for name, figure in drawn.items():
+        png = style.to_png(figure)
+        write_atomic(folder / f"{name}.png", png)
+        table = _stage_table(stage_times(run)) if name == "cost" else ""
+        sections.append(_figure_section(name, png, table))
+    sections.append(_settings_section(run))
+    page = folder / "report.html"
+    write_atomic(page, _page(run, sections).encode())
+    return page
+
+
+def _page(run: Run, sections: list[str]) -> str:
+    last = run.rows[-1]
+    cards = {
+        "views": str(len(run.rows)),
+        "mission clock": f"{last.seconds:.1f} s",
+        "path": f"{last.metres:.1f} m",
+        "explored": f"{100 * last.coverage.known_share:.0f} %",
+        "mean renderability": f"{last.coverage.mean_renderability:.2f}",
+        "map in use": summary(run)["map"].split(", ")[1].removesuffix(" in use"),
+    }
+    card = '<div class="card"><b>{}</b><span>{}</span></div>'
+    return _PAGE.substitute(
+        title=html.escape(f"{run.header.policy.get('name')} in {run.header.scene.get('name')}"),
+        lead=html.escape(f"{run.outcome}."),
+        cards="".join(card.format(html.escape(v), html.escape(k)) for k, v in cards.items()),
+        sections="\n".join(sections),
+    )
+
+
+def _figure_section(name: str, png: bytes, extra: str) -> str:
+    title, note = _NOTES[name]
+    data = base64.b64encode(png).decode()
+    return (
+        f'<section><h2>{title}</h2><p class="note">{note}</p>'
+        f'<img alt="{title}" src="data:image/png;base64,{data}">{extra}</section>'
+    )
+
+
+def _stage_table(stages: list[StageTime]) -> str:
+    head = (
+        '<tr><th>stage</th><th>on the clock</th><th class="n">p50 [ms]</th>'
+        '<th class="n">p95 [ms]</th><th class="n">total [s]</th></tr>'
+    )
+    rows = "".join(
+        f"<tr><td>{html.escape(s.name)}</td><td>{'yes' if s.on_clock else ''}</td>"
+        f'<td class="n">{1e3 * s.median:.1f}</td><td class="n">{1e3 * s.p95:.1f}</td>'
+        f'<td class="n">{s.total:.2f}</td></tr>'
+        for s in stages
+    )
+    return f"<table>{head}{rows}</table>"
+
+
+def _settings_section(run: Run) -> str:
+    """Outcome, numbers and every setting, so that the page explains itself."""
+    header = run.header
+    groups = {
+        **summary(run),
+        "scene hash": str(header.scene.get("hash", "")),
+        "scene settings": _compact({k: v for k, v in header.scene.items() if k != "hash"}),
+        "policy settings": _compact(header.policy.get("settings", {})),
+        "loop settings": _compact(header.config),
+        "camera": _compact(header.camera),
+        "software": _compact(header.packages),
+    }
+    rows = "".join(
+        f"<tr><th>{html.escape(name)}</th><td><code>{html.escape(text)}</code></td></tr>"
+        for name, text in groups.items()
+    )
+    return f"<section><h2>Outcome and settings</h2><table>{rows}</table></section>"
+
+
+def _compact(settings: object) -> str:
+    if not isinstance(settings, dict):
+        return json.dumps(settings)
+    return ", ".join(f"{k} {v}" for k, v in settings.items())
