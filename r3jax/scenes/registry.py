@@ -1,7 +1,5 @@
 """Scenes by name: the embedded rooms, and any mesh file as `mesh:<file>`."""
 
-from typing import Literal
-
 import numpy as np
 
 from r3jax.geometry.cameras import Camera
@@ -32,12 +30,12 @@ def describe(name: str) -> str:
     return procedural.describe(name)
 
 
-def open_world(spec: str, up: Literal["y", "z"] | None = None) -> World:
+def open_world(spec: str, up: str | None = None) -> World:
     """The triangles and materials behind a scene's name.
 
     Args:
         spec: the name of an embedded scene, or `mesh:<file>`.
-        up: vertical axis of a mesh file; None: y for glTF, z for everything else.
+        up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
 
     Raises:
         ValueError: the scene is unknown, `up` is given for an embedded scene, or the mesh file is
@@ -57,18 +55,18 @@ def open_world(spec: str, up: Literal["y", "z"] | None = None) -> World:
 def open_scene(
     spec: str,
     *,
-    up: Literal["y", "z"] | None = None,
+    up: str | None = None,
     camera: Camera | None = None,
-    noise: float = 0.01,
+    noise: float | int = 0.01,
     seed: int = 0,
-    max_range: float | None = 5.0,
+    max_range: float | int | None = 5.0,
     start_pose: np.ndarray | None = None,
 ) -> Simulator:
     """Opens a scene for exploration.
 
     Args:
         spec: the name of an embedded scene, or `mesh:<file>`.
-        up: vertical axis of a mesh file; None: y for glTF, z for everything else.
+        up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
         camera: intrinsics; None: 512x512 pixels, 60 degrees.
         noise: standard deviation of the depth as a share of the depth; 0: exact depth.
         seed: of the noise, and of the search for a start where the scene has none.

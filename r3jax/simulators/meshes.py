@@ -9,10 +9,11 @@ Shape symbols: V vertices; F faces.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from r3jax.simulators.gltf import texture_transforms
 from r3jax.simulators.world import Material, World
 
 _GLTF_SUFFIXES = (".glb", ".gltf")
@@ -35,7 +36,7 @@ class _Part:
     material: Material
 
 
-def load_world(path: str | Path, up: Literal["y", "z"] | None = None) -> World:
+def load_world(path: str | Path, up: str | None = None) -> World:
     """Reads a mesh file.
 
     Textures, vertex colours, face colours, plain colours and mixtures of them are kept; the nodes
@@ -44,7 +45,7 @@ def load_world(path: str | Path, up: Literal["y", "z"] | None = None) -> World:
 
     Args:
         path: the file.
-        up: the file's vertical axis; None: y for glTF, z for everything else.
+        up: the file's vertical axis, "y" or "z"; None: y for glTF, z for everything else.
 
     Returns:
         The world, z up, named `mesh:<path>`.
@@ -59,10 +60,16 @@ def load_world(path: str | Path, up: Literal["y", "z"] | None = None) -> World:
     if not path.is_file():
         raise ValueError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
     scene = _read(path)
-    parts = [part for node in scene.graph.nodes_geometry if (part := _part_of(scene, node))]
+    is_gltf = path.suffix.lower() in _GLTF_SUFFIXES
+    moves = texture_transforms(path) if is_gltf else {}
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        part = _part_of(path, scene, node, moves)
+        if part is not None:
+            parts.append(part)
     if not parts:
         _refuse_empty(path, scene)
-    is_y_up = up == "y" or (up is None and path.suffix.lower() in _GLTF_SUFFIXES)
+    is_y_up = up == "y" or (up is None and is_gltf)
     turn = _Z_UP_FROM_Y_UP if is_y_up else np.eye(3)
     world = _assemble(path, parts, turn)
     _check(path, world)
@@ -94,16 +101,24 @@ def _refuse_empty(path: Path, scene: Any) -> None:
     raise ValueError(f"{path} holds an empty mesh: no vertices, no faces; export it again")
 
 
-def _part_of(scene: Any, node: str) -> _Part | None:
+def _part_of(path: Path, scene: Any, node: str, moves: dict[str, np.ndarray]) -> _Part | None:
     """The mesh at a node of the scene graph; None for points, lines and empty meshes."""
     T_world_node, name = scene.graph[node]
     mesh = scene.geometry[name]
     faces = np.asarray(getattr(mesh, "faces", ()), dtype=np.int64).reshape(-1, 3)
     if len(faces) == 0:
         return None
+    if faces.min() < 0 or faces.max() >= len(mesh.vertices):
+        raise ValueError(
+            f"{path}: a face of {name!r} names vertex {faces.max()}, but there are only "
+            f"{len(mesh.vertices)}; the file is damaged, export it again"
+        )
     T = np.asarray(T_world_node, dtype=np.float64)
     vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
     uv, colors, material = _appearance(mesh, faces)
+    move = moves.get(str(getattr(getattr(mesh.visual, "material", None), "name", "")))
+    if move is not None:
+        uv = uv @ move[:2, :2].T + move[:2, 2]
     if np.linalg.det(T[:3, :3]) < 0.0:  # a mirrored node: keep the front faces in front
         faces, uv = faces[:, ::-1], uv[:, ::-1]
         colors = None if colors is None else colors[:, ::-1]
@@ -191,11 +206,6 @@ def _assemble(path: Path, parts: list[_Part], turn: np.ndarray) -> World:
 
 def _check(path: Path, world: World) -> None:
     """Refuses geometry that no ray can meet."""
-    if world.faces.min() < 0 or world.faces.max() >= len(world.vertices):
-        raise ValueError(
-            f"{path}: a face names vertex {world.faces.max()}, but there are "
-            f"{len(world.vertices)} vertices; the file is damaged, export it again"
-        )
     bad = np.flatnonzero(~np.isfinite(world.vertices).all(axis=1))
     if len(bad):
         raise ValueError(

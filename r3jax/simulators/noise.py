@@ -18,7 +18,9 @@ class NoisySimulator:
     pure function of the seed and the pose: a frame that is rendered again is the same frame.
     """
 
-    def __init__(self, simulator: Simulator, relative_sigma: float = 0.01, seed: int = 0) -> None:
+    def __init__(
+        self, simulator: Simulator, relative_sigma: float | int = 0.01, seed: int = 0
+    ) -> None:
         """Wraps `simulator`.
 
         Args:

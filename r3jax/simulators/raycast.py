@@ -35,7 +35,7 @@ class RaycastSimulator:
         world: World,
         camera: Camera | None = None,
         *,
-        max_range: float | None = 5.0,
+        max_range: float | int | None = 5.0,
         start_pose: np.ndarray | None = None,
         cull_back_faces: bool = False,
         supersample: int = 4,

@@ -26,7 +26,7 @@ def compare(simulator, poses, golden):
 
 def camera_of(golden):
     K = golden["K"]
-    return Camera(256, 256, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    return Camera(256, 256, *(float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_a_flat_colored_room_with_holes_is_the_same(shared):
 def test_depth_with_culled_back_faces_is_as_in_opengl(shared):
     folder = shared("golden", "van_gogh_depth")
     golden = np.load(folder / "golden_depth.npz")
-    camera = Camera(320, 240, golden["fx"], golden["fy"], golden["cx"], golden["cy"])
+    camera = Camera(320, 240, *(float(golden[name]) for name in ("fx", "fy", "cx", "cy")))
     simulator = RaycastSimulator(
         load_world(folder / "van-gogh-room.mesh.ply"),
         camera,
