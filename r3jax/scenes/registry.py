@@ -15,7 +15,7 @@ _MESH_PREFIX = "mesh:"
 
 def scene_names() -> list[str]:
     """Names of the embedded scenes. `mesh:<file>` opens any mesh besides."""
-    return procedural.names()
+    return list(procedural.names())
 
 
 def describe(name: str) -> str:
