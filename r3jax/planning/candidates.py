@@ -116,7 +116,8 @@ def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.7
         for n, step in zip(shape, spacing, strict=True)
     ]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    cells = np.unique(np.floor(points / travel.cell_size).astype(np.int64), axis=0)
+    # The nudge puts points that lie on a border of cells on the same side of it.
+    cells = np.unique(np.floor(points / travel.cell_size + 1e-3).astype(np.int64), axis=0)
     cells = cells[np.all(cells < np.array(shape), axis=1)]
     return travel.centers(cells[travel.goals[tuple(cells.T)]])
 

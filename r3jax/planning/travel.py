@@ -90,12 +90,13 @@ class Travel:
         """Centres [m] of cells given by index, [n, 3]."""
         return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
 
-    def distance(self, cell: tuple[int, int, int]) -> float:
+    def distance(self, cell: np.ndarray | tuple[int, int, int]) -> float:
         """Length of the way from the robot to the centre of a cell [m]; inf if there is none."""
-        if not self.contains(cell):
+        x, y, z = (int(i) for i in np.asarray(cell))
+        if not self.contains((x, y, z)):
             return float("inf")
         first = self.centers(np.array(self.start_cell))
-        return float(np.linalg.norm(first - self.start) + self.cost[cell])
+        return float(np.linalg.norm(first - self.start) + self.cost[x, y, z])
 
     def lengths(self, positions: np.ndarray) -> np.ndarray:
         """Path lengths [m] to positions [n, 3]; inf where there is no way.

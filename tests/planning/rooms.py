@@ -1,0 +1,45 @@
+"""Small known worlds for the planning tests."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.mapping.occupancy import OccupancyGrid
+
+CELL = 0.2
+ORIGIN = np.array([-1.0, 2.0, 0.5])
+
+
+def grid_of(free: np.ndarray, occupied: np.ndarray | None = None) -> OccupancyGrid:
+    """A grid in which the given cells are known; all others are unexplored."""
+    log_odds = np.where(free, -3.0, 0.0)
+    if occupied is not None:
+        log_odds = np.where(occupied, 3.0, log_odds)
+    return OccupancyGrid(
+        log_odds=jnp.asarray(log_odds, jnp.float32),
+        origin=jnp.asarray(ORIGIN, jnp.float32),
+        cell_size=jnp.asarray(CELL, jnp.float32),
+    )
+
+
+def center(*cell: float) -> np.ndarray:
+    """Centre of a cell in the world [m]."""
+    return ORIGIN + (np.array(cell, float) + 0.5) * CELL
+
+
+def pose_at(position: np.ndarray) -> np.ndarray:
+    """A pose there; where it looks does not matter."""
+    T = np.eye(4)
+    T[:3, 3] = position
+    return T
+
+
+def two_rooms() -> tuple[np.ndarray, np.ndarray]:
+    """Two rooms with a doorway of five cells between them: the free and the occupied cells.
+
+    Walls are at x = 0, 12, 24 and round the outside; the door spans y = 4..8 and z = 1..7.
+    """
+    free = np.zeros((25, 14, 10), dtype=bool)
+    free[1:12, 1:13, 1:9] = True
+    free[13:24, 1:13, 1:9] = True
+    free[12, 4:9, 1:8] = True
+    return free, ~free
