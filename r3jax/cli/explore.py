@@ -88,7 +88,7 @@ def _plan(options: Explore) -> tuple[Budget, ExplorationConfig, Policy]:
         cell_size=options.cell_size,
         max_range=options.max_range,
         capacity=options.capacity,
-        allow_growth=options.growth,
+        allow_growth=not options.fixed_capacity,
         clock=options.clock,
     )
     scoring = ScoringConfig(max_range=jnp.asarray(options.max_range, jnp.float32))

@@ -76,8 +76,8 @@ class Explore:
     capacity: Annotated[int, tyro.conf.arg(metavar="ROWS")] = 1 << 17
     """Rows of the map at the start, a power of two."""
 
-    growth: bool = True
-    """Let the map grow; if not, what finds no row is counted as dropped."""
+    fixed_capacity: bool = False
+    """Never grow the map: what finds no row is counted as dropped and reported."""
 
     candidates: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Candidates per decision (policy's default: 100)."""
