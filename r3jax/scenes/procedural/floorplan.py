@@ -5,6 +5,7 @@ wall; a shell round everything is the outer wall. Doorways and windows are boxes
 faces they touch and get reveals, frames and sills. So a camera inside sees surfaces only.
 """
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -256,7 +257,7 @@ def _ticks(lo: float, hi: float, cuts: list[float]) -> np.ndarray:
     stops = np.unique(np.round([lo, hi, *inner], 9))
     parts = [
         np.linspace(a, b, int(np.ceil((b - a) / _CELL)) + 1)[:-1]
-        for a, b in zip(stops[:-1], stops[1:], strict=True)
+        for a, b in itertools.pairwise(stops)
     ]
     return np.concatenate([*parts, [hi]])
 

@@ -32,16 +32,19 @@ def _on_spine(shape: Shape, spine: int, low: float = 0.02, high: float = 0.98) -
     return Shape(shape.corners, np.stack([u, low + (high - low) * unit[..., 1]], axis=-1))
 
 
-def book_row(length: float, height: float, depth: float, seed: int) -> Model:
+def book_row(
+    length: float, height: float, depth: float, seed: int, thickness: float = 1.0
+) -> Model:
     """Books side by side with a few gaps and leaners, spines towards +y.
 
-    Spans x = 0 .. length, y = 0 .. depth; no book is taller than `height`.
+    Spans x = 0 .. length, y = 0 .. depth; no book is taller than `height`. Books are 1.8 to 5.6 cm
+    thick, times `thickness`.
     """
     rng = np.random.default_rng(seed)
     covers, pages = [], []
     x = 0.0
     while x < length - 0.02:
-        thick = min(0.016 + 0.034 * rng.random(), length - x)
+        thick = min(thickness * (0.018 + 0.038 * rng.random()), length - x)
         tall = height * (0.68 + 0.3 * rng.random())
         deep = depth * (0.7 + 0.28 * rng.random())
         spine = int(rng.integers(SPINES))
@@ -49,8 +52,9 @@ def book_row(length: float, height: float, depth: float, seed: int) -> Model:
             x += 0.04 + 0.1 * rng.random()
             continue
         front = panel(x + thick / 2, 0.0, thick - 0.002, tall, deep)
-        sides = box((x + 0.001, 0.0, 0.0), (x + thick - 0.001, deep - 0.001, tall - 0.003))
-        covers += [_on_spine(front, spine), _on_spine(sides, spine, 0.12, 0.2)]
+        left = quad((x + 0.001, deep, 0.0), (0, -deep, 0), (0, 0, tall))
+        right = quad((x + thick - 0.001, 0.0, 0.0), (0, deep, 0), (0, 0, tall))
+        covers += [_on_spine(front, spine), _on_spine(left + right, spine, 0.12, 0.2)]
         pages.append(
             quad((x + 0.003, 0.004, tall - 0.002), (thick - 0.006, 0, 0), (0, deep - 0.01, 0))
         )
@@ -82,11 +86,11 @@ def book_pile(count: int, seed: int) -> Model:
 def vase(seed: int, height: float = 0.28) -> Model:
     """A turned vase; every second one is glazed in two colours."""
     rng = np.random.default_rng(seed)
-    t = np.linspace(0.0, 1.0, 12)
+    t = np.linspace(0.0, 1.0, 9)
     belly = 0.3 + 0.22 * np.sin(np.pi * (t * (0.8 + 0.5 * rng.random())) + 0.6 * rng.random())
     profile = [
         (0.0, 0.0),
-        *((float(b) * 0.75 * height, float(a) * height) for a, b in zip(t, belly, strict=True)),
+        *((float(b) * 0.6 * height, float(a) * height) for a, b in zip(t, belly, strict=True)),
     ]
     color = _BRIGHT[seed % len(_BRIGHT)]
     finish = (
@@ -108,7 +112,7 @@ def bowl_of_fruit(seed: int) -> Model:
         angle, reach = 2.4 * k, 0.03 + 0.008 * k
         tint = ((0.95, 0.55, 0.12), (0.75, 0.16, 0.12), (0.93, 0.83, 0.25), (0.5, 0.66, 0.2))[k % 4]
         r = 0.033 + 0.008 * rng.random()
-        fruit = ball((r, r, r * 0.93), 9, 6)
+        fruit = ball((r, r, r * 0.93), 8, 5)
         model.add(
             fruit.moved(reach * np.cos(angle), reach * np.sin(angle), 0.085 + 0.03 * (k < 4)),
             peel,
@@ -149,16 +153,16 @@ def leafy_plant(height: float, seed: int, leaves: int = 34, broad: float = 0.3) 
 
 def _blade(length: float, broad: float, lift: float) -> Shape:
     """A leaf that starts at the origin along +x, rises and bends down; unit coordinates."""
-    t = np.linspace(0.0, 1.0, 7)
+    t = np.linspace(0.0, 1.0, 6)
     angle = lift - 1.5 * t**1.5
-    step = length / 6
+    step = length / 5
     x = np.concatenate([[0.0], np.cumsum(np.cos(angle[:-1]) * step)])
     z = np.concatenate([[0.0], np.cumsum(np.sin(angle[:-1]) * step)])
     half = 0.5 * broad * length * np.sin(np.pi * np.clip(0.06 + 0.94 * t, 0, 1) ** 0.75) + 0.003
     side = np.array([-1.0, 0.0, 1.0])
     cup = 0.25 * half[None, :] * np.abs(side)[:, None]
     points = np.stack(
-        [np.broadcast_to(x, (3, 7)), side[:, None] * half[None, :], z[None, :] + cup], axis=-1
+        [np.broadcast_to(x, (3, 6)), side[:, None] * half[None, :], z[None, :] + cup], axis=-1
     )
     return grid(points, t, (side + 1.0) / 2.0)
 
@@ -261,8 +265,8 @@ def bottle(seed: int, height: float = 0.3) -> Model:
 def crockery(seed: int) -> Model:
     """A place setting: plate, bowl, mug."""
     white, color = f.enamel(f.WHITE, 5, 0.7), f.enamel(_BRIGHT[seed % len(_BRIGHT)], 2, 0.6)
-    plate = lathe([(0.0, 0.004), (0.08, 0.004), (0.13, 0.02), (0.13, 0.014), (0.08, 0.0)], 20)
-    bowl = lathe([(0.04, 0.012), (0.075, 0.06), (0.07, 0.06), (0.03, 0.02), (0.0, 0.02)], 16)
+    plate = lathe([(0.0, 0.004), (0.08, 0.004), (0.13, 0.02), (0.13, 0.014), (0.08, 0.0)], 16)
+    bowl = lathe([(0.04, 0.012), (0.075, 0.06), (0.07, 0.06), (0.03, 0.02), (0.0, 0.02)], 12)
     mug = lathe(
         [(0.0, 0.0), (0.038, 0.0), (0.038, 0.09), (0.034, 0.09), (0.034, 0.02), (0.0, 0.02)], 14
     )
@@ -278,7 +282,7 @@ def clutter(seed: int) -> Model:
         lambda: book_pile(3 + seed % 3, seed),
         lambda: jar(seed),
         lambda: carton(seed),
-        lambda: leafy_plant(0.26, seed, 18),
+        lambda: leafy_plant(0.26, seed, 12),
         lambda: bottle(seed, 0.24),
         lambda: Model().add(
             ball((0.07, 0.07, 0.07), 14, 9).moved(z=0.07),

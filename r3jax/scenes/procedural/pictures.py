@@ -66,6 +66,16 @@ def write_lines(draw: ImageDraw.ImageDraw, box, height: float, rng, fill, ragged
         y += 1.75 * height
 
 
+_MOODS = (
+    ((0.55, 0.63, 0.75), (0.2, 0.36, 0.14)),
+    ((0.62, 0.56, 0.6), (0.52, 0.3, 0.1)),
+    ((0.78, 0.66, 0.56), (0.66, 0.46, 0.26)),
+    ((0.78, 0.84, 0.92), (0.5, 0.56, 0.62)),
+    ((0.45, 0.58, 0.6), (0.3, 0.42, 0.2)),
+)
+"""Colours of the farthest and the nearest hills."""
+
+
 def _scene(seed: int, height: int, width: int, sunset: float) -> np.ndarray:
     """Sky, clouds, four ranges of hills, a plain with trees; [h, w, 3] float32."""
     rng = np.random.default_rng(seed)
@@ -85,12 +95,12 @@ def _scene(seed: int, height: int, width: int, sunset: float) -> np.ndarray:
     glow = np.clip(np.exp(-distance * 7.0) + (distance < 0.05), 0, 1) * (0.4 + 0.6 * sunset)
     image = blend(image, np.array([1.0, 0.93, 0.72], dtype=np.float32), glow)
     texture = 0.16 * cloud(height, width, seed + 5, 0.9) + 0.1 * cloud(height, width, seed + 6, 0.3)
-    far, near = np.array([0.55, 0.63, 0.75]), np.array([0.2, 0.3 + 0.12 * rng.random(), 0.14])
+    far, near = (np.array(c) for c in _MOODS[seed % len(_MOODS)])
+    relief, rise = 0.03 + 0.06 * rng.random(), 0.34 + 0.14 * rng.random()
     for k in range(5):
         depth = k / 4.0
-        line = (
-            0.42 + 0.11 * k - 0.06 * (1 - 0.5 * depth) * ridge(width, seed + 10 + k, 1.5 - 0.1 * k)
-        )
+        profile = ridge(width, 7 * seed + k, 1.7 - 0.12 * k)
+        line = rise + 0.11 * k - relief * (1 - 0.5 * depth) * profile
         color = (far * (1 - depth) + near * depth) * (1 - 0.25 * sunset)
         shade = color.astype(np.float32) * (1 + (0.3 + depth) * texture)[..., None]
         image = blend(image, shade, smoothstep(-0.004, 0.004, y - line[None, :]))
@@ -99,6 +109,7 @@ def _scene(seed: int, height: int, width: int, sunset: float) -> np.ndarray:
 
 def _trees(image: np.ndarray, seed: int, count: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
+    hue = np.asarray(_MOODS[seed % len(_MOODS)][1]) * np.array([0.8, 1.15, 0.8])
     height, width = image.shape[:2]
     canvas = Image.fromarray(texels(image))
     draw = ImageDraw.Draw(canvas)
@@ -110,7 +121,7 @@ def _trees(image: np.ndarray, seed: int, count: int) -> np.ndarray:
         for _ in range(60):
             dx, dy = rng.normal(0, 0.17, 2) * size
             r = size * (0.04 + 0.05 * rng.random())
-            green = (0.16 + 0.2 * rng.random(), 0.3 + 0.3 * rng.random(), 0.1 + 0.1 * rng.random())
+            green = hue * (0.7 + 0.8 * rng.random()) + 0.05 * rng.random(3)
             cx, cy = x + dx, foot * height - 0.72 * size + dy
             draw.ellipse([cx - r, cy - r, cx + r, cy + r], ink(green))
     return to_float(canvas)

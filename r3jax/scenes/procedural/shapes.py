@@ -7,9 +7,12 @@ them into texture units. z is up; v grows upwards on upright faces.
 Shape symbols: F triangles; n points.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+
+_UNIT_QUAD = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], dtype=np.float64)
 
 Point = tuple[float, float, float]
 
@@ -83,9 +86,12 @@ def quad(origin: Point, across: Point, up: Point, step: float = 10.0) -> Shape:
     It is cut into cells of at most `step` [m], for shading that varies over it.
     """
     o, a, b = (np.asarray(p, dtype=np.float64) for p in (origin, across, up))
-    width, height = float(np.linalg.norm(a)), float(np.linalg.norm(b))
-    s = np.linspace(0.0, 1.0, int(np.ceil(width / step)) + 1)
-    t = np.linspace(0.0, 1.0, int(np.ceil(height / step)) + 1)
+    width, height = math.sqrt(a @ a), math.sqrt(b @ b)
+    columns, rows = math.ceil(width / step), math.ceil(height / step)
+    if columns == rows == 1:  # by far the most frequent case, and many times faster
+        corners = o + np.stack([0 * a, a, a + b, 0 * a, a + b, b]).reshape(2, 3, 3)
+        return Shape(corners, np.array([width, height]) * _UNIT_QUAD)
+    s, t = np.linspace(0.0, 1.0, columns + 1), np.linspace(0.0, 1.0, rows + 1)
     points = o + t[:, None, None] * b + s[None, :, None] * a
     return grid(points, s * width, t * height)
 
@@ -189,11 +195,17 @@ def ball(radii: Point, segments: int = 12, rings: int = 7, power: float = 1.0) -
 
 
 def cushion(low: Point, high: Point, power: float = 0.42) -> Shape:
-    """A soft block that fills a box: upholstery, pillows, mattresses."""
+    """A soft block that fills a box: upholstery, pillows, mattresses.
+
+    Its texture is laid on from the six sides, as cloth is, not from the poles.
+    """
     lo, hi = np.asarray(low), np.asarray(high)
     a, b, c = (float(x) for x in (hi - lo) / 2)
-    x, y, z = (float(v) for v in (hi + lo) / 2)
-    return ball((a, b, c), 16, 8, power).moved(x, y, z)
+    corners = ball((a, b, c), 16, 8, power).corners
+    normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    axes = np.array([[1, 2], [0, 2], [0, 1]])[np.argmax(normal, axis=1)]
+    uv = np.take_along_axis(corners, np.repeat(axes[:, None], 3, axis=1), axis=2)
+    return Shape(corners + (hi + lo) / 2, uv + np.array([0.37, 0.21]))
 
 
 def tube(points: list[Point], radius: float, segments: int = 6) -> Shape:

@@ -8,8 +8,10 @@ from r3jax.scenes.procedural.model import Finish, Model
 from r3jax.scenes.procedural.shapes import box, combine, cylinder, panel, quad, tube
 
 
-def bookshelf(width: float, height: float, wood: Finish, seed: int, depth: float = 0.3) -> Model:
-    """An open shelf full of books, with objects between them."""
+def bookshelf(
+    width: float, height: float, wood: Finish, seed: int, depth: float = 0.3, thickness: float = 1.0
+) -> Model:
+    """An open shelf full of books (`thickness` 2: of binders), with objects between them."""
     rng = np.random.default_rng(seed)
     w, t = width / 2, 0.022
     floors = max(2, round(height / 0.36))
@@ -25,11 +27,13 @@ def bookshelf(width: float, height: float, wood: Finish, seed: int, depth: float
     model = Model().add(combine(boards), wood)
     for k in range(floors):
         z, free = 0.08 + k * pitch + t, pitch - t - 0.02
-        split = (0.45 + 0.5 * rng.random()) * (width - 2 * t)
+        split = (0.6 + 0.36 * rng.random()) * (width - 2 * t)
         left = rng.random() < 0.5
         x0, x1 = (-w + t, -w + t + split) if left else (w - t - split, w - t)
         seeds = rng.integers(0, 1000, 4)
-        model.put(objects.book_row(x1 - x0, free, depth - 0.05, int(seeds[0])), x0, 0.012, z)
+        model.put(
+            objects.book_row(x1 - x0, free, depth - 0.05, int(seeds[0]), thickness), x0, 0.012, z
+        )
         r0, r1 = (x1, w - t) if left else (-w + t, x0)
         for i in range(int((r1 - r0) / 0.2)):
             x = r0 + (i + 0.5) * (r1 - r0) / int((r1 - r0) / 0.2)
@@ -37,11 +41,13 @@ def bookshelf(width: float, height: float, wood: Finish, seed: int, depth: float
     return model
 
 
-def library_shelf(width: float, height: float, wood: Finish, seed: int) -> Model:
+def library_shelf(
+    width: float, height: float, wood: Finish, seed: int, thickness: float = 1.0
+) -> Model:
     """Two bookshelves back to back, origin in the middle, with end panels."""
     model = Model()
-    model.put(bookshelf(width, height, wood, seed, 0.28), 0, 0.01, 0, "n")
-    model.put(bookshelf(width, height, wood, seed + 1, 0.28), 0, -0.01, 0, "s")
+    model.put(bookshelf(width, height, wood, seed, 0.28, thickness), 0, 0.01, 0, "n")
+    model.put(bookshelf(width, height, wood, seed + 1, 0.28, thickness), 0, -0.01, 0, "s")
     for x in (-width / 2 - 0.02, width / 2):
         model.add(box((x, -0.31, 0), (x + 0.02, 0.31, height + 0.05)), wood)
     return model

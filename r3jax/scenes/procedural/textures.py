@@ -6,6 +6,7 @@ is a read-only [h, w, 3] uint8 array that is made once per process. Colours are 
 """
 
 import functools
+import itertools
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -26,7 +27,7 @@ def plaster(color: Color, seed: int, strength: float = 1.0, size: int = 768) -> 
     strokes = cloud(size, size, seed + 1, 1.1, 3.0, 8.0)
     grain = cloud(size, size, seed + 2, 0.5, 1.0, 60.0)
     stain = smoothstep(0.9, 2.4, cloud(size, size, seed + 3, 2.2))
-    shade = 1.0 + strength * (0.03 * broad + 0.032 * strokes + 0.036 * grain - 0.09 * stain)
+    shade = 1.0 + strength * (0.022 * broad + 0.03 * strokes + 0.036 * grain - 0.06 * stain)
     warmth = strength * 0.012 * np.roll(broad, size // 3, axis=1)
     tint = np.stack([1.0 + warmth, np.ones_like(warmth), 1.0 - warmth], axis=-1)
     return texels(_rgb(color) * tint * shade[..., None])
@@ -73,7 +74,7 @@ def planks(
     base = _grain(color, seed, size, size, 17.0)
     image = np.empty_like(base)
     edges = np.linspace(0, size, rows + 1).astype(int)
-    for top, bottom in zip(edges[:-1], edges[1:], strict=True):
+    for top, bottom in itertools.pairwise(edges):
         joints = np.sort(rng.integers(0, size, 2))
         shift = np.roll(base, tuple(rng.integers(0, size, 2)), axis=(0, 1))
         strip = np.empty((bottom - top, size, 3), dtype=np.float32)
@@ -129,10 +130,8 @@ def tiles(
     i = np.floor(row * rows).astype(int)
     across = column * columns + bond * (i % 2)
     j = np.floor(across).astype(int) % columns
-    if len(colors) == 2:
-        which = (i + j) % 2
-    else:
-        which = rng.integers(0, len(colors), (rows, columns))[i, j]
+    drawn = rng.integers(0, len(colors), (rows, columns))[i, j]
+    which = (i + j) % 2 if len(colors) == 2 else drawn
     tone = 1.0 + 0.07 * rng.standard_normal((rows, columns))[i, j]
     fy, fx = row * rows - i, across - np.floor(across)
     edge = np.minimum(

@@ -59,7 +59,7 @@ def _plan() -> Plan:
     for center in (3.5, 5.7, 7.9):
         plan.doorway("y", (5.82, 5.94), center)
     plan.window("living", "s", 2.6, 2.2, 0.6, 2.3, 3)
-    plan.window("kitchen", "s", 8.4, 1.4, 1.05, 2.2, 9)
+    plan.window("kitchen", "e", 2.4, 1.2, 0.95, 2.2, 9)
     plan.window("bedroom", "n", 1.2, 1.4, 0.9, 2.2, 5)
     plan.window("bath", "n", 5.7, 0.7, 1.5, 2.2, 6)
     plan.window("study", "e", 7.6, 1.6, 0.9, 2.2, 8)
@@ -101,7 +101,7 @@ def _kitchen(m: Model) -> None:
     front = f.enamel((0.86, 0.83, 0.76), 3, 0.35)
     m.put(kitchen.kitchen_run(3.6, front, stone, splash, 6, uppers=False), 8.4, 0.0, 0, "n")
     m.put(kitchen.fridge(3), 10.4, 1.1, 0, "w")
-    m.put(decor.wall_shelf(1.2, 1.55, kitchen.kitchen_shelf(4)), 10.4, 3.1, 0, "w")
+    m.put(decor.wall_shelf(0.9, 1.55, kitchen.kitchen_shelf(4, 0.9)), 10.4, 3.6, 0, "w")
     m.put(seating.dining_set(1.5, 0.85, f.wood(f.OAK, 4), f.fabric(f.TEAL, 1), 2), 8.5, 2.55)
     m.put(objects.pendant(2.7, 0.6, 0.25, 1), 8.5, 2.55).put(
         objects.ceiling_panel(2.7, 0.9, 0.3, 2.0), 6.6, 1.6

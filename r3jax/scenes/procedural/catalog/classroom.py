@@ -1,6 +1,6 @@
 """The classroom: rows of desks before a blackboard, a cloakroom and a science store."""
 
-from r3jax.scenes.procedural import decor, kitchen, objects, office, storage
+from r3jax.scenes.procedural import decor, kitchen, objects, storage, workplace
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.assemble import assemble
 from r3jax.scenes.procedural.floorplan import Plan
@@ -59,10 +59,14 @@ def _classroom(m: Model) -> None:
     for row in range(3):
         for column in range(3):
             m.put(
-                office.school_desk(row * 3 + column), 3.1 + 1.75 * row, 1.4 + 2.0 * column, 0, 270.0
+                workplace.school_desk(row * 3 + column),
+                3.1 + 1.75 * row,
+                1.4 + 2.0 * column,
+                0,
+                270.0,
             )
     m.put(decor.board("black", 3.2, 1.2, 1.55, 2), 0.0, 3.4, 0, "e").put(
-        office.lectern(f.wood(f.OAK, 13)), 1.25, 1.3, 0, "e"
+        workplace.lectern(f.wood(f.OAK, 13)), 1.25, 1.3, 0, "e"
     )
     m.put(decor.clock(5, 2.5), 0.0, 3.4, 0, "e").put(
         decor.picture("landscape", 150, 1.1, 0.8, 1.7), 0.0, 5.9, 0, "e"
@@ -70,9 +74,9 @@ def _classroom(m: Model) -> None:
     m.put(storage.bookshelf(1.8, 1.3, f.wood(f.PINE, 6), 95), 8.6, 3.3, 0, "w").put(
         storage.bookshelf(1.8, 1.3, f.wood(f.PINE, 6), 97), 8.6, 5.4, 0, "w"
     )
-    m.put(office.globe(5), 8.4, 2.8, 1.3).put(objects.leafy_plant(0.6, 5, 26), 8.4, 5.2, 1.3).put(
-        objects.vase(9), 8.4, 3.8, 1.3
-    )
+    m.put(workplace.globe(5), 8.4, 2.8, 1.3).put(
+        objects.leafy_plant(0.6, 5, 26), 8.4, 5.2, 1.3
+    ).put(objects.vase(9), 8.4, 3.8, 1.3)
     kinds = ("poster", "landscape", "abstract", "poster", "sunset", "abstract", "poster", "poster")
     for k, kind in enumerate(kinds):
         m.put(
@@ -104,7 +108,7 @@ def _side_rooms(m: Model) -> None:
     m.put(storage.bookshelf(2.2, 2.1, f.wood(f.BEECH, 7), 99), 11.4, 5.5, 0, "w").put(
         storage.drawers(1.2, 1.0, 0.45, f.wood(f.PINE, 8), 2, 4), 9.4, 6.8, 0, "s"
     )
-    m.put(office.globe(4), 9.2, 6.55, 1.0).put(
+    m.put(workplace.globe(4), 9.2, 6.55, 1.0).put(
         objects.carton(7, 0.3, 0.22, 0.24), 9.7, 6.55, 1.0
     ).put(decor.wall_shelf(1.2, 1.7, kitchen.kitchen_shelf(3)), 9.5, 6.8, 0, "s")
     m.put(decor.board("white", 1.1, 0.8, 1.55, 12), 8.72, 5.5, 0, "e").put(

@@ -1,6 +1,6 @@
 """The corridor: a long passage with three offices, an archive and a lounge along it."""
 
-from r3jax.scenes.procedural import decor, objects, office, seating, storage
+from r3jax.scenes.procedural import decor, objects, seating, storage, workplace
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.assemble import assemble
 from r3jax.scenes.procedural.catalog.palettes import BERBER, NORDIC, PERSIAN
@@ -8,7 +8,7 @@ from r3jax.scenes.procedural.floorplan import Plan
 from r3jax.scenes.procedural.model import Model
 from r3jax.simulators.world import World
 
-SUMMARY = "corridor with three offices, an archive and a lounge, 110 m2"
+SUMMARY = "corridor with three offices, an archive and a lounge, 118 m2"
 
 
 def _plan() -> Plan:
@@ -34,7 +34,7 @@ def _plan() -> Plan:
         floor = f.plank_floor(f.BEECH, 95, 0.25) if k == 1 else grey
         plan.room(
             f"office {k + 1}",
-            (x0, 2.02, x1, 5.6),
+            (x0, 2.02, x1, 5.4),
             wall=walls[k],
             floor=floor,
             ceiling=ceiling,
@@ -44,7 +44,7 @@ def _plan() -> Plan:
         plan.window(f"office {k + 1}", "n", (x0 + x1) / 2, 2.2, 0.9, 2.2, 51 + k)
     plan.room(
         "archive",
-        (0, -3.9, 6.4, -0.12),
+        (0, -3.4, 6.4, -0.12),
         wall=f.concrete((0.72, 0.71, 0.68), 96),
         floor=f.concrete((0.55, 0.54, 0.52), 97),
         ceiling=ceiling,
@@ -52,7 +52,7 @@ def _plan() -> Plan:
     lines = ((0.72, 0.62, 0.5), (0.5, 0.3, 0.24))
     plan.room(
         "lounge",
-        (6.52, -3.9, 14.0, -0.12),
+        (6.52, -3.4, 14.0, -0.12),
         wall=f.wallpaper((0.84, 0.76, 0.64), lines, "lines", 22),
         floor=f.parquet_floor(f.OAK, 98),
         ceiling=f.plaster((0.92, 0.91, 0.88), 99),
@@ -96,8 +96,8 @@ def _corridor(m: Model) -> None:
 def _offices(m: Model) -> None:
     for k, x0 in enumerate((0.0, 4.72, 9.42)):
         x1 = x0 + 4.58
-        m.put(office.workstation(20 + k, 1.7), x0 + 1.0, 5.6, 0, "s") if k != 1 else m.put(
-            office.desk_island(1, 24), x0 + 2.7, 4.3, 0, 90.0
+        m.put(workplace.workstation(20 + k, 1.7), x0 + 1.0, 5.4, 0, "s") if k != 1 else m.put(
+            workplace.desk_island(1, 24), x0 + 2.7, 4.3, 0, 90.0
         )
         m.put(
             storage.bookshelf(1.5, 2.1, f.wood((f.OAK, f.WALNUT, f.BEECH)[k], 2), 70 + k),
@@ -106,8 +106,8 @@ def _offices(m: Model) -> None:
             0,
             "w",
         )
-        m.put(office.filing_cabinet(k), x1, 4.9, 0, "w").put(
-            decor.radiator(1.4), x0 + 3.0, 5.6, 0, "s"
+        m.put(workplace.filing_cabinet(k), x1, 4.9, 0, "w").put(
+            decor.radiator(1.4), x0 + 3.0, 5.4, 0, "s"
         )
         m.put(decor.board("white", 1.4, 0.9, 1.55, 30 + k), x0, 4.0, 0, "e").put(
             objects.leafy_plant(1.2, 3 + k, 34), x0 + 0.45, 2.5
@@ -120,15 +120,15 @@ def _offices(m: Model) -> None:
 
 def _archive(m: Model) -> None:
     steel = f.enamel((0.5, 0.55, 0.58), 6, 0.25)
-    for k, x in enumerate((1.3, 3.7)):
-        m.put(storage.library_shelf(1.9, 2.1, steel, 80 + 4 * k), x, -2.3, 0, 90.0)
-    m.put(storage.bookshelf(2.4, 2.1, steel, 90), 6.4, -2.2, 0, "w").put(
-        office.filing_cabinet(1), 3.7, -0.12, 0, "s"
-    ).put(office.filing_cabinet(2), 2.8, -0.12, 0, "s")
-    m.put(office.copier(), 0.0, -0.75, 0, "e")
+    for k, x in enumerate((1.5, 4.4)):
+        m.put(storage.library_shelf(1.9, 2.1, steel, 80 + 4 * k, 2.2), x, -2.2, 0, 90.0)
+    m.put(storage.bookshelf(2.4, 2.1, steel, 90, thickness=2.2), 6.4, -1.9, 0, "w").put(
+        workplace.filing_cabinet(1), 3.7, -0.12, 0, "s"
+    ).put(workplace.filing_cabinet(2), 2.8, -0.12, 0, "s")
+    m.put(workplace.copier(), 0.0, -0.65, 0, "e")
     for k in range(3):
-        m.put(objects.carton(k, 0.4, 0.35, 0.32), 0.35, -3.5 + 0.02 * k, 0.32 * k, 10.0 * k)
-    m.put(decor.picture("poster", 140, 0.5, 0.7), 2.5, -3.9, 0, "n").put(
+        m.put(objects.carton(k, 0.4, 0.35, 0.32), 0.35, -3.0 + 0.02 * k, 0.32 * k, 10.0 * k)
+    m.put(decor.picture("poster", 140, 0.5, 0.7), 2.5, -3.4, 0, "n").put(
         objects.ceiling_panel(2.6, 1.2, 0.3, 2.2), 2.5, -2.0
     ).put(objects.ceiling_panel(2.6, 1.2, 0.3, 2.2), 5.2, -1.6)
 
@@ -141,20 +141,20 @@ def _lounge(m: Model) -> None:
     m.put(seating.coffee_table(f.wood(f.WALNUT, 12), 9), 8.1, -2.2, 0, "e").put(
         seating.armchair(f.leather((0.5, 0.3, 0.2), 9), f.fabric(f.CREAM, 4)), 8.2, -0.2, 0, 180.0
     )
-    m.put(office.meeting_table(2.0, 1.0, 3, 2), 12.3, -2.5).put(
+    m.put(workplace.meeting_table(2.0, 1.0, 3, 2), 12.3, -1.9).put(
         objects.pendant(2.6, 0.45, 0.28, 1, 2.4), 12.3, -2.4
     ).put(objects.pendant(2.6, 0.45, 0.28, 2, 2.4), 8.6, -2.0)
     m.put(
         decor.curtains(2.4, 2.4, f.printed(f.CREAM, (f.TERRACOTTA, f.SAGE), "damask", 23)),
         9.0,
-        -3.9,
+        -3.4,
         0,
         "n",
-    ).put(decor.board("white", 1.8, 1.1, 1.5, 35), 14.0, -2.4, 0, "w")
+    ).put(decor.board("white", 1.8, 1.1, 1.5, 35), 14.0, -1.9, 0, "w")
     m.put(decor.picture_group(142, 1.7), 6.52, -2.2, 0, "e").put(
         objects.floor_lamp(0), 6.9, -0.6
-    ).put(objects.leafy_plant(1.5, 2, 44), 7.0, -3.5)
-    m.put(decor.picture("sunset", 147, 1.0, 0.7), 12.3, -3.9, 0, "n").put(
+    ).put(objects.leafy_plant(1.5, 2, 44), 7.0, -2.95)
+    m.put(decor.picture("sunset", 147, 1.0, 0.7), 12.3, -3.4, 0, "n").put(
         storage.sideboard(1.3, f.wood(f.WALNUT, 13), 11), 13.2, -0.12, 0, "s"
     )
 

@@ -1,6 +1,6 @@
 """The gallery: three halls with pictures, sculptures, benches and a large mirror."""
 
-from r3jax.scenes.procedural import decor, objects, office, seating, storage
+from r3jax.scenes.procedural import decor, objects, seating, storage, workplace
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.assemble import assemble
 from r3jax.scenes.procedural.catalog.palettes import CHIPS, PERSIAN
@@ -82,8 +82,8 @@ def _red_hall(m: Model) -> None:
     m.put(storage.sideboard(1.5, f.wood(f.WALNUT, 11), 9), 4.4, 0.0, 0, "n").put(
         objects.leafy_plant(1.4, 2, 40), 0.5, 0.5
     )
-    m.put(office.spotlight_rail(4.4, 3.0, 3), 3.2, 4.7).put(
-        office.spotlight_rail(4.4, 3.0, 3), 3.2, 1.3, 0, 180.0
+    m.put(workplace.spotlight_rail(4.4, 3.0, 3), 3.2, 4.7).put(
+        workplace.spotlight_rail(4.4, 3.0, 3), 3.2, 1.3, 0, 180.0
     )
 
 
@@ -102,8 +102,8 @@ def _white_hall(m: Model) -> None:
         )
         m.put(seating.plinth_sculpture(k + 2, stone), x, y)
     m.put(seating.bench(1.4, f.wood(f.OAK, 10), f.fabric(f.CHARCOAL, 4)), 9.6, 0.6).put(
-        office.spotlight_rail(4.0, 3.0, 3), 9.4, 3.2
-    ).put(office.spotlight_rail(4.0, 3.0, 2), 9.6, 1.2, 0, 180.0)
+        workplace.spotlight_rail(4.0, 3.0, 3), 9.4, 3.2
+    ).put(workplace.spotlight_rail(4.0, 3.0, 2), 9.6, 1.2, 0, 180.0)
 
 
 def _blue_hall(m: Model) -> None:
@@ -123,7 +123,7 @@ def _blue_hall(m: Model) -> None:
     m.put(storage.bookshelf(1.4, 1.2, oak, 61), 11.8, 8.6, 0, "s").put(
         seating.table(1.3, 0.7, oak, 0.8), 8.3, 6.6
     )
-    m.put(objects.vase(4, 0.4), 8.0, 6.6, 0.8).put(office.globe(2), 8.55, 6.65, 0.8).put(
+    m.put(objects.vase(4, 0.4), 8.0, 6.6, 0.8).put(workplace.globe(2), 8.55, 6.65, 0.8).put(
         objects.book_pile(5, 12), 8.3, 6.45, 0.8
     )
     m.put(seating.plinth_sculpture(3, gilt), 7.2, 8.0).put(

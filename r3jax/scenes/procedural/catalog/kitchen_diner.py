@@ -103,4 +103,4 @@ def build() -> World:
     m = _plan().build()
     for furnish in (_cooking, _dining, _pantry):
         furnish(m)
-    return assemble("kitchen", m, (2.75, 2.5, 1.3), 60.0, SUMMARY)
+    return assemble("kitchen", m, (2.3, 2.8, 1.3), 300.0, SUMMARY)

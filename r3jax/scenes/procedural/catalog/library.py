@@ -1,6 +1,6 @@
 """The library: a reading hall with shelves, a study and a foyer."""
 
-from r3jax.scenes.procedural import decor, objects, office, seating, storage
+from r3jax.scenes.procedural import decor, objects, seating, storage, workplace
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.assemble import assemble
 from r3jax.scenes.procedural.catalog.palettes import NORDIC, PERSIAN
@@ -58,7 +58,7 @@ def _plan() -> Plan:
 def _hall(m: Model) -> None:
     wood = f.wood(f.WALNUT, 14)
     for k, x in enumerate((1.5, 3.6, 5.7)):
-        m.put(storage.library_shelf(2.4, 2.0, wood, 200 + 4 * k), x, 1.95, 0, 90.0)
+        m.put(storage.library_shelf(2.4, 2.0, wood, 200 + 4 * k, 1.25), x, 1.95, 0, 90.0)
     for k, y in enumerate((1.2, 3.4)):
         m.put(storage.bookshelf(1.8, 2.4, wood, 220 + k), 0.0, y, 0, "e")
     m.put(storage.bookshelf(2.0, 2.4, wood, 224), 8.2, 7.6, 0, "s")
@@ -84,7 +84,7 @@ def _hall(m: Model) -> None:
         0,
         135.0,
     ).put(decor.rug(1.9, 1.4, PERSIAN, 30), 7.5, 5.2)
-    m.put(objects.floor_lamp(0), 9.25, 4.1).put(office.globe(6), 8.95, 0.4).put(
+    m.put(objects.floor_lamp(0), 9.25, 4.1).put(workplace.globe(6), 8.95, 0.4).put(
         objects.leafy_plant(1.6, 4, 46), 0.5, 7.1
     ).put(objects.leafy_plant(1.3, 2, 40), 9.1, 0.5)
     m.put(decor.picture("landscape", 170, 1.2, 0.8, 1.9), 0.0, 5.8, 0, "e").put(
@@ -117,7 +117,7 @@ def _foyer(m: Model) -> None:
     m.put(seating.bench(1.3, f.wood(f.OAK, 15), f.leather(f.TEAL, 14)), 12.45, 5.0, 0, "w").put(
         storage.drawers(1.0, 0.95, 0.42, f.wood(f.OAK, 15), 2, 4), 9.72, 4.35, 0, "e"
     )
-    m.put(objects.vase(2, 0.36), 9.95, 4.1, 0.95).put(office.globe(8), 9.95, 4.55, 0.95).put(
+    m.put(objects.vase(2, 0.36), 9.95, 4.1, 0.95).put(workplace.globe(8), 9.95, 4.55, 0.95).put(
         decor.picture("poster", 180, 0.7, 0.95, 1.7), 10.6, 3.72, 0, "n"
     )
     m.put(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from r3jax.scenes.procedural import decor, kitchen, objects, office, seating, storage
+from r3jax.scenes.procedural import decor, kitchen, objects, seating, storage, workplace
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.assemble import assemble
 from r3jax.scenes.procedural.catalog.palettes import BERBER, PERSIAN
@@ -137,7 +137,7 @@ def _cook_and_work(m: Model) -> None:
     )
     m.put(storage.drawers(1.0, 0.9, 0.42, f.enamel(f.MUSTARD, 5, 0.3), 2, 3), 8.5, 6.4, 0, "s")
     m.put(objects.vase(6, 0.35), 8.3, 6.2, 0.9).put(objects.clutter(12), 8.7, 6.2, 0.9)
-    m.put(office.globe(3), 8.5, 6.2, 0.9)
+    m.put(workplace.globe(3), 8.5, 6.2, 0.9)
 
 
 def _side_rooms(m: Model) -> None:
@@ -160,4 +160,4 @@ def build() -> World:
     m = _plan().build()
     for furnish in (_structure, _live, _cook_and_work, _side_rooms):
         furnish(m)
-    return assemble("loft", m, (4.0, 3.1, 1.3), 235.0, SUMMARY, ambient=0.68)
+    return assemble("loft", m, (4.0, 3.1, 1.3), 235.0, SUMMARY, ambient=0.74)

@@ -1,6 +1,6 @@
 """The office: desk islands, a meeting room behind glass, a break room and a copy room."""
 
-from r3jax.scenes.procedural import decor, kitchen, objects, office, seating, storage
+from r3jax.scenes.procedural import decor, kitchen, objects, seating, storage, workplace
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.assemble import assemble
 from r3jax.scenes.procedural.catalog.palettes import NORDIC
@@ -52,19 +52,21 @@ def _plan() -> Plan:
 
 def _meeting_room(m: Model) -> None:
     """Glass walls round x = 0 .. 4.2, y = 3.7 .. 6.8, open between x = 2.9 and 4.2."""
-    m.put(office.glass_partition(2.9, 2.8), 1.45, 3.7)
-    m.put(office.glass_partition(3.06, 2.8), 4.24, 5.27, 0, 90.0)
-    m.put(office.meeting_table(1.8, 0.9, 3, 1), 1.7, 5.2)
+    m.put(workplace.glass_partition(2.9, 2.8), 1.45, 3.7)
+    m.put(workplace.glass_partition(3.06, 2.8), 4.24, 5.27, 0, 90.0)
+    m.put(workplace.meeting_table(1.8, 0.9, 3, 1), 1.7, 5.2)
     m.put(decor.board("white", 1.8, 1.1, 1.5, 4), 1.8, 6.8, 0, "s")
     m.put(decor.picture("poster", 10, 0.6, 0.85), 3.4, 6.8, 0, "s")
     m.put(objects.ceiling_panel(2.8), 1.7, 5.2).put(objects.leafy_plant(1.2, 3, 36), 0.4, 6.4)
 
 
 def _desks(m: Model) -> None:
-    m.put(office.desk_island(2, 4), 2.4, 1.75).put(office.desk_island(2, 9), 7.0, 1.75)
-    m.put(office.workstation(15), 6.0, 6.8, 0, "s").put(office.workstation(18), 8.2, 6.8, 0, "s")
+    m.put(workplace.desk_island(2, 4), 2.4, 1.75).put(workplace.desk_island(2, 9), 7.0, 1.75)
+    m.put(workplace.workstation(15), 6.0, 6.8, 0, "s").put(
+        workplace.workstation(18), 8.2, 6.8, 0, "s"
+    )
     m.put(storage.bookshelf(1.2, 1.9, f.wood(f.BEECH, 4), 51), 10.4, 3.35, 0, "w")
-    m.put(office.filing_cabinet(0), 9.6, 6.8, 0, "s").put(decor.clock(4, 2.2), 7.1, 6.8, 0, "s")
+    m.put(workplace.filing_cabinet(0), 9.6, 6.8, 0, "s").put(decor.clock(4, 2.2), 7.1, 6.8, 0, "s")
     m.put(objects.leafy_plant(1.5, 7, 44), 4.75, 1.75 - 1.2).put(
         objects.leafy_plant(1.3, 1, 40), 9.6, 0.5
     )
@@ -86,15 +88,15 @@ def _side_rooms(m: Model) -> None:
     )
     m.put(seating.chair(f.wood(f.BEECH, 3), f.fabric(f.TEAL, 2)), 12.5, 2.0, 0, 10.0)
     m.put(seating.chair(f.wood(f.BEECH, 3), f.fabric(f.MUSTARD, 2)), 12.0, 2.7, 0, -80.0)
-    m.put(office.water_cooler(), 10.52, 2.9, 0, "e").put(
+    m.put(workplace.water_cooler(), 10.52, 2.9, 0, "e").put(
         objects.ceiling_panel(2.6, 0.6, 0.6, 2.1), 11.8, 1.7
     )
     m.put(decor.picture("poster", 13, 0.6, 0.8), 11.4, 3.3, 0, "s").put(
         decor.clock(1), 13.2, 1.4, 0, "w"
     )
-    m.put(office.copier(), 13.2, 4.2, 0, "w").put(office.filing_cabinet(1), 13.2, 5.4, 0, "w").put(
-        office.filing_cabinet(2), 13.2, 6.3, 0, "w"
-    )
+    m.put(workplace.copier(), 13.2, 4.2, 0, "w").put(
+        workplace.filing_cabinet(1), 13.2, 5.4, 0, "w"
+    ).put(workplace.filing_cabinet(2), 13.2, 6.3, 0, "w")
     m.put(storage.bookshelf(1.8, 2.1, f.enamel((0.7, 0.71, 0.72), 5, 0.2), 55), 11.6, 6.8, 0, "s")
     m.put(decor.board("white", 1.2, 0.8, 1.6, 8), 11.7, 3.42, 0, "n").put(
         decor.rug(1.4, 1.0, NORDIC, 16), 11.6, 5.0

@@ -106,7 +106,10 @@ def water_cooler() -> Model:
 
 
 def school_desk(seed: int) -> Model:
-    """A desk for two with chairs, books and pencils; pupils look towards -y. Origin at its middle."""
+    """A desk for two with chairs, books and pencils; origin in its middle.
+
+    The pupils sit on the +y side and look towards -y.
+    """
     model = Model().put(seating.table(1.2, 0.5, f.wood(f.BEECH, seed % 3), 0.72))
     tint = (f.TEAL, f.TERRACOTTA, f.MUSTARD, f.NAVY)[seed % 4]
     for k, x in enumerate((-0.3, 0.3)):
