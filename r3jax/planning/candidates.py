@@ -21,6 +21,8 @@ _JITTER = 0.25
 _NEIGHBORS = 256
 """A region of interest is looked at from one of this many nearest cells."""
 
+_poses_along = jax.jit(jax.vmap(pose_along))  # compiled once per number of candidates
+
 VIEW_DISTANCE = (0.3, 2.0)
 """A region of interest is looked at from between these distances [m] (Active-GS)."""
 
@@ -140,7 +142,7 @@ def random_directions(num: int, *, key: Array) -> np.ndarray:
 
 def poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Roll-free poses at positions [n, 3] that look along directions [n, 3]; [n, 4, 4] float64."""
-    poses = jax.vmap(pose_along)(
+    poses = _poses_along(
         jnp.asarray(positions, dtype=jnp.float32), jnp.asarray(directions, dtype=jnp.float32)
     )
     exact = np.array(poses, dtype=np.float64)
