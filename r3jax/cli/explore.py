@@ -30,6 +30,9 @@ from r3jax.trace.reader import Run, read_run
 from r3jax.trace.writer import RunWriter
 
 DEMO_SCENE = "flat"
+_PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
+"""Text as it is: paths must stay whole for copying."""
+
 _EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
 
 
@@ -158,7 +161,7 @@ def plain_settings(settings: Any) -> Any:
 
 def _conclude(console: Console, path: Path, result: Result) -> None:
     """Data set, report, and a few words; a full disk must not hide how the run ended."""
-    console.print(f"[bold]{result.reason.value}[/]: {result.message}", highlight=False)
+    console.print(f"{result.reason.value}: {result.message}", **_PLAIN)
     if result.state.views == 0:
         return
     try:
@@ -167,17 +170,17 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
             write_data_set(run, result)
             page = write_report(run, result.state.map_state, result.state.grid)
     except (RunError, OSError) as error:
-        console.print(f"the report could not be written: {one_line(error)}", highlight=False)
+        console.print(f"the report could not be written: {one_line(error)}", **_PLAIN)
         return
     last = result.rows[-1]
     console.print(
         f"{len(result.rows)} views, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
         f"{100 * last.coverage.known_share:.0f} % of the box explored, mean renderability "
         f"{last.coverage.mean_renderability:.2f}",
-        highlight=False,
+        **_PLAIN,
     )
-    console.print(f"data set  {path / 'transforms.json'}", highlight=False, soft_wrap=True)
-    console.print(f"report    {page}", highlight=False, soft_wrap=True)
+    console.print(f"data set  {path / 'transforms.json'}", **_PLAIN)
+    console.print(f"report    {page}", **_PLAIN)
 
 
 def write_data_set(run: Run, result: Result) -> None:

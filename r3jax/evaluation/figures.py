@@ -91,11 +91,14 @@ def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
         linewidths=0.8,
         zorder=3,
     )
-    for place, text in ((positions[0], "start"), (positions[-1], "end")):
+    for place, text, offset in (
+        (positions[0], "start", (-34, -16)),
+        (positions[-1], "end", (8, 8)),
+    ):
         axes.annotate(
             text,
             place[:2],
-            xytext=(7, 7),
+            xytext=offset,
             textcoords="offset points",
             fontsize=9,
             fontweight="bold",

@@ -19,6 +19,7 @@ from r3jax.scoring.voxels import voxels_of
 
 _UNKNOWN = (0.86, 0.87, 0.89)
 _FREE = (0.985, 0.985, 0.985)
+_OCCUPIED = (0.68, 0.71, 0.76)
 _HEADROOM = 0.35
 """The floor picture shows what lies below the cameras' height plus this [m]."""
 
@@ -28,8 +29,8 @@ def floor_picture(
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """The place from above, cut open over the cameras' heads.
 
-    Grey is unexplored at the cameras' height, white is free; on top lie the highest voxels
-    below the cut, in their mean colour.
+    Light grey is unexplored at the cameras' height, white is free, dark grey is occupied; on
+    top lie the highest voxels below the cut, in their mean colour.
 
     Args:
         map_state: the voxels.
@@ -45,8 +46,9 @@ def floor_picture(
     layer = int(np.clip((height - origin[2]) / cell, 0, shape[2] - 1))
     voxel = float(map_state.voxel_size)
     scale = max(1, round(cell / voxel))
-    known = ~np.asarray(grid.unexplored)[:, :, layer]
-    picture = np.where(known[..., None], np.asarray(_FREE), np.asarray(_UNKNOWN))
+    picture = np.full((*shape[:2], 3), _UNKNOWN)
+    picture[np.asarray(grid.free)[:, :, layer]] = _FREE
+    picture[np.asarray(grid.occupied)[:, :, layer]] = _OCCUPIED
     picture = picture.repeat(scale, axis=0).repeat(scale, axis=1)  # [x, y, 3]
 
     present = np.asarray(map_state.occupied)

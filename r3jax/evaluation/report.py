@@ -53,7 +53,8 @@ _NOTES = {
     "plan": (
         "Path from above",
         "Dots are views, ticks their viewing directions. The picture shows what lies below the "
-        "cameras' heads in the map's own colours; white is known to be free, grey is unexplored.",
+        "cameras' heads in the map's own colours; white is known to be free, dark grey "
+        "occupied, light grey unexplored at that height.",
     ),
     "progress": (
         "Coverage and renderability",

@@ -1,5 +1,6 @@
 """Settings of the loop. Plain numbers: they go into run.json as they are."""
 
+import math
 from dataclasses import dataclass
 
 from r3jax.exploration.clock import ClockName
@@ -51,10 +52,12 @@ class ExplorationConfig:
     def __post_init__(self) -> None:
         """Refuses what cannot work."""
         for name in ("voxel_size", "cell_size", "max_range", "speed"):
-            if not getattr(self, name) > 0.0:
+            if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("num_probes", "checkpoint_every", "max_still_views"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.capacity < 2 or self.capacity & (self.capacity - 1):
+            raise ValueError(f"capacity must be a power of two >= 2, got {self.capacity}")
         if self.clock not in ("wall", "model"):
             raise ValueError(f"clock must be `wall` or `model`, got {self.clock!r}")

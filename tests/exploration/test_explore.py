@@ -240,7 +240,16 @@ def test_a_start_outside_the_box_is_refused():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"voxel_size": 0.0}, {"speed": -1.0}, {"num_probes": 0}, {"checkpoint_every": 0}]
+    "wrong",
+    [
+        {"voxel_size": 0.0},
+        {"max_range": float("nan")},
+        {"cell_size": float("inf")},
+        {"speed": -1.0},
+        {"num_probes": 0},
+        {"checkpoint_every": 0},
+        {"capacity": 1000},
+    ],
 )
 def test_settings_that_cannot_work_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):

@@ -1,0 +1,193 @@
+"""The command line, as a user meets it: help, mistakes, a run, an interrupt, a recording."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from r3jax.cli.main import main
+from r3jax.exploration.budget import parse_budget
+from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.trace.reader import read_run
+from tests.trace.runs import make_view
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A box room with a pillar, as `mesh:<file>`."""
+    walls = trimesh.creation.box(extents=(4.0, 3.0, 2.4))
+    walls.invert()
+    pillar = trimesh.creation.box(extents=(0.3, 0.3, 2.4))
+    pillar.apply_translation((1.2, 0.6, 0.0))
+    mesh = trimesh.util.concatenate([walls.subdivide().subdivide(), pillar.subdivide()])
+    rng = np.random.default_rng(0)
+    mesh.visual.vertex_colors = rng.integers(0, 256, (len(mesh.vertices), 3), dtype=np.uint8)
+    path = tmp_path_factory.mktemp("mesh") / "room.ply"
+    mesh.export(path)
+    return f"mesh:{path}"
+
+
+def explore(room, out, *words):
+    """A small run; the same shapes as all others here, so that each part compiles once."""
+    options = {"scene": room, "policy": "random", "budget": "views:3", "clock": "model"}
+    options |= {"resolution": 48, "fov": 90, "capacity": 16384, "voxel-size": 0.1}
+    options |= {"out": out, "name": "box"}
+    given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    return main(["explore", *given, *words])
+
+
+@pytest.fixture(scope="module")
+def run_folder(room, tmp_path_factory):
+    """One finished run."""
+    out = tmp_path_factory.mktemp("runs")
+    assert explore(room, out) == 0
+    return out / "box"
+
+
+def test_a_run_leaves_data_set_and_report(run_folder):
+    run = read_run(run_folder)
+    assert run.end is not None
+    assert (run.end.outcome, len(run.rows)) == ("budget", 3)
+    assert run.header.policy["settings"]["num_candidates"] == 100
+    assert len(run.header.scene["hash"]) == 64
+    content = json.loads((run_folder / "transforms.json").read_text())
+    assert len(content["frames"]) == 3
+    cloud = trimesh.load(run_folder / content["ply_file_path"])
+    assert len(cloud.vertices) == run.rows[-1].coverage.voxels
+    assert (run_folder / "report" / "report.html").stat().st_size > 100_000
+    assert [frame.camera.width for frame in run.frames()] == [48] * 3
+
+
+def test_an_existing_run_is_kept(room, run_folder, capsys):
+    before = (run_folder / "trace.jsonl").read_bytes()
+    assert explore(room, run_folder.parent) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert (run_folder / "trace.jsonl").read_bytes() == before
+
+
+def test_the_model_clock_makes_a_run_repeatable(room, run_folder, tmp_path):
+    assert explore(room, tmp_path) == 0
+    again = (tmp_path / "box" / "trace.jsonl").read_bytes()
+    assert again == (run_folder / "trace.jsonl").read_bytes()
+
+
+def test_info_tells_what_a_run_did(run_folder, capsys):
+    assert main(["info", str(run_folder)]) == 0
+    text = capsys.readouterr().out
+    assert "budget: 3 views" in text
+    assert "planning" in text
+    assert "report.html" in text.replace("\n", "")
+
+
+def test_info_lists_what_there_is(capsys):
+    assert main(["info"]) == 0
+    text = capsys.readouterr().out
+    for name in ("flat", "mesh:<file>", "ours-pano", "frontier", "jax", "device"):
+        assert name in text
+
+
+def test_info_follows_a_recording(shared, tmp_path, capsys):
+    plot = tmp_path / "plot.png"
+    folder = shared("recordings", "hololens_lounge")
+    assert main(["info", str(folder), "--voxel-size", "0.1", "--plot", str(plot)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    frames = [line.split() for line in lines if line[:5].strip().isdigit()]
+    assert [int(words[0]) for words in frames] == list(range(48))
+    assert float(frames[0][1]) == 0.0 < float(frames[20][1]) <= 1.0
+    assert plot.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--scene", "castle"], ["unknown scene 'castle'", "flat", "mesh:<file>"]),
+        (["--policy", "oracle"], ["unknown policy 'oracle'", "ours-pano", "frontier"]),
+        (["--budget", "minutes:5"], ["minutes:5", "views:100"]),
+        (["--resolution", "3"], ["--resolution"]),
+        (["--voxel-size", "-1"], ["voxel_size must be positive"]),
+        (["--capacity", "1000"], ["power of two"]),
+        (["--scene", "mesh:/nowhere/house.glb"], ["/nowhere/house.glb"]),
+        (["--scene", "mesh:"], ["mesh:"]),
+        (["--start", "50", "0", "0"], ["50"]),
+    ],
+)
+def test_a_mistake_gets_one_line_and_no_traceback(room, tmp_path, capsys, words, message):
+    assert explore(room, tmp_path, *words) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("r3jax: ")
+    for part in message:
+        assert part in error
+    assert not (tmp_path / "box").exists()
+
+
+def test_a_folder_that_is_neither_run_nor_recording_is_said_so(tmp_path, capsys):
+    assert main(["info", str(tmp_path)]) == 2
+    assert "neither a run" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "nowhere")]) == 2
+    assert "no such folder" in capsys.readouterr().err
+
+
+def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monkeypatch, capsys):
+    real, count = RaycastSimulator.render, iter(range(10))
+
+    def render(self, T_world_camera):
+        if next(count) == 2:
+            raise KeyboardInterrupt
+        return real(self, T_world_camera)
+
+    monkeypatch.setattr(RaycastSimulator, "render", render)
+    assert explore(room, tmp_path) == 130
+    assert "interrupted" in capsys.readouterr().err
+    run = read_run(tmp_path / "box")
+    assert run.end is not None
+    assert (run.end.outcome, len(run.rows)) == ("interrupted", 2)
+    assert "interrupted" in (tmp_path / "box" / "report" / "report.html").read_text()
+
+
+def test_the_demo_overwrites_its_own_folder_only(tmp_path):
+    (tmp_path / "other").mkdir()
+    words = ["demo", "--out", str(tmp_path), "--views", "2", "--resolution", "48"]
+    for _ in range(2):
+        assert main(words) == 0
+    assert len(read_run(tmp_path / "demo").rows) == 2
+    assert (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("words", [["--help"], ["explore", "--help"], ["info", "--help"]])
+def test_help_reads_well_and_waits_for_nothing_heavy(words):
+    program = (
+        "import sys\nfrom r3jax.cli import main\n"
+        f"try:\n    main({words})\nexcept SystemExit as done:\n    assert done.code == 0\n"
+        "heavy = {'matplotlib', 'skimage', 'trimesh', 'orbax', 'scipy'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "--budget" in done.stdout or words[0] != "explore"
+    assert max(len(line) for line in done.stdout.splitlines()) <= 200
+
+
+def test_progress_says_what_is_happening():
+    import io
+
+    from rich.console import Console
+
+    from r3jax.cli.progress import RunProgress
+
+    terminal = Console(file=io.StringIO(), force_terminal=True, width=160)
+    with RunProgress(terminal, parse_budget("views:4")) as progress:
+        progress.on_stage("render")
+        progress.on_step(make_view(0)[0])
+        progress.on_stage("plan")
+        progress._bar.refresh()
+    text = terminal.file.getvalue()
+    assert "view 2/4: planning" in text
+    assert "% explored" in text
+    log = Console(file=io.StringIO(), force_terminal=False)
+    with RunProgress(log, parse_budget("views:1000")) as progress:
+        for step in range(50):
+            progress.on_step(make_view(step)[0])
+    assert 1 <= len(log.file.getvalue().splitlines()) <= 11
