@@ -18,11 +18,31 @@ class ScoringConfig(eqx.Module):
     max_range: Float[Array, ""] = eqx.field(default=5.0, converter=_float32)
     """Nothing farther away counts as visible [m]: the sensor's range."""
 
+    tolerance: Float[Array, ""] = eqx.field(default=2.5, converter=_float32)
+    """A voxel this far behind the depth buffer still counts as visible [voxels]; the slope of
+    the buffer is allowed on top. Voxel centers lie up to 1.7 voxels apart along a ray that
+    crosses a single surface; 2.5 agrees best with ray casting."""
+
     kappa: str = eqx.field(default="box", static=True)
     """`box`: 1 inside the seen directions' box, else 2. `one`: always 1."""
 
-    downscale: int = eqx.field(default=4, static=True)
-    """The pinhole z-buffer has 1/downscale of the camera's width and height."""
+    delta: str = eqx.field(default="trace", static=True)
+    """`trace`: the paper's Algorithm 2. `pairwise`: its text, 1 - 2 tr(M) / (n - 1)."""
+
+    zbuffer_size: int = eqx.field(default=128, static=True)
+    """Longest side of the pinhole depth buffer [px]; never more than the image's."""
+
+    panorama_size: int = eqx.field(default=256, static=True)
+    """Side of the octahedral depth buffer round a position [px]; a power of two."""
 
     panorama_bins: int = eqx.field(default=526, static=True)
     """Directions of the panorama; 526 are 10 degrees apart."""
+
+    def __check_init__(self) -> None:
+        """Refuses settings that no formula knows."""
+        if self.kappa not in ("box", "one"):
+            raise ValueError(f"kappa must be 'box' or 'one', got {self.kappa!r}")
+        if self.delta not in ("trace", "pairwise"):
+            raise ValueError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
+        if self.panorama_size < 2 or self.panorama_size & (self.panorama_size - 1):
+            raise ValueError(f"panorama_size must be a power of two, got {self.panorama_size}")

@@ -1,0 +1,93 @@
+"""What renders badly: 1 - R of the visible voxels, summed by direction.
+
+Only visible voxels, a tenth of a map as a rule, are worth the arithmetic of R. They are gathered
+and scored in chunks, so that the cost follows the view and not the capacity of the table.
+
+Shape symbols: n voxels; B bins of the panorama.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from r3jax.geometry.numerics import safe_norm
+from r3jax.geometry.sphere import nearest_bin
+from r3jax.mapping.compact import positions_of_set
+from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.voxels import Voxels
+
+CHUNK = 1 << 12
+"""Visible voxels that are scored at once."""
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
+def lack_by_direction(
+    voxels: Voxels,
+    visible: Bool[Array, " n"],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    kappa: str,
+    num_bins: int,
+) -> Float[Array, " B"]:
+    """Sum of (1 - R) over the visible voxels in each direction bin round a position.
+
+    Differentiable with respect to everything but the choice of voxels and bins.
+
+    Args:
+        voxels: what is known.
+        visible: which of them count.
+        position: camera center [m].
+        focal: focal length [px].
+        kappa: as in `ScoringConfig`.
+        num_bins: bins of the Fibonacci lattice; 1 sums over all directions.
+    """
+    num = visible.shape[0]
+    size = min(CHUNK, num)
+    order = positions_of_set(visible, -(-num // size) * size)
+    num_visible = jnp.sum(visible, dtype=jnp.int32)
+
+    def add_chunk(carry):
+        first, total = carry
+        index = jax.lax.dynamic_slice_in_dim(order, first, size)
+        seen = voxels.take(jnp.minimum(index, num - 1), index < num)
+        return first + size, total + _lack(seen, seen.present, position, focal, kappa, num_bins)
+
+    start = (jnp.zeros((), jnp.int32), jnp.zeros(num_bins, dtype=jnp.float32))
+    return jax.lax.while_loop(lambda c: c[0] < num_visible, add_chunk, start)[1]
+
+
+@lack_by_direction.defjvp
+def _lack_by_direction_jvp(kappa, num_bins, primals, tangents):
+    # A loop of unknown length has no reverse mode; the dense form has, and gives the same sums.
+    dense = functools.partial(_lack, kappa=kappa, num_bins=num_bins)
+    return jax.jvp(dense, primals, tangents)
+
+
+def _lack(
+    voxels: Voxels,
+    visible: Bool[Array, " n"],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    kappa: str,
+    num_bins: int,
+) -> Float[Array, " B"]:
+    lack = 1.0 - score_voxels(voxels, position, focal, kappa).value
+    lack = jnp.where(visible & voxels.present, lack, 0.0)
+    if num_bins == 1:
+        return jnp.sum(lack, keepdims=True)
+    return sum_by_direction(voxels.center, lack, position, num_bins)
+
+
+def sum_by_direction(
+    points: Float[Array, "3 n"],
+    weight: Float[Array, " n"],
+    position: Float[Array, " 3"],
+    num_bins: int,
+) -> Float[Array, " B"]:
+    """Sums weights into the direction bins in which points lie, seen from a position."""
+    offset = jax.lax.stop_gradient(points - position[:, None])
+    direction = offset / jnp.maximum(safe_norm(offset, axis=0), 1e-6)[None, :]
+    bins = nearest_bin(direction, num_bins)
+    return jnp.zeros(num_bins, dtype=jnp.float32).at[bins].add(weight)

@@ -1,0 +1,98 @@
+"""The panorama of a position: every direction's worth at once, and the best one.
+
+Shape symbols: B bins of the panorama.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.scoring.cells import unexplored_cells
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.lack import lack_by_direction, sum_by_direction
+from r3jax.scoring.visibility import is_visible, panorama_buffer, place_panorama
+from r3jax.scoring.voxels import Voxels, voxels_of
+
+
+class Panorama(eqx.Module):
+    """Scores of all directions from one position."""
+
+    bin_scores: Float[Array, " B"]
+    """Per bin: the sum of lambda1 over its visible unexplored cells and of (1 - R) over its
+    visible voxels."""
+
+    direction_scores: Float[Array, " B"]
+    """Per camera axis q_k: the sum of the bins inside the camera's field of view."""
+
+    best_direction: Float[Array, " 3"]
+    """The axis with the largest score, unit length."""
+
+    best_score: Float[Array, ""]
+    """Its score: lambda1 U_G + U_R of that view, to the resolution of the bins."""
+
+    T_world_camera: Float[Array, "4 4"]
+    """The roll-free pose at the position that looks along the best direction."""
+
+
+@jax.jit
+def panorama(
+    state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    position: Float[Array, " 3"],
+    config: ScoringConfig | None = None,
+) -> Panorama:
+    """Scores every direction from one position with one depth buffer (arXiv 2601.07484).
+
+    Args:
+        state: the map.
+        grid: the coarse grid.
+        camera: whose field of view and focal length count.
+        position: camera center [m]. `jax.vmap` over many, or use
+            `scoring.batch.score_positions`.
+        config: settings.
+    """
+    config = ScoringConfig() if config is None else config
+    return panorama_of(voxels_of(state, config.delta), grid, camera, position, config)
+
+
+def panorama_of(
+    voxels: Voxels,
+    grid: OccupancyGrid,
+    camera: Camera,
+    position: Float[Array, " 3"],
+    config: ScoringConfig,
+) -> Panorama:
+    """`panorama` of voxels that are already at hand."""
+    num_bins, size = config.panorama_bins, config.panorama_size
+    still = jax.lax.stop_gradient(position)
+    buffer = panorama_buffer(voxels, still, config)
+    place = place_panorama(voxels.center, voxels.present, still, size, config.max_range)
+    visible = is_visible(place, buffer)
+    lack = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, num_bins)
+    cells, unexplored = unexplored_cells(grid)
+    place = place_panorama(cells, unexplored, still, size, config.max_range)
+    seen = is_visible(place, buffer, strict=True).astype(jnp.float32)
+    bins = lack + config.lambda1 * sum_by_direction(cells, seen, still, num_bins)
+    directions = bins_in_view(camera, num_bins) @ bins
+    best = jnp.argmax(directions)
+    axis = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)[best]
+    return Panorama(bins, directions, axis, directions[best], pose_along(position, axis))
+
+
+def bins_in_view(camera: Camera, num_bins: int) -> Float[Array, "B B"]:
+    """1 where bin j lies in the roll-free, rectangular field of view with axis q_k: N(k)."""
+    lattice = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)
+    R = jax.vmap(lambda q: pose_along(jnp.zeros(3, dtype=jnp.float32), q)[:3, :3])(lattice)
+    x, y, z = jnp.einsum("kij,bi->jkb", R, lattice)
+    is_ahead = z > 1e-6
+    z_safe = jnp.where(is_ahead, z, 1.0)
+    column = camera.fx * x / z_safe + camera.cx
+    row = camera.fy * y / z_safe + camera.cy
+    is_in = (column >= 0.0) & (column < camera.width) & (row >= 0.0) & (row < camera.height)
+    return (is_ahead & is_in).astype(jnp.float32)

@@ -1,0 +1,145 @@
+"""Renderability: how well a voxel, and so a view, could be rendered; in closed form.
+
+    R = bias x noise x resolution        (arXiv 2601.07484)
+
+Shape symbols: n voxels; N capacity of the map; h w size of the depth buffer.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r3jax.geometry.cameras import Camera
+from r3jax.geometry.numerics import safe_norm, safe_power
+from r3jax.mapping.state import MapState
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.directions import seen_directions
+from r3jax.scoring.visibility import pinhole_buffer
+from r3jax.scoring.voxels import Voxels, voxels_of
+
+
+class Renderability(eqx.Module):
+    """The terms of one query, per voxel."""
+
+    kappa: Float[Array, " n"]
+    """1 between the seen directions, 2 outside their box."""
+
+    bias: Float[Array, " n"]
+    """b = cos(theta)^kappa, theta the angle to the nearest seen direction."""
+
+    delta: Float[Array, " n"]
+    """Color consistency of the observations."""
+
+    noise: Float[Array, " n"]
+    """eps = delta^(kappa (1 - b)): noise hurts where the view must interpolate."""
+
+    resolution: Float[Array, " n"]
+    """gamma = min(1, rho_max / rho)^(1 - delta b), rho = focal / distance."""
+
+    value: Float[Array, " n"]
+    """R = b eps gamma, in [0, 1]; 0 for voxels never seen."""
+
+
+def score_voxels(
+    voxels: Voxels,
+    camera_position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    kappa: str = "box",
+) -> Renderability:
+    """The terms of every voxel as seen from one camera position.
+
+    Args:
+        voxels: what is known of them.
+        camera_position: center of the camera that asks [m].
+        focal: its focal length [px], in the unit used when the map was made.
+        kappa: `box`, or `one` to leave the box test out.
+    """
+    offset = camera_position[:, None] - voxels.center
+    distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
+    direction = offset / distance[None, :]
+    cosine, inside = seen_directions(voxels.visited, direction, voxels.num_bins)
+    is_one = (inside > 0.0) | (kappa == "one")
+    kappa_value = jnp.where(is_one, 1.0, 2.0)
+    bias = jnp.where(is_one, cosine, cosine * cosine)
+    noise = safe_power(voxels.delta, kappa_value * (1.0 - bias))
+    ratio = jnp.minimum(voxels.resolution * distance / focal, 1.0)
+    resolution = safe_power(ratio, 1.0 - voxels.delta * bias)
+    blank = lambda term: jnp.where(voxels.present, term, 0.0)
+    return Renderability(
+        kappa=kappa_value,
+        bias=blank(bias),
+        delta=voxels.delta,
+        noise=blank(noise),
+        resolution=blank(resolution),
+        value=blank(bias * noise * resolution),
+    )
+
+
+@functools.partial(jax.jit, static_argnames="kappa")
+def _voxel_renderability(state, camera_position, focal, kappa):
+    return score_voxels(voxels_of(state), camera_position, focal, kappa)
+
+
+def voxel_renderability(
+    state: MapState,
+    camera_position: Float[Array, " 3"],
+    focal: float | Float[Array, ""] = 1.0,
+    kappa: str = "box",
+) -> Renderability:
+    """The terms of every row of the map, as seen from one camera position; no occlusion.
+
+    Args:
+        state: the map.
+        camera_position: [m], world.
+        focal: focal length of the camera that asks [px].
+        kappa: `box`, or `one` to leave the box test out.
+
+    Returns:
+        The terms, each of shape [capacity]; `value` is 0 for rows never seen.
+    """
+    position = jnp.asarray(camera_position, dtype=jnp.float32)
+    return _voxel_renderability(state, position, jnp.asarray(focal, dtype=jnp.float32), kappa)
+
+
+@jax.jit
+def renderability_image(
+    state: MapState,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+) -> Float[Array, "h w"]:
+    """R of the voxel that each pixel of one view sees; 0 where it sees none.
+
+    The image is a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or
+    high, with the camera's field of view. Differentiable with respect to the pose: which voxel
+    a pixel sees is held fixed, its R varies.
+    """
+    config = ScoringConfig() if config is None else config
+    voxels = voxels_of(state, config.delta)
+    buffer = pinhole_buffer(voxels, camera, jax.lax.stop_gradient(T_world_camera), config)
+    shape = buffer.item.shape
+    item = buffer.item.reshape(-1)
+    is_hit = item < voxels.present.shape[0]
+    seen = voxels.take(jnp.where(is_hit, item, 0), is_hit)
+    value = score_voxels(seen, T_world_camera[:3, 3], camera.focal, config.kappa).value
+    return value.reshape(shape)
+
+
+@jax.jit
+def renderability(
+    state: MapState,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+) -> Float[Array, ""]:
+    """How well one view could be rendered: the mean of `renderability_image`, in [0, 1].
+
+    Written for one pose; `jax.vmap` it over many:
+
+        score = functools.partial(r3jax.renderability, map_state, camera)
+        jax.vmap(score)(candidates)
+    """
+    return jnp.mean(renderability_image(state, camera, T_world_camera, config))

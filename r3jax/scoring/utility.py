@@ -1,0 +1,67 @@
+"""U_G, U_R and their sum: what one view would explore and how badly it would render now."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.scoring.cells import unexplored_cells
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.lack import lack_by_direction
+from r3jax.scoring.visibility import is_visible, pinhole_buffer, place_pinhole, reduced_camera
+from r3jax.scoring.voxels import Voxels, voxels_of
+
+
+class ViewUtility(eqx.Module):
+    """What a view promises, before the way to it is paid for."""
+
+    exploration: Float[Array, ""]
+    """U_G: visible unexplored cells."""
+
+    rendering: Float[Array, ""]
+    """U_R: sum of (1 - R) over the visible voxels. A sum: a mean would pick close-ups."""
+
+    total: Float[Array, ""]
+    """lambda1 U_G + U_R."""
+
+
+@jax.jit
+def view_utility(
+    state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+) -> ViewUtility:
+    """U_G and U_R of one view (arXiv 2601.07484).
+
+    Visible means in the field of view, not hidden by voxels, and within `config.max_range`.
+    Written for one pose; `jax.vmap` it over many, or use `scoring.batch.score_views`.
+    """
+    config = ScoringConfig() if config is None else config
+    voxels = voxels_of(state, config.delta)
+    return utility_of_view(voxels, grid, camera, T_world_camera, config)
+
+
+def utility_of_view(
+    voxels: Voxels,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+) -> ViewUtility:
+    """`view_utility` of voxels that are already at hand."""
+    pose = jax.lax.stop_gradient(T_world_camera)
+    small = reduced_camera(camera, config)
+    buffer = pinhole_buffer(voxels, camera, pose, config)
+    place = place_pinhole(voxels.center, voxels.present, small, pose, config.max_range)
+    visible = is_visible(place, buffer)
+    position = T_world_camera[:3, 3]
+    lack = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, 1)[0]
+    cells, unexplored = unexplored_cells(grid)
+    place = place_pinhole(cells, unexplored, small, pose, config.max_range)
+    exploration = jnp.sum(is_visible(place, buffer, strict=True), dtype=jnp.float32)
+    return ViewUtility(exploration, lack, config.lambda1 * exploration + lack)
