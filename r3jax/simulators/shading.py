@@ -28,7 +28,7 @@ from r3jax.simulators.rays import Hits
 from r3jax.simulators.textures import MAX_LEVELS, build_atlas, round_up
 from r3jax.simulators.world import World
 
-CHUNK = 1 << 16
+CHUNK = 1 << 15
 """Rays per call of the kernel."""
 
 PROBES = 2
@@ -62,7 +62,7 @@ class Surface(eqx.Module):
     """First texel of each level."""
 
     lamps: Float[Array, "L 7"]
-    """Position (3), colour (3), reach."""
+    """Position (3), colour (3), reach; black ones fill up to a multiple of 8."""
 
     ambient: Float[Array, ""]
     """Share of the surface colour that shows without any lamp."""
@@ -116,6 +116,8 @@ def build_surface(world: World, *, lighting: bool) -> Surface:
     colors = world.face_color
     corner_colors = np.ones((1, 9)) if colors is None else _padded(colors.reshape(-1, 9))
     lamps = [(*lamp.position, *lamp.color, lamp.reach) for lamp in world.lamps if lighting]
+    # Dark lamps fill up the table, so that worlds share compiled kernels.
+    lamps += [(0.0,) * 6 + (1.0,)] * (-len(lamps) % 8)
     as_float = lambda x: jnp.asarray(np.asarray(x, dtype=np.float32))
     return Surface(
         faces=as_float(_padded(faces)),
@@ -179,8 +181,8 @@ def _face_table(world: World, material_size: np.ndarray) -> np.ndarray:
     )
 
 
-def _dot(a: Array, b: Array) -> Float[Array, " n"]:
-    """Scalar products of the columns of two [3, n] arrays."""
+def _dot(a: Array | list[Array], b: Array | list[Array]) -> Array:
+    """Scalar products of vectors whose three components are the rows of `a` and `b`."""
     # Written out: XLA's reductions over such a short axis are many times slower on a CPU.
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -289,19 +291,24 @@ def _lit(
     view = unit(-rays.direction.T)
     facing = jnp.where((_dot(normal, view) < 0.0)[None, :], -normal, normal)
     position = rays.origin.T + distance[None, :] * rays.direction.T
+    # All that is per ray is worked out once, not once per lamp.
+    view, facing, position = jax.lax.optimization_barrier((view, facing, position))
+    per_lamp = lambda x: [row[None, :] for row in x]  # [1, n] each, against [L, 1]
+    view_of, facing_of = per_lamp(view), per_lamp(facing)
+    offset = [surface.lamps[:, k, None] - position[None, k] for k in range(3)]
+    squared = _dot(offset, offset)
+    fall = 1.0 / (1.0 + squared / surface.lamps[:, 6, None] ** 2)
+    scale = jax.lax.rsqrt(jnp.maximum(squared, 1e-12))
+    to_lamp = [x * scale for x in offset]
+    incidence = _dot(facing_of, to_lamp)
+    half = [x + y for x, y in zip(to_lamp, view_of, strict=True)]
+    cosine = _dot(facing_of, half) * jax.lax.rsqrt(jnp.maximum(_dot(half, half), 1e-12))
     specular, shininess, emission = look[3], look[4], look[5]
-    diffuse = jnp.zeros_like(albedo)
-    highlight = jnp.zeros_like(albedo)
-    for lamp in surface.lamps:
-        to_lamp = lamp[:3, None] - position
-        fall = 1.0 / (1.0 + _dot(to_lamp, to_lamp) / lamp[6] ** 2)
-        light = lamp[3:6, None] * fall[None, :]
-        to_lamp = unit(to_lamp)
-        incidence = _dot(facing, to_lamp)
-        gloss = jnp.maximum(_dot(facing, unit(to_lamp + view)), 1e-6) ** shininess
-        gloss = jnp.where(incidence > 0.0, gloss, 0.0)
-        diffuse = diffuse + light * jnp.maximum(incidence, 0.0)[None, :]
-        highlight = highlight + light * gloss[None, :]
+    gloss = jnp.exp2(shininess[None, :] * jnp.log2(jnp.maximum(cosine, 1e-6)))
+    gloss = jnp.where(incidence > 0.0, gloss, 0.0)
+    colors = surface.lamps[:, 3:6].T  # [3, L]
+    diffuse = colors @ (fall * jnp.maximum(incidence, 0.0))
+    highlight = colors @ (fall * gloss)
     received = surface.ambient + (1.0 - surface.ambient) * diffuse
     lit = emission[None, :] + (1.0 - emission)[None, :] * received
     return albedo * lit + specular[None, :] * highlight
