@@ -104,6 +104,8 @@ def test_the_way_to_the_next_room_leads_through_the_door():
     assert np.all((in_door[:, 0] >= 5) & (in_door[:, 0] <= 7))
     length = np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum()
     assert np.linalg.norm(goal - start) < length <= travel.lengths(goal[None])[0] + 1e-9
+    over_centers = travel.distance((21, 3, 3)) + np.linalg.norm(goal - center(21, 3, 3))
+    assert travel.lengths(goal[None])[0] == pytest.approx(over_centers)
     assert len(waypoints) <= 6
 
 
@@ -193,6 +195,11 @@ def test_a_robot_that_finds_itself_shut_in_may_go_back():
     back = plan_travel(grid_of(free, occupied), start, trail=trail)
     assert back.reachable[9, 6, 4]
     assert_inside(back.safe | trail, back.path(center(5, 6, 4)))
+    # What turned out to be occupied stays shut, trail or not.
+    blocked = trail & (np.arange(25) == 11)[:, None, None]
+    assert (
+        not plan_travel(grid_of(free, occupied | blocked), start, trail=trail).reachable[10].any()
+    )
     # From a safe cell the trail opens nothing.
     outside = plan_travel(grid_of(free, occupied), center(9, 6, 4), trail=trail)
     np.testing.assert_array_equal(outside.usable, outside.safe)
