@@ -54,6 +54,16 @@ def build(name: str) -> World:
     return _scene(name).build()
 
 
+def rooms(name: str) -> dict[str, tuple[float, float, float, float]]:
+    """The rooms of the scene of that name: free rectangles (x0, y0, x1, y1) [m].
+
+    Raises:
+        ValueError: no scene has that name.
+    """
+    drawn = _scene(name).plan()
+    return {key: (r.x0, r.y0, r.x1, r.y1) for key, r in drawn.rooms.items()}
+
+
 def describe(name: str) -> str:
     """One line about the scene of that name.
 

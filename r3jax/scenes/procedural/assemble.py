@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from r3jax.scenes.procedural.model import Finish, Model
+from r3jax.scenes.procedural.noise import Real
 from r3jax.simulators.world import Lamp, Material, World
 
 _VOXEL = 0.1  # [m]
@@ -20,10 +21,10 @@ _VOXEL = 0.1  # [m]
 def assemble(
     name: str,
     model: Model,
-    start: tuple[float, float, float],
-    yaw_deg: float,
+    start: tuple[Real, Real, Real],
+    yaw_deg: Real,
     description: str,
-    ambient: float = 0.78,
+    ambient: Real = 0.78,
 ) -> World:
     """The world of a furnished model.
 
@@ -93,7 +94,7 @@ def ambient_occlusion(corners: np.ndarray) -> np.ndarray:
     """
     origin = corners.min(axis=(0, 1)) - 3 * _VOXEL
     size = np.ceil((corners.max(axis=(0, 1)) - origin) / _VOXEL).astype(int) + 4
-    filled = _splat(corners, origin, tuple(int(n) for n in size))
+    filled = _splat(corners, origin, size)
     edge_a, edge_b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(edge_a, edge_b)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -110,7 +111,7 @@ def ambient_occlusion(corners: np.ndarray) -> np.ndarray:
     return np.clip(light, 0.4, 1.0)
 
 
-def _splat(corners: np.ndarray, origin: np.ndarray, size: tuple[int, int, int]) -> np.ndarray:
+def _splat(corners: np.ndarray, origin: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Voxels that any surface touches, [X, Y, Z] float32 of 0 and 1."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.linalg.norm(normal, axis=1)
@@ -125,6 +126,6 @@ def _splat(corners: np.ndarray, origin: np.ndarray, size: tuple[int, int, int]) 
     start, edges = scaled[:, 0], scaled[:, 1:] - scaled[:, :1]
     points = start[face] + a[:, None] * edges[face, 0] + b[:, None] * edges[face, 1]
     index = points.astype(int)
-    filled = np.zeros(size, dtype=np.float32)
+    filled = np.zeros(tuple(size), dtype=np.float32)
     filled[index[:, 0], index[:, 1], index[:, 2]] = 1.0
     return filled

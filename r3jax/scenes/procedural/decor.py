@@ -7,11 +7,12 @@ import numpy as np
 
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.model import Finish, Model
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import box, combine, curtain, cylinder, disc, panel, quad, tube
 
 
 def picture(
-    kind: str, seed: int, width: float, height: float, z: float = 1.55, frame: Finish | None = None
+    kind: str, seed: int, width: Real, height: Real, z: Real = 1.55, frame: Finish | None = None
 ) -> Model:
     """A framed picture, its middle at height z."""
     finish = frame or f.wood(f.EBONY, 1)
@@ -26,7 +27,7 @@ def picture(
     return model.add(panel(0, z - h, width, height, 0.015), f.picture(kind, seed, width > height))
 
 
-def wall_mirror(width: float, height: float, z: float, frame: Finish | None = None) -> Model:
+def wall_mirror(width: Real, height: Real, z: Real, frame: Finish | None = None) -> Model:
     """A framed mirror, its middle at height z."""
     finish = frame or f.wood(f.WALNUT, 2)
     w, h = width / 2, height / 2
@@ -34,7 +35,7 @@ def wall_mirror(width: float, height: float, z: float, frame: Finish | None = No
     return model.add(panel(0, z - h, width, height, 0.028), f.mirror())
 
 
-def curtains(width: float, top: float, finish: Finish, bottom: float = 0.04) -> Model:
+def curtains(width: Real, top: Real, finish: Finish, bottom: Real = 0.04) -> Model:
     """A pair of open curtains on a rail for a window of the given width."""
     model = Model()
     rail = tube([(-width / 2 - 0.45, 0.1, top), (width / 2 + 0.45, 0.1, top)], 0.015, 8)
@@ -45,7 +46,7 @@ def curtains(width: float, top: float, finish: Finish, bottom: float = 0.04) -> 
     return model
 
 
-def radiator(width: float = 1.0, height: float = 0.55) -> Model:
+def radiator(width: Real = 1.0, height: Real = 0.55) -> Model:
     """A column radiator with its valve and pipe."""
     white, count = f.enamel(f.WHITE, 4, 0.3), max(3, round(width / 0.07))
     columns = [
@@ -61,21 +62,21 @@ def radiator(width: float = 1.0, height: float = 0.55) -> Model:
     return model.add(pipe, f.metal((0.72, 0.5, 0.36), 2))
 
 
-def rug(width: float, depth: float, palette, seed: int) -> Model:
+def rug(width: Real, depth: Real, palette, seed: int) -> Model:
     """A rug, origin in its middle."""
     sheet = quad((-width / 2, -depth / 2, 0.012), (width, 0, 0), (0, depth, 0), 0.3)
     rim = box((-width / 2, -depth / 2, 0.001), (width / 2, depth / 2, 0.0115))
     return Model().add(sheet, f.rug(palette, seed)).add(rim, f.fabric(palette[0], 1))
 
 
-def clock(seed: int, z: float = 2.0, radius: float = 0.17) -> Model:
+def clock(seed: int, z: Real = 2.0, radius: Real = 0.17) -> Model:
     """A round wall clock, its middle at height z."""
     case = cylinder(radius, 0.0, 0.035, 24).turned(-90.0, "x").moved(z=z)
     model = Model().add(case, f.enamel(f.CHARCOAL, 1))
     return model.add(disc(0.92 * radius, 0.037).moved(z=z), f.clock_face(seed))
 
 
-def board(kind: str, width: float, height: float, z: float, seed: int) -> Model:
+def board(kind: str, width: Real, height: Real, z: Real, seed: int) -> Model:
     """A framed "white" or "black" board with a tray, its middle at height z."""
     w, h = width / 2, height / 2
     frame = f.metal((0.75, 0.75, 0.76), 1) if kind == "white" else f.wood(f.OAK, 1)
@@ -84,7 +85,7 @@ def board(kind: str, width: float, height: float, z: float, seed: int) -> Model:
     return model.add(box((-0.6 * w, 0.02, z - h - 0.03), (0.6 * w, 0.1, z - h - 0.01)), frame)
 
 
-def picture_group(seed: int, z: float = 1.6) -> Model:
+def picture_group(seed: int, z: Real = 1.6) -> Model:
     """Five small pictures hung as a cloud, about 1.7 m wide."""
     model = Model()
     kinds = ("poster", "landscape", "abstract", "sunset", "abstract")
@@ -101,7 +102,7 @@ def picture_group(seed: int, z: float = 1.6) -> Model:
     return model
 
 
-def wall_shelf(width: float, z: float, things: list[Model]) -> Model:
+def wall_shelf(width: Real, z: Real, things: list[Model]) -> Model:
     """A board on brackets with things spread over it."""
     model = Model().add(box((-width / 2, 0, z - 0.03), (width / 2, 0.24, z)), f.wood(f.OAK, 2))
     for x in (-width / 2 + 0.15, width / 2 - 0.15):

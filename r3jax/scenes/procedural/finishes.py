@@ -7,6 +7,7 @@ import functools
 
 from r3jax.scenes.procedural import patterns, pictures, screens, textures
 from r3jax.scenes.procedural.model import Finish
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.textures import Color
 from r3jax.simulators.world import Material
 
@@ -34,7 +35,7 @@ WHITE, CREAM, CHARCOAL, SAGE, NAVY, TERRACOTTA, MUSTARD, BLUSH, TEAL = (
 
 
 @functools.cache
-def plaster(color: Color, seed: int, strength: float = 1.0) -> Finish:
+def plaster(color: Color, seed: int, strength: Real = 1.0) -> Finish:
     """Painted plaster on walls and ceilings."""
     return Finish(Material(textures.plaster(color, seed, strength)), (2.4, 2.4))
 
@@ -64,14 +65,14 @@ def acoustic_ceiling(seed: int) -> Finish:
 
 
 @functools.cache
-def wood(color: Color, seed: int = 0, gloss: float = 0.15) -> Finish:
+def wood(color: Color, seed: int = 0, gloss: Real = 0.15) -> Finish:
     """Oiled or lacquered furniture wood."""
     material = Material(textures.wood(color, seed), specular=gloss, shininess=24.0)
     return Finish(material, (1.1, 0.8))
 
 
 @functools.cache
-def plank_floor(color: Color, seed: int, gloss: float = 0.2, rows: int = 14) -> Finish:
+def plank_floor(color: Color, seed: int, gloss: Real = 0.2, rows: int = 14) -> Finish:
     """A floor of boards; glossy ones mirror a little."""
     material = Material(
         textures.planks(color, seed, rows), specular=gloss, shininess=40.0, mirror=0.18 * gloss
@@ -80,7 +81,7 @@ def plank_floor(color: Color, seed: int, gloss: float = 0.2, rows: int = 14) -> 
 
 
 @functools.cache
-def parquet_floor(color: Color, seed: int, gloss: float = 0.3) -> Finish:
+def parquet_floor(color: Color, seed: int, gloss: Real = 0.3) -> Finish:
     """Basket-weave parquet."""
     material = Material(
         textures.parquet(color, seed), specular=gloss, shininess=48.0, mirror=0.25 * gloss
@@ -94,9 +95,9 @@ def tiled(
     seed: int,
     columns: int = 6,
     rows: int = 6,
-    edge: float = 0.3,
-    bond: float = 0.0,
-    mirror: float = 0.05,
+    edge: Real = 0.3,
+    bond: Real = 0.0,
+    mirror: Real = 0.05,
 ) -> Finish:
     """Glazed tiles; `edge` is the height of one [m], the width follows from the counts."""
     texture = textures.tiles(colors, seed, columns, rows, bond=bond)
@@ -105,7 +106,7 @@ def tiled(
 
 
 @functools.cache
-def marble(color: Color, vein: Color, seed: int, mirror: float = 0.08) -> Finish:
+def marble(color: Color, vein: Color, seed: int, mirror: Real = 0.08) -> Finish:
     """Polished stone."""
     texture = textures.marble(color, vein, seed)
     return Finish(Material(texture, specular=0.5, shininess=80.0, mirror=mirror), (1.8, 1.8))
@@ -119,14 +120,14 @@ def terrazzo(color: Color, chips: tuple[Color, ...], seed: int) -> Finish:
 
 
 @functools.cache
-def metal(color: Color = (0.68, 0.69, 0.7), seed: int = 0, mirror: float = 0.15) -> Finish:
+def metal(color: Color = (0.68, 0.69, 0.7), seed: int = 0, mirror: Real = 0.15) -> Finish:
     """Brushed metal."""
     texture = textures.metal(color, seed)
     return Finish(Material(texture, specular=0.7, shininess=50.0, mirror=mirror), (0.9, 0.9))
 
 
 @functools.cache
-def enamel(color: Color, seed: int = 0, gloss: float = 0.4) -> Finish:
+def enamel(color: Color, seed: int = 0, gloss: Real = 0.4) -> Finish:
     """Lacquer, ceramic, plastic."""
     texture = textures.enamel(color, seed)
     return Finish(
@@ -183,7 +184,7 @@ def leaf(color: Color, seed: int = 0) -> Finish:
 
 
 @functools.cache
-def glow(color: Color, seed: int = 0, emission: float = 0.95) -> Finish:
+def glow(color: Color, seed: int = 0, emission: Real = 0.95) -> Finish:
     """A lamp shade or diffuser that shines by itself."""
     return Finish(Material(patterns.fabric(color, seed, 64), emission=emission), (0.5, 0.5))
 
@@ -221,7 +222,7 @@ def frosted(seed: int = 6) -> Finish:
     return Finish(Material(texture, specular=0.4, shininess=60.0, mirror=0.08), (0.9, 0.9))
 
 
-def _flat(texture, gloss: float = 0.15, emission: float = 0.0) -> Finish:
+def _flat(texture, gloss: Real = 0.15, emission: Real = 0.0) -> Finish:
     return Finish(Material(texture, specular=gloss, shininess=40.0, emission=emission))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.model import Finish, Model
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import Shape, box, combine, grid, quad
 
 OUTER_WALL = 0.25
@@ -20,29 +21,29 @@ OUTER_WALL = 0.25
 DOOR_HEIGHT = 2.15
 """Clear height of doorways [m]."""
 
-_CELL = 0.3  # largest cell of a wall, floor or ceiling [m]: how finely corners are shaded
+_CELL = 0.36  # largest cell of a wall, floor or ceiling [m]: how finely corners are shaded
 
 
 @dataclass
 class Room:
     """A rectangle of free space and what its surfaces are made of."""
 
-    x0: float
-    y0: float
-    x1: float
-    y1: float
+    x0: Real
+    y0: Real
+    x1: Real
+    y1: Real
     wall: Finish
     floor: Finish
     ceiling: Finish
-    height: float = 2.6
+    height: Real = 2.6
     sides: dict[str, Finish] = field(default_factory=dict)
     """Other finishes for single walls: "n", "e", "s", "w"."""
-    wainscot: tuple[float, Finish] | None = None
+    wainscot: tuple[Real, Finish] | None = None
     """Height [m] and finish of the lower part of all walls."""
     skirting: Finish | None = None
 
     @property
-    def center(self) -> tuple[float, float]:
+    def center(self) -> tuple[Real, Real]:
         """Middle of the floor [m]."""
         return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
 
@@ -51,8 +52,8 @@ class Room:
 class Opening:
     """A box cut out of the walls, axis-aligned [m]."""
 
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: tuple[Real, Real, Real]
+    high: tuple[Real, Real, Real]
 
 
 @dataclass
@@ -63,7 +64,7 @@ class Plan:
     openings: list[Opening] = field(default_factory=list)
     model: Model = field(default_factory=Model)
 
-    def room(self, name: str, rect: tuple[float, float, float, float], **surfaces) -> Room:
+    def room(self, name: str, rect: tuple[Real, Real, Real, Real], **surfaces) -> Room:
         """Adds a room (x0, y0, x1, y1); `surfaces` are the fields of `Room`."""
         self.rooms[name] = Room(*rect, **surfaces)
         return self.rooms[name]
@@ -71,10 +72,10 @@ class Plan:
     def doorway(
         self,
         axis: str,
-        gap: tuple[float, float],
-        center: float,
-        width: float = 1.2,
-        height: float = DOOR_HEIGHT,
+        gap: tuple[Real, Real],
+        center: Real,
+        width: Real = 1.2,
+        height: Real = DOOR_HEIGHT,
         frame: Finish | None = None,
         floor: Finish | None = None,
     ) -> None:
@@ -111,7 +112,7 @@ class Plan:
                 self.model.add(bar, finish)
 
     def window(
-        self, room: str, side: str, center: float, width: float, sill: float, top: float, view: int
+        self, room: str, side: str, center: Real, width: Real, sill: Real, top: Real, view: int
     ) -> None:
         """Cuts a window into an outer wall: reveal, sill, frame, pane with the view outside.
 
@@ -149,7 +150,8 @@ class Plan:
         board = box(
             (-width / 2 - 0.06, depth - 0.01, sill - 0.04), (width / 2 + 0.06, depth + 0.07, sill)
         )
-        pane.add(combine(bars), white).add(board, f.marble((0.86, 0.85, 0.82), (0.5, 0.5, 0.5), 21))
+        pane.add(combine(bars), white)
+        pane.add(board, f.marble((0.86, 0.85, 0.82), (0.5, 0.5, 0.5), 21))
         inward = {"n": "s", "s": "n", "e": "w", "w": "e"}[side]
         x, y = (face + out * depth, center) if axis == "x" else (center, face + out * depth)
         self.model.put(pane, x, y, 0.0, inward)
@@ -183,7 +185,7 @@ class Plan:
                 self._strip(r, side, (0.0, 0.09), 0.015, holes, r.skirting)
 
     def _rail(
-        self, r: Room, side: str, z: float, holes: list[tuple[float, float, float, float]]
+        self, r: Room, side: str, z: Real, holes: list[tuple[Real, Real, Real, Real]]
     ) -> None:
         finish = r.skirting or f.enamel(f.WHITE, 3, 0.2)
         blocking = [
@@ -192,7 +194,7 @@ class Plan:
         self._strip(r, side, (z - 0.02, z + 0.02), 0.018, blocking, finish)
 
     def _strip(
-        self, r: Room, side: str, z: tuple[float, float], depth: float, holes, finish: Finish
+        self, r: Room, side: str, z: tuple[Real, Real], depth: Real, holes, finish: Finish
     ) -> None:
         """A bar along a wall, interrupted by the openings that reach down to it."""
         lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
@@ -210,7 +212,7 @@ class Plan:
             }[side]
             self.model.add(box((*low, z[0]), (*high, z[1])), finish)
 
-    def _holes(self, r: Room, side: str) -> list[tuple[float, float, float, float]]:
+    def _holes(self, r: Room, side: str) -> list[tuple[Real, Real, Real, Real]]:
         """Openings in one wall: (from, to, bottom, top) along it [m]."""
         face = {"n": r.y1, "s": r.y0, "e": r.x1, "w": r.x0}[side]
         across, along = (1, 0) if side in "ns" else (0, 1)
@@ -223,7 +225,7 @@ class Plan:
         return holes
 
 
-def _wall(r: Room, side: str, z0: float, z1: float, holes) -> Shape:
+def _wall(r: Room, side: str, z0: Real, z1: Real, holes) -> Shape:
     """One wall between two heights, seen from inside, without its openings."""
     lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
     s = _ticks(lo, hi, [v for a, b, _, _ in holes for v in (a, b)])
@@ -252,7 +254,7 @@ def _wall(r: Room, side: str, z0: float, z1: float, holes) -> Shape:
     return Shape(shape.corners[keep], shape.uv[keep])
 
 
-def _ticks(lo: float, hi: float, cuts: list[float]) -> np.ndarray:
+def _ticks(lo: Real, hi: Real, cuts: list[Real]) -> np.ndarray:
     inner = [c for c in cuts if lo < c < hi]
     stops = np.unique(np.round([lo, hi, *inner], 9))
     parts = [

@@ -5,6 +5,7 @@ import numpy as np
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural import objects
 from r3jax.scenes.procedural.model import Finish, Model
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import (
     ball,
     box,
@@ -19,9 +20,7 @@ from r3jax.scenes.procedural.shapes import (
 )
 
 
-def _front(
-    model: Model, x0: float, x1: float, z0: float, z1: float, y: float, finish: Finish
-) -> None:
+def _front(model: Model, x0: Real, x1: Real, z0: Real, z1: Real, y: Real, finish: Finish) -> None:
     """A cupboard door or drawer front with a frame and a bar handle."""
     model.add(box((x0 + 0.003, y, z0 + 0.003), (x1 - 0.003, y + 0.018, z1 - 0.003)), finish)
     t = 0.06
@@ -39,7 +38,7 @@ def _front(
 
 
 def kitchen_run(
-    width: float, front: Finish, top: Finish, splash: Finish, seed: int, uppers: bool = True
+    width: Real, front: Finish, top: Finish, splash: Finish, seed: int, uppers: bool = True
 ) -> Model:
     """A kitchen along a wall: units, worktop, sink, hob and oven, splashback, wall cupboards."""
     w, model = width / 2, Model()
@@ -67,7 +66,7 @@ def kitchen_run(
     return model
 
 
-def _oven(model: Model, x0: float, x1: float) -> None:
+def _oven(model: Model, x0: Real, x1: Real) -> None:
     steel, dark = f.metal(), f.enamel((0.1, 0.1, 0.11), 2, 0.8)
     model.add(box((x0 + 0.01, 0.56, 0.12), (x1 - 0.01, 0.585, 0.86)), steel)
     model.add(box((x0 + 0.05, 0.585, 0.25), (x1 - 0.05, 0.592, 0.62)), dark)
@@ -104,13 +103,13 @@ def _oven(model: Model, x0: float, x1: float) -> None:
     model.add(pot.moved(middle + 0.13, 0.18, 0.922), steel)
 
 
-def _hood(model: Model, x: float) -> None:
+def _hood(model: Model, x: Real) -> None:
     steel = f.metal()
     model.add(box((x - 0.3, 0, 1.55), (x + 0.3, 0.48, 1.62)), steel)
     model.add(box((x - 0.13, 0, 1.62), (x + 0.13, 0.26, 2.35)), steel)
 
 
-def _sink(model: Model, x: float) -> None:
+def _sink(model: Model, x: Real) -> None:
     steel = f.metal((0.74, 0.75, 0.76), 1, 0.25)
     model.add(box((x - 0.25, 0.1, 0.911), (x + 0.25, 0.52, 0.917)), steel)
     model.add(
@@ -120,7 +119,7 @@ def _sink(model: Model, x: float) -> None:
     model.add(tube(tap, 0.013, 8), steel)
 
 
-def _worktop_things(model: Model, width: float, pitch: float, seed: int) -> None:
+def _worktop_things(model: Model, width: Real, pitch: Real, seed: int) -> None:
     w = width / 2
     board = box((-0.14, 0, 0), (0.14, 0.02, 0.38)).turned(12.0, "x")
     model.add(board.moved(-w + 0.2, 0.09, 0.91), f.wood(f.OAK, 4))
@@ -163,7 +162,7 @@ def fridge(seed: int) -> Model:
     return model.put(objects.carton(seed, 0.25, 0.2, 0.22), -0.1, 0.3, 1.85)
 
 
-def island(width: float, front: Finish, top: Finish, seed: int) -> Model:
+def island(width: Real, front: Finish, top: Finish, seed: int) -> Model:
     """A kitchen island, origin in its middle, with fruit, bottles and a plant."""
     w, model = width / 2, Model()
     model.add(box((-w, -0.35, 0), (w, 0.35, 0.87), upright=True, step=0.5), front)
@@ -172,13 +171,12 @@ def island(width: float, front: Finish, top: Finish, seed: int) -> Model:
     for k in range(units):
         _front(model, -w + k * width / units, -w + (k + 1) * width / units, 0.08, 0.86, 0.35, front)
     model.put(objects.bowl_of_fruit(seed), -0.2 * width, 0.05, 0.92)
-    model.put(objects.bottle(seed), 0.15 * width, -0.1, 0.92).put(
-        objects.bottle(seed + 1), 0.22 * width, 0.02, 0.92
-    )
+    model.put(objects.bottle(seed), 0.15 * width, -0.1, 0.92)
+    model.put(objects.bottle(seed + 1), 0.22 * width, 0.02, 0.92)
     return model.put(objects.leafy_plant(0.42, seed, 24), 0.38 * width, 0.0, 0.92)
 
 
-def kitchen_shelf(seed: int, width: float = 1.2) -> list[Model]:
+def kitchen_shelf(seed: int, width: Real = 1.2) -> list[Model]:
     """Packages, jars and bottles for a wall shelf."""
     makers = (objects.jar, objects.carton, objects.bottle)
     return [makers[k % 3](seed + k) for k in range(round(width / 0.13))]
@@ -196,7 +194,7 @@ def toilet() -> Model:
     return model.add(roll.moved(0.38, 0.08, 0.72), f.fabric(f.WHITE, 4))
 
 
-def washbasin(width: float, front: Finish, seed: int) -> Model:
+def washbasin(width: Real, front: Finish, seed: int) -> Model:
     """A basin on a cabinet under a mirror with a lamp; bottles and a towel."""
     w, white = width / 2, f.enamel((0.93, 0.93, 0.92), 6, 0.8)
     model = Model().add(box((-w, 0, 0.3), (w, 0.44, 0.78)), front)
@@ -221,7 +219,7 @@ def washbasin(width: float, front: Finish, seed: int) -> Model:
     return model.put(objects.jar(seed), -w + 0.1, 0.12, 0.82)
 
 
-def bathtub(length: float = 1.7) -> Model:
+def bathtub(length: Real = 1.7) -> Model:
     """A tub along the wall with a printed shower curtain half drawn."""
     white, w = f.enamel((0.93, 0.93, 0.92), 6, 0.8), length / 2
     model = Model().add(

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import Shape, rotation
 from r3jax.simulators.world import Lamp, Material
 
@@ -22,7 +23,7 @@ class Finish:
 
     material: Material
 
-    tile: tuple[float, float] | None = None
+    tile: tuple[Real, Real] | None = None
     """Width and height that the texture covers [m]; None: it is fitted to each shape once."""
 
 
@@ -33,7 +34,7 @@ class Piece:
     corners: np.ndarray
     uv: np.ndarray
     finish: Finish
-    tint: tuple[float, float, float]
+    tint: tuple[Real, Real, Real]
 
 
 @dataclass
@@ -47,7 +48,7 @@ class Model:
         self,
         shape: Shape,
         finish: Finish,
-        tint: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        tint: tuple[Real, Real, Real] = (1.0, 1.0, 1.0),
         atlas: bool = False,
     ) -> "Model":
         """Adds a shape in a finish.
@@ -73,7 +74,7 @@ class Model:
         self.pieces.append(Piece(shape.corners, uv, finish, tint))
         return self
 
-    def light(self, at: tuple[float, float, float], reach: float = 2.5, color=None) -> "Model":
+    def light(self, at: tuple[Real, Real, Real], reach: Real = 2.5, color=None) -> "Model":
         """Adds a lamp at a place in the model's frame; returns the model."""
         self.lamps.append(Lamp(at, color or (1.0, 0.9, 0.75), reach))
         return self
@@ -81,10 +82,10 @@ class Model:
     def put(
         self,
         other: "Model",
-        x: float = 0.0,
-        y: float = 0.0,
-        z: float = 0.0,
-        heading: str | float = 0.0,
+        x: Real = 0.0,
+        y: Real = 0.0,
+        z: Real = 0.0,
+        heading: str | Real = 0.0,
     ) -> "Model":
         """Places another model in this one.
 

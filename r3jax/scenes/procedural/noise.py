@@ -6,21 +6,23 @@ Shape symbols: h w texels. Fields have mean 0 and standard deviation 1.
 import functools
 
 import numpy as np
-from scipy import fft
+
+Real = float | int
+"""A number as people write it: 2 as well as 2.0."""
 
 
 @functools.lru_cache(maxsize=64)
 def _field(
-    height: int, width: int, seed: int, slope: float, stretch_x: float, lowest: float
+    height: int, width: int, seed: int, slope: Real, stretch_x: Real, lowest: Real
 ) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    spectrum = fft.rfft2(rng.standard_normal((height, width), dtype=np.float32))
+    spectrum = np.fft.rfft2(rng.standard_normal((height, width), dtype=np.float32))
     fy = np.fft.fftfreq(height, 1.0 / height)[:, None] * (width / height)
     fx = np.fft.rfftfreq(width, 1.0 / width)[None, :]
     squared = ((fx * stretch_x) ** 2 + fy**2).astype(np.float32)
     gain = np.maximum(squared, 1.0) ** np.float32(-0.5 * slope)
     gain[squared < lowest**2] = 0.0
-    field = fft.irfft2(spectrum * gain, s=(height, width))
+    field = np.fft.irfft2(spectrum * gain, s=(height, width))
     field = (field - field.mean()) / field.std()
     field.flags.writeable = False
     return field
@@ -30,9 +32,9 @@ def cloud(
     height: int,
     width: int,
     seed: int,
-    slope: float = 1.6,
-    stretch_x: float = 1.0,
-    lowest: float = 1.0,
+    slope: Real = 1.6,
+    stretch_x: Real = 1.0,
+    lowest: Real = 1.0,
 ) -> np.ndarray:
     """A periodic random field with the amplitude spectrum 1 / f ** slope.
 
@@ -57,7 +59,7 @@ def cloud(
     return np.roll(field, tuple(int(n) for n in shift), axis=(0, 1))
 
 
-def ridge(num: int, seed: int, slope: float = 1.5) -> np.ndarray:
+def ridge(num: int, seed: int, slope: Real = 1.5) -> np.ndarray:
     """A periodic one-dimensional skyline, [num] float32, mean 0, standard deviation 1."""
     rng = np.random.default_rng(seed)
     spectrum = np.fft.rfft(rng.standard_normal(num))
@@ -67,7 +69,7 @@ def ridge(num: int, seed: int, slope: float = 1.5) -> np.ndarray:
     return ((line - line.mean()) / line.std()).astype(np.float32)
 
 
-def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
+def smoothstep(low: Real, high: Real, x: np.ndarray) -> np.ndarray:
     """0 below `low`, 1 above `high`, a smooth ramp between."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)

@@ -7,6 +7,7 @@ import numpy as np
 
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.model import Model
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.screens import SPINES
 from r3jax.scenes.procedural.shapes import (
     Shape,
@@ -24,7 +25,7 @@ from r3jax.scenes.procedural.shapes import (
 _BRIGHT = (f.TERRACOTTA, f.MUSTARD, f.TEAL, f.NAVY, f.BLUSH, f.SAGE, f.CREAM, f.CHARCOAL)
 
 
-def _on_spine(shape: Shape, spine: int, low: float = 0.02, high: float = 0.98) -> Shape:
+def _on_spine(shape: Shape, spine: int, low: Real = 0.02, high: Real = 0.98) -> Shape:
     """Fits a shape's coordinates into one spine of the book atlas."""
     span = np.maximum(shape.uv.max(axis=(0, 1)) - shape.uv.min(axis=(0, 1)), 1e-9)
     unit = (shape.uv - shape.uv.min(axis=(0, 1))) / span
@@ -32,9 +33,7 @@ def _on_spine(shape: Shape, spine: int, low: float = 0.02, high: float = 0.98) -
     return Shape(shape.corners, np.stack([u, low + (high - low) * unit[..., 1]], axis=-1))
 
 
-def book_row(
-    length: float, height: float, depth: float, seed: int, thickness: float = 1.0
-) -> Model:
+def book_row(length: Real, height: Real, depth: Real, seed: int, thickness: Real = 1.0) -> Model:
     """Books side by side with a few gaps and leaners, spines towards +y.
 
     Spans x = 0 .. length, y = 0 .. depth; no book is taller than `height`. Books are 1.8 to 5.6 cm
@@ -83,7 +82,7 @@ def book_pile(count: int, seed: int) -> Model:
     return model
 
 
-def vase(seed: int, height: float = 0.28) -> Model:
+def vase(seed: int, height: Real = 0.28) -> Model:
     """A turned vase; every second one is glazed in two colours."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 1.0, 9)
@@ -121,7 +120,7 @@ def bowl_of_fruit(seed: int) -> Model:
     return model
 
 
-def leafy_plant(height: float, seed: int, leaves: int = 34, broad: float = 0.3) -> Model:
+def leafy_plant(height: Real, seed: int, leaves: int = 34, broad: Real = 0.3) -> Model:
     """A pot plant with arching leaves; `broad` is the width of a leaf over its length."""
     rng = np.random.default_rng(seed)
     pot = 0.13 * height + 0.04
@@ -140,9 +139,14 @@ def leafy_plant(height: float, seed: int, leaves: int = 34, broad: float = 0.3) 
         length = (height - 1.5 * pot) * (0.62 + 0.35 * rng.random())
         root = 1.45 * pot + (0.35 * (height - 1.5 * pot) * (1 - k / leaves) if broad > 0.2 else 0.0)
         blades[k % 2].append(_blade(length, broad, lift).turned(np.rad2deg(angle)).moved(z=root))
+    # Leaves keep within the pot's surroundings, clear of walls and shelf boards.
+    widest = max(float(np.abs(s.corners[..., :2]).max()) for k in blades for s in blades[k])
+    shrink = min(1.0, min(0.42, 0.36 * height) / widest)
+    spread = np.array([shrink, shrink, 1.0])
     for k, shapes in blades.items():
         green = ((0.22, 0.42, 0.16), (0.33, 0.5, 0.2), (0.16, 0.36, 0.22))[(seed + k) % 3]
-        model.add(combine(shapes), f.leaf(green, k), atlas=True)
+        joined = combine(shapes)
+        model.add(Shape(joined.corners * spread, joined.uv), f.leaf(green, k), atlas=True)
     if broad > 0.2:
         model.add(
             tube([(0, 0, pot), (0.02, 0.01, 0.5 * height), (0, 0.02, 0.75 * height)], 0.012),
@@ -151,7 +155,7 @@ def leafy_plant(height: float, seed: int, leaves: int = 34, broad: float = 0.3) 
     return model
 
 
-def _blade(length: float, broad: float, lift: float) -> Shape:
+def _blade(length: Real, broad: Real, lift: Real) -> Shape:
     """A leaf that starts at the origin along +x, rises and bends down; unit coordinates."""
     t = np.linspace(0.0, 1.0, 6)
     angle = lift - 1.5 * t**1.5
@@ -167,7 +171,7 @@ def _blade(length: float, broad: float, lift: float) -> Shape:
     return grid(points, t, (side + 1.0) / 2.0)
 
 
-def table_lamp(seed: int, height: float = 0.45) -> Model:
+def table_lamp(seed: int, height: Real = 0.45) -> Model:
     """A lamp with a cloth shade that glows and lights its surroundings."""
     color = _BRIGHT[seed % len(_BRIGHT)]
     foot = lathe(
@@ -175,7 +179,7 @@ def table_lamp(seed: int, height: float = 0.45) -> Model:
         14,
     )
     model = Model().add(foot, f.enamel(color, 1, 0.6))
-    shade = lathe([(0.15, 0.5 * height), (0.1, height)], 18)
+    shade = lathe([(0.13, 0.5 * height), (0.09, height)], 18)
     model.add(shade, f.glow((0.98, 0.9, 0.72), 1))
     return model.light((0.0, 0.0, 0.8 * height), 1.0, (0.5, 0.42, 0.3))
 
@@ -190,7 +194,7 @@ def floor_lamp(seed: int) -> Model:
 
 
 def pendant(
-    ceiling: float, drop: float = 0.55, radius: float = 0.22, seed: int = 0, reach: float = 2.4
+    ceiling: Real, drop: Real = 0.55, radius: Real = 0.22, seed: int = 0, reach: Real = 2.4
 ) -> Model:
     """A hanging lamp: cord, dome, glowing bulb. Origin on the floor below it."""
     top = ceiling - drop
@@ -210,9 +214,7 @@ def pendant(
     return model.light((0.0, 0.0, top - 0.02), reach, (0.85, 0.75, 0.6))
 
 
-def ceiling_panel(
-    ceiling: float, width: float = 1.2, depth: float = 0.3, reach: float = 2.6
-) -> Model:
+def ceiling_panel(ceiling: Real, width: Real = 1.2, depth: Real = 0.3, reach: Real = 2.6) -> Model:
     """A fluorescent panel under the ceiling. Origin on the floor below its middle."""
     w, d = width / 2, depth / 2
     model = Model().add(
@@ -223,19 +225,19 @@ def ceiling_panel(
     return model.light((0.0, 0.0, ceiling - 0.25), reach, (0.72, 0.72, 0.7))
 
 
-def carton(seed: int, width: float = 0.12, depth: float = 0.08, height: float = 0.2) -> Model:
+def carton(seed: int, width: Real = 0.12, depth: Real = 0.08, height: Real = 0.2) -> Model:
     """A printed carton."""
     return Model().add(_six_prints(width, depth, height), f.package(seed % 12), atlas=True)
 
 
-def _six_prints(w: float, d: float, h: float) -> Shape:
+def _six_prints(w: Real, d: Real, h: Real) -> Shape:
     """A box whose every face shows the whole print; unit coordinates."""
     shape = box((-w / 2, -d / 2, 0), (w / 2, d / 2, h), upright=True)
     uv = shape.uv.reshape(6, -1, 3, 2)
     return Shape(shape.corners, (uv / uv.max(axis=(1, 2), keepdims=True)).reshape(-1, 3, 2))
 
 
-def jar(seed: int, radius: float = 0.045, height: float = 0.16) -> Model:
+def jar(seed: int, radius: Real = 0.045, height: Real = 0.16) -> Model:
     """A tin or jar with a printed label and a lid."""
     body = lathe([(radius, 0.0), (radius, height)], 14)
     model = Model().add(body, f.package((seed + 5) % 12))
@@ -243,7 +245,7 @@ def jar(seed: int, radius: float = 0.045, height: float = 0.16) -> Model:
     return model.add(lathe(lid, 14), f.metal((0.75, 0.68, 0.5), 3))
 
 
-def bottle(seed: int, height: float = 0.3) -> Model:
+def bottle(seed: int, height: Real = 0.3) -> Model:
     """A glazed bottle with a label."""
     r = 0.13 * height
     profile = [

@@ -8,7 +8,7 @@ import functools
 import numpy as np
 from PIL import Image, ImageDraw
 
-from r3jax.scenes.procedural.noise import blend, cloud, smoothstep, texels
+from r3jax.scenes.procedural.noise import Real, blend, cloud, smoothstep, texels
 from r3jax.scenes.procedural.textures import Color
 
 
@@ -16,7 +16,7 @@ def _rgb(color: Color) -> np.ndarray:
     return np.asarray(color, dtype=np.float32)
 
 
-def _bytes(color: Color, shade: float = 1.0) -> tuple[int, int, int]:
+def _bytes(color: Color, shade: Real = 1.0) -> tuple[int, int, int]:
     r, g, b = (int(255 * min(1.0, max(0.0, c * shade))) for c in color)
     return r, g, b
 
@@ -102,7 +102,7 @@ def rug(palette: tuple[Color, ...], seed: int, height: int = 512, width: int = 7
     return texels(image * shade[..., None])
 
 
-def _leaf(draw: ImageDraw.ImageDraw, at: np.ndarray, angle: float, length: float, fill) -> None:
+def _leaf(draw: ImageDraw.ImageDraw, at: np.ndarray, angle: Real, length: Real, fill) -> None:
     along = np.linspace(0.0, 1.0, 9)
     half = 0.22 * np.sin(np.pi * along**0.8)
     direction = np.array([np.cos(angle), np.sin(angle)])
@@ -112,7 +112,7 @@ def _leaf(draw: ImageDraw.ImageDraw, at: np.ndarray, angle: float, length: float
     draw.polygon([tuple(p) for p in np.concatenate([spine + edge, (spine - edge)[::-1]])], fill)
 
 
-def _sprig(draw: ImageDraw.ImageDraw, at: np.ndarray, size: float, rng, inks) -> None:
+def _sprig(draw: ImageDraw.ImageDraw, at: np.ndarray, size: Real, rng, inks) -> None:
     """A branch with leaves on both sides and a flower on top."""
     lean = rng.normal(0.0, 0.35) - np.pi / 2
     tip = at + size * np.array([np.cos(lean), np.sin(lean)])

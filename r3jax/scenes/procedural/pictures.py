@@ -8,7 +8,7 @@ import functools
 import numpy as np
 from PIL import Image, ImageDraw
 
-from r3jax.scenes.procedural.noise import blend, cloud, ridge, smoothstep, texels
+from r3jax.scenes.procedural.noise import Real, blend, cloud, ridge, smoothstep, texels
 
 PALETTES = (
     (
@@ -31,7 +31,7 @@ PALETTES = (
 """Colours that go together, five each."""
 
 
-def ink(color, shade: float = 1.0) -> tuple[int, int, int]:
+def ink(color, shade: Real = 1.0) -> tuple[int, int, int]:
     """A colour in [0, 1] as the bytes that Pillow draws with."""
     r, g, b = (int(255 * min(1.0, max(0.0, c * shade))) for c in color)
     return r, g, b
@@ -42,7 +42,7 @@ def to_float(image: Image.Image) -> np.ndarray:
     return np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
 
 
-def write_lines(draw: ImageDraw.ImageDraw, box, height: float, rng, fill, ragged=0.35) -> None:
+def write_lines(draw: ImageDraw.ImageDraw, box, height: Real, rng, fill, ragged=0.35) -> None:
     """Fills a box (left, top, right, bottom) with marks that look like lines of print."""
     left, top, right, bottom = box
     y = top
@@ -76,7 +76,7 @@ _MOODS = (
 """Colours of the farthest and the nearest hills."""
 
 
-def _scene(seed: int, height: int, width: int, sunset: float) -> np.ndarray:
+def _scene(seed: int, height: int, width: int, sunset: Real) -> np.ndarray:
     """Sky, clouds, four ranges of hills, a plain with trees; [h, w, 3] float32."""
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[0:height, 0:width].astype(np.float32)
@@ -128,7 +128,7 @@ def _trees(image: np.ndarray, seed: int, count: int) -> np.ndarray:
 
 
 @functools.cache
-def landscape(seed: int, height: int = 384, width: int = 512, sunset: float = 0.3) -> np.ndarray:
+def landscape(seed: int, height: int = 384, width: int = 512, sunset: Real = 0.3) -> np.ndarray:
     """A painted landscape with brush marks."""
     image = _trees(_scene(seed, height, width, sunset), seed, 14)
     brush = 0.06 * cloud(height, width, seed + 40, 0.6, 3.0) + 0.03 * cloud(height, width, 41, 0.2)

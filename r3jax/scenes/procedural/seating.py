@@ -5,10 +5,11 @@ import numpy as np
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural import objects
 from r3jax.scenes.procedural.model import Finish, Model
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import box, combine, cushion, cylinder, drape, lathe, tube
 
 
-def _legs(width: float, depth: float, height: float, finish: Finish, thick: float = 0.045) -> Model:
+def _legs(width: Real, depth: Real, height: Real, finish: Finish, thick: Real = 0.045) -> Model:
     model = Model()
     for x in (-width / 2 + thick, width / 2 - thick):
         for y in (-depth / 2 + thick, depth / 2 - thick):
@@ -17,7 +18,7 @@ def _legs(width: float, depth: float, height: float, finish: Finish, thick: floa
     return model
 
 
-def sofa(width: float, cloth: Finish, accents: tuple[Finish, ...], seed: int = 0) -> Model:
+def sofa(width: Real, cloth: Finish, accents: tuple[Finish, ...], seed: int = 0) -> Model:
     """A sofa with seat, back and loose cushions; 0.9 m deep, back on y = 0."""
     arm, seats = 0.18, max(1, round((width - 0.36) / 0.75))
     model = Model().put(_legs(width - 0.1, 0.75, 0.12, f.wood(f.WALNUT, 2)), 0, 0.45)
@@ -60,7 +61,7 @@ def chair(wood: Finish, seat: Finish) -> Model:
     return model
 
 
-def stool(wood: Finish, height: float = 0.65) -> Model:
+def stool(wood: Finish, height: Real = 0.65) -> Model:
     """A bar stool with a foot ring."""
     model = Model().put(_legs(0.34, 0.34, height - 0.04, wood))
     model.add(cylinder(0.18, height - 0.04, height, 18), wood)
@@ -68,7 +69,7 @@ def stool(wood: Finish, height: float = 0.65) -> Model:
     return model.add(tube(ring, 0.01), f.metal())
 
 
-def table(width: float, depth: float, wood: Finish, height: float = 0.74) -> Model:
+def table(width: Real, depth: Real, wood: Finish, height: Real = 0.74) -> Model:
     """A four-legged table, origin in its middle."""
     model = Model()
     model.add(
@@ -83,7 +84,7 @@ def table(width: float, depth: float, wood: Finish, height: float = 0.74) -> Mod
     return model
 
 
-def dining_set(width: float, depth: float, wood: Finish, seat: Finish, seed: int) -> Model:
+def dining_set(width: Real, depth: Real, wood: Finish, seat: Finish, seed: int) -> Model:
     """A laid table with chairs on both long sides."""
     rng = np.random.default_rng(seed)
     model = Model().put(table(width, depth, wood))
@@ -100,7 +101,7 @@ def dining_set(width: float, depth: float, wood: Finish, seat: Finish, seed: int
     return model.put(objects.vase(seed, 0.3), 0.24 * width, 0.03, 0.741)
 
 
-def coffee_table(wood: Finish, seed: int, width: float = 1.0) -> Model:
+def coffee_table(wood: Finish, seed: int, width: Real = 1.0) -> Model:
     """A low table with books, a bowl and a cup; origin in its middle."""
     model = Model().put(table(width, 0.55, wood, 0.4))
     model.add(box((-width / 2 + 0.08, -0.2, 0.14), (width / 2 - 0.08, 0.2, 0.16)), wood)
@@ -110,7 +111,7 @@ def coffee_table(wood: Finish, seed: int, width: float = 1.0) -> Model:
     return model.put(objects.crockery(seed), 0.32 * width, 0.06, 0.4)
 
 
-def bed(width: float, cover: Finish, throw: Finish, wood: Finish, length: float = 2.0) -> Model:
+def bed(width: Real, cover: Finish, throw: Finish, wood: Finish, length: Real = 2.0) -> Model:
     """A bed with mattress, duvet, throw and pillows; head on y = 0."""
     w, model = width / 2, Model()
     model.add(box((-w - 0.05, 0, 0), (w + 0.05, 0.06, 1.05), step=0.5), wood)
@@ -129,7 +130,7 @@ def bed(width: float, cover: Finish, throw: Finish, wood: Finish, length: float 
     return model
 
 
-def bench(width: float, wood: Finish, cloth: Finish) -> Model:
+def bench(width: Real, wood: Finish, cloth: Finish) -> Model:
     """An upholstered bench, origin in its middle."""
     model = Model().put(_legs(width, 0.42, 0.36, wood))
     model.add(box((-width / 2, -0.2, 0.34), (width / 2, 0.2, 0.38)), wood)

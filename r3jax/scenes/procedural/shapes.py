@@ -12,9 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r3jax.scenes.procedural.noise import Real
+
 _UNIT_QUAD = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], dtype=np.float64)
 
-Point = tuple[float, float, float]
+Point = tuple[Real, Real, Real]
 
 
 @dataclass(frozen=True)
@@ -33,16 +35,16 @@ class Shape:
             np.concatenate([self.corners, other.corners]), np.concatenate([self.uv, other.uv])
         )
 
-    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Shape":
+    def moved(self, x: Real = 0.0, y: Real = 0.0, z: Real = 0.0) -> "Shape":
         """The shape shifted by (x, y, z) [m]."""
         return Shape(self.corners + np.array([x, y, z]), self.uv)
 
-    def turned(self, degrees: float, axis: str = "z") -> "Shape":
+    def turned(self, degrees: Real, axis: str = "z") -> "Shape":
         """The shape turned about a coordinate axis through the origin [deg], right-handed."""
         return Shape(self.corners @ rotation(degrees, axis).T, self.uv)
 
 
-def rotation(degrees: float, axis: str = "z") -> np.ndarray:
+def rotation(degrees: Real, axis: str = "z") -> np.ndarray:
     """Right-handed rotation about x, y or z, [3, 3]."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -80,7 +82,7 @@ def grid(points: np.ndarray, u: np.ndarray, v: np.ndarray) -> Shape:
     return Shape(faces[..., :3].copy(), faces[..., 3:].copy())
 
 
-def quad(origin: Point, across: Point, up: Point, step: float = 10.0) -> Shape:
+def quad(origin: Point, across: Point, up: Point, step: Real = 10.0) -> Shape:
     """A rectangle from a corner and two edges; front on the side of across x up.
 
     It is cut into cells of at most `step` [m], for shading that varies over it.
@@ -96,7 +98,7 @@ def quad(origin: Point, across: Point, up: Point, step: float = 10.0) -> Shape:
     return grid(points, s * width, t * height)
 
 
-def box(low: Point, high: Point, upright: bool = False, step: float = 10.0) -> Shape:
+def box(low: Point, high: Point, upright: bool = False, step: Real = 10.0) -> Shape:
     """An axis-aligned box.
 
     Args:
@@ -126,7 +128,7 @@ def _along_grain(face: Shape) -> Shape:
     return Shape(face.corners, face.uv[..., ::-1]) if extent[1] > extent[0] else face
 
 
-def panel(x: float, z: float, width: float, height: float, y: float = 0.0) -> Shape:
+def panel(x: Real, z: Real, width: Real, height: Real, y: Real = 0.0) -> Shape:
     """An upright rectangle whose front faces +y, lower corner nearest +x; [m].
 
     It spans x - width / 2 .. x + width / 2 and z .. z + height.
@@ -134,7 +136,7 @@ def panel(x: float, z: float, width: float, height: float, y: float = 0.0) -> Sh
     return quad((x + width / 2, y, z), (-width, 0, 0), (0, 0, height))
 
 
-def disc(radius: float, y: float = 0.0, segments: int = 24) -> Shape:
+def disc(radius: Real, y: Real = 0.0, segments: int = 24) -> Shape:
     """An upright disc about the origin whose front faces +y; flat coordinates [m]."""
     angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     angle[-1] = 0.0
@@ -147,7 +149,7 @@ def disc(radius: float, y: float = 0.0, segments: int = 24) -> Shape:
     )
 
 
-def lathe(profile: list[tuple[float, float]], segments: int = 14) -> Shape:
+def lathe(profile: list[tuple[Real, Real]], segments: int = 14) -> Shape:
     """A solid of revolution about z.
 
     Args:
@@ -164,13 +166,13 @@ def lathe(profile: list[tuple[float, float]], segments: int = 14) -> Shape:
     return grid(points, angle * max(float(radius.max()), 1e-3), arc)
 
 
-def cylinder(radius: float, z0: float, z1: float, segments: int = 12, top: float = -1.0) -> Shape:
+def cylinder(radius: Real, z0: Real, z1: Real, segments: int = 12, top: Real = -1.0) -> Shape:
     """A closed upright cylinder, or a cone when `top` gives another radius there [m]."""
     end = radius if top < 0 else top
     return lathe([(0.0, z0), (radius, z0), (end, z1), (0.0, z1)], segments)
 
 
-def ball(radii: Point, segments: int = 12, rings: int = 7, power: float = 1.0) -> Shape:
+def ball(radii: Point, segments: int = 12, rings: int = 7, power: Real = 1.0) -> Shape:
     """An ellipsoid about the origin; `power` < 1 makes it boxy, as a cushion is.
 
     x = a sgn(c) |c|^power with c the unit sphere's coordinate (a superellipsoid).
@@ -194,21 +196,21 @@ def ball(radii: Point, segments: int = 12, rings: int = 7, power: float = 1.0) -
     return grid(points, phi * (a + b) / 2, (theta + np.pi / 2) * (c + min(a, b)) / 2)
 
 
-def cushion(low: Point, high: Point, power: float = 0.42) -> Shape:
+def cushion(low: Point, high: Point, power: Real = 0.42) -> Shape:
     """A soft block that fills a box: upholstery, pillows, mattresses.
 
     Its texture is laid on from the six sides, as cloth is, not from the poles.
     """
     lo, hi = np.asarray(low), np.asarray(high)
     a, b, c = (float(x) for x in (hi - lo) / 2)
-    corners = ball((a, b, c), 16, 8, power).corners
+    corners = ball((a, b, c), 14, 8, power).corners
     normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     axes = np.array([[1, 2], [0, 2], [0, 1]])[np.argmax(normal, axis=1)]
     uv = np.take_along_axis(corners, np.repeat(axes[:, None], 3, axis=1), axis=2)
     return Shape(corners + (hi + lo) / 2, uv + np.array([0.37, 0.21]))
 
 
-def tube(points: list[Point], radius: float, segments: int = 6) -> Shape:
+def tube(points: list[Point], radius: Real, segments: int = 5) -> Shape:
     """A round bar along a polyline, without caps [m]."""
     path = np.array(points, dtype=np.float64)
     tangent = np.gradient(path, axis=0)
@@ -226,7 +228,7 @@ def tube(points: list[Point], radius: float, segments: int = 6) -> Shape:
     return grid(path[:, None] + radius * ring, angle * radius, length)
 
 
-def curtain(width: float, z0: float, z1: float, folds: int, depth: float = 0.05) -> Shape:
+def curtain(width: Real, z0: Real, z1: Real, folds: int, depth: Real = 0.05) -> Shape:
     """A hanging cloth in folds along x, about y = 0, front towards +y [m]."""
     s = np.linspace(0.0, 1.0, 8 * folds + 1)
     t = np.linspace(0.0, 1.0, 5)
@@ -238,7 +240,7 @@ def curtain(width: float, z0: float, z1: float, folds: int, depth: float = 0.05)
     return grid(np.stack([x, swing + sway, z], axis=-1), s * width * 1.6, t * (z1 - z0))
 
 
-def drape(low: Point, high: Point, hang: float, ripple: float = 0.015) -> Shape:
+def drape(low: Point, high: Point, hang: Real, ripple: Real = 0.015) -> Shape:
     """A cloth that lies on the top of a box and hangs over three sides (not y = low) [m]."""
     (x0, y0, _), (x1, y1, top) = low, high
     width = x1 - x0

@@ -5,11 +5,12 @@ import numpy as np
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural import objects
 from r3jax.scenes.procedural.model import Finish, Model
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import box, combine, cylinder, panel, quad, tube
 
 
 def bookshelf(
-    width: float, height: float, wood: Finish, seed: int, depth: float = 0.3, thickness: float = 1.0
+    width: Real, height: Real, wood: Finish, seed: int, depth: Real = 0.3, thickness: Real = 1.0
 ) -> Model:
     """An open shelf full of books (`thickness` 2: of binders), with objects between them."""
     rng = np.random.default_rng(seed)
@@ -42,7 +43,7 @@ def bookshelf(
 
 
 def library_shelf(
-    width: float, height: float, wood: Finish, seed: int, thickness: float = 1.0
+    width: Real, height: Real, wood: Finish, seed: int, thickness: Real = 1.0
 ) -> Model:
     """Two bookshelves back to back, origin in the middle, with end panels."""
     model = Model()
@@ -53,7 +54,7 @@ def library_shelf(
     return model
 
 
-def _handle(x: float, z: float, y: float, length: float = 0.14, upright: bool = True):
+def _handle(x: Real, z: Real, y: Real, length: Real = 0.14, upright: bool = True):
     a, b = (
         ((x, y, z - length / 2), (x, y, z + length / 2))
         if upright
@@ -63,7 +64,7 @@ def _handle(x: float, z: float, y: float, length: float = 0.14, upright: bool = 
     return tube([foot_a, a, b, foot_b], 0.006)
 
 
-def wardrobe(width: float, height: float, wood: Finish, mirror: bool = True) -> Model:
+def wardrobe(width: Real, height: Real, wood: Finish, mirror: bool = True) -> Model:
     """A wardrobe with panelled doors; one of them may carry a mirror. 0.6 m deep."""
     model = Model().add(box((-width / 2, 0, 0), (width / 2, 0.57, height), step=0.5), wood)
     doors = max(2, round(width / 0.5))
@@ -82,7 +83,7 @@ def wardrobe(width: float, height: float, wood: Finish, mirror: bool = True) -> 
 
 
 def drawers(
-    width: float, height: float, depth: float, finish: Finish, columns: int, rows: int
+    width: Real, height: Real, depth: Real, finish: Finish, columns: int, rows: int
 ) -> Model:
     """A chest of drawers (or a sideboard) on a plinth."""
     w = width / 2
@@ -102,7 +103,7 @@ def drawers(
     return model
 
 
-def sideboard(width: float, wood: Finish, seed: int) -> Model:
+def sideboard(width: Real, wood: Finish, seed: int) -> Model:
     """A sideboard with a lamp and things on it."""
     model = Model().put(drawers(width, 0.8, 0.42, wood, max(2, round(width / 0.5)), 3))
     model.put(objects.table_lamp(seed), -width / 2 + 0.25, 0.2, 0.8)
@@ -124,15 +125,14 @@ def nightstand(wood: Finish, seed: int) -> Model:
     return model.put(objects.book_pile(2, seed), 0.1, 0.26, 0.5, 10.0)
 
 
-def television_unit(width: float, wood: Finish, seed: int) -> Model:
+def television_unit(width: Real, wood: Finish, seed: int) -> Model:
     """A low unit with a large screen, speakers and boxes."""
     model = Model().put(drawers(width, 0.45, 0.4, wood, 3, 1))
     dark = f.enamel(f.CHARCOAL, 2, 0.5)
     model.add(box((-0.62, 0.12, 0.55), (0.62, 0.16, 1.27)), dark)
     model.add(panel(0, 0.57, 1.2, 0.68, 0.163), f.picture("sunset", 50 + seed, True))
-    model.add(box((-0.2, 0.06, 0.45), (0.2, 0.26, 0.465)), dark).add(
-        box((-0.03, 0.1, 0.46), (0.03, 0.13, 0.56)), dark
-    )
+    model.add(box((-0.2, 0.06, 0.45), (0.2, 0.26, 0.465)), dark)
+    model.add(box((-0.03, 0.1, 0.46), (0.03, 0.13, 0.56)), dark)
     for x in (-width / 2 + 0.13, width / 2 - 0.13):
         model.add(box((x - 0.1, 0.05, 0.45), (x + 0.1, 0.27, 0.8)), f.wood(f.WALNUT, 3))
         for z, r in ((0.55, 0.07), (0.7, 0.045)):
@@ -141,7 +141,7 @@ def television_unit(width: float, wood: Finish, seed: int) -> Model:
     return model
 
 
-def monitor(seed: int, width: float = 0.55) -> Model:
+def monitor(seed: int, width: Real = 0.55) -> Model:
     """A monitor on its foot; screen towards +y, origin below it."""
     dark, w = f.enamel(f.CHARCOAL, 2, 0.4), width / 2
     model = Model().add(box((-0.12, -0.08, 0), (0.12, 0.08, 0.012)), dark)
@@ -150,7 +150,7 @@ def monitor(seed: int, width: float = 0.55) -> Model:
     return model.add(panel(0, 0.13, width - 0.02, 0.62 * width - 0.02, 0.002), f.screen(seed % 5))
 
 
-def desk(width: float, wood: Finish, seed: int, monitors: int = 1) -> Model:
+def desk(width: Real, wood: Finish, seed: int, monitors: int = 1) -> Model:
     """A desk against a wall: monitors, keyboard, papers, pots, a drawer block. 0.75 m deep."""
     w, rng = width / 2, np.random.default_rng(seed)
     model = Model().add(box((-w, 0, 0.71), (w, 0.75, 0.74), step=0.4), wood)

@@ -11,9 +11,9 @@ import itertools
 import numpy as np
 from PIL import Image, ImageDraw
 
-from r3jax.scenes.procedural.noise import blend, cloud, smoothstep, texels
+from r3jax.scenes.procedural.noise import Real, blend, cloud, smoothstep, texels
 
-Color = tuple[float, float, float]
+Color = tuple[Real, Real, Real]
 
 
 def _rgb(color: Color) -> np.ndarray:
@@ -21,7 +21,7 @@ def _rgb(color: Color) -> np.ndarray:
 
 
 @functools.cache
-def plaster(color: Color, seed: int, strength: float = 1.0, size: int = 768) -> np.ndarray:
+def plaster(color: Color, seed: int, strength: Real = 1.0, size: int = 768) -> np.ndarray:
     """Painted plaster: roller grain, trowel strokes, faint stains."""
     broad = cloud(size, size, seed, 1.9)
     strokes = cloud(size, size, seed + 1, 1.1, 3.0, 8.0)
@@ -45,7 +45,7 @@ def concrete(color: Color, seed: int, size: int = 768) -> np.ndarray:
     return texels(_rgb(color) * shade[..., None])
 
 
-def _grain(color: Color, seed: int, height: int, width: int, rings: float) -> np.ndarray:
+def _grain(color: Color, seed: int, height: int, width: int, rings: Real) -> np.ndarray:
     """Wood cut along the grain, [h, w, 3] float32."""
     warp = cloud(height, width, seed, 2.1, 7.0)
     fibre = cloud(height, width, seed + 1, 0.7, 24.0, 6.0)
@@ -60,14 +60,14 @@ def _grain(color: Color, seed: int, height: int, width: int, rings: float) -> np
 
 
 @functools.cache
-def wood(color: Color, seed: int, rings: float = 11.0, size: int = 512) -> np.ndarray:
+def wood(color: Color, seed: int, rings: Real = 11.0, size: int = 512) -> np.ndarray:
     """Furniture wood, grain along the rows."""
     return texels(_grain(color, seed, size, size, rings))
 
 
 @functools.cache
 def planks(
-    color: Color, seed: int, rows: int = 14, contrast: float = 0.16, size: int = 768
+    color: Color, seed: int, rows: int = 14, contrast: Real = 0.16, size: int = 768
 ) -> np.ndarray:
     """A floor of staggered planks, each cut from another place of the wood."""
     rng = np.random.default_rng(seed)
@@ -81,7 +81,8 @@ def planks(
         for i, (start, stop) in enumerate([(0, joints[0]), tuple(joints), (joints[1], size)]):
             tone = 1.0 + contrast * (rng.random() - 0.5) * 2.0
             if i == 2:  # The last piece goes on in the first: the tile repeats.
-                tone = float(strip[0, 0, 0] / max(shift[0, 0, 0], 1e-3))
+                match = float(strip[0, 0, 0] / max(shift[0, 0, 0], 1e-3))
+                tone = min(max(match, 1.0 - contrast), 1.0 + contrast)
             piece = shift if i != 1 else np.roll(shift, size // 2, axis=1)
             strip[:, start:stop] = piece[top:bottom, start:stop] * tone
         strip[:2] *= 0.45
@@ -121,7 +122,7 @@ def tiles(
     columns: int = 6,
     rows: int = 6,
     grout: Color = (0.62, 0.6, 0.57),
-    bond: float = 0.0,
+    bond: Real = 0.0,
     size: int = 768,
 ) -> np.ndarray:
     """Glazed tiles with grout. `bond` shifts every other row by that share of a tile."""
@@ -190,7 +191,7 @@ def terrazzo(color: Color, chips: tuple[Color, ...], seed: int, size: int = 768)
 
 
 @functools.cache
-def metal(color: Color, seed: int, size: int = 512) -> np.ndarray:
+def metal(color: Color, seed: int, size: int = 384) -> np.ndarray:
     """Brushed metal with smudges."""
     brushed = cloud(size, size, seed, 0.5, 40.0)
     smudge = cloud(size, size, seed + 1, 1.7)
@@ -199,7 +200,7 @@ def metal(color: Color, seed: int, size: int = 512) -> np.ndarray:
 
 
 @functools.cache
-def enamel(color: Color, seed: int, size: int = 512) -> np.ndarray:
+def enamel(color: Color, seed: int, size: int = 384) -> np.ndarray:
     """Lacquer, ceramic, plastic: nearly even, with wear, dust and scratches."""
     broad, fine = cloud(size, size, seed, 1.7), cloud(size, size, seed + 1, 0.5, 1.0, 20.0)
     scratch = smoothstep(2.2, 3.2, cloud(size, size, seed + 2, 0.8, 12.0, 10.0))

@@ -5,10 +5,11 @@ import numpy as np
 from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural import objects, seating, storage
 from r3jax.scenes.procedural.model import Finish, Model
+from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import ball, box, combine, cylinder, panel, quad, tube
 
 
-def glass_partition(width: float, height: float) -> Model:
+def glass_partition(width: Real, height: Real) -> Model:
     """A framed glass wall, 8 cm thick, in its middle plane y = 0.
 
     The panes between the posts are clear glass (no depth there, half a mirror) with an etched
@@ -35,7 +36,7 @@ def glass_partition(width: float, height: float) -> Model:
     return model
 
 
-def workstation(seed: int, width: float = 1.5) -> Model:
+def workstation(seed: int, width: Real = 1.5) -> Model:
     """A desk with a chair, monitors and personal things."""
     model = storage.desk(
         width, f.wood(f.BEECH if seed % 2 else f.OAK, seed % 3), seed, 1 + seed % 2
@@ -57,7 +58,7 @@ def desk_island(pairs: int, seed: int) -> Model:
     return model.add(screen, f.fabric(f.SAGE if seed % 2 else f.NAVY, 2))
 
 
-def meeting_table(width: float, depth: float, seats: int, seed: int) -> Model:
+def meeting_table(width: Real, depth: Real, seats: int, seed: int) -> Model:
     """A conference table with swivel chairs, papers, cups and a conference phone."""
     model = Model().put(seating.table(width, depth, f.wood(f.WALNUT, 4, 0.35), 0.74))
     for k in range(seats):
@@ -88,9 +89,8 @@ def copier() -> Model:
     """A floor-standing copier."""
     white, dark = f.enamel((0.86, 0.86, 0.84), 5, 0.3), f.enamel(f.CHARCOAL, 2, 0.4)
     model = Model().add(box((-0.3, 0.02, 0.04), (0.3, 0.62, 0.82)), white)
-    model.add(box((-0.32, 0, 0.82), (0.32, 0.6, 0.9)), dark).add(
-        box((-0.3, 0.02, 0.9), (0.3, 0.6, 1.02)), white
-    )
+    model.add(box((-0.32, 0, 0.82), (0.32, 0.6, 0.9)), dark)
+    model.add(box((-0.3, 0.02, 0.9), (0.3, 0.6, 1.02)), white)
     for z in (0.12, 0.34, 0.56):
         model.add(box((-0.27, 0.62, z), (0.27, 0.64, z + 0.18)), white, (0.9, 0.9, 0.9))
     model.add(box((-0.62, 0.12, 0.7), (-0.3, 0.5, 0.72)), dark)
@@ -132,7 +132,7 @@ def globe(seed: int) -> Model:
     return model.add(sphere, f.picture("landscape", 80 + seed, True))
 
 
-def spotlight_rail(length: float, ceiling: float, count: int, reach: float = 2.2) -> Model:
+def spotlight_rail(length: Real, ceiling: Real, count: int, reach: Real = 2.2) -> Model:
     """A rail along x under the ceiling with spotlights that shine on what is below."""
     dark = f.enamel(f.CHARCOAL, 1)
     model = Model().add(
@@ -150,8 +150,8 @@ def spotlight_rail(length: float, ceiling: float, count: int, reach: float = 2.2
 def lectern(wood: Finish) -> Model:
     """A teacher's desk with a globe, books and a chair behind it; front towards +y."""
     model = Model().put(storage.drawers(0.45, 0.7, 0.55, wood, 1, 3), -0.5, -0.3)
-    model.put(seating.table(1.5, 0.7, wood, 0.76)).put(globe(1), 0.55, 0.1, 0.76)
-    model.put(objects.book_pile(5, 4), -0.5, 0.1, 0.76, 25.0).put(
-        objects.book_pile(3, 9), 0.1, -0.1, 0.76
-    )
+    model.put(seating.table(1.5, 0.7, wood, 0.76))
+    model.put(globe(1), 0.55, 0.1, 0.76)
+    model.put(objects.book_pile(5, 4), -0.5, 0.1, 0.76, 25.0)
+    model.put(objects.book_pile(3, 9), 0.1, -0.1, 0.76)
     return model.put(seating.chair(wood, f.leather((0.4, 0.22, 0.15), 1)), 0.0, -0.6, 0, 12.0)

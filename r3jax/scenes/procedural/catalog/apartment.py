@@ -11,8 +11,9 @@ from r3jax.simulators.world import World
 SUMMARY = "two-bedroom apartment with living room, kitchen, bathroom and hall, 90 m2"
 
 
-def _plan() -> Plan:
-    plan, white = Plan(), f.enamel(f.WHITE, 3, 0.2)
+def plan() -> Plan:
+    """Rooms, doorways and windows."""
+    drawn, white = Plan(), f.enamel(f.WHITE, 3, 0.2)
     parquet, boards = f.parquet_floor(f.OAK, 14), f.plank_floor(f.WALNUT, 15, 0.25)
     ceiling = f.plaster((0.93, 0.92, 0.9), 50, 0.7)
     lilac = ((0.72, 0.68, 0.74), (0.56, 0.5, 0.62))
@@ -47,23 +48,23 @@ def _plan() -> Plan:
         ),
     }
     for name, (rect, wall, floor) in surfaces.items():
-        plan.room(name, rect, wall=wall, floor=floor, ceiling=ceiling, skirting=white, height=2.7)
-    plan.rooms["bath"].wainscot = (
+        drawn.room(name, rect, wall=wall, floor=floor, ceiling=ceiling, skirting=white, height=2.7)
+    drawn.rooms["bath"].wainscot = (
         1.5,
         f.tiled((f.WHITE, (0.82, 0.86, 0.84), f.SAGE), 19, 10, 20, 0.1, 0.5),
     )
-    plan.rooms["living"].sides = {"w": f.plaster((0.45, 0.54, 0.5), 6)}
-    plan.doorway("x", (5.6, 5.72), 1.25, 1.4)
+    drawn.rooms["living"].sides = {"w": f.plaster((0.45, 0.54, 0.5), 6)}
+    drawn.doorway("x", (5.6, 5.72), 1.25, 1.4)
     for center in (4.6, 6.6):
-        plan.doorway("y", (4.2, 4.32), center)
+        drawn.doorway("y", (4.2, 4.32), center)
     for center in (3.5, 5.7, 7.9):
-        plan.doorway("y", (5.82, 5.94), center)
-    plan.window("living", "s", 2.6, 2.2, 0.6, 2.3, 3)
-    plan.window("kitchen", "e", 2.4, 1.2, 0.95, 2.2, 9)
-    plan.window("bedroom", "n", 1.2, 1.4, 0.9, 2.2, 5)
-    plan.window("bath", "n", 5.7, 0.7, 1.5, 2.2, 6)
-    plan.window("study", "e", 7.6, 1.6, 0.9, 2.2, 8)
-    return plan
+        drawn.doorway("y", (5.82, 5.94), center)
+    drawn.window("living", "s", 2.6, 2.2, 0.6, 2.3, 3)
+    drawn.window("kitchen", "e", 2.4, 1.2, 0.95, 2.2, 9)
+    drawn.window("bedroom", "n", 1.2, 1.4, 0.9, 2.2, 5)
+    drawn.window("bath", "n", 5.7, 0.7, 1.5, 2.2, 6)
+    drawn.window("study", "e", 7.6, 1.6, 0.9, 2.2, 8)
+    return drawn
 
 
 def _living(m: Model) -> None:
@@ -82,7 +83,8 @@ def _living(m: Model) -> None:
     )
     m.put(storage.bookshelf(1.6, 2.2, f.wood(f.EBONY, 3), 21), 1.3, 4.2, 0, "s")
     m.put(storage.bookshelf(0.8, 1.2, f.wood(f.EBONY, 3), 22), 2.7, 4.2, 0, "s")
-    m.put(objects.leafy_plant(1.3, 2, 40), 0.5, 0.5).put(objects.floor_lamp(1), 0.45, 3.45)
+    m.put(objects.leafy_plant(1.3, 2, 40), 0.5, 0.5)
+    m.put(objects.floor_lamp(1), 0.45, 3.45)
     m.put(
         decor.curtains(2.2, 2.5, f.printed(f.CREAM, (f.SAGE, f.TEAL, f.MUSTARD), "botanical", 14)),
         2.6,
@@ -103,20 +105,21 @@ def _kitchen(m: Model) -> None:
     m.put(kitchen.fridge(3), 10.4, 1.1, 0, "w")
     m.put(decor.wall_shelf(0.9, 1.55, kitchen.kitchen_shelf(4, 0.9)), 10.4, 3.6, 0, "w")
     m.put(seating.dining_set(1.5, 0.85, f.wood(f.OAK, 4), f.fabric(f.TEAL, 1), 2), 8.5, 2.55)
-    m.put(objects.pendant(2.7, 0.6, 0.25, 1), 8.5, 2.55).put(
-        objects.ceiling_panel(2.7, 0.9, 0.3, 2.0), 6.6, 1.6
-    )
-    m.put(decor.picture_group(30, 1.6), 8.9, 4.2, 0, "s").put(decor.clock(7), 5.72, 3.2, 0, "e")
+    m.put(objects.pendant(2.7, 0.6, 0.25, 1), 8.5, 2.55)
+    m.put(objects.ceiling_panel(2.7, 0.9, 0.3, 2.0), 6.6, 1.6)
+    m.put(decor.picture_group(30, 1.6), 8.9, 4.2, 0, "s")
+    m.put(decor.clock(7), 5.72, 3.2, 0, "e")
     m.put(storage.sideboard(1.2, f.wood(f.OAK, 4), 4), 9.6, 4.2, 0, "s")
 
 
 def _hall(m: Model) -> None:
-    m.put(decor.rug(3.0, 0.8, PERSIAN, 9), 3.0, 5.07).put(decor.rug(2.2, 0.8, NORDIC, 3), 7.6, 5.07)
-    m.put(decor.coat_rack(0), 10.4, 5.07, 0, "w").put(
-        decor.wall_mirror(0.7, 1.3, 1.4), 0.0, 5.07, 0, "e"
-    )
+    m.put(decor.rug(3.0, 0.8, PERSIAN, 9), 3.0, 5.07)
+    m.put(decor.rug(2.2, 0.8, NORDIC, 3), 7.6, 5.07)
+    m.put(decor.coat_rack(0), 10.4, 5.07, 0, "w")
+    m.put(decor.wall_mirror(0.7, 1.3, 1.4), 0.0, 5.07, 0, "e")
     m.put(storage.drawers(0.9, 0.9, 0.3, f.wood(f.OAK, 5), 2, 3), 1.0, 5.82, 0, "s")
-    m.put(objects.vase(3, 0.34), 0.8, 5.66, 0.9).put(objects.standing_frame(2), 1.2, 5.66, 0.9, "s")
+    m.put(objects.vase(3, 0.34), 0.8, 5.66, 0.9)
+    m.put(objects.standing_frame(2), 1.2, 5.66, 0.9, "s")
     for k, x in enumerate((1.6, 2.7, 8.6, 9.5)):
         m.put(
             decor.picture(("poster", "abstract", "landscape", "poster")[k], 40 + k, 0.45, 0.6),
@@ -125,9 +128,8 @@ def _hall(m: Model) -> None:
             0,
             "n",
         )
-    m.put(objects.pendant(2.7, 0.3, 0.16, 2, 1.8), 2.4, 5.07).put(
-        objects.pendant(2.7, 0.3, 0.16, 2, 1.8), 8.0, 5.07
-    )
+    m.put(objects.pendant(2.7, 0.3, 0.16, 2, 1.8), 2.4, 5.07)
+    m.put(objects.pendant(2.7, 0.3, 0.16, 2, 1.8), 8.0, 5.07)
 
 
 def _bedrooms(m: Model) -> None:
@@ -144,20 +146,16 @@ def _bedrooms(m: Model) -> None:
         0,
         "e",
     )
-    m.put(storage.nightstand(oak, 4), 0.0, 6.6, 0, "e").put(
-        storage.nightstand(oak, 7), 0.0, 8.8, 0, "e"
-    )
+    m.put(storage.nightstand(oak, 4), 0.0, 6.6, 0, "e")
+    m.put(storage.nightstand(oak, 7), 0.0, 8.8, 0, "e")
     m.put(storage.wardrobe(1.8, 2.2, f.wood(f.OAK, 8)), 4.4, 8.2, 0, "w")
     m.put(decor.curtains(1.4, 2.4, f.striped((f.NAVY, f.CREAM), 7)), 1.2, 9.3, 0, "s")
-    m.put(decor.rug(2.2, 1.5, NORDIC, 6), 2.6, 7.5).put(
-        objects.pendant(2.7, 0.4, 0.25, 4), 2.3, 7.5
-    )
-    m.put(decor.picture("sunset", 33, 0.9, 0.6, 1.7), 0.0, 7.7, 0, "e").put(
-        objects.leafy_plant(0.9, 6, 30), 2.9, 9.0
-    )
-    m.put(decor.picture("landscape", 35, 0.7, 0.5), 1.8, 5.94, 0, "n").put(
-        decor.radiator(1.0), 1.2, 9.3, 0, "s"
-    )
+    m.put(decor.rug(2.2, 1.5, NORDIC, 6), 2.6, 7.5)
+    m.put(objects.pendant(2.7, 0.4, 0.25, 4), 2.3, 7.5)
+    m.put(decor.picture("sunset", 33, 0.9, 0.6, 1.7), 0.0, 7.7, 0, "e")
+    m.put(objects.leafy_plant(0.9, 6, 30), 2.9, 9.0)
+    m.put(decor.picture("landscape", 35, 0.7, 0.5), 1.8, 5.94, 0, "n")
+    m.put(decor.radiator(1.0), 1.2, 9.3, 0, "s")
     m.put(storage.desk(1.4, f.wood(f.BEECH, 3), 9, 2), 9.5, 5.94, 0, "n")
     m.put(seating.office_chair(f.fabric(f.TEAL, 4)), 9.5, 6.95, 0, 165.0)
     m.put(
@@ -180,22 +178,23 @@ def _bedrooms(m: Model) -> None:
         0,
         "w",
     )
-    m.put(decor.picture_group(36, 1.65), 7.02, 7.6, 0, "e").put(
-        objects.pendant(2.7, 0.4, 0.2, 6), 8.6, 7.6
-    )
+    m.put(decor.picture_group(36, 1.65), 7.02, 7.6, 0, "e")
+    m.put(objects.pendant(2.7, 0.4, 0.2, 6), 8.6, 7.6)
     m.put(decor.rug(1.5, 1.1, BERBER, 4), 8.9, 7.9)
 
 
 def _bath(m: Model) -> None:
-    m.put(kitchen.bathtub(), 6.9, 8.3, 0, "w").put(kitchen.toilet(), 4.52, 8.7, 0, "e")
+    m.put(kitchen.bathtub(), 6.9, 8.3, 0, "w")
+    m.put(kitchen.toilet(), 4.52, 8.7, 0, "e")
     m.put(kitchen.washbasin(0.8, f.wood(f.WALNUT, 3), 5), 4.52, 7.6, 0, "e")
-    m.put(kitchen.washing_machine(), 6.9, 6.8, 0, "w").put(kitchen.towel_rail(2), 4.9, 5.94, 0, "n")
+    m.put(kitchen.washing_machine(), 6.9, 6.8, 0, "w")
+    m.put(kitchen.towel_rail(2), 4.9, 5.94, 0, "n")
     m.put(objects.ceiling_panel(2.7, 0.5, 0.5, 2.0), 5.7, 7.4)
 
 
 def build() -> World:
     """Makes the apartment."""
-    m = _plan().build()
+    m = plan().build()
     for furnish in (_living, _kitchen, _hall, _bedrooms, _bath):
         furnish(m)
     return assemble("apartment", m, (3.7, 2.0, 1.3), 200.0, SUMMARY)

@@ -11,10 +11,11 @@ from r3jax.simulators.world import World
 SUMMARY = "one-room flat with kitchenette, hall and bathroom, 34 m2"
 
 
-def _plan() -> Plan:
-    plan, white, oak = Plan(), f.enamel(f.WHITE, 3, 0.2), f.plank_floor(f.OAK, 4)
+def plan() -> Plan:
+    """Rooms, doorways and windows."""
+    drawn, white, oak = Plan(), f.enamel(f.WHITE, 3, 0.2), f.plank_floor(f.OAK, 4)
     ceiling = f.plaster((0.93, 0.92, 0.9), 50, 0.7)
-    plan.room(
+    drawn.room(
         "living",
         (0, 0, 5.6, 4.2),
         wall=f.plaster((0.86, 0.82, 0.73), 1),
@@ -26,7 +27,7 @@ def _plan() -> Plan:
             "n": f.plaster((0.62, 0.69, 0.64), 9),
         },
     )
-    plan.room(
+    drawn.room(
         "bath",
         (5.72, 2.0, 8.2, 4.2),
         wall=f.plaster((0.85, 0.87, 0.86), 3),
@@ -38,7 +39,7 @@ def _plan() -> Plan:
         ),
     )
     trellis = ((0.74, 0.67, 0.56), (0.55, 0.4, 0.3))
-    plan.room(
+    drawn.room(
         "hall",
         (5.72, 0, 8.2, 1.88),
         wall=f.wallpaper((0.85, 0.8, 0.7), trellis, "trellis", 8),
@@ -46,12 +47,12 @@ def _plan() -> Plan:
         ceiling=ceiling,
         skirting=white,
     )
-    plan.doorway("x", (5.6, 5.72), 0.95)
-    plan.doorway("y", (1.88, 2.0), 6.5)
-    plan.window("living", "w", 2.15, 1.6, 0.85, 2.2, 3)
-    plan.window("living", "s", 2.3, 1.5, 0.85, 2.2, 7)
-    plan.window("bath", "e", 3.1, 0.8, 1.2, 2.0, 5)
-    return plan
+    drawn.doorway("x", (5.6, 5.72), 0.95)
+    drawn.doorway("y", (1.88, 2.0), 6.5)
+    drawn.window("living", "w", 2.15, 1.6, 0.85, 2.2, 3)
+    drawn.window("living", "s", 2.3, 1.5, 0.85, 2.2, 7)
+    drawn.window("bath", "e", 3.1, 0.8, 1.2, 2.0, 5)
+    return drawn
 
 
 def _sleep_and_work(m: Model) -> None:
@@ -68,7 +69,7 @@ def _sleep_and_work(m: Model) -> None:
     m.put(storage.desk(1.1, pine, 6), 0.0, 0.75, 0, "e")
     m.put(seating.chair(pine, f.fabric(f.TERRACOTTA, 1)), 0.85, 0.75, 0, 80.0)
     m.put(storage.bookshelf(1.0, 2.0, f.wood(f.OAK, 3), 11), 5.6, 2.15, 0, "w")
-    m.put(objects.leafy_plant(1.1, 3), 0.32, 2.95)
+    m.put(objects.leafy_plant(1.1, 3), 0.43, 2.93)
     m.put(decor.picture_group(10, 1.75), 1.3, 4.2, 0, "s")
     m.put(objects.pendant(2.6, 0.5, 0.24, 1), 2.6, 2.3)
 
@@ -99,7 +100,8 @@ def _bath_and_hall(m: Model) -> None:
     m.put(objects.ceiling_panel(2.6, 0.5, 0.5, 2.0), 6.9, 3.1)
     m.put(decor.coat_rack(1), 7.6, 1.88, 0, "s")
     m.put(storage.drawers(0.9, 0.85, 0.35, f.wood(f.WALNUT, 5), 2, 3), 8.2, 0.9, 0, "w")
-    m.put(objects.vase(5), 8.0, 1.15, 0.85).put(objects.clutter(14), 8.0, 0.65, 0.85)
+    m.put(objects.vase(5), 8.0, 1.15, 0.85)
+    m.put(objects.clutter(14), 8.0, 0.65, 0.85)
     m.put(decor.wall_mirror(0.6, 0.9, 1.5), 8.2, 0.9, 0, "w")
     m.put(decor.picture("poster", 8, 0.5, 0.7), 6.6, 0.0, 0, "n")
     m.put(objects.pendant(2.6, 0.3, 0.15, 3, 1.7), 6.8, 0.95)
@@ -107,7 +109,7 @@ def _bath_and_hall(m: Model) -> None:
 
 def build() -> World:
     """Makes the flat."""
-    m = _plan().build()
+    m = plan().build()
     _sleep_and_work(m)
     _sit_and_cook(m)
     _bath_and_hall(m)

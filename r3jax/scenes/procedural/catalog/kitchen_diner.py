@@ -11,10 +11,11 @@ from r3jax.simulators.world import World
 SUMMARY = "kitchen-diner with an island, marble worktops and a pantry, 32 m2"
 
 
-def _plan() -> Plan:
-    plan, ceiling = Plan(), f.plaster((0.93, 0.92, 0.9), 50, 0.7)
+def plan() -> Plan:
+    """Rooms, doorways and windows."""
+    drawn, ceiling = Plan(), f.plaster((0.93, 0.92, 0.9), 50, 0.7)
     lines = ((0.8, 0.78, 0.72), (0.5, 0.6, 0.5))
-    plan.room(
+    drawn.room(
         "kitchen",
         (0, 0, 6.0, 4.3),
         wall=f.plaster((0.82, 0.86, 0.84), 15),
@@ -26,7 +27,7 @@ def _plan() -> Plan:
             "e": f.brick(6, (0.72, 0.62, 0.55)),
         },
     )
-    plan.room(
+    drawn.room(
         "pantry",
         (6.12, 0.8, 8.0, 4.3),
         wall=f.plaster((0.86, 0.8, 0.7), 16),
@@ -34,10 +35,10 @@ def _plan() -> Plan:
         ceiling=ceiling,
         height=2.5,
     )
-    plan.doorway("x", (6.0, 6.12), 1.55)
-    plan.window("kitchen", "s", 1.6, 1.7, 0.9, 2.2, 12)
-    plan.window("kitchen", "w", 2.2, 1.2, 0.9, 2.2, 13)
-    return plan
+    drawn.doorway("x", (6.0, 6.12), 1.55)
+    drawn.window("kitchen", "s", 1.6, 1.7, 0.9, 2.2, 12)
+    drawn.window("kitchen", "w", 2.2, 1.2, 0.9, 2.2, 13)
+    return drawn
 
 
 def _cooking(m: Model) -> None:
@@ -77,11 +78,12 @@ def _dining(m: Model) -> None:
         "n",
     )
     m.put(storage.drawers(1.0, 0.85, 0.4, f.wood(f.PINE, 4), 2, 3), 3.7, 0.0, 0, "n")
-    m.put(objects.table_lamp(2), 3.4, 0.2, 0.85).put(objects.book_pile(5, 3), 3.75, 0.2, 0.85).put(
-        objects.vase(7), 4.0, 0.2, 0.85
-    )
+    m.put(objects.table_lamp(2), 3.4, 0.2, 0.85)
+    m.put(objects.book_pile(5, 3), 3.75, 0.2, 0.85)
+    m.put(objects.vase(7), 4.0, 0.2, 0.85)
     m.put(decor.picture_group(50, 1.75), 3.8, 0.0, 0, "n")
-    m.put(objects.leafy_plant(1.4, 4, 42), 5.45, 0.45).put(decor.radiator(0.9), 0.0, 2.2, 0, "e")
+    m.put(objects.leafy_plant(1.4, 4, 42), 5.45, 0.45)
+    m.put(decor.radiator(0.9), 0.0, 2.2, 0, "e")
     m.put(decor.clock(2), 0.0, 3.2, 0, "e")
 
 
@@ -90,17 +92,15 @@ def _pantry(m: Model) -> None:
     for k, z in enumerate(rows):
         m.put(decor.wall_shelf(2.4, z, kitchen.kitchen_shelf(11 * k, 2.4)), 8.0, 2.9, 0, "w")
         m.put(decor.wall_shelf(1.6, z, kitchen.kitchen_shelf(5 + 7 * k, 1.6)), 7.05, 4.3, 0, "s")
-    m.put(storage.drawers(0.5, 0.9, 0.4, shelves, 1, 3), 6.12, 3.5, 0, "e").put(
-        objects.bowl_of_fruit(3), 6.32, 3.5, 0.9
-    )
-    m.put(decor.picture("poster", 4, 0.4, 0.55), 6.12, 2.7, 0, "e").put(
-        objects.ceiling_panel(2.5, 0.6, 0.3, 1.8), 7.0, 2.3
-    )
+    m.put(storage.drawers(0.5, 0.9, 0.4, shelves, 1, 3), 6.12, 3.5, 0, "e")
+    m.put(objects.bowl_of_fruit(3), 6.32, 3.5, 0.9)
+    m.put(decor.picture("poster", 4, 0.4, 0.55), 6.12, 2.7, 0, "e")
+    m.put(objects.ceiling_panel(2.5, 0.6, 0.3, 1.8), 7.0, 2.3)
 
 
 def build() -> World:
     """Makes the kitchen-diner."""
-    m = _plan().build()
+    m = plan().build()
     for furnish in (_cooking, _dining, _pantry):
         furnish(m)
     return assemble("kitchen", m, (2.3, 2.8, 1.3), 300.0, SUMMARY)

@@ -14,10 +14,11 @@ from r3jax.simulators.world import World
 SUMMARY = "brick loft with columns and beams, bathroom and dressing room, 72 m2"
 
 
-def _plan() -> Plan:
-    plan, brick = Plan(), f.brick(7)
+def plan() -> Plan:
+    """Rooms, doorways and windows."""
+    drawn, brick = Plan(), f.brick(7)
     floor = f.concrete((0.62, 0.6, 0.57), 31)
-    plan.room(
+    drawn.room(
         "loft",
         (0, 0, 9.0, 6.4),
         wall=brick,
@@ -26,7 +27,7 @@ def _plan() -> Plan:
         height=3.0,
         sides={"n": f.plaster((0.86, 0.84, 0.8), 34), "e": f.concrete((0.66, 0.65, 0.62), 35)},
     )
-    plan.room(
+    drawn.room(
         "bath",
         (9.12, 3.5, 11.5, 6.4),
         wall=f.concrete((0.7, 0.69, 0.66), 36),
@@ -40,7 +41,7 @@ def _plan() -> Plan:
         ),
         height=2.6,
     )
-    plan.room(
+    drawn.room(
         "dressing",
         (9.12, 0, 11.5, 3.38),
         wall=f.wallpaper(
@@ -54,12 +55,12 @@ def _plan() -> Plan:
         height=2.6,
     )
     steel = f.metal((0.3, 0.31, 0.32), 3, 0.05)
-    plan.doorway("x", (9.0, 9.12), 4.4, frame=steel, floor=floor)
-    plan.doorway("x", (9.0, 9.12), 1.2, frame=steel, floor=floor)
+    drawn.doorway("x", (9.0, 9.12), 4.4, frame=steel, floor=floor)
+    drawn.doorway("x", (9.0, 9.12), 1.2, frame=steel, floor=floor)
     for center, view in ((1.6, 21), (4.4, 22), (7.2, 23)):
-        plan.window("loft", "s", center, 2.0, 0.7, 2.6, view)
-    plan.window("loft", "w", 4.6, 1.8, 0.7, 2.6, 24)
-    return plan
+        drawn.window("loft", "s", center, 2.0, 0.7, 2.6, view)
+    drawn.window("loft", "w", 4.6, 1.8, 0.7, 2.6, 24)
+    return drawn
 
 
 def _structure(m: Model) -> None:
@@ -76,9 +77,8 @@ def _structure(m: Model) -> None:
 def _live(m: Model) -> None:
     hide = f.leather((0.45, 0.27, 0.16), 7)
     pillows = (f.plaid(f.CREAM, f.NAVY, f.TERRACOTTA, 8), f.fabric(f.MUSTARD, 4))
-    m.put(seating.sofa(2.3, hide, pillows, 6), 5.0, 1.55, 0, "w").put(
-        decor.rug(2.6, 1.9, PERSIAN, 12), 3.1, 1.5
-    )
+    m.put(seating.sofa(2.3, hide, pillows, 6), 5.0, 1.55, 0, "w")
+    m.put(decor.rug(2.6, 1.9, PERSIAN, 12), 3.1, 1.5)
     m.put(seating.coffee_table(f.wood(f.EBONY, 4), 8, 1.1), 3.3, 1.55, 0, "e")
     m.put(
         seating.armchair(f.fabric(f.TEAL, 5), f.striped((f.MUSTARD, f.CREAM), 9)),
@@ -88,7 +88,8 @@ def _live(m: Model) -> None:
         15.0,
     )
     m.put(storage.television_unit(1.7, f.wood(f.WALNUT, 7), 2), 0.0, 1.9, 0, "e")
-    m.put(objects.floor_lamp(1), 5.3, 0.35).put(objects.leafy_plant(1.6, 5, 46), 0.5, 0.5)
+    m.put(objects.floor_lamp(1), 5.3, 0.35)
+    m.put(objects.leafy_plant(1.6, 5, 46), 0.5, 0.5)
     m.put(storage.library_shelf(1.5, 1.15, f.wood(f.OAK, 6), 40), 3.0, 4.75, 0, 90.0)
     m.put(
         seating.bed(
@@ -102,9 +103,8 @@ def _live(m: Model) -> None:
         0,
         "s",
     )
-    m.put(storage.nightstand(f.wood(f.WALNUT, 8), 8), 2.45, 6.4, 0, "s").put(
-        decor.picture("abstract", 12, 1.2, 0.9, 1.75), 1.35, 6.4, 0, "s"
-    )
+    m.put(storage.nightstand(f.wood(f.WALNUT, 8), 8), 2.45, 6.4, 0, "s")
+    m.put(decor.picture("abstract", 12, 1.2, 0.9, 1.75), 1.35, 6.4, 0, "s")
     for x, seed in ((1.5, 0), (4.4, 2), (7.4, 5)):
         m.put(objects.pendant(2.78, 0.5, 0.28, seed, 2.4), x, 3.0)
 
@@ -121,9 +121,8 @@ def _cook_and_work(m: Model) -> None:
         0,
         "s",
     )
-    m.put(kitchen.fridge(6), 7.6, 6.4, 0, "s").put(
-        kitchen.island(1.6, f.wood(f.WALNUT, 9), top, 7), 5.4, 4.4
-    )
+    m.put(kitchen.fridge(6), 7.6, 6.4, 0, "s")
+    m.put(kitchen.island(1.6, f.wood(f.WALNUT, 9), top, 7), 5.4, 4.4)
     for x in (4.9, 5.7):
         m.put(seating.stool(f.metal((0.32, 0.33, 0.34), 3, 0.05)), x, 3.75)
     m.put(
@@ -132,32 +131,31 @@ def _cook_and_work(m: Model) -> None:
         1.6,
     )
     m.put(objects.pendant(2.78, 0.6, 0.3, 3, 2.2), 7.2, 1.6)
-    m.put(decor.board("black", 1.4, 0.9, 1.6, 6), 9.0, 2.8, 0, "w").put(
-        decor.picture("poster", 9, 0.7, 1.0, 1.7), 9.0, 5.7, 0, "w"
-    )
+    m.put(decor.board("black", 1.4, 0.9, 1.6, 6), 9.0, 2.8, 0, "w")
+    m.put(decor.picture("poster", 9, 0.7, 1.0, 1.7), 9.0, 5.7, 0, "w")
     m.put(storage.drawers(1.0, 0.9, 0.42, f.enamel(f.MUSTARD, 5, 0.3), 2, 3), 8.5, 6.4, 0, "s")
-    m.put(objects.vase(6, 0.35), 8.3, 6.2, 0.9).put(objects.clutter(12), 8.7, 6.2, 0.9)
+    m.put(objects.vase(6, 0.35), 8.3, 6.2, 0.9)
+    m.put(objects.clutter(12), 8.7, 6.2, 0.9)
     m.put(workplace.globe(3), 8.5, 6.2, 0.9)
 
 
 def _side_rooms(m: Model) -> None:
-    m.put(kitchen.bathtub(1.7), 10.3, 6.4, 0, "s").put(kitchen.toilet(), 11.5, 4.0, 0, "w")
-    m.put(kitchen.washbasin(0.8, f.wood(f.OAK, 7), 6), 11.5, 5.0, 0, "w").put(
-        kitchen.towel_rail(6), 9.12, 5.4, 0, "e"
-    )
+    m.put(kitchen.bathtub(1.7), 10.3, 6.4, 0, "s")
+    m.put(kitchen.toilet(), 11.5, 4.0, 0, "w")
+    m.put(kitchen.washbasin(0.8, f.wood(f.OAK, 7), 6), 11.5, 5.0, 0, "w")
+    m.put(kitchen.towel_rail(6), 9.12, 5.4, 0, "e")
     m.put(objects.ceiling_panel(2.6, 0.5, 0.5, 2.0), 10.2, 4.6)
-    m.put(storage.wardrobe(2.0, 2.2, f.wood(f.OAK, 9)), 11.5, 1.7, 0, "w").put(
-        storage.wardrobe(1.4, 2.2, f.enamel(f.SAGE, 5, 0.2), False), 10.0, 3.38, 0, "s"
-    )
-    m.put(decor.coat_rack(2), 10.2, 0.0, 0, "n").put(decor.rug(1.3, 1.0, BERBER, 14), 10.1, 1.5)
-    m.put(seating.bench(0.9, f.wood(f.OAK, 9), f.fabric(f.BLUSH, 3)), 9.8, 0.4).put(
-        objects.pendant(2.6, 0.35, 0.2, 4, 1.9), 10.1, 1.6
-    )
+    m.put(storage.wardrobe(2.0, 2.2, f.wood(f.OAK, 9)), 11.5, 1.7, 0, "w")
+    m.put(storage.wardrobe(1.4, 2.2, f.enamel(f.SAGE, 5, 0.2), False), 10.0, 3.38, 0, "s")
+    m.put(decor.coat_rack(2), 10.2, 0.0, 0, "n")
+    m.put(decor.rug(1.3, 1.0, BERBER, 14), 10.1, 1.5)
+    m.put(seating.bench(0.9, f.wood(f.OAK, 9), f.fabric(f.BLUSH, 3)), 9.8, 0.4)
+    m.put(objects.pendant(2.6, 0.35, 0.2, 4, 1.9), 10.1, 1.6)
 
 
 def build() -> World:
     """Makes the loft."""
-    m = _plan().build()
+    m = plan().build()
     for furnish in (_structure, _live, _cook_and_work, _side_rooms):
         furnish(m)
     return assemble("loft", m, (4.0, 3.1, 1.3), 235.0, SUMMARY, ambient=0.74)
