@@ -40,7 +40,7 @@ class ExplorationConfig:
     clock: ClockName = "wall"
     """`wall`: measured planning and mapping. `model`: fixed costs, the same run every time."""
 
-    num_probes: int = 32
+    num_probes: int = 16
     """Views that mean renderability is averaged over."""
 
     checkpoint_every: int = 25
