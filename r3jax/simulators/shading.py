@@ -150,7 +150,7 @@ def _unique_textures(world: World) -> tuple[list[np.ndarray], list[int]]:
 
 
 def _padded(table: np.ndarray, least: int = 1024) -> np.ndarray:
-    """Adds rows of zeros up to a round number, so that worlds share compiled kernels."""
+    """Adds rows of zeros up to `round_up`, so that worlds share compiled kernels."""
     extra = round_up(len(table), least) - len(table)
     return np.concatenate([table, np.zeros((extra, table.shape[1]), table.dtype)])
 

@@ -93,10 +93,5 @@ def _pack(image: np.ndarray) -> np.ndarray:
 
 
 def round_up(count: int, least: int = 1024) -> int:
-    """A size of at least `count` and `least` with only two bits after the leading one.
-
-    Tables of such sizes waste at most a quarter, and most worlds share the compiled kernels.
-    """
-    count = max(count, least)
-    step = 1 << max(count.bit_length() - 3, 0)
-    return -(-count // step) * step
+    """The next power of two, at least `least`: most worlds then share one compiled kernel."""
+    return 1 << (max(count, least) - 1).bit_length()

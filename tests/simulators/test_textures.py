@@ -50,7 +50,8 @@ def test_a_world_without_textures_has_an_atlas():
 
 
 @given(st.integers(0, 2**30))
-def test_rounding_up_wastes_at_most_a_quarter(count):
-    rounded = round_up(count, least=1)
-    assert count <= rounded <= max(1.25 * count, 1)
-    assert round_up(rounded, least=1) == rounded
+def test_sizes_are_rounded_up_to_powers_of_two(count):
+    rounded = round_up(count, least=16)
+    assert rounded >= max(count, 16)
+    assert rounded < 2 * max(count, 16)
+    assert rounded & (rounded - 1) == 0
