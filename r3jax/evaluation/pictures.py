@@ -1,25 +1,25 @@
 """Pictures computed from a map: the floor from above, and everything round a position.
 
-Shape symbols: N rows of the map; X Y Z cells; h w picture size.
+Shape symbols: N rows of the map; h w picture size.
 """
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.renderability import score_voxels
-from r3jax.scoring.visibility import panorama_buffer, place_panorama
+from r3jax.scoring.renderability import voxel_renderability
 from r3jax.scoring.voxels import voxels_of
 
 _UNKNOWN = (0.86, 0.87, 0.89)
 _FREE = (0.985, 0.985, 0.985)
 _OCCUPIED = (0.68, 0.71, 0.76)
+_HEIGHT, _WIDTH = 256, 512
+"""Size of a panorama picture [px]."""
+
 _HEADROOM = 0.35
 """The floor picture shows what lies below the cameras' height plus this [m]."""
 
@@ -94,39 +94,46 @@ def panorama_picture(
         max_range: range of the sensor [m].
     """
     position = jnp.asarray(T_world_camera[:3, 3], dtype=jnp.float32)
-    config = ScoringConfig(max_range=jnp.asarray(max_range, jnp.float32))
-    voxels = voxels_of(map_state)
-    buffer = jax.jit(panorama_buffer)(voxels, position, config)
-    value = np.asarray(jax.jit(score_voxels)(voxels, position, camera.focal).value)
-    directions = _equirectangular(256, 512)
-    place = place_panorama(
-        jnp.asarray(directions.reshape(-1, 3).T) + position[:, None],
-        jnp.ones(256 * 512, dtype=bool),
-        position,
-        config.panorama_size,
-        config.max_range,
-    )
-    limit = config.panorama_size - 1
-    row = np.clip(np.asarray(place.row).astype(int), 0, limit).reshape(256, 512)
-    column = np.clip(np.asarray(place.column).astype(int), 0, limit).reshape(256, 512)
-    item = np.asarray(buffer.item)[row, column]
-    is_seen = item < map_state.capacity
-    item = np.where(is_seen, item, 0)
-    rgb = np.where(is_seen[..., None], np.asarray(map_state.mean).T[item], np.asarray(_UNKNOWN))
+    value = np.asarray(voxel_renderability(map_state, position, camera.focal).value)
+    row = _nearest_rows(map_state, np.asarray(position), max_range)
+    is_seen = row < map_state.capacity
+    row = np.where(is_seen, row, 0)
+    rgb = np.where(is_seen[..., None], np.asarray(map_state.mean).T[row], np.asarray(_UNKNOWN))
     forward = T_world_camera[:3, 2]
     return PanoramaPicture(
         rgb=rgb,
-        value=np.where(is_seen, value[item], np.nan),
+        value=np.where(is_seen, value[row], np.nan),
         azimuth=float(np.arctan2(forward[1], forward[0])),
         elevation=float(np.arcsin(np.clip(forward[2], -1.0, 1.0))),
     )
 
 
-def _equirectangular(height: int, width: int) -> np.ndarray:
-    """Unit directions of the pixel centers, [h, w, 3] float32: left is azimuth +180 degrees."""
-    azimuth = np.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
-    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
-    level = np.cos(elevation)[:, None]
-    x, y = level * np.cos(azimuth), level * np.sin(azimuth)
-    z = np.broadcast_to(np.sin(elevation)[:, None], x.shape)
-    return np.stack([x, y, z], axis=-1).astype(np.float32)
+def _nearest_rows(map_state: MapState, position: np.ndarray, max_range: float) -> np.ndarray:
+    """The map row that is seen in every direction, [h, w]; N where there is none.
+
+    A painter's picture: every voxel covers the angle of its edge, the far ones are painted
+    first. The first column looks along azimuth +180 degrees, the first row straight up.
+    """
+    offset = np.asarray(voxels_of(map_state).center).T - position
+    distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
+    rows = np.flatnonzero(np.asarray(map_state.occupied) & (distance <= max_range))
+    rows = rows[np.argsort(-distance[rows], kind="stable")]
+    offset, distance = offset[rows], distance[rows]
+    elevation = np.arcsin(offset[:, 2] / distance)
+    azimuth = np.arctan2(offset[:, 1], offset[:, 0])
+    # Half the angle of a voxel seen corner on, so that walls have no gaps; wider near the poles.
+    half = np.arctan(0.75 * float(map_state.voxel_size) / distance)
+    half_wide = np.minimum(half / np.maximum(np.cos(elevation), 1e-3), np.pi)
+    pixel = np.pi / _HEIGHT
+    top = np.clip((0.5 * np.pi - elevation - half) / pixel, 0, _HEIGHT).astype(int)
+    bottom = np.ceil((0.5 * np.pi - elevation + half) / pixel).astype(int)
+    left = np.floor((np.pi - azimuth - half_wide) / pixel).astype(int)
+    right = np.ceil((np.pi - azimuth + half_wide) / pixel).astype(int)
+    picture = np.full((_HEIGHT, _WIDTH), map_state.capacity)
+    for row, y0, y1, x0, x1 in zip(rows, top, bottom, left, right, strict=True):
+        picture[y0:y1, max(x0, 0) : x1] = row
+        if x0 < 0:  # the picture closes on itself
+            picture[y0:y1, x0:] = row
+        if x1 > _WIDTH:
+            picture[y0:y1, : x1 - _WIDTH] = row
+    return picture
