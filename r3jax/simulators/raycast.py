@@ -18,6 +18,7 @@ from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.simulators import shading, start
 from r3jax.simulators.clearance import SurfaceDistance
 from r3jax.simulators.rays import Hits, TriangleScene, join
+from r3jax.simulators.surface import build_surface
 from r3jax.simulators.world import World
 
 # A rotated grid: nearly level and nearly upright edges, the ones that show, get four steps.
@@ -71,7 +72,7 @@ class RaycastSimulator:
         self._seed = seed
         self._bounds = world.bounds
         self._scene = TriangleScene(world.vertices, world.faces)
-        self._surface = shading.build_surface(world, lighting=lighting)
+        self._surface = build_surface(world, lighting=lighting)
         mirror = np.array([m.mirror if lighting else 0.0 for m in world.materials], np.float32)
         hole = np.array([m.is_hole for m in world.materials])
         self._face_mirror = mirror[world.face_material] if mirror.any() else None

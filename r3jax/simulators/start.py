@@ -9,7 +9,7 @@ import numpy as np
 
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.simulators.clearance import SurfaceDistance
-from r3jax.simulators.rays import TriangleScene
+from r3jax.simulators.rays import Hits, TriangleScene
 
 MIN_CLEARANCE = 0.3
 """A start nearer to the mesh than this is an error [m]."""
@@ -92,7 +92,7 @@ def find_start(
     return None
 
 
-def _cast(scene: TriangleScene, origins: np.ndarray, directions: np.ndarray):
+def _cast(scene: TriangleScene, origins: np.ndarray, directions: np.ndarray) -> Hits:
     """Casts D directions from each of n origins; hits come as [n * D]."""
     n, d = len(origins), len(directions)
     return scene.cast(
