@@ -61,7 +61,9 @@ def rooms(name: str) -> dict[str, tuple[float, float, float, float]]:
         ValueError: no scene has that name.
     """
     drawn = _scene(name).plan()
-    return {key: (r.x0, r.y0, r.x1, r.y1) for key, r in drawn.rooms.items()}
+    return {
+        key: (float(r.x0), float(r.y0), float(r.x1), float(r.y1)) for key, r in drawn.rooms.items()
+    }
 
 
 def describe(name: str) -> str:

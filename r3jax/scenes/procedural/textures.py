@@ -204,7 +204,7 @@ def enamel(color: Color, seed: int, size: int = 384) -> np.ndarray:
     """Lacquer, ceramic, plastic: nearly even, with wear, dust and scratches."""
     broad, fine = cloud(size, size, seed, 1.7), cloud(size, size, seed + 1, 0.5, 1.0, 20.0)
     scratch = smoothstep(2.2, 3.2, cloud(size, size, seed + 2, 0.8, 12.0, 10.0))
-    shade = 1.0 + 0.035 * broad + 0.022 * fine - 0.12 * scratch
+    shade = 1.0 + 0.05 * broad + 0.035 * fine - 0.12 * scratch
     return texels(_rgb(color) * shade[..., None])
 
 
