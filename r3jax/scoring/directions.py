@@ -40,7 +40,20 @@ def seen_directions(
         `cosine` and `inside`. The derivative of `cosine` is that of the nearest bin's product;
         `inside` is piecewise constant.
     """
-    return _scan(visited, direction, num_bins)[:2]
+    # One output behind a branch: XLA on a CPU would otherwise repeat the whole scan over the
+    # bins in every kernel that uses one of its results.
+    packed = jax.lax.cond(
+        jnp.any(visited != jnp.uint32(0)),
+        lambda: _pack(*_scan(visited, direction, num_bins)[:2]),
+        lambda: jnp.zeros_like(direction[0]),
+    )
+    inside = packed >= 2.0
+    return jnp.where(inside, packed - 2.0, packed), inside.astype(direction.dtype)
+
+
+def _pack(cosine: Float[Array, " n"], inside: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Both results in one number; the shift by 2 costs the cosine one bit."""
+    return jnp.where(inside > 0.0, cosine + 2.0, cosine)
 
 
 @seen_directions.defjvp

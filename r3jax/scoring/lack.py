@@ -14,12 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
-from r3jax.mapping.compact import positions_of_set
+from r3jax.scoring.chunks import for_selected, select
 from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.voxels import Voxels
-
-CHUNK = 1 << 12
-"""Visible voxels that are scored at once."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
@@ -43,19 +40,12 @@ def lack_by_direction(
         kappa: as in `ScoringConfig`.
         num_bins: bins of the Fibonacci lattice; 1 sums over all directions.
     """
-    num = visible.shape[0]
-    size = min(CHUNK, num)
-    order = positions_of_set(visible, -(-num // size) * size)
-    num_visible = jnp.sum(visible, dtype=jnp.int32)
 
-    def add_chunk(carry):
-        first, total = carry
-        index = jax.lax.dynamic_slice_in_dim(order, first, size)
-        seen = voxels.take(jnp.minimum(index, num - 1), index < num)
-        return first + size, total + _lack(seen, seen.present, position, focal, kappa, num_bins)
+    def add(index, valid, total):
+        seen = voxels.take(index, valid)
+        return total + _lack(seen, valid, position, focal, kappa, num_bins)
 
-    start = (jnp.zeros((), jnp.int32), jnp.zeros(num_bins, dtype=jnp.float32))
-    return jax.lax.while_loop(lambda c: c[0] < num_visible, add_chunk, start)[1]
+    return for_selected(select(visible), add, jnp.zeros(num_bins, dtype=jnp.float32))
 
 
 @lack_by_direction.defjvp
@@ -75,8 +65,6 @@ def _lack(
 ) -> Float[Array, " B"]:
     lack = 1.0 - score_voxels(voxels, position, focal, kappa).value
     lack = jnp.where(visible & voxels.present, lack, 0.0)
-    if num_bins == 1:
-        return jnp.sum(lack, keepdims=True)
     return sum_by_direction(voxels.center, lack, position, num_bins)
 
 
@@ -86,7 +74,9 @@ def sum_by_direction(
     position: Float[Array, " 3"],
     num_bins: int,
 ) -> Float[Array, " B"]:
-    """Sums weights into the direction bins in which points lie, seen from a position."""
+    """Sums weights into the bins in which points lie, seen from a position; 1 bin sums all."""
+    if num_bins == 1:
+        return jnp.sum(weight, keepdims=True)
     offset = jax.lax.stop_gradient(points - position[:, None])
     direction = offset / jnp.maximum(safe_norm(offset, axis=0), 1e-6)[None, :]
     bins = nearest_bin(direction, num_bins)

@@ -12,10 +12,10 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import unexplored_cells
+from r3jax.scoring.cells import unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.lack import lack_by_direction, sum_by_direction
-from r3jax.scoring.visibility import is_visible, panorama_buffer, place_panorama
+from r3jax.scoring.lack import lack_by_direction
+from r3jax.scoring.visibility import candidates_of, depth_buffer, panorama_view, visible_voxels
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
@@ -69,16 +69,14 @@ def panorama_of(
     config: ScoringConfig,
 ) -> Panorama:
     """`panorama` of voxels that are already at hand."""
-    num_bins, size = config.panorama_bins, config.panorama_size
-    still = jax.lax.stop_gradient(position)
-    buffer = panorama_buffer(voxels, still, config)
-    place = place_panorama(voxels.center, voxels.present, still, size, config.max_range)
-    visible = is_visible(place, buffer)
-    lack = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, num_bins)
-    cells, unexplored = unexplored_cells(grid)
-    place = place_panorama(cells, unexplored, still, size, config.max_range)
-    seen = is_visible(place, buffer, strict=True).astype(jnp.float32)
-    bins = lack + config.lambda1 * sum_by_direction(cells, seen, still, num_bins)
+    num_bins = config.panorama_bins
+    view = panorama_view(position, config)
+    candidates = candidates_of(voxels, view)
+    buffer = depth_buffer(voxels, candidates, view, config)
+    visible = visible_voxels(voxels, candidates, view, buffer)
+    bins = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, num_bins)
+    cells = unexplored_by_direction(grid, view, buffer, view.position, num_bins)
+    bins = bins + config.lambda1 * cells
     directions = bins_in_view(camera, num_bins) @ bins
     best = jnp.argmax(directions)
     axis = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)[best]

@@ -15,9 +15,10 @@ from jaxtyping import Array, Float
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.numerics import safe_norm, safe_power
 from r3jax.mapping.state import MapState
+from r3jax.scoring.chunks import for_selected, select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.directions import seen_directions
-from r3jax.scoring.visibility import pinhole_buffer
+from r3jax.scoring.visibility import candidates_of, depth_buffer, pinhole_view
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
@@ -78,9 +79,33 @@ def score_voxels(
     )
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _score_present(
+    voxels: Voxels, camera_position: Float[Array, " 3"], focal: Float[Array, ""], kappa: str
+) -> Renderability:
+    """`score_voxels`, at a cost that follows the voxels present and not the capacity."""
+    num = voxels.present.shape[0]
+
+    def score(index, valid, terms):
+        part = score_voxels(voxels.take(index, valid), camera_position, focal, kappa)
+        target = jnp.where(valid, index, num)
+        return jax.tree.map(lambda all, new: all.at[target].set(new, mode="drop"), terms, part)
+
+    zeros, ones = jnp.zeros(num), jnp.ones(num)
+    return for_selected(
+        select(voxels.present), score, Renderability(2.0 * ones, zeros, ones, zeros, zeros, zeros)
+    )
+
+
+@_score_present.defjvp
+def _score_present_jvp(kappa, primals, tangents):
+    # A loop of unknown length has no reverse mode; the dense form has.
+    return jax.jvp(functools.partial(score_voxels, kappa=kappa), primals, tangents)
+
+
 @functools.partial(jax.jit, static_argnames="kappa")
 def _voxel_renderability(state, camera_position, focal, kappa):
-    return score_voxels(voxels_of(state), camera_position, focal, kappa)
+    return _score_present(voxels_of(state), camera_position, focal, kappa)
 
 
 def voxel_renderability(
@@ -119,7 +144,8 @@ def renderability_image(
     """
     config = ScoringConfig() if config is None else config
     voxels = voxels_of(state, config.delta)
-    buffer = pinhole_buffer(voxels, camera, jax.lax.stop_gradient(T_world_camera), config)
+    view = pinhole_view(camera, T_world_camera, config)
+    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
     shape = buffer.item.shape
     item = buffer.item.reshape(-1)
     is_hit = item < voxels.present.shape[0]

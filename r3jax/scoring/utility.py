@@ -2,16 +2,15 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import unexplored_cells
+from r3jax.scoring.cells import unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.lack import lack_by_direction
-from r3jax.scoring.visibility import is_visible, pinhole_buffer, place_pinhole, reduced_camera
+from r3jax.scoring.visibility import candidates_of, depth_buffer, pinhole_view, visible_voxels
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
@@ -54,14 +53,11 @@ def utility_of_view(
     config: ScoringConfig,
 ) -> ViewUtility:
     """`view_utility` of voxels that are already at hand."""
-    pose = jax.lax.stop_gradient(T_world_camera)
-    small = reduced_camera(camera, config)
-    buffer = pinhole_buffer(voxels, camera, pose, config)
-    place = place_pinhole(voxels.center, voxels.present, small, pose, config.max_range)
-    visible = is_visible(place, buffer)
+    view = pinhole_view(camera, T_world_camera, config)
+    candidates = candidates_of(voxels, view)
+    buffer = depth_buffer(voxels, candidates, view, config)
+    visible = visible_voxels(voxels, candidates, view, buffer)
     position = T_world_camera[:3, 3]
-    lack = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, 1)[0]
-    cells, unexplored = unexplored_cells(grid)
-    place = place_pinhole(cells, unexplored, small, pose, config.max_range)
-    exploration = jnp.sum(is_visible(place, buffer, strict=True), dtype=jnp.float32)
-    return ViewUtility(exploration, lack, config.lambda1 * exploration + lack)
+    rendering = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, 1)[0]
+    exploration = unexplored_by_direction(grid, view, buffer, position, 1)[0]
+    return ViewUtility(exploration, rendering, config.lambda1 * exploration + rendering)

@@ -11,12 +11,15 @@ borders wrap in closed form.
 Shape symbols: n voxels; c points; h w size of the finest level; S side of the panorama.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.geometry.cameras import Camera
-from r3jax.geometry.numerics import safe_norm
+from r3jax.scoring.chunks import Selection, for_selected, select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.voxels import Voxels
 
@@ -64,146 +67,211 @@ class Placement(eqx.Module):
     distance: Float[Array, " n"]
     """From the camera [m]."""
 
-    inside: Bool[Array, " n"]
-    """In front of the camera and within range; the image borders are not tested."""
+    ahead: Bool[Array, " n"]
+    """False behind the camera, where the rest means nothing."""
 
 
-def reduced_camera(camera: Camera, config: ScoringConfig) -> Camera:
-    """The camera at the depth buffer's size: the longest side has at most `zbuffer_size` px."""
+class PinholeView(eqx.Module):
+    """One view, at the size of its depth buffer."""
+
+    camera: Camera
+    """Intrinsics of the buffer."""
+
+    T_world_camera: Float[Array, "4 4"]
+    """Pose."""
+
+    max_range: Float[Array, ""]
+    """Nothing farther is visible [m]."""
+
+    wraps: ClassVar[bool] = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the buffer [px]."""
+        return self.camera.height, self.camera.width
+
+    def in_camera(self, points: Float[Array, "3 n"]) -> tuple[Array, Array, Array]:
+        """Coordinates in the camera's frame [m]."""
+        R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        offset = [points[i] - t[i] for i in range(3)]
+        along = lambda j: R[0, j] * offset[0] + R[1, j] * offset[1] + R[2, j] * offset[2]
+        return along(0), along(1), along(2)
+
+    def may_see(self, points: Float[Array, "3 n"], margin: Float[Array, ""]) -> Bool[Array, " n"]:
+        """False only for points that lie outside the frustum by more than `margin` [m]."""
+        x, y, z = self.in_camera(points)
+        camera = self.camera
+        reach = self.max_range + margin
+        low_x, high_x = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
+        low_y, high_y = -camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
+        # Distance to a side plane x = k z is |x - k z| / sqrt(1 + k^2).
+        slack = lambda k: margin * jnp.sqrt(1.0 + k * k)
+        is_in = (x >= low_x * z - slack(low_x)) & (x <= high_x * z + slack(high_x))
+        is_in &= (y >= low_y * z - slack(low_y)) & (y <= high_y * z + slack(high_y))
+        return is_in & (z > -margin) & (x * x + y * y + z * z <= reach * reach)
+
+    def place(self, points: Float[Array, "3 n"]) -> Placement:
+        """Projects points of the world."""
+        x, y, z = self.in_camera(points)
+        is_ahead = z > 1e-3
+        inverse = 1.0 / jnp.where(is_ahead, z, 1.0)
+        return Placement(
+            column=self.camera.fx * x * inverse + self.camera.cx,
+            row=self.camera.fy * y * inverse + self.camera.cy,
+            column_scale=self.camera.fx * inverse,
+            row_scale=self.camera.fy * inverse,
+            distance=jnp.sqrt(x * x + y * y + z * z),
+            ahead=is_ahead,
+        )
+
+
+class PanoramaView(eqx.Module):
+    """All directions round a position, on an octahedral map."""
+
+    position: Float[Array, " 3"]
+    """[m], world."""
+
+    max_range: Float[Array, ""]
+    """Nothing farther is visible [m]."""
+
+    size: int = eqx.field(static=True)
+    """Side of the map [px]."""
+
+    wraps: ClassVar[bool] = True
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the buffer [px]."""
+        return self.size, self.size
+
+    def may_see(self, points: Float[Array, "3 n"], margin: Float[Array, ""]) -> Bool[Array, " n"]:
+        """False only for points out of range by more than `margin` [m]."""
+        x, y, z = (points[i] - self.position[i] for i in range(3))
+        reach = self.max_range + margin
+        return x * x + y * y + z * z <= reach * reach
+
+    def place(self, points: Float[Array, "3 n"]) -> Placement:
+        """Projects points of the world on the map.
+
+        For a unit direction d and a = |x| / |d|_1 the map stretches |grad u| =
+        sqrt(1 - 2 a + 3 a^2) / |d|_1 along u, between 0.47 and 1.41; on the lower half u and v
+        swap.
+        """
+        x, y, z = (points[i] - self.position[i] for i in range(3))
+        distance = jnp.maximum(jnp.sqrt(x * x + y * y + z * z), 1e-6)
+        inverse = 1.0 / jnp.maximum(jnp.abs(x) + jnp.abs(y) + jnp.abs(z), 1e-6)
+        u, v = x * inverse, y * inverse
+        a, b = jnp.abs(u), jnp.abs(v)
+        sign = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
+        half = 0.5 * self.size
+        is_lower = z < 0.0
+        p, q = jnp.where(is_lower, b, a), jnp.where(is_lower, a, b)
+        return Placement(
+            column=jnp.where(is_lower, (1.0 - b) * sign(u), u) * half + half,
+            row=jnp.where(is_lower, (1.0 - a) * sign(v), v) * half + half,
+            column_scale=half * inverse * jnp.sqrt(1.0 - 2.0 * p + 3.0 * p * p),
+            row_scale=half * inverse * jnp.sqrt(1.0 - 2.0 * q + 3.0 * q * q),
+            distance=distance,
+            ahead=jnp.ones(distance.shape, dtype=bool),
+        )
+
+
+View = PinholeView | PanoramaView
+
+
+def pinhole_view(
+    camera: Camera, T_world_camera: Float[Array, "4 4"], config: ScoringConfig
+) -> PinholeView:
+    """The view of a camera; its longest side is reduced to `config.zbuffer_size` pixels.
+
+    Visibility is piecewise constant, so no derivative passes through the pose.
+    """
     longest = max(camera.width, camera.height)
     scale = min(1.0, config.zbuffer_size / longest)
-    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    pose = jax.lax.stop_gradient(T_world_camera)
+    return PinholeView(camera.resized(*size), pose, config.max_range)
 
 
-def place_pinhole(
-    points: Float[Array, "3 n"],
-    present: Bool[Array, " n"],
-    camera: Camera,
-    T_world_camera: Float[Array, "4 4"],
-    max_range: Float[Array, ""],
-) -> Placement:
-    """Projects points of the world into a pinhole camera."""
-    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    offset = [points[i] - t[i] for i in range(3)]
-    x, y, z = (sum(R[i, j] * offset[i] for i in range(3)) for j in range(3))
-    distance = jnp.sqrt(x * x + y * y + z * z)
-    is_ahead = z > 1e-3
-    inverse = 1.0 / jnp.where(is_ahead, z, 1.0)
-    return Placement(
-        column=camera.fx * x * inverse + camera.cx,
-        row=camera.fy * y * inverse + camera.cy,
-        column_scale=camera.fx * inverse,
-        row_scale=camera.fy * inverse,
-        distance=distance,
-        inside=present & is_ahead & (distance <= max_range),
-    )
+def panorama_view(position: Float[Array, " 3"], config: ScoringConfig) -> PanoramaView:
+    """All directions from a position; no derivative passes through it."""
+    still = jax.lax.stop_gradient(position)
+    return PanoramaView(still, config.max_range, config.panorama_size)
 
 
-def place_panorama(
-    points: Float[Array, "3 n"],
-    present: Bool[Array, " n"],
-    position: Float[Array, " 3"],
-    size: int,
-    max_range: Float[Array, ""],
-) -> Placement:
-    """Projects points of the world on the octahedral map round a position.
-
-    For a unit direction d and a = |x| / |d|_1 the map stretches |grad u| =
-    sqrt(1 - 2 a + 3 a^2) / |d|_1 along u, between 0.47 and 1.41; on the lower half u and v swap.
-    """
-    offset = points - position[:, None]
-    distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
-    x, y, z = offset / distance[None, :]
-    inverse = 1.0 / (jnp.abs(x) + jnp.abs(y) + jnp.abs(z))
-    u, v = x * inverse, y * inverse
-    a, b = jnp.abs(u), jnp.abs(v)
-    sign = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
-    half = 0.5 * size
-    is_lower = z < 0.0
-    column = jnp.where(is_lower, (1.0 - b) * sign(u), u) * half + half
-    row = jnp.where(is_lower, (1.0 - a) * sign(v), v) * half + half
-    p, q = jnp.where(is_lower, b, a), jnp.where(is_lower, a, b)
-    scale = half * inverse / distance
-    return Placement(
-        column=column,
-        row=row,
-        column_scale=scale * jnp.sqrt(1.0 - 2.0 * p + 3.0 * p * p),
-        row_scale=scale * jnp.sqrt(1.0 - 2.0 * q + 3.0 * q * q),
-        distance=distance,
-        inside=present & (distance <= max_range),
-    )
+def candidates_of(voxels: Voxels, view: View) -> Selection:
+    """The voxels that may appear in a view: a tenth to a half of a map."""
+    return select(voxels.present & view.may_see(voxels.center, voxels.size))
 
 
-def pinhole_buffer(
-    voxels: Voxels, camera: Camera, T_world_camera: Float[Array, "4 4"], config: ScoringConfig
+def depth_buffer(
+    voxels: Voxels, candidates: Selection, view: View, config: ScoringConfig
 ) -> DepthBuffer:
-    """Depth buffer of one view, at the reduced size."""
-    small = reduced_camera(camera, config)
-    place = place_pinhole(voxels.center, voxels.present, small, T_world_camera, config.max_range)
-    return _splat(place, (small.height, small.width), voxels.size, config, wraps=False)
-
-
-def panorama_buffer(
-    voxels: Voxels, position: Float[Array, " 3"], config: ScoringConfig
-) -> DepthBuffer:
-    """Depth buffer of all directions from one position; every view there can reuse it."""
-    size = config.panorama_size
-    place = place_panorama(voxels.center, voxels.present, position, size, config.max_range)
-    return _splat(place, (size, size), voxels.size, config, wraps=True)
-
-
-def is_visible(place: Placement, buffer: DepthBuffer, *, strict: bool = False) -> Bool[Array, " n"]:
-    """True for points whose pixel lies in the buffer and shows nothing clearly nearer.
-
-    Args:
-        place: where the points fall in the buffer.
-        buffer: of the same view.
-        strict: points of empty space: nothing nearer at all. Otherwise points of the surfaces
-            themselves, for which the buffer's tolerance is meant.
-    """
-    height, width = buffer.limit.shape
-    is_in = (place.column >= 0.0) & (place.column < width)
-    is_in &= (place.row >= 0.0) & (place.row < height) & place.inside
-    column = jnp.clip(place.column, 0.0, width - 1.0).astype(jnp.int32)
-    row = jnp.clip(place.row, 0.0, height - 1.0).astype(jnp.int32)
-    limit = (buffer.distance if strict else buffer.limit).reshape(-1)[row * width + column]
-    return is_in & (place.distance <= limit)
-
-
-def _splat(
-    place: Placement,
-    shape: tuple[int, int],
-    voxel_size: Float[Array, ""],
-    config: ScoringConfig,
-    *,
-    wraps: bool,
-) -> DepthBuffer:
-    num = place.distance.shape[0]
-    shapes = _pyramid(shape)
+    """The nearest voxel in every pixel of a view."""
+    shapes = _pyramid(view.shape)
     offsets = [0]
     for height, width in shapes:
         offsets.append(offsets[-1] + height * width)
+    num = candidates.num
     item_bits = max(1, (num - 1).bit_length())
-    packed = _pack(place, item_bits, config.max_range)
-    pixels = jnp.full(offsets[-1], _NOTHING, dtype=jnp.uint32)
-    for index in _block_indices(place, voxel_size, shapes, offsets, wraps=wraps):
-        pixels = pixels.at[index].min(packed, mode="drop")
-    finest = _push_down(pixels, shapes, offsets)
+
+    def splat(index, valid, pixels):
+        place = view.place(voxels.center_of(index))
+        valid = valid & place.ahead & (place.distance <= view.max_range)
+        packed = _pack(place.distance / view.max_range, index, item_bits)
+        for target in _footprint(place, valid, voxels.size, shapes, offsets, wraps=view.wraps):
+            pixels = pixels.at[target].min(packed, mode="drop")
+        return pixels
+
+    blank = jnp.full(offsets[-1], _NOTHING, dtype=jnp.uint32)
+    finest = _push_down(for_selected(candidates, splat, blank), shapes, offsets)
     is_hit = finest != jnp.uint32(_NOTHING)
     item = jnp.where(is_hit, (finest & jnp.uint32((1 << item_bits) - 1)).astype(jnp.int32), num)
-    step = config.max_range / float(1 << (32 - item_bits))
-    distance = jnp.where(is_hit, (finest >> item_bits).astype(jnp.float32) * step, jnp.inf)
-    return DepthBuffer(item, distance, _limit(distance, config.tolerance * voxel_size, voxel_size))
+    share = (finest >> item_bits).astype(jnp.float32) / _num_steps(item_bits)
+    distance = jnp.where(is_hit, share * view.max_range, jnp.inf)
+    return DepthBuffer(item, distance, _limit(distance, config.tolerance, voxels.size))
 
 
-def _pack(place: Placement, item_bits: int, max_range: Float[Array, ""]) -> UInt32[Array, " n"]:
+def visible_voxels(
+    voxels: Voxels, candidates: Selection, view: View, buffer: DepthBuffer
+) -> Bool[Array, " n"]:
+    """Which voxels the view sees: not hidden by voxels, in the image and within range."""
+
+    def test(index, valid, visible):
+        is_seen = valid & is_visible(view, view.place(voxels.center_of(index)), buffer.limit)
+        return visible.at[jnp.where(valid, index, candidates.num)].set(is_seen, mode="drop")
+
+    return for_selected(candidates, test, jnp.zeros(candidates.num, dtype=bool))
+
+
+def is_visible(view: View, place: Placement, limit: Float[Array, "h w"]) -> Bool[Array, " n"]:
+    """True for points in the image and within range, no farther than `limit` at their pixel.
+
+    Args:
+        view: the view.
+        place: where the points fall in it.
+        limit: `DepthBuffer.limit` for points on surfaces, `DepthBuffer.distance` for points in
+            empty space, which nothing may hide.
+    """
+    height, width = limit.shape
+    is_in = (place.column >= 0.0) & (place.column < width) & place.ahead
+    is_in &= (place.row >= 0.0) & (place.row < height) & (place.distance <= view.max_range)
+    column = jnp.clip(place.column, 0.0, width - 1.0).astype(jnp.int32)
+    row = jnp.clip(place.row, 0.0, height - 1.0).astype(jnp.int32)
+    return is_in & (place.distance <= limit.reshape(-1)[row * width + column])
+
+
+def _num_steps(item_bits: int) -> float:
+    return float((1 << (32 - item_bits)) - 1)
+
+
+def _pack(
+    share: Float[Array, " n"], index: Int[Array, " n"], item_bits: int
+) -> UInt32[Array, " n"]:
     """Distance in the high bits, index in the low ones: `min` keeps the nearest voxel."""
-    num_steps = float((1 << (32 - item_bits)) - 1)
-    share = jnp.clip(place.distance / max_range, 0.0, 1.0)
-    steps = (share * num_steps).astype(jnp.uint32)
-    index = jnp.arange(place.distance.shape[0], dtype=jnp.uint32)
-    # All ones would read as "nothing".
-    return jnp.minimum((steps << item_bits) | index, jnp.uint32(_NOTHING - 1))
+    steps = (jnp.clip(share, 0.0, 1.0) * _num_steps(item_bits)).astype(jnp.uint32)
+    packed = (steps << item_bits) | index.astype(jnp.uint32)
+    return jnp.minimum(packed, jnp.uint32(_NOTHING - 1))  # all ones would read as "nothing"
 
 
 def _pyramid(shape: tuple[int, int]) -> list[tuple[int, int]]:
@@ -214,8 +282,9 @@ def _pyramid(shape: tuple[int, int]) -> list[tuple[int, int]]:
     return shapes
 
 
-def _block_indices(
+def _footprint(
     place: Placement,
+    valid: Bool[Array, " n"],
     voxel_size: Float[Array, ""],
     shapes: list[tuple[int, int]],
     offsets: list[int],
@@ -239,7 +308,7 @@ def _block_indices(
     indices = []
     for r, covers_row in rows:
         for c, covers_column in columns:
-            is_in = place.inside & covers_row & covers_column
+            is_in = valid & covers_row & covers_column
             if wraps:
                 r_in, c_in = _wrap(r, c, height)
             else:
@@ -307,4 +376,8 @@ def _limit(
         first = jnp.concatenate([jnp.take(step, jnp.array([0]), axis=axis), step], axis=axis)
         second = jnp.concatenate([step, jnp.take(step, jnp.array([n - 2]), axis=axis)], axis=axis)
         slope = slope + jnp.minimum(first, second)
-    return distance + tolerance + jnp.minimum(_SLOPE_GAIN * slope, _MAX_SLOPE * voxel_size)
+    return (
+        distance
+        + tolerance * voxel_size
+        + jnp.minimum(_SLOPE_GAIN * slope, _MAX_SLOPE * voxel_size)
+    )

@@ -12,22 +12,26 @@ from r3jax.mapping.state import MapState
 
 
 class Voxels(eqx.Module):
-    """Some or all voxels of a map, ready to be scored."""
+    """Some or all voxels of a map, ready to be scored.
 
-    center: Float[Array, "3 n"]
-    """Centers [m]; meaningless where `present` is False."""
+    Fields are the map's own; what follows from them is computed where it is used, so that a loop
+    over a few voxels does not prepare all of them.
+    """
+
+    key: UInt32[Array, "2 n"]
+    """Packed voxel index."""
 
     visited: UInt32[Array, "W n"]
-    """Direction bins, as in `MapState`."""
+    """Direction bins."""
 
-    delta: Float[Array, " n"]
-    """Color consistency: 1 where nothing contradicts, 0 where the color is arbitrary."""
+    count: Float[Array, " n"]
+    """Observations; 0 where there is no voxel."""
+
+    m2: Float[Array, " n"]
+    """Sum of squared color deviations."""
 
     resolution: Float[Array, " n"]
     """Best resolution so far [px/m]."""
-
-    present: Bool[Array, " n"]
-    """True where there is a voxel that was seen."""
 
     size: Float[Array, ""]
     """Edge of a voxel [m]."""
@@ -35,17 +39,41 @@ class Voxels(eqx.Module):
     num_bins: int = eqx.field(static=True)
     """Direction bins B."""
 
+    delta_form: str = eqx.field(static=True)
+    """As in `ScoringConfig.delta`."""
+
+    @property
+    def present(self) -> Bool[Array, " n"]:
+        """True where there is a voxel that was seen."""
+        return self.count > 0.0
+
+    @property
+    def center(self) -> Float[Array, "3 n"]:
+        """Centers [m]; meaningless where there is no voxel."""
+        return voxel_center(jnp.stack(unpack(self.key[0], self.key[1])), self.size)
+
+    @property
+    def delta(self) -> Float[Array, " n"]:
+        """Color consistency: 1 where nothing contradicts, 0 where the color is arbitrary."""
+        return consistency(self.count, self.m2, self.delta_form)
+
     def take(self, index: Int[Array, " m"], valid: Bool[Array, " m"]) -> "Voxels":
         """The voxels at `index`; absent where `valid` is False."""
         return Voxels(
-            center=self.center[:, index],
+            key=self.key[:, index],
             visited=self.visited[:, index],
-            delta=self.delta[index],
+            count=jnp.where(valid, self.count[index], 0.0),
+            m2=self.m2[index],
             resolution=self.resolution[index],
-            present=valid & self.present[index],
             size=self.size,
             num_bins=self.num_bins,
+            delta_form=self.delta_form,
         )
+
+    def center_of(self, index: Int[Array, " m"]) -> Float[Array, "3 m"]:
+        """Centers of the voxels at `index` [m]."""
+        low, high = self.key[0, index], self.key[1, index]
+        return voxel_center(jnp.stack(unpack(low, high)), self.size)
 
 
 def consistency(
@@ -64,13 +92,13 @@ def consistency(
 
 def voxels_of(state: MapState, delta: str = "trace") -> Voxels:
     """All rows of a map, in the map's order: n = N."""
-    x, y, z = unpack(state.key[0], state.key[1])
     return Voxels(
-        center=jnp.stack([voxel_center(axis, state.voxel_size) for axis in (x, y, z)]),
+        key=state.key,
         visited=state.visited,
-        delta=consistency(state.count, state.m2, delta),
+        count=state.count,
+        m2=state.m2,
         resolution=state.resolution,
-        present=state.occupied & (state.count > 0.0),
         size=state.voxel_size,
         num_bins=state.num_bins,
+        delta_form=delta,
     )

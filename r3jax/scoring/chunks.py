@@ -1,0 +1,65 @@
+"""Loops over the selected few of many, in chunks: cost follows the selection, not the capacity.
+
+A chunk also stays in the cache of one core, where XLA would otherwise write every intermediate
+array of the whole table to memory.
+
+Shape symbols: n items of which some are selected; K items of a chunk.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from r3jax.mapping.compact import positions_of_set
+
+CHUNK = 1 << 13
+"""Items at once."""
+
+Carry = TypeVar("Carry")
+
+
+class Selection(eqx.Module):
+    """Places of the selected items."""
+
+    order: Int[Array, " n_padded"]
+    """Places in increasing order, then n; whole chunks."""
+
+    count: Int[Array, ""]
+    """Number of selected items."""
+
+    num: int = eqx.field(static=True)
+    """Number of items to select from, n."""
+
+
+def select(selected: Bool[Array, " n"]) -> Selection:
+    """The places where a mask is set."""
+    num = selected.shape[0]
+    size = min(CHUNK, num)
+    order = positions_of_set(selected, -(-num // size) * size)
+    return Selection(order, jnp.sum(selected, dtype=jnp.int32), num)
+
+
+def for_selected(
+    selection: Selection,
+    body: Callable[[Int[Array, " K"], Bool[Array, " K"], Carry], Carry],
+    start: Carry,
+) -> Carry:
+    """Calls `body(index, valid, carry) -> carry` for the selected items, a chunk at a time.
+
+    `index` holds places of selected items in increasing order; where `valid` is False it is
+    padding (and within bounds). A loop of unknown length: forward derivatives only.
+    """
+    num = selection.num
+    size = min(CHUNK, num)
+
+    def next_chunk(state):
+        first, carry = state
+        index = jax.lax.dynamic_slice_in_dim(selection.order, first, size)
+        return first + size, body(jnp.minimum(index, num - 1), index < num, carry)
+
+    begin = (jnp.zeros((), jnp.int32), start)
+    return jax.lax.while_loop(lambda state: state[0] < selection.count, next_chunk, begin)[1]
