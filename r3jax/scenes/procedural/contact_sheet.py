@@ -64,10 +64,8 @@ def _shoot(world: World, eyes_and_targets: list[np.ndarray], fov_deg: float) -> 
     pictures = []
     for eye, target in eyes_and_targets:
         pose = look_at(jnp.asarray(eye, jnp.float32), jnp.asarray(target, jnp.float32))
-        frame = simulator.render(np.asarray(pose, dtype=np.float64))
-        rgb = np.array(frame.rgb)
-        nothing = ~np.isfinite(np.asarray(frame.depth))
-        rgb[nothing] = 1.0  # white paper round the cut
+        rgb = np.array(simulator.render(np.asarray(pose, dtype=np.float64)).rgb)
+        rgb[rgb.max(axis=2) == 0.0] = 1.0  # what no ray hits is white paper round the cut
         picture = Image.fromarray((rgb * 255.0 + 0.5).astype(np.uint8))
         pictures.append(picture.resize((_TILE, _TILE), Image.Resampling.LANCZOS))
     return pictures

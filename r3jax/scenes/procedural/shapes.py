@@ -141,12 +141,9 @@ def disc(radius: Real, y: Real = 0.0, segments: int = 24) -> Shape:
     angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     angle[-1] = 0.0
     rim = radius * np.stack([-np.cos(angle), np.sin(angle)], axis=-1)
-    flat = np.stack([np.zeros((segments, 2)), rim[1:], rim[:-1]], axis=1)[:, ::-1]
-    height = np.full((segments, 3), y)
-    corners = np.stack([flat[..., 0], height, flat[..., 1]], axis=-1)
-    return Shape(
-        corners[:, ::-1], np.stack([radius - flat[..., 0], radius + flat[..., 1]], -1)[:, ::-1]
-    )
+    flat = np.stack([np.zeros((segments, 2)), rim[:-1], rim[1:]], axis=1)
+    corners = np.stack([flat[..., 0], np.full((segments, 3), y), flat[..., 1]], axis=-1)
+    return Shape(corners, np.stack([radius - flat[..., 0], radius + flat[..., 1]], axis=-1))
 
 
 def lathe(profile: list[tuple[Real, Real]], segments: int = 14) -> Shape:
