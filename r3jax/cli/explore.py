@@ -20,6 +20,7 @@ from r3jax.exploration.state import StopReason
 from r3jax.formats.pointcloud import voxel_points, write_points
 from r3jax.formats.transforms import write_transforms
 from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policy import Policy, make_policy
 from r3jax.scenes.registry import open_scene, scene_hash
 from r3jax.scoring.config import ScoringConfig
@@ -103,6 +104,11 @@ def _plan(options: Explore) -> tuple[Budget, ExplorationConfig, Policy]:
         "num_candidates": options.candidates,
         "lambda2": options.lambda2,
     }
+    if options.candidates is not None:
+        # Keeps the share that is aimed at the frontier, whatever the number.
+        default = PlannerConfig()
+        share = default.num_frontier / default.num_candidates
+        settings["num_frontier"] = round(share * options.candidates)
     given = {name: value for name, value in settings.items() if value is not None}
     return parse_budget(options.budget), config, make_policy(options.policy, **given)
 

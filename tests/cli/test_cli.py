@@ -12,7 +12,8 @@ from r3jax.cli.main import main
 from r3jax.exploration.budget import parse_budget
 from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.trace.reader import read_run
-from tests.trace.runs import make_view
+from r3jax.trace.writer import RunWriter
+from tests.trace.runs import make_header, make_view
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def explore(room, out, *words):
     """A small run; the same shapes as all others here, so that each part compiles once."""
     options = {"scene": room, "policy": "random", "budget": "views:3", "clock": "model"}
     options |= {"resolution": 48, "fov": 90, "capacity": 16384, "voxel-size": 0.1}
-    options |= {"out": out, "name": "box"}
+    options |= {"out": out, "name": "box", "candidates": 20}
     given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     return main(["explore", *given, *words])
 
@@ -51,7 +52,8 @@ def test_a_run_leaves_data_set_and_report(run_folder):
     run = read_run(run_folder)
     assert run.end is not None
     assert (run.end.outcome, len(run.rows)) == ("budget", 3)
-    assert run.header.policy["settings"]["num_candidates"] == 100
+    assert run.header.policy["settings"]["num_candidates"] == 20
+    assert run.header.policy["settings"]["num_frontier"] == 6
     assert len(run.header.scene["hash"]) == 64
     content = json.loads((run_folder / "transforms.json").read_text())
     assert len(content["frames"]) == 3
@@ -148,12 +150,15 @@ def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monke
 
 
 def test_the_demo_overwrites_its_own_folder_only(tmp_path):
-    (tmp_path / "other").mkdir()
-    words = ["demo", "--out", str(tmp_path), "--views", "2", "--resolution", "48"]
-    for _ in range(2):
-        assert main(words) == 0
-    assert len(read_run(tmp_path / "demo").rows) == 2
-    assert (tmp_path / "other").exists()
+    for name in ("demo", "other"):
+        with RunWriter(tmp_path / name, make_header()) as writer:
+            writer.add(*make_view(0))
+    assert main(["demo", "--out", str(tmp_path), "--views", "2", "--resolution", "48"]) == 0
+    demo = read_run(tmp_path / "demo")
+    assert (demo.header.scene["name"], demo.header.policy["name"]) == ("flat", "ours-pano")
+    assert len(demo.rows) == 2
+    assert (tmp_path / "demo" / "report" / "report.html").exists()
+    assert read_run(tmp_path / "other").header == make_header()
 
 
 @pytest.mark.parametrize("words", [["--help"], ["explore", "--help"], ["info", "--help"]])
