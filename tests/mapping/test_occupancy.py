@@ -208,6 +208,15 @@ def test_half_a_picture_without_measurement_leaves_its_half_alone(grid):
     assert float(log_odds_at(after, left)[0]) == 0.0
 
 
+def test_the_nearest_measurement_of_a_block_rules_it(grid):
+    """A picket fence at 2 m, every other pixel: nothing behind it is cleared."""
+    depth = np.where(np.arange(SIZE) % 2 == 0, 2.0, np.inf)[None, :]
+    free = update(grid, frame_at([0.5, 2.5, 1.3], [5.0, 2.5, 1.3], depth=depth)).free
+    centers = np.asarray(cell_centers(grid, jnp.asarray(np.argwhere(np.asarray(free)))))
+    assert len(centers) > 20
+    assert centers[:, 0].max() < 2.5
+
+
 @pytest.mark.parametrize("depth", [np.inf, 5.5, 40.0])
 def test_beyond_range_is_free_up_to_the_range_and_hits_nothing(grid, depth):
     position = np.array([0.3, 2.5, 1.3])
@@ -222,12 +231,13 @@ def test_beyond_range_is_free_up_to_the_range_and_hits_nothing(grid, depth):
 
 def test_one_look_decides_anywhere_within_range(grid):
     """At 4.99 m one hit makes a cell occupied, one pass makes it free, and the steps are known."""
-    after = update(grid, frame_at([0.55, 2.5, 1.3], [5.5, 2.5, 1.3], depth=4.98))
-    hit = jnp.array([[5.53, 2.5, 1.3]])
+    position = [0.40, 2.5, 1.3]
+    after = update(grid, frame_at(position, [5.5, 2.5, 1.3], depth=4.98))
+    hit = jnp.array([[5.38, 2.5, 1.3]])  # in a cell whose centre lies beyond the range
     passed = jnp.array([[2.5, 2.5, 1.3]])
     assert bool(after.occupied[tuple(world_to_cell(grid, hit)[0])])
     center = cell_centers(grid, world_to_cell(grid, passed))[0]
-    d = float(jnp.linalg.norm(center - jnp.array([0.55, 2.5, 1.3])))
+    d = float(jnp.linalg.norm(center - jnp.array(position)))
     expected = -2.8 * (1.0 - 0.1 * d)
     np.testing.assert_allclose(log_odds_at(after, passed)[0], expected, rtol=1e-5)
 
