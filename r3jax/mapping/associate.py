@@ -150,8 +150,11 @@ def _neighborhood(image: Float[Array, "H W"]) -> list[Float[Array, "H W"]]:
 
 
 def _median9(values: list[Float[Array, "H W"]]) -> Float[Array, "H W"]:
-    """Median of nine images: sort triples, then the median of (largest minimum, median of the
-    medians, smallest maximum)."""
+    """Median of nine images.
+
+    Of sorted triples: the median of the largest minimum, the median of the medians and the
+    smallest maximum.
+    """
     triples = [_sort3(*values[i : i + 3]) for i in (0, 3, 6)]
     smallest = jnp.maximum(jnp.maximum(triples[0][0], triples[1][0]), triples[2][0])
     middle = _sort3(triples[0][1], triples[1][1], triples[2][1])[1]

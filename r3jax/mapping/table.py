@@ -74,7 +74,7 @@ def find_or_insert(
         The table with the new keys, and the row of each key: N for padding and for keys that
         found no place.
     """
-    capacity, num_keys = table.shape[1], keys.shape[1]
+    capacity = table.shape[1]
     found = find(table, keys, valid)
     is_new = valid & (found == capacity)
     claimed = _claim(table[1] == jnp.uint32(EMPTY_WORD), hash_key(keys[0], keys[1]), is_new)
