@@ -236,6 +236,7 @@ def test_one_look_decides_anywhere_within_range(grid):
     hit = jnp.array([[5.38, 2.5, 1.3]])  # in a cell whose centre lies beyond the range
     passed = jnp.array([[2.5, 2.5, 1.3]])
     assert bool(after.occupied[tuple(world_to_cell(grid, hit)[0])])
+    np.testing.assert_allclose(log_odds_at(after, hit)[0], 2.8 * 0.5, rtol=1e-5)
     center = cell_centers(grid, world_to_cell(grid, passed))[0]
     d = float(jnp.linalg.norm(center - jnp.array(position)))
     expected = -2.8 * (1.0 - 0.1 * d)
