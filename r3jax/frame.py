@@ -1,5 +1,7 @@
 """A posed RGB-D image: all that a simulator, a recording or a robot hands over."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,9 @@ class Frame(eqx.Module):
     depth: Float[Array, "H W"] = eqx.field(converter=jnp.asarray)
     """z-depth [m]. 0: no measurement. inf: nothing within the sensor's range."""
 
-    T_world_camera: Float[Array, "4 4"] = eqx.field(converter=jnp.asarray)
+    T_world_camera: Float[Array, "4 4"] = eqx.field(
+        converter=functools.partial(jnp.asarray, dtype=jnp.float32)
+    )
     """Camera-to-world pose; OpenCV axes, world z up [m]."""
 
     camera: Camera

@@ -21,7 +21,12 @@ def _as_float32(value: float | Array) -> Float[Array, ""]:
 
 
 class Camera(eqx.Module):
-    """Intrinsics of a pinhole camera. The image size is static, the rest is traced."""
+    """Intrinsics of a pinhole camera. The image size is static, the rest is traced.
+
+    Raises:
+        ValueError: an image without pixels; a focal length that is not positive or a principal
+            point that is not finite (where they are known, that is outside jit).
+    """
 
     width: int = eqx.field(static=True)
     """Columns [px]."""
@@ -40,6 +45,19 @@ class Camera(eqx.Module):
 
     cy: Float[Array, ""] = eqx.field(converter=_as_float32)
     """Principal point, row [px]; the top edge of the image is 0."""
+
+    def __check_init__(self) -> None:
+        """Refuses intrinsics whose rays would be infinite or NaN."""
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"a camera's image needs pixels, got {self.width} x {self.height}")
+        if is_traced(self.fx, self.fy, self.cx, self.cy):
+            return
+        for name, value in (("fx", float(self.fx)), ("fy", float(self.fy))):
+            if not 0.0 < value < np.inf:
+                raise ValueError(f"{name} must be positive and finite [px], got {value}")
+        for name, value in (("cx", float(self.cx)), ("cy", float(self.cy))):
+            if not np.isfinite(value):
+                raise ValueError(f"{name} must be finite [px], got {value}")
 
     @staticmethod
     def from_fov(width: int, height: int, horizontal_fov_deg: float = 60.0) -> "Camera":

@@ -71,7 +71,9 @@ class MapState(eqx.Module):
         return sum(x.nbytes for x in rows) // self.capacity
 
 
-def empty_map(capacity: int = 1 << 17, voxel_size: float = 0.05, num_bins: int = 64) -> MapState:
+def empty_map(
+    capacity: int = 1 << 17, voxel_size: float | int = 0.05, num_bins: int = 64
+) -> MapState:
     """A map that has seen nothing.
 
     Args:
@@ -80,12 +82,13 @@ def empty_map(capacity: int = 1 << 17, voxel_size: float = 0.05, num_bins: int =
         num_bins: direction bins per voxel.
 
     Raises:
-        ValueError: a capacity that is not a power of two, a size that is not positive.
+        ValueError: a capacity that is not a power of two, a size that is not positive and finite, no
+            bins.
     """
     if capacity < 2 or capacity & (capacity - 1):
         raise ValueError(f"capacity must be a power of two >= 2, got {capacity}")
-    if not voxel_size > 0.0:
-        raise ValueError(f"voxel_size must be positive [m], got {voxel_size}")
+    if not 0.0 < voxel_size < float("inf"):
+        raise ValueError(f"voxel_size must be positive and finite [m], got {voxel_size}")
     if num_bins < 1:
         raise ValueError(f"num_bins must be at least 1, got {num_bins}")
     num_words = -(-num_bins // 32)

@@ -6,6 +6,7 @@ Shape symbols: P points of a frame; M observations that join at once; H W image 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, UInt32
 
 from r3jax.frame import Frame
@@ -119,25 +120,27 @@ def _integrate_points(state, points_world, rgb, camera_position, focal):
 
 def integrate_points(
     state: MapState,
-    points_world: Float[Array, "P 3"],
-    rgb: Float[Array, "P 3"],
-    camera_position: Float[Array, " 3"],
-    focal: float | Float[Array, ""] = 1.0,
+    points_world: ArrayLike,
+    rgb: ArrayLike,
+    camera_position: ArrayLike,
+    focal: ArrayLike = 1.0,
 ) -> MapState:
     """Points seen by one camera join the map: like `integrate`, from points.
 
+    Arrays of NumPy and JAX are welcome; shapes and values are checked here.
+
     Args:
         state: the map before.
-        points_world: points [m], world.
-        rgb: their colours in [0, 1].
-        camera_position: center of the camera that saw them [m].
+        points_world: points [m], world, [P, 3].
+        rgb: their colours in [0, 1], [P, 3].
+        camera_position: center of the camera that saw them [m], [3].
         focal: its focal length [px]; with 1.0 the resolution is the paper's 1 / distance.
 
     Raises:
         ValueError: shapes that do not fit; values that are not finite or colours outside [0, 1]
             (where they are known, that is outside jit).
     """
-    points_world, rgb = jnp.asarray(points_world), jnp.asarray(rgb)
+    points_world, rgb = jnp.asarray(points_world, dtype=jnp.float32), jnp.asarray(rgb)
     camera_position = jnp.asarray(camera_position, dtype=jnp.float32)
     focal = jnp.asarray(focal, dtype=jnp.float32)
     _check_points(points_world, rgb, camera_position, focal)
@@ -147,6 +150,8 @@ def integrate_points(
 
 
 def _check_points(points: Array, rgb: Array, camera_position: Array, focal: Array) -> None:
+    if focal.ndim != 0:
+        raise ValueError(f"focal must be one number [px], got shape {focal.shape}")
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points_world must have shape [M, 3], got {points.shape}")
     if rgb.shape != points.shape:

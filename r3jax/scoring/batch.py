@@ -1,23 +1,40 @@
 """Scores of many candidates against one map: the inner loop of planning.
 
-Shape symbols: C candidates.
+Candidates of a step lie close together, so what none of them can see is left out once for all.
+XLA runs the loops of one score on one core; on a CPU the candidates are therefore dealt out to as
+many threads as the process may use.
+
+Shape symbols: C candidates; n voxels; c cells.
 """
 
 import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from r3jax.geometry.cameras import Camera
+from r3jax.geometry.cameras import Camera, is_traced
+from r3jax.mapping.compact import positions_of_set
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.panorama import Panorama, panorama_of
 from r3jax.scoring.utility import ViewUtility, utility_of_view
-from r3jax.scoring.voxels import voxels_of
+from r3jax.scoring.voxels import Voxels, voxels_of
+
+SMALLEST = 1 << 14
+"""Voxels and cells at hand are padded to this or twice, four times, ... as many: a run compiles
+once for each size that it meets."""
+
+Scores = TypeVar("Scores")
 
 
-@jax.jit
 def score_views(
     state: MapState,
     grid: OccupancyGrid,
@@ -25,13 +42,12 @@ def score_views(
     poses: Float[Array, "C 4 4"],
     config: ScoringConfig,
 ) -> ViewUtility:
-    """`view_utility` of every pose; fields of shape [C]."""
-    voxels = voxels_of(state, config.delta)
-    score = functools.partial(utility_of_view, voxels, grid, camera, config=config)
-    return jax.lax.map(score, poses)
+    """`view_utility` of every pose; fields of shape [C]. Not to be called under jit."""
+    poses = jnp.asarray(poses, dtype=jnp.float32)
+    voxels, cells = _near(state, grid, poses[:, :3, 3], config)
+    return _deal(functools.partial(_score_views, voxels, cells, camera, config), poses)
 
 
-@jax.jit
 def score_positions(
     state: MapState,
     grid: OccupancyGrid,
@@ -39,7 +55,81 @@ def score_positions(
     positions: Float[Array, "C 3"],
     config: ScoringConfig,
 ) -> Panorama:
-    """`panorama` of every position; fields of shape [C, ...]."""
-    voxels = voxels_of(state, config.delta)
-    score = functools.partial(panorama_of, voxels, grid, camera, config=config)
+    """`panorama` of every position; fields of shape [C, ...]. Not to be called under jit."""
+    positions = jnp.asarray(positions, dtype=jnp.float32)
+    voxels, cells = _near(state, grid, positions, config)
+    return _deal(functools.partial(_score_positions, voxels, cells, camera, config), positions)
+
+
+@jax.jit
+def _score_views(voxels, cells, camera, config, poses):
+    score = functools.partial(utility_of_view, voxels, cells, camera, config=config)
+    return jax.lax.map(score, poses)
+
+
+@jax.jit
+def _score_positions(voxels, cells, camera, config, positions):
+    score = functools.partial(panorama_of, voxels, cells, camera, config=config)
     return jax.lax.map(score, positions)
+
+
+def _near(
+    state: MapState, grid: OccupancyGrid, positions: Float[Array, "C 3"], config: ScoringConfig
+) -> tuple[Voxels, Cells]:
+    """The voxels and unexplored cells that at least one of the positions may see."""
+    if is_traced(state.key, positions):
+        raise TypeError("score_views and score_positions choose sizes: call them outside jit")
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    counts = np.asarray(_count_near(state, grid, low, high, config))
+    sizes = (_padded(counts[0], state.capacity), _padded(counts[1], grid.log_odds.size))
+    return _gather_near(state, grid, low, high, config, sizes)
+
+
+def _padded(count: int, most: int) -> int:
+    return min(max(SMALLEST, 1 << max(int(count) - 1, 0).bit_length()), most)
+
+
+def _masks(voxels, cells, low, high, config):
+    """Voxels and unexplored cells within range of a box."""
+
+    def is_near(points, margin):
+        gap = [
+            jnp.maximum(jnp.maximum(low[i] - points[i], points[i] - high[i]), 0.0) for i in range(3)
+        ]
+        reach = config.max_range + margin
+        return gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] <= reach * reach
+
+    near_voxels = voxels.present & is_near(voxels.center, voxels.size)
+    near_cells = cells.unexplored & is_near((cells.x, cells.y, cells.z), 0.0)
+    return near_voxels, near_cells
+
+
+@jax.jit
+def _count_near(state, grid, low, high, config):
+    masks = _masks(voxels_of(state, config.delta), cells_of(grid), low, high, config)
+    return jnp.stack([jnp.sum(mask, dtype=jnp.int32) for mask in masks])
+
+
+@functools.partial(jax.jit, static_argnames="sizes")
+def _gather_near(state, grid, low, high, config, sizes):
+    voxels, cells = voxels_of(state, config.delta), cells_of(grid)
+    gathered = []
+    masks = _masks(voxels, cells, low, high, config)
+    for items, mask, size in zip((voxels, cells), masks, sizes, strict=True):
+        index = positions_of_set(mask, size)
+        gathered.append(items.take(jnp.minimum(index, mask.shape[0] - 1), index < mask.shape[0]))
+    return tuple(gathered)
+
+
+def _deal(score: Callable[[Array], Scores], candidates: Float[Array, "C ..."]) -> Scores:
+    """Scores candidates in equal shares on all cores of a CPU; at once elsewhere."""
+    num = candidates.shape[0]
+    workers = min(len(os.sched_getaffinity(0)), num) if jax.default_backend() == "cpu" else 1
+    if workers < 2:
+        return score(candidates)
+    share = -(-num // workers)
+    padding = jnp.broadcast_to(candidates[-1:], (share * workers - num, *candidates.shape[1:]))
+    shares = jnp.split(jnp.concatenate([candidates, padding]), workers)
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(lambda part: jax.block_until_ready(score(part)), shares))
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays)[:num], *parts)

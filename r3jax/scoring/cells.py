@@ -1,10 +1,11 @@
 """Visible unexplored cells of the coarse grid: the exploration side of a view.
 
-Shape symbols: X Y Z cells of the grid; c all cells; B bins of the panorama.
+Shape symbols: X Y Z cells of the grid; c cells at hand; B bins of the panorama.
 """
 
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.scoring.chunks import for_selected, select
@@ -12,19 +13,45 @@ from r3jax.scoring.lack import sum_by_direction
 from r3jax.scoring.visibility import DepthBuffer, View, is_visible
 
 
-def cell_points(grid: OccupancyGrid) -> Float[Array, "3 c"]:
-    """Centers of all cells [m], z fastest."""
+class Cells(eqx.Module):
+    """Some or all cells of a grid. The coordinates are apart: XLA fills each in one sweep."""
+
+    x: Float[Array, " c"]
+    """Center [m]."""
+
+    y: Float[Array, " c"]
+    """Center [m]."""
+
+    z: Float[Array, " c"]
+    """Center [m]."""
+
+    unexplored: Bool[Array, " c"]
+    """False for cells that are known, and for padding."""
+
+    def take(self, index: Int[Array, " k"], valid: Bool[Array, " k"]) -> "Cells":
+        """The cells at `index`; not unexplored where `valid` is False."""
+        part = (self.x[index], self.y[index], self.z[index])
+        return Cells(*part, valid & self.unexplored[index])
+
+
+def cells_of(grid: OccupancyGrid) -> Cells:
+    """All cells of a grid, z fastest."""
     shape = grid.log_odds.shape
-    axes = [
+    x, y, z = (
         grid.origin[i] + (jnp.arange(n, dtype=jnp.float32) + 0.5) * grid.cell_size
         for i, n in enumerate(shape)
-    ]
-    along = (axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :])
-    return jnp.stack([jnp.broadcast_to(axis, shape).reshape(-1) for axis in along])
+    )
+    fill = lambda axis: jnp.broadcast_to(axis, shape).reshape(-1)
+    return Cells(
+        fill(x[:, None, None]),
+        fill(y[None, :, None]),
+        fill(z[None, None, :]),
+        grid.unexplored.reshape(-1),
+    )
 
 
 def unexplored_by_direction(
-    grid: OccupancyGrid,
+    cells: Cells,
     view: View,
     buffer: DepthBuffer,
     position: Float[Array, " 3"],
@@ -33,19 +60,19 @@ def unexplored_by_direction(
     """U_G: number of unexplored cells whose center the view sees, per direction bin.
 
     Args:
-        grid: the coarse grid.
+        cells: of the coarse grid.
         view: where from.
         buffer: what hides.
         position: of the camera [m].
         num_bins: bins of the Fibonacci lattice; 1 counts over all directions.
     """
-    center = cell_points(grid)
 
     def count(index, valid, total):
-        points = center[:, index]
+        points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
         is_seen = valid & is_visible(view, view.place(points), buffer.distance)
         weight = is_seen.astype(jnp.float32)
         return total + sum_by_direction(points, weight, position, num_bins)
 
-    selection = select(grid.unexplored.reshape(-1) & view.may_see(center, jnp.zeros(())))
-    return for_selected(selection, count, jnp.zeros(num_bins, dtype=jnp.float32))
+    in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
+    start = jnp.zeros(num_bins, dtype=jnp.float32)
+    return for_selected(select(cells.unexplored & in_view), count, start)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Int
 
 from r3jax.mapping.compact import positions_of_set
 
-CHUNK = 1 << 13
+CHUNK = 1 << 12
 """Items at once."""
 
 Carry = TypeVar("Carry")

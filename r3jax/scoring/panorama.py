@@ -12,7 +12,7 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import unexplored_by_direction
+from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.visibility import candidates_of, depth_buffer, panorama_view, visible_voxels
@@ -58,25 +58,26 @@ def panorama(
         config: settings.
     """
     config = ScoringConfig() if config is None else config
-    return panorama_of(voxels_of(state, config.delta), grid, camera, position, config)
+    voxels = voxels_of(state, config.delta)
+    return panorama_of(voxels, cells_of(grid), camera, position, config)
 
 
 def panorama_of(
     voxels: Voxels,
-    grid: OccupancyGrid,
+    cells: Cells,
     camera: Camera,
     position: Float[Array, " 3"],
     config: ScoringConfig,
 ) -> Panorama:
-    """`panorama` of voxels that are already at hand."""
+    """`panorama` of voxels and cells that are already at hand."""
     num_bins = config.panorama_bins
     view = panorama_view(position, config)
     candidates = candidates_of(voxels, view)
     buffer = depth_buffer(voxels, candidates, view, config)
     visible = visible_voxels(voxels, candidates, view, buffer)
     bins = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, num_bins)
-    cells = unexplored_by_direction(grid, view, buffer, view.position, num_bins)
-    bins = bins + config.lambda1 * cells
+    unexplored = unexplored_by_direction(cells, view, buffer, view.position, num_bins)
+    bins = bins + config.lambda1 * unexplored
     directions = bins_in_view(camera, num_bins) @ bins
     best = jnp.argmax(directions)
     axis = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)[best]

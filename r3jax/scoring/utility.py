@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import unexplored_by_direction
+from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.visibility import candidates_of, depth_buffer, pinhole_view, visible_voxels
@@ -42,22 +42,22 @@ def view_utility(
     """
     config = ScoringConfig() if config is None else config
     voxels = voxels_of(state, config.delta)
-    return utility_of_view(voxels, grid, camera, T_world_camera, config)
+    return utility_of_view(voxels, cells_of(grid), camera, T_world_camera, config)
 
 
 def utility_of_view(
     voxels: Voxels,
-    grid: OccupancyGrid,
+    cells: Cells,
     camera: Camera,
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> ViewUtility:
-    """`view_utility` of voxels that are already at hand."""
+    """`view_utility` of voxels and cells that are already at hand."""
     view = pinhole_view(camera, T_world_camera, config)
     candidates = candidates_of(voxels, view)
     buffer = depth_buffer(voxels, candidates, view, config)
     visible = visible_voxels(voxels, candidates, view, buffer)
     position = T_world_camera[:3, 3]
     rendering = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, 1)[0]
-    exploration = unexplored_by_direction(grid, view, buffer, position, 1)[0]
+    exploration = unexplored_by_direction(cells, view, buffer, position, 1)[0]
     return ViewUtility(exploration, rendering, config.lambda1 * exploration + rendering)

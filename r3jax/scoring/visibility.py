@@ -36,6 +36,10 @@ _MAX_SLOPE = 4.0
 _NOTHING = 0xFFFFFFFF
 
 
+Coordinates = Float[Array, "3 n"] | tuple[Array, Array, Array]
+"""x, y and z of points [m], as one array or three."""
+
+
 class DepthBuffer(eqx.Module):
     """The nearest voxel per pixel."""
 
@@ -90,14 +94,14 @@ class PinholeView(eqx.Module):
         """Height and width of the buffer [px]."""
         return self.camera.height, self.camera.width
 
-    def in_camera(self, points: Float[Array, "3 n"]) -> tuple[Array, Array, Array]:
+    def in_camera(self, points: Coordinates) -> tuple[Array, Array, Array]:
         """Coordinates in the camera's frame [m]."""
         R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         offset = [points[i] - t[i] for i in range(3)]
         along = lambda j: R[0, j] * offset[0] + R[1, j] * offset[1] + R[2, j] * offset[2]
         return along(0), along(1), along(2)
 
-    def may_see(self, points: Float[Array, "3 n"], margin: Float[Array, ""]) -> Bool[Array, " n"]:
+    def may_see(self, points: Coordinates, margin: Float[Array, ""]) -> Bool[Array, " n"]:
         """False only for points that lie outside the frustum by more than `margin` [m]."""
         x, y, z = self.in_camera(points)
         camera = self.camera
@@ -144,7 +148,7 @@ class PanoramaView(eqx.Module):
         """Height and width of the buffer [px]."""
         return self.size, self.size
 
-    def may_see(self, points: Float[Array, "3 n"], margin: Float[Array, ""]) -> Bool[Array, " n"]:
+    def may_see(self, points: Coordinates, margin: Float[Array, ""]) -> Bool[Array, " n"]:
         """False only for points out of range by more than `margin` [m]."""
         x, y, z = (points[i] - self.position[i] for i in range(3))
         reach = self.max_range + margin

@@ -1,0 +1,25 @@
+"""From points to rows of the map."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from r3jax.geometry.voxels import pack, voxel_index
+from r3jax.mapping.state import MapState
+from r3jax.mapping.table import find
+
+
+@jax.jit
+def lookup(state: MapState, points_world: Float[Array, "*n 3"]) -> Int[Array, "*n"]:
+    """Row of the voxel that holds each point; `state.capacity` where the map has none.
+
+    Args:
+        state: the map.
+        points_world: points [m]; points that are not finite are in no voxel.
+    """
+    points = points_world.reshape(-1, 3)
+    is_finite = jnp.all(jnp.isfinite(points), axis=1)
+    index = voxel_index(jnp.where(is_finite[:, None], points, 0.0), state.voxel_size)
+    low, high = pack(index[:, 0], index[:, 1], index[:, 2])
+    row = find(state.key, jnp.stack([low, high]), is_finite)
+    return row.reshape(points_world.shape[:-1])
