@@ -43,7 +43,8 @@ def bins_for_angle(angle_deg: float) -> int:
     if not 0.0 < angle_deg <= 360.0:
         raise ValueError(f"angle_deg must lie in (0, 360], got {angle_deg}")
     cap = 2.0 * math.pi * (1.0 - math.cos(0.5 * math.radians(angle_deg)))
-    return math.ceil(4.0 * math.pi / cap)
+    # Rounding must not add a bin where the quotient is whole (120 degrees: 4).
+    return math.ceil(4.0 * math.pi / cap - 1e-9)
 
 
 def octahedral_cell(directions: Float[Array, "3 n"], size: int) -> Int[Array, " n"]:

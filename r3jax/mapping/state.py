@@ -82,8 +82,8 @@ def empty_map(
         num_bins: direction bins per voxel.
 
     Raises:
-        ValueError: a capacity that is not a power of two, a size that is not positive and finite, no
-            bins.
+        ValueError: a capacity that is not a power of two, a size that is not positive and
+            finite, no bins.
     """
     if capacity < 2 or capacity & (capacity - 1):
         raise ValueError(f"capacity must be a power of two >= 2, got {capacity}")
