@@ -39,7 +39,7 @@ def score_views(
     state: MapState,
     grid: OccupancyGrid,
     camera: Camera,
-    poses: Float[Array, "C 4 4"],
+    poses: Float[Array | np.ndarray, "C 4 4"],
     config: ScoringConfig,
 ) -> ViewUtility:
     """`view_utility` of every pose; fields of shape [C]. Not to be called under jit."""
@@ -52,7 +52,7 @@ def score_positions(
     state: MapState,
     grid: OccupancyGrid,
     camera: Camera,
-    positions: Float[Array, "C 3"],
+    positions: Float[Array | np.ndarray, "C 3"],
     config: ScoringConfig,
 ) -> Panorama:
     """`panorama` of every position; fields of shape [C, ...]. Not to be called under jit."""
