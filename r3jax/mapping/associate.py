@@ -130,13 +130,15 @@ def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Boo
     around = _neighborhood(capped)
     # Holes take the value of the pixel in the middle.
     median = _median9([jnp.where(value > 0.0, value, capped) for value in around])
-    is_edge = jnp.abs(capped - median) > voxel_size
+    # A stray within two or three sigma of 1 % noise is no edge.
+    is_edge = jnp.abs(capped - median) > voxel_size + 0.01 * capped
     raw_limit = voxel_size + 0.06 * capped
     beside = (1, 3, 5, 7)
     for median_beside, raw_beside in zip(
         [_neighborhood(median)[i] for i in beside], [around[i] for i in beside], strict=True
     ):
-        is_edge |= jnp.abs(median_beside - median) > voxel_size
+        # The median is 0 inside a hole: no neighbor.
+        is_edge |= (median_beside > 0.0) & (jnp.abs(median_beside - median) > voxel_size)
         # What noise of 1 % cannot explain is an edge whatever the median says: thin parts.
         is_edge |= (raw_beside > 0.0) & (jnp.abs(raw_beside - capped) > raw_limit)
     return (depth > 0.0) & is_edge
