@@ -9,47 +9,10 @@ be rendered.
     s = r3jax.renderability(m, camera, T_world_camera)
 """
 
-from r3jax.frame import Frame
-from r3jax.geometry.cameras import Camera, look_at, pose_along
-from r3jax.mapping.join import grow, merge
-from r3jax.mapping.lookup import lookup
-from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth
-from r3jax.mapping.state import MapState, empty_map
-from r3jax.mapping.update import integrate, integrate_points
-from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.panorama import Panorama, panorama
-from r3jax.scoring.renderability import (
-    Renderability,
-    renderability,
-    renderability_image,
-    voxel_renderability,
-)
-from r3jax.scoring.utility import ViewUtility, view_utility
+import lazy_loader
+
+# The names and their homes stand in `__init__.pyi`, where type checkers find them too. They load
+# when first used, so that `r3jax --help` does not wait for JAX.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "Camera",
-    "Frame",
-    "MapState",
-    "OccupancyGrid",
-    "Panorama",
-    "Renderability",
-    "ScoringConfig",
-    "ViewUtility",
-    "empty_grid",
-    "empty_map",
-    "grow",
-    "integrate",
-    "integrate_depth",
-    "integrate_points",
-    "look_at",
-    "lookup",
-    "merge",
-    "panorama",
-    "pose_along",
-    "renderability",
-    "renderability_image",
-    "view_utility",
-    "voxel_renderability",
-]

@@ -81,12 +81,15 @@ def _near(
         raise TypeError("score_views and score_positions choose sizes: call them outside jit")
     low, high = positions.min(axis=0), positions.max(axis=0)
     counts = np.asarray(_count_near(state, grid, low, high, config))
-    sizes = (_padded(counts[0], state.capacity), _padded(counts[1], grid.log_odds.size))
+    sizes = (
+        _padded(int(counts[0]), state.capacity),
+        _padded(int(counts[1]), grid.log_odds.size),
+    )
     return _gather_near(state, grid, low, high, config, sizes)
 
 
 def _padded(count: int, most: int) -> int:
-    return min(max(SMALLEST, 1 << max(int(count) - 1, 0).bit_length()), most)
+    return min(max(SMALLEST, 1 << max(count - 1, 0).bit_length()), most)
 
 
 def _masks(voxels, cells, low, high, config):
