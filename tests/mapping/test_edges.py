@@ -90,6 +90,8 @@ def test_holes_are_no_edges_and_make_none():
     depth = plane(2.0)
     depth[5:8, 5:8] = 0.0
     depth[::3, 20::3] = 0.0
+    depth[14:17, 5:8] = 0.0
+    depth[15, 6] = 2.0  # alone among holes
     assert not edges_of(depth).any()
 
 
@@ -129,7 +131,8 @@ def law_edges(modules: Modules) -> None:
     depth = plane(2.0)
     depth[:, 16:] = 2.06
     depth[20:, 4] = 3.0
-    depth[2:5, 2:5] = 0.0
+    depth[2:9, 2:5] = 0.0
+    depth[7, 3] = 2.0  # alone among holes
     expected = np.zeros((HEIGHT, WIDTH), bool)
     expected[:, 15:17] = True
     found = edges_of(depth, edges)
