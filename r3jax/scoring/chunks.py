@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from r3jax.mapping.compact import positions_of_set
+from r3jax.mapping.compact import positions_of_set, running_count
 
 CHUNK = 1 << 12
 """Items at once."""
@@ -33,6 +33,11 @@ class Selection(eqx.Module):
 
     num: int = eqx.field(static=True)
     """Number of items to select from, n."""
+
+    @property
+    def mask(self) -> Bool[Array, " n"]:
+        """True for the selected items."""
+        return jnp.zeros(self.num, dtype=bool).at[self.order].set(True, mode="drop")
 
 
 def select(selected: Bool[Array, " n"]) -> Selection:
@@ -63,3 +68,22 @@ def for_selected(
 
     begin = (jnp.zeros((), jnp.int32), start)
     return jax.lax.while_loop(lambda state: state[0] < selection.count, next_chunk, begin)[1]
+
+
+def narrow(
+    selection: Selection, test: Callable[[Int[Array, " K"]], Bool[Array, " K"]]
+) -> Selection:
+    """The selected items that pass `test(index)`, in the same order."""
+    size = min(CHUNK, selection.num)
+    room = selection.order.shape[0]
+
+    def keep(index, valid, kept):
+        order, count = kept
+        passes = valid & test(index)
+        place = running_count(passes)
+        order = order.at[jnp.where(passes, count + place - 1, room)].set(index, mode="drop")
+        return order, count + place[size - 1]
+
+    nothing = jnp.full(room, selection.num, dtype=jnp.int32)
+    order, count = for_selected(selection, keep, (nothing, jnp.zeros((), jnp.int32)))
+    return Selection(order, count, selection.num)

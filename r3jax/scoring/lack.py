@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
-from r3jax.scoring.chunks import for_selected, select
+from r3jax.scoring.chunks import Selection, for_selected
 from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.voxels import Voxels
 
@@ -22,7 +22,7 @@ from r3jax.scoring.voxels import Voxels
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
 def lack_by_direction(
     voxels: Voxels,
-    visible: Bool[Array, " n"],
+    visible: Selection,
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
     kappa: str,
@@ -45,13 +45,15 @@ def lack_by_direction(
         seen = voxels.take(index, valid)
         return total + _lack(seen, valid, position, focal, kappa, num_bins)
 
-    return for_selected(select(visible), add, jnp.zeros(num_bins, dtype=jnp.float32))
+    return for_selected(visible, add, jnp.zeros(num_bins, dtype=jnp.float32))
 
 
 @lack_by_direction.defjvp
 def _lack_by_direction_jvp(kappa, num_bins, primals, tangents):
     # A loop of unknown length has no reverse mode; the dense form has, and gives the same sums.
-    dense = functools.partial(_lack, kappa=kappa, num_bins=num_bins)
+    def dense(voxels, visible, position, focal):
+        return _lack(voxels, visible.mask, position, focal, kappa, num_bins)
+
     return jax.jvp(dense, primals, tangents)
 
 

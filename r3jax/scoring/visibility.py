@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.geometry.cameras import Camera
-from r3jax.scoring.chunks import Selection, for_selected, select
+from r3jax.scoring.chunks import Selection, for_selected, narrow, select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.voxels import Voxels
 
@@ -238,14 +238,13 @@ def depth_buffer(
 
 def visible_voxels(
     voxels: Voxels, candidates: Selection, view: View, buffer: DepthBuffer
-) -> Bool[Array, " n"]:
-    """Which voxels the view sees: not hidden by voxels, in the image and within range."""
+) -> Selection:
+    """The voxels that the view sees: not hidden by voxels, in the image and within range."""
 
-    def test(index, valid, visible):
-        is_seen = valid & is_visible(view, view.place(voxels.center_of(index)), buffer.limit)
-        return visible.at[jnp.where(valid, index, candidates.num)].set(is_seen, mode="drop")
+    def test(index):
+        return is_visible(view, view.place(voxels.center_of(index)), buffer.limit)
 
-    return for_selected(candidates, test, jnp.zeros(candidates.num, dtype=bool))
+    return narrow(candidates, test)
 
 
 def is_visible(view: View, place: Placement, limit: Float[Array, "h w"]) -> Bool[Array, " n"]:
