@@ -87,6 +87,7 @@ def _integrate(
 
 
 _integrate_jitted = jax.jit(_integrate)
+_integrate_donating = jax.jit(_integrate, donate_argnums=0)
 
 
 def integrate(
@@ -94,6 +95,8 @@ def integrate(
     frame: Frame,
     max_range: float | Float[Array, ""] = np.inf,
     drop_edges: bool | Bool[Array, ""] = True,
+    *,
+    donate: bool = False,
 ) -> MapState:
     """One posed RGB-D frame joins the map: one observation per voxel that it touches.
 
@@ -105,9 +108,12 @@ def integrate(
         frame: the frame. Depth 0 (no measurement) and inf (out of range) are ignored.
         max_range: measurements beyond this z-depth are ignored [m].
         drop_edges: False lets pixels on depth edges in.
+        donate: True updates the table in place: `state` must not be used again. The cost then
+            does not grow with the capacity, where a copy of a million rows takes 15 ms.
     """
     max_range = jnp.asarray(max_range, dtype=jnp.float32)
-    return _integrate_jitted(state, frame, max_range, jnp.asarray(drop_edges))
+    update = _integrate_donating if donate else _integrate_jitted
+    return update(state, frame, max_range, jnp.asarray(drop_edges))
 
 
 @jax.jit
@@ -146,6 +152,7 @@ def integrate_points(
     _check_points(points_world, rgb, camera_position, focal)
     if points_world.shape[0] == 0:
         return state
+    rgb = rgb.astype(jnp.float32)
     return _integrate_points(state, points_world, rgb, camera_position, focal)
 
 

@@ -1,0 +1,52 @@
+"""A real map to measure on: an apartment, seen through the paper's camera with its noise."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import r3jax
+from r3jax.mapping.occupancy import mark_free_ball
+from r3jax.scenes import procedural
+from r3jax.scenes.registry import open_scene
+from r3jax.scoring.config import ScoringConfig
+
+VOXELS = 60_000
+
+
+class Explored:
+    """An apartment whose map holds some 60 000 voxels, and the last frame that joined it."""
+
+    def __init__(self):
+        self.simulator = open_scene("apartment", camera=r3jax.Camera.from_fov(512, 512, 60.0))
+        self.camera = self.simulator.camera
+        self.map = r3jax.empty_map()
+        self.grid = r3jax.empty_grid(self.simulator.bounds)
+        self.frames = []
+        rooms = list(procedural.rooms("apartment").values())
+        rng = np.random.default_rng(0)
+        while int(self.map.num_occupied) < VOXELS:
+            x0, y0, x1, y1 = rooms[len(self.frames) % len(rooms)]
+            position = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 1.4], dtype=np.float32)
+            direction = (rng.standard_normal(3) * [1.0, 1.0, 0.3]).astype(np.float32)
+            pose = r3jax.pose_along(jnp.asarray(position), jnp.asarray(direction))
+            self.add(self.simulator.render(np.asarray(pose, dtype=np.float64)))
+
+    def add(self, frame: r3jax.Frame) -> None:
+        self.map = r3jax.integrate(self.map, frame)
+        grid = r3jax.integrate_depth(self.grid, frame)
+        self.grid = mark_free_ball(grid, frame.position, 0.3)
+        self.frames.append(frame)
+
+    @property
+    def pose(self):
+        return self.frames[-1].T_world_camera
+
+
+@pytest.fixture(scope="session")
+def explored() -> Explored:
+    return Explored()
+
+
+@pytest.fixture(scope="session")
+def scoring() -> ScoringConfig:
+    return ScoringConfig()
