@@ -3,12 +3,18 @@
 import functools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera, is_traced, rigid_error
+
+
+def _as_image(image: ArrayLike) -> Array:
+    """Half and double precision become float32; integers stay, to be refused by name."""
+    array = jnp.asarray(image)
+    return array.astype(jnp.float32) if jnp.issubdtype(array.dtype, jnp.floating) else array
 
 
 class Frame(eqx.Module):
@@ -20,10 +26,10 @@ class Frame(eqx.Module):
             not finite or not rigid. Values are checked where they are known (outside jit).
     """
 
-    rgb: Float[Array, "H W 3"] = eqx.field(converter=jnp.asarray)
+    rgb: Float[Array, "H W 3"] = eqx.field(converter=_as_image)
     """Colour in [0, 1]."""
 
-    depth: Float[Array, "H W"] = eqx.field(converter=jnp.asarray)
+    depth: Float[Array, "H W"] = eqx.field(converter=_as_image)
     """z-depth [m]. 0: no measurement. inf: nothing within the sensor's range."""
 
     T_world_camera: Float[Array, "4 4"] = eqx.field(
@@ -36,8 +42,6 @@ class Frame(eqx.Module):
 
     def __check_init__(self) -> None:
         """Refuses what would become a NaN or a silent error later."""
-        if isinstance(self.rgb, jax.ShapeDtypeStruct):
-            return
         self._check_structure()
         if not is_traced(self.rgb, self.depth, self.T_world_camera):
             self._check_values()

@@ -216,7 +216,7 @@ def law_full_map(modules: Modules) -> None:
 def law_merge(modules: Modules) -> None:
     """The module is a copy of its own: its chunks may be made smaller than the map."""
     module = modules["join"]
-    module.CHUNK = 4
+    vars(module)["CHUNK"] = 4
     batches = [Batch(seed, num_voxels=7) for seed in range(4)]
     a, b = map_of(batches[:2]), map_of(batches[2:])
     assert_same_rows(read_map(module.merge(a, b)), expected_rows(batches))
