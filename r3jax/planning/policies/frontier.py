@@ -37,8 +37,10 @@ _MAX_TARGETS = 300
 _STOPS_PER_TARGET = 4
 """Places that are tried per frontier cell: the nearest by path among its neighbours."""
 
-_ATTEMPT_RADIUS = 0.5
-"""Frontier cells this near to the one looked at count as looked at too [m]."""
+_ATTEMPT_COSINE = 0.9
+_ATTEMPT_REACH = 3.0
+"""Frontier cells within 26 degrees of the line of sight and 3 m count as looked at too: they lie
+inside the picture of any camera with 52 degrees or more."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,19 @@ class Frontier:
             path = travel.lengths(stops)
         utilities = {"path": path, "total": -path}
         decision, state, info = settle(state, travel, poses, utilities, stopwatch)
+        chosen = np.argmin(path)
         centers = travel.centers(np.moveaxis(np.indices(targets.shape), 0, -1))
-        is_near = np.linalg.norm(centers - aims[np.argmin(path)], axis=-1) <= _ATTEMPT_RADIUS
-        state = eqx.tree_at(lambda s: s.attempted, state, jnp.asarray(attempted | is_near))
+        looked_at = attempted | _is_looked_at(centers, stops[chosen], aims[chosen])
+        state = eqx.tree_at(lambda s: s.attempted, state, jnp.asarray(looked_at))
         return decision, state, info
+
+
+def _is_looked_at(centers: np.ndarray, place: np.ndarray, aim: np.ndarray) -> np.ndarray:
+    """Which cells a view from `place` to `aim` shows, walls left aside: [X, Y, Z] bool."""
+    offset, axis = centers - place, aim - place
+    distance = np.linalg.norm(offset, axis=-1)
+    along = offset @ (axis / np.linalg.norm(axis))
+    return (along >= _ATTEMPT_COSINE * distance) & (distance <= _ATTEMPT_REACH)
 
 
 def nearest_views(
