@@ -1,7 +1,5 @@
 """A malformed frame cannot be made, and the error names what is wrong."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np

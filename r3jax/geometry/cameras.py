@@ -11,12 +11,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Num
 
 from r3jax.geometry.numerics import safe_norm
 
 
-def _as_float32(value: float | Array) -> Float[Array, ""]:
+def _as_float32(value: ArrayLike) -> Float[Array, "..."]:
     return jnp.asarray(value, dtype=jnp.float32)
 
 
@@ -60,7 +61,7 @@ class Camera(eqx.Module):
                 raise ValueError(f"{name} must be finite [px], got {value}")
 
     @staticmethod
-    def from_fov(width: int, height: int, horizontal_fov_deg: float = 60.0) -> "Camera":
+    def from_fov(width: int, height: int, horizontal_fov_deg: float | int = 60.0) -> "Camera":
         """A camera with square pixels, centred, with the given horizontal field of view [deg]."""
         if not 0.0 < horizontal_fov_deg < 180.0:
             raise ValueError(
@@ -136,7 +137,9 @@ def invert_pose(T: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
     return jnp.concatenate([top, jnp.array([[0.0, 0.0, 0.0, 1.0]], dtype=T.dtype)], axis=0)
 
 
-def pose_along(position: Float[Array, " 3"], direction: Float[Array, " 3"]) -> Float[Array, "4 4"]:
+def pose_along(
+    position: Num[Array | np.ndarray, " 3"], direction: Num[Array | np.ndarray, " 3"]
+) -> Float[Array, "4 4"]:
     """The roll-free pose at `position` that looks along `direction`.
 
     The image's x axis stays level. Looking straight up or down, level is ambiguous: the x axis
@@ -149,6 +152,7 @@ def pose_along(position: Float[Array, " 3"], direction: Float[Array, " 3"]) -> F
     Returns:
         `T_world_camera`.
     """
+    position, direction = _as_float32(position), _as_float32(direction)
     forward = direction / jnp.maximum(safe_norm(direction), 1e-12)
     right = jnp.stack([forward[1], -forward[0], jnp.zeros_like(forward[0])])
     length = safe_norm(right)
@@ -161,8 +165,11 @@ def pose_along(position: Float[Array, " 3"], direction: Float[Array, " 3"]) -> F
     return jnp.concatenate([top, jnp.array([[0.0, 0.0, 0.0, 1.0]])], axis=0)
 
 
-def look_at(position: Float[Array, " 3"], target: Float[Array, " 3"]) -> Float[Array, "4 4"]:
+def look_at(
+    position: Num[Array | np.ndarray, " 3"], target: Num[Array | np.ndarray, " 3"]
+) -> Float[Array, "4 4"]:
     """The roll-free pose at `position` that looks at the point `target` (both [m], world)."""
+    position, target = _as_float32(position), _as_float32(target)
     return pose_along(position, target - position)
 
 

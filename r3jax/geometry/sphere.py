@@ -35,7 +35,7 @@ def fibonacci_lattice(num: int) -> np.ndarray:
     return _lattice(num)
 
 
-def bins_for_angle(angle_deg: float) -> int:
+def bins_for_angle(angle_deg: float | int) -> int:
     """Number of bins so that each covers a cap of the full opening `angle_deg` [deg].
 
     A = 2 pi (1 - cos(angle / 2)), num = ceil(4 pi / A); 10 degrees give 526.

@@ -93,7 +93,7 @@ _integrate_donating = jax.jit(_integrate, donate_argnums=0)
 def integrate(
     state: MapState,
     frame: Frame,
-    max_range: float | Float[Array, ""] = np.inf,
+    max_range: float | int | Float[Array, ""] = np.inf,
     drop_edges: bool | Bool[Array, ""] = True,
     *,
     donate: bool = False,
@@ -110,7 +110,12 @@ def integrate(
         drop_edges: False lets pixels on depth edges in.
         donate: True updates the table in place: `state` must not be used again. The cost then
             does not grow with the capacity, where a copy of a million rows takes 15 ms.
+
+    Raises:
+        ValueError: a range that is not positive (where it is known, that is outside jit).
     """
+    if not is_traced(max_range) and not float(max_range) > 0.0:
+        raise ValueError(f"max_range must be positive [m], got {float(max_range)}")
     max_range = jnp.asarray(max_range, dtype=jnp.float32)
     update = _integrate_donating if donate else _integrate_jitted
     return update(state, frame, max_range, jnp.asarray(drop_edges))

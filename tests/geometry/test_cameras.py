@@ -93,6 +93,16 @@ def test_look_at_centers_its_target():
     assert seen[2] > 0.0
 
 
+def test_numbers_of_any_kind_are_welcome():
+    expected = look_at(jnp.array([1.0, -2.0, 1.0]), jnp.zeros(3))
+    np.testing.assert_array_equal(look_at(np.array([1, -2, 1]), np.zeros(3)), expected)
+    backward = pose_along(np.array([1.0, -2.0, 1.0]), np.array([-1, 2, -1]))
+    np.testing.assert_array_equal(backward, expected)
+    of_matrix = Camera(12, 8, *np.array([9, 11, 5, 4], np.float32))
+    assert float(of_matrix.fy) == float(Camera(12, 8, 9, 11, 5, 4).fy) == 11.0
+    assert float(Camera.from_fov(12, 8, 60).fx) == float(Camera.from_fov(12, 8, 60.0).fx)
+
+
 @given(points(), directions())
 def test_inverse_undoes_the_pose(position, direction):
     T = pose(jnp.asarray(position, jnp.float32), jnp.asarray(direction, jnp.float32))

@@ -68,7 +68,7 @@ def test_lattice_cannot_be_changed_by_its_users():
 
 
 def test_ten_degrees_give_526_bins():
-    assert bins_for_angle(10.0) == 526
+    assert bins_for_angle(10.0) == bins_for_angle(10) == 526
     assert bins_for_angle(120.0) == 4
     assert bins_for_angle(180.0) == 2
     assert bins_for_angle(360.0) == 1

@@ -1,0 +1,189 @@
+"""Frames join the map: the pixels that take part, and no other, against float64.
+
+The camera and its poses are such that float32 holds all points exactly: no rounding decides
+which voxel a point is in, and the reference can be exact about it.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping import update as real
+from r3jax.mapping.associate import edge_pixels
+from r3jax.mapping.state import MapState
+from r3jax.mapping.update import integrate
+from tests.mapping.reference import ReferenceMap, assert_same_rows, read_map
+from tests.mapping.sighted import NUM_BINS, assert_identical_rows, new_map
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.strategies import VOXEL_SIZE
+
+HEIGHT, WIDTH, CAPACITY = 12, 16, 512  # one shape: one compile
+CAMERA = Camera(WIDTH, HEIGHT, 16.0, 32.0, 7.5, 6.5)  # nothing square, nothing centred
+TURNS = {
+    "x": np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+    "-x": np.array([[0, 0, -1], [1, 0, 0], [0, -1, 0]]),
+    "down": np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
+}
+"""Rotations camera to world, named by where the camera looks."""
+
+
+def frame_of(depth: np.ndarray, turn: str = "x", seed: int = 0) -> Frame:
+    """A frame of random colours; the camera stands at a multiple of 1/1024 m."""
+    random = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = TURNS[turn]
+    T[:3, 3] = (random.integers(-512, 512, 3) + 0.25) / 256
+    rgb = random.random((HEIGHT, WIDTH, 3)).astype(np.float32)
+    return Frame(rgb=rgb, depth=depth, T_world_camera=T, camera=CAMERA)
+
+
+def scene_depth(seed: int = 0) -> np.ndarray:
+    """Steps, a slope of whole voxels, holes and pixels out of range; multiples of 1/16 m."""
+    random = np.random.default_rng(seed)
+    depth = np.full((HEIGHT, WIDTH), 1.5, np.float32)
+    depth[:, 9:] = 2.25
+    depth[8:] += np.arange(WIDTH, dtype=np.float32) / 16
+    depth[random.random(depth.shape) < 0.1] = 0.0
+    depth[:3, 12:] = np.inf
+    return depth
+
+
+def reference_of(frames: list[Frame], takes_part: list[np.ndarray]) -> ReferenceMap:
+    """The map as a dictionary, in float64, of the pixels that are said to take part."""
+    reference = ReferenceMap(VOXEL_SIZE, NUM_BINS)
+    for frame, mask in zip(frames, takes_part, strict=True):
+        depth, T = np.float64(frame.depth)[mask], np.float64(frame.T_world_camera)
+        row, column = np.nonzero(mask)
+        x = (column + 0.5 - float(CAMERA.cx)) / float(CAMERA.fx) * depth
+        y = (row + 0.5 - float(CAMERA.cy)) / float(CAMERA.fy) * depth
+        points = np.stack([x, y, depth], axis=1) @ T[:3, :3].T + T[:3, 3]
+        focal = np.sqrt(float(CAMERA.fx) * float(CAMERA.fy))
+        reference.see(points, np.asarray(frame.rgb)[mask], T[:3, 3], focal)
+    return reference
+
+
+def map_of(frames: list[Frame], integrate=integrate, **options) -> MapState:
+    state = new_map(CAPACITY)
+    for frame in frames:
+        state = integrate(state, frame, **options)
+    return state
+
+
+def is_edge(frame: Frame) -> np.ndarray:
+    return np.asarray(edge_pixels(frame.depth, jnp.float32(VOXEL_SIZE)))
+
+
+FRAMES = [frame_of(scene_depth(i), turn, seed=i) for i, turn in enumerate(TURNS)]
+
+
+def test_map_holds_the_statistics_of_all_frames():
+    law_frames({"update": real})
+
+
+def test_edges_take_no_part_unless_they_are_let_in():
+    law_edges({"update": real})
+
+
+def test_range_ends_at_z_depth_and_includes_its_end():
+    law_range({"update": real})
+
+
+def test_the_same_frame_again_adds_observations_but_no_noise():
+    once, twice = read_map(map_of(FRAMES[:1])), read_map(map_of([FRAMES[0]] * 2))
+    assert once.keys() == twice.keys()
+    for voxel, row in twice.items():
+        assert (row.count, row.bins) == (2.0, once[voxel].bins)
+        assert row.m2 < 1e-10
+        np.testing.assert_allclose(row.mean, once[voxel].mean, atol=1e-6)
+
+
+def test_frames_scan_into_a_map():
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *FRAMES)
+    step = lambda state, frame: (integrate(state, frame), None)
+    scanned, _ = jax.lax.scan(step, new_map(CAPACITY), stacked)
+    assert_same_rows(read_map(scanned), read_map(map_of(FRAMES)))
+
+
+def test_sweeps_over_numbers_compile_once():
+    sweep = jax.jit(lambda *arguments: integrate(*arguments))
+    for size, max_range, drop in [(0.0625, 5.0, True), (0.1, 2.0, False), (0.3, np.inf, True)]:
+        sweep(new_map(CAPACITY, size), FRAMES[0], jnp.float32(max_range), jnp.asarray(drop))
+    assert sweep._cache_size() == 1
+    before = real._integrate_jitted._cache_size()
+    for size, max_range, drop in [(0.07, 4.0, True), (0.2, 3, False), (0.4, jnp.float32(2), True)]:
+        integrate(new_map(CAPACITY, size), FRAMES[1], max_range, drop)
+    assert real._integrate_jitted._cache_size() <= max(before, 1)
+
+
+def test_a_map_may_be_updated_in_place():
+    state = new_map(CAPACITY)
+    for frame in FRAMES:
+        state = integrate(state, frame, donate=True)
+    assert_identical_rows(state, map_of(FRAMES))
+
+
+@pytest.mark.parametrize("max_range", [0.0, -1.0, np.nan])
+def test_bad_range_is_named(max_range):
+    with pytest.raises(ValueError, match=r"max_range must be positive \[m\], got"):
+        integrate(new_map(CAPACITY), FRAMES[0], max_range)
+
+
+# Laws of fixed examples, for the mutants ---------------------------------------------------------
+
+
+def law_frames(modules: Modules) -> None:
+    """All that was measured, edges and all; nothing else."""
+    measured = [np.isfinite(frame.depth) & (np.asarray(frame.depth) > 0.0) for frame in FRAMES]
+    reference = reference_of(FRAMES, measured)
+    assert reference.clearance > 1e-6
+    state = map_of(FRAMES, modules["update"].integrate, drop_edges=False)
+    assert_same_rows(read_map(state), reference.rows())
+
+
+def law_edges(modules: Modules) -> None:
+    frame = FRAMES[0]
+    measured = np.isfinite(frame.depth) & (np.asarray(frame.depth) > 0.0)
+    edges = is_edge(frame)
+    assert 0.1 < edges.mean() < 0.7
+    inside = reference_of([frame], [measured & ~edges]).rows()
+    assert len(inside) < len(reference_of([frame], [measured]).rows())
+    assert_same_rows(read_map(map_of([frame], modules["update"].integrate)), inside)
+
+
+def law_range(modules: Modules) -> None:
+    """1.5 m is the depth of the nearest surface, whatever the length of its rays."""
+    near = [np.asarray(frame.depth) == 1.5 for frame in FRAMES]
+    options = {"max_range": 1.5, "drop_edges": False}
+    state = map_of(FRAMES, modules["update"].integrate, **options)
+    assert_same_rows(read_map(state), reference_of(FRAMES, near).rows())
+
+
+CHAIN = ("r3jax.mapping.update",)
+MUTANTS = [
+    Mutant("update", "(depth > 0.0) &", "(depth >= 0.0) &", law_frames),
+    Mutant("update", "jnp.isfinite(depth) &", "", law_frames),
+    Mutant("update", "& (depth <= max_range)", "", law_range),
+    Mutant("update", "(depth <= max_range)", "(depth < max_range)", law_range),
+    Mutant("update", "is_measured & ~edge_pixels(", "is_measured & edge_pixels(", law_edges),
+    Mutant("update", "is_measured & ~edge_pixels(", "is_measured | edge_pixels(", law_edges),
+    Mutant("update", "        drop_edges,\n", "        ~drop_edges,\n", law_frames),
+    Mutant("update", "valid.reshape(-1)", "valid.T.reshape(-1)", law_frames),
+    Mutant("update", "frame.position, frame.camera.focal",
+           "frame.position, frame.camera.fx", law_frames),
+    Mutant("update", "frame.position, frame.camera.focal",
+           "frame.T_world_camera[3, :3], frame.camera.focal", law_frames),
+]  # fmt: skip
+
+
+def test_laws_hold_without_a_fault():
+    modules = load(CHAIN)
+    for law in (law_frames, law_edges, law_range):
+        law(modules)
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
