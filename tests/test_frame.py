@@ -40,6 +40,13 @@ def test_poses_become_float32(kind):
     assert Frame(**SOUND | {"T_world_camera": np.eye(4, dtype=kind)}).position.dtype == jnp.float32
 
 
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+def test_images_of_any_precision_become_float32(kind):
+    frame = Frame(**SOUND | {name: SOUND[name].astype(kind) for name in ("rgb", "depth")})
+    assert frame.rgb.dtype == frame.depth.dtype == jnp.float32
+    np.testing.assert_array_equal(frame.depth, SOUND["depth"])
+
+
 BAD = {
     "rgb of another size": ({"rgb": np.zeros((6, 9, 3), np.float32)}, r"rgb has shape \(6, 9, 3\)"),
     "rgb with alpha": ({"rgb": np.zeros((6, 8, 4), np.float32)}, r"rgb has shape \(6, 8, 4\)"),
