@@ -12,9 +12,9 @@ import pytest
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping import update as real
-from r3jax.mapping.associate import edge_pixels
+from r3jax.mapping.associate import edge_pixels, points_of_pixels
 from r3jax.mapping.state import MapState
-from r3jax.mapping.update import integrate
+from r3jax.mapping.update import integrate, integrate_points
 from tests.mapping.reference import ReferenceMap, assert_same_rows, read_map
 from tests.mapping.sighted import NUM_BINS, assert_identical_rows, new_map
 from tests.mutants import Modules, Mutant, assert_caught, each, load
@@ -72,6 +72,10 @@ def map_of(frames: list[Frame], integrate=integrate, **options) -> MapState:
     return state
 
 
+def is_measured(frame: Frame) -> np.ndarray:
+    return np.isfinite(frame.depth) & (np.asarray(frame.depth) > 0.0)
+
+
 def is_edge(frame: Frame) -> np.ndarray:
     return np.asarray(edge_pixels(frame.depth, jnp.float32(VOXEL_SIZE)))
 
@@ -91,6 +95,19 @@ def test_range_ends_at_z_depth_and_includes_its_end():
     law_range({"update": real})
 
 
+def test_frame_equals_its_points():
+    frame = FRAMES[0]
+    seen = is_measured(frame)
+    points = np.asarray(points_of_pixels(frame, frame.depth)).T[seen.reshape(-1)]
+    rgb = np.asarray(frame.rgb)[seen]
+    alone = integrate_points(new_map(CAPACITY), points, rgb, frame.position, CAMERA.focal)
+    assert_same_rows(read_map(map_of([frame], drop_edges=False)), read_map(alone))
+
+
+def test_order_of_frames_does_not_matter():
+    assert_same_rows(read_map(map_of(FRAMES[::-1])), read_map(map_of(FRAMES)))
+
+
 def test_the_same_frame_again_adds_observations_but_no_noise():
     once, twice = read_map(map_of(FRAMES[:1])), read_map(map_of([FRAMES[0]] * 2))
     assert once.keys() == twice.keys()
@@ -98,6 +115,24 @@ def test_the_same_frame_again_adds_observations_but_no_noise():
         assert (row.count, row.bins) == (2.0, once[voxel].bins)
         assert row.m2 < 1e-10
         np.testing.assert_allclose(row.mean, once[voxel].mean, atol=1e-6)
+
+
+@pytest.mark.parametrize("depth", [0.0, np.inf])
+def test_a_frame_without_measurements_changes_nothing(depth):
+    before = map_of(FRAMES)
+    after = integrate(before, frame_of(np.full((HEIGHT, WIDTH), depth, np.float32)))
+    jax.tree.map(np.testing.assert_array_equal, after, before)
+
+
+def test_integrate_under_jit_and_vmap_is_the_same():
+    start = map_of(FRAMES[:1])
+    one_by_one = [integrate(start, frame) for frame in FRAMES]
+    assert_identical_rows(jax.jit(integrate)(start, FRAMES[1]), one_by_one[1])
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *FRAMES)
+    together = jax.vmap(integrate, in_axes=(None, 0))(start, stacked)
+    for i, alone in enumerate(one_by_one):
+        of_frame = jax.tree.map(lambda leaf, i=i: leaf[i], together)
+        assert_same_rows(read_map(of_frame), read_map(alone))
 
 
 def test_frames_scan_into_a_map():
@@ -136,7 +171,7 @@ def test_bad_range_is_named(max_range):
 
 def law_frames(modules: Modules) -> None:
     """All that was measured, edges and all; nothing else."""
-    measured = [np.isfinite(frame.depth) & (np.asarray(frame.depth) > 0.0) for frame in FRAMES]
+    measured = [is_measured(frame) for frame in FRAMES]
     reference = reference_of(FRAMES, measured)
     assert reference.clearance > 1e-6
     state = map_of(FRAMES, modules["update"].integrate, drop_edges=False)
@@ -145,7 +180,7 @@ def law_frames(modules: Modules) -> None:
 
 def law_edges(modules: Modules) -> None:
     frame = FRAMES[0]
-    measured = np.isfinite(frame.depth) & (np.asarray(frame.depth) > 0.0)
+    measured = is_measured(frame)
     edges = is_edge(frame)
     assert 0.1 < edges.mean() < 0.7
     inside = reference_of([frame], [measured & ~edges]).rows()
@@ -161,7 +196,7 @@ def law_range(modules: Modules) -> None:
     assert_same_rows(read_map(state), reference_of(FRAMES, near).rows())
 
 
-CHAIN = ("r3jax.mapping.update",)
+CHAIN = ("r3jax.mapping.associate", "r3jax.mapping.update")
 MUTANTS = [
     Mutant("update", "(depth > 0.0) &", "(depth >= 0.0) &", law_frames),
     Mutant("update", "jnp.isfinite(depth) &", "", law_frames),
@@ -169,6 +204,10 @@ MUTANTS = [
     Mutant("update", "(depth <= max_range)", "(depth < max_range)", law_range),
     Mutant("update", "is_measured & ~edge_pixels(", "is_measured & edge_pixels(", law_edges),
     Mutant("update", "is_measured & ~edge_pixels(", "is_measured | edge_pixels(", law_edges),
+    Mutant("associate", "T[i, 1] * y + T[i, 2] * depth", "T[i, 1] * y", law_frames),
+    Mutant("associate", "jnp.float32) + 0.5 - camera.cx",
+           "jnp.float32) - camera.cx", law_frames),
+    Mutant("associate", "v[:, None] * depth", "v[:, None]", law_frames),
     Mutant("update", "        drop_edges,\n", "        ~drop_edges,\n", law_frames),
     Mutant("update", "valid.reshape(-1)", "valid.T.reshape(-1)", law_frames),
     Mutant("update", "frame.position, frame.camera.focal",
