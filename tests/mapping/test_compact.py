@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from r3jax.mapping.compact import positions_of_set, running_count
+from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 SIZES = [1, 2, 63, 64, 65, 4095, 4097, 64**3 + 5]
 
@@ -41,3 +42,38 @@ def test_counts_that_float32_cannot_hold_are_refused():
     too_many = jax.ShapeDtypeStruct((1 << 24,), jnp.bool_)
     with pytest.raises(ValueError, match=r"below 2\^24 flags, got 16777216"):
         jax.eval_shape(running_count, too_many)
+
+
+# A law of fixed examples, for the mutants --------------------------------------------------------
+
+
+def law_counts(modules: Modules) -> None:
+    compact = modules["compact"]
+    for size in (64, 4097):
+        flags = flags_of(size, 0.5)
+        np.testing.assert_array_equal(compact.running_count(jnp.asarray(flags)), np.cumsum(flags))
+        positions = compact.positions_of_set(jnp.asarray(flags), 20)
+        np.testing.assert_array_equal(positions, np.flatnonzero(flags)[:20])
+    few = compact.positions_of_set(jnp.array([False, True, False]), 4)
+    np.testing.assert_array_equal(few, [1, 3, 3, 3])
+
+
+CHAIN = ("r3jax.mapping.compact",)
+MUTANTS = [
+    Mutant("compact", "np.triu(", "np.tril(", law_counts),
+    Mutant("compact", " - within[:, -1]", "", law_counts),
+    Mutant("compact", "within + before[:, None]", "within", law_counts),
+    Mutant("compact", "running_count(flags) - 1, size)", "running_count(flags), size)", law_counts),
+    Mutant("compact", "running_count(flags) - 1, size)",
+           "running_count(flags) - 1, 0)", law_counts),
+    Mutant("compact", "jnp.full(size, n,", "jnp.full(size, n + 1,", law_counts),
+]  # fmt: skip
+
+
+def test_law_holds_without_a_fault():
+    law_counts(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
