@@ -82,6 +82,23 @@ def test_voxel_renderability_has_every_term_per_row(m, frame):
     assert float(t.value[np.asarray(m.occupied)].mean()) > 0.5
 
 
+def test_positions_may_be_any_array_and_focal_lengths_any_number(m, frame):
+    expected = np.asarray(r3jax.voxel_renderability(m, frame.position, focal=2.0).value)
+    position = np.asarray(frame.position)
+    for where, focal in ((position, 2), (position.astype(np.float64), np.float32(2.0))):
+        value = np.asarray(r3jax.voxel_renderability(m, where, focal=focal).value)
+        np.testing.assert_array_equal(value, expected)
+
+
+def test_malformed_queries_are_refused(m, frame):
+    with pytest.raises(ValueError, match=r"shape \[3\]"):
+        r3jax.voxel_renderability(m, jnp.zeros(4))
+    with pytest.raises(ValueError, match="one number"):
+        r3jax.voxel_renderability(m, frame.position, focal=jnp.ones(2))
+    with pytest.raises(ValueError, match="kappa must be"):
+        r3jax.voxel_renderability(m, frame.position, kappa="two")
+
+
 def test_a_view_is_the_mean_of_its_image(m, camera, frame):
     s = r3jax.renderability(m, camera, frame.T_world_camera)
     i = r3jax.renderability_image(m, camera, frame.T_world_camera)

@@ -10,6 +10,7 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera
@@ -109,24 +110,32 @@ def _voxel_renderability(state, camera_position, focal, kappa):
 
 
 def voxel_renderability(
-    state: MapState,
-    camera_position: Float[Array, " 3"],
-    focal: float | Float[Array, ""] = 1.0,
-    kappa: str = "box",
+    state: MapState, camera_position: ArrayLike, focal: ArrayLike = 1.0, kappa: str = "box"
 ) -> Renderability:
     """The terms of every row of the map, as seen from one camera position; no occlusion.
 
     Args:
         state: the map.
-        camera_position: [m], world.
-        focal: focal length of the camera that asks [px].
+        camera_position: [3] [m], world.
+        focal: focal length of the camera that asks [px], one number.
         kappa: `box`, or `one` to leave the box test out.
 
     Returns:
         The terms, each of shape [capacity]; `value` is 0 for rows never seen.
+
+    Raises:
+        ValueError: a position that is not [3], a focal length that is not one number, a `kappa`
+            that is neither.
     """
     position = jnp.asarray(camera_position, dtype=jnp.float32)
-    return _voxel_renderability(state, position, jnp.asarray(focal, dtype=jnp.float32), kappa)
+    focal = jnp.asarray(focal, dtype=jnp.float32)
+    if position.shape != (3,):
+        raise ValueError(f"camera_position must have shape [3], got {position.shape}")
+    if focal.ndim != 0:
+        raise ValueError(f"focal must be one number [px], got shape {focal.shape}")
+    if kappa not in ("box", "one"):
+        raise ValueError(f"kappa must be 'box' or 'one', got {kappa!r}")
+    return _voxel_renderability(state, position, focal, kappa)
 
 
 @jax.jit
