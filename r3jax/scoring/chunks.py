@@ -61,13 +61,14 @@ def for_selected(
     num = selection.num
     size = min(CHUNK, num)
 
-    def next_chunk(state):
-        first, carry = state
-        index = jax.lax.dynamic_slice_in_dim(selection.order, first, size)
-        return first + size, body(jnp.minimum(index, num - 1), index < num, carry)
+    # Chunks are counted one by one: for a limit that XLA knows and that is no multiple of the
+    # step, it gets the number of turns wrong (one chunk: none).
+    def next_chunk(chunk, carry):
+        index = jax.lax.dynamic_slice_in_dim(selection.order, chunk * size, size)
+        return body(jnp.minimum(index, num - 1), index < num, carry)
 
-    begin = (jnp.zeros((), jnp.int32), start)
-    return jax.lax.while_loop(lambda state: state[0] < selection.count, next_chunk, begin)[1]
+    num_chunks = (selection.count + (size - 1)) // size
+    return jax.lax.fori_loop(0, num_chunks, next_chunk, start)
 
 
 def narrow(
