@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.scoring.chunks import for_selected, select
 from r3jax.scoring.lack import sum_by_direction
-from r3jax.scoring.visibility import DepthBuffer, View, is_visible
+from r3jax.scoring.views import View
+from r3jax.scoring.visibility import DepthBuffer, is_visible
 
 
 class Cells(eqx.Module):

@@ -18,10 +18,10 @@ class ScoringConfig(eqx.Module):
     max_range: Float[Array, ""] = eqx.field(default=5.0, converter=_float32)
     """Nothing farther away counts as visible [m]: the sensor's range."""
 
-    tolerance: Float[Array, ""] = eqx.field(default=2.5, converter=_float32)
-    """A voxel this far behind the depth buffer still counts as visible [voxels]; the slope of
-    the buffer is allowed on top. Voxel centers lie up to 1.7 voxels apart along a ray that
-    crosses a single surface; 2.5 agrees best with ray casting."""
+    tolerance: Float[Array, ""] = eqx.field(default=2.0, converter=_float32)
+    """A voxel this far behind the depth buffer, across the surface in it, still counts as
+    visible [voxels]. Centers lie up to 1.7 voxels apart along a ray that crosses a single
+    surface; 2 agrees best with ray casting."""
 
     kappa: str = eqx.field(default="box", static=True)
     """`box`: 1 inside the seen directions' box, else 2. `one`: always 1."""

@@ -15,7 +15,8 @@ from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.lack import lack_by_direction
-from r3jax.scoring.visibility import candidates_of, depth_buffer, panorama_view, visible_voxels
+from r3jax.scoring.views import panorama_view
+from r3jax.scoring.visibility import candidates_of, depth_buffer, visible_voxels
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 

@@ -19,7 +19,8 @@ from r3jax.mapping.state import MapState
 from r3jax.scoring.chunks import for_selected, select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.directions import seen_directions
-from r3jax.scoring.visibility import candidates_of, depth_buffer, pinhole_view
+from r3jax.scoring.views import pinhole_view
+from r3jax.scoring.visibility import candidates_of, depth_buffer
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
