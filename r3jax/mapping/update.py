@@ -56,18 +56,17 @@ def integrate_groups(
     leaders = positions_of_set(groups.is_leader, -(-num // size) * size)
     num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
 
-    def join_chunk(carry):
-        first, state = carry
-        index = jax.lax.dynamic_slice_in_dim(leaders, first, size)
+    # Chunks are counted one by one, as in `scoring.chunks`: XLA miscounts other steps.
+    def join_chunk(chunk, state):
+        index = jax.lax.dynamic_slice_in_dim(leaders, chunk * size, size)
         valid = index < num
         index = jnp.minimum(index, num - 1)
         sums = groups.rgb_sum[index].T
         rgb = sums[:3] / jnp.maximum(sums[3:], 1.0)
         seen = observe_voxels(state, groups.key[:, index], valid, rgb, camera_position, focal)
-        return first + size, join(state, seen)
+        return join(state, seen)
 
-    start = (jnp.zeros((), jnp.int32), state)
-    return jax.lax.while_loop(lambda c: c[0] < num_voxels, join_chunk, start)[1]
+    return jax.lax.fori_loop(0, (num_voxels + (size - 1)) // size, join_chunk, state)
 
 
 def _integrate(
