@@ -3,7 +3,6 @@
 Shape symbols: h w size of the buffer.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -36,28 +35,33 @@ def surface_limit(
         allowance: depth of the surface across itself [m].
     """
     capped = jnp.minimum(distance, _FAR)
+    # Beyond the border the buffer is continued in a straight line.
+    padded = jnp.pad(capped, max(_STRIDES), mode="reflect", reflect_type="odd")
     squared = jnp.zeros_like(distance)
     for axis in (0, 1):
-        slopes = [_slope(capped, step, axis) for step in _STRIDES if step < distance.shape[axis]]
-        for slope in slopes[1:]:
-            slopes[0] = jnp.maximum(slopes[0], slope)
-        if slopes:
-            squared = squared + slopes[0] * slopes[0]
+        steepest = jnp.zeros_like(distance)
+        for step in _STRIDES:
+            steepest = jnp.maximum(steepest, _slope(capped, padded, step, axis))
+        squared = squared + steepest * steepest
     tangent = jnp.sqrt(squared) / (pixel_angle * jnp.maximum(capped, 1e-6))
     stretch = jnp.minimum(jnp.sqrt(1.0 + tangent * tangent), _MAX_STRETCH)
     return distance + allowance * stretch
 
 
-def _slope(distance: Float[Array, "h w"], step: int, axis: int) -> Float[Array, "h w"]:
+def _slope(
+    distance: Float[Array, "h w"], padded: Float[Array, "hp wp"], step: int, axis: int
+) -> Float[Array, "h w"]:
     """Change per pixel on the flatter side of each pixel [m/px]; 0 where the sides disagree.
 
-    So neither a silhouette nor a ragged edge counts as a slope. Beyond the border the buffer is
-    continued in a straight line.
+    So neither a silhouette nor a ragged edge counts as a slope.
     """
-    widths = [(step, step) if i == axis else (0, 0) for i in range(2)]
-    padded = jnp.pad(distance, widths, mode="reflect", reflect_type="odd")
-    n = distance.shape[axis]
-    part = lambda first: jax.lax.slice_in_dim(padded, first, first + n, axis=axis)
-    before, after = distance - part(0), part(2 * step) - distance
+    margin = max(_STRIDES)
+    height, width = distance.shape
+
+    def moved(shift: int) -> Float[Array, "h w"]:
+        row, column = margin + shift * (axis == 0), margin + shift * (axis == 1)
+        return padded[row : row + height, column : column + width]
+
+    before, after = distance - moved(-step), moved(step) - distance
     flatter = jnp.minimum(jnp.abs(before), jnp.abs(after)) / step
     return jnp.where(before * after > 0.0, flatter, 0.0)
