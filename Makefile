@@ -27,7 +27,7 @@ lint: setup
 	$(BIN)/lint-imports
 
 benchmark: setup
-	$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only -m benchmark
+	$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only --benchmark-columns=min,median,rounds
 
 clean:
 	rm -rf $(VENV) .cache build *.egg-info
