@@ -1,0 +1,1 @@
+"""3D Gaussian splatting: render, train, store."""

@@ -1,0 +1,79 @@
+"""What a rasteriser backend takes and gives, and which one serves where."""
+
+import importlib.util
+from typing import Protocol
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float, Int
+
+from r3jax.geometry.cameras import Camera
+from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.scene import GaussianScene
+
+
+class Composite(eqx.Module):
+    """What a backend returns: the Gaussians composited on black."""
+
+    rgb: Float[Array, "H W 3"]
+    """Sum of weight x color."""
+
+    depth_sum: Float[Array, "H W"]
+    """Sum of weight x z-depth [m]."""
+
+    alpha: Float[Array, "H W"]
+    """Sum of the weights."""
+
+    num_intersections: Int[Array, ""]
+    """Pairs of tile and Gaussian that the view needs."""
+
+    overflow: Int[Array, ""]
+    """How many of them found no room in the budget."""
+
+
+class Rasterise(Protocol):
+    """A backend: differentiable by the scene, the pose, the intrinsics and `center_offsets`."""
+
+    def __call__(
+        self,
+        scene: GaussianScene,
+        camera: Camera,
+        T_world_camera: Float[Array, "4 4"],
+        center_offsets: Float[Array, "n 2"],
+        config: RasterConfig,
+    ) -> Composite:
+        """Composites the scene on black; one view, to be vmapped over poses."""
+        ...
+
+
+def find_backend(name: str) -> Rasterise:
+    """The backend of that name; `auto` takes the fastest that runs on this machine.
+
+    Raises:
+        ValueError: there is no such backend.
+        ImportError: its packages are not installed; the message names the extra.
+    """
+    if name == "auto":
+        name = _fastest()
+    if name == "numba":
+        from r3jax.splatting.backends.numba import rasterise
+    elif name == "xla":
+        from r3jax.splatting.backends.xla import rasterise
+    elif name == "splax":
+        from r3jax.splatting.backends.splax import rasterise
+    elif name == "reference":
+        from r3jax.splatting.reference import rasterise
+    else:
+        raise ValueError(
+            f"there is no rasteriser backend {name!r}: choose auto, numba, xla, splax or reference"
+        )
+    return rasterise
+
+
+def _fastest() -> str:
+    platform = jax.default_backend()
+    if platform == "cpu":
+        return "numba"
+    if platform in ("gpu", "cuda") and importlib.util.find_spec("splax") is not None:
+        return "splax"
+    return "xla"

@@ -1,0 +1,1 @@
+"""Backends of the rasteriser: the same numbers by different means."""

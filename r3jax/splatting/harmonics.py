@@ -1,0 +1,67 @@
+"""Real spherical harmonics up to degree 3, in the order and with the signs of 3DGS files."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
+
+
+def harmonics(
+    x: Float[Array, " n"], y: Float[Array, " n"], z: Float[Array, " n"], degree: int
+) -> list[Float[Array, " n"]]:
+    """The basis functions at unit directions (x, y, z), (degree + 1)^2 of them."""
+    basis = [jnp.full_like(x, C0)]
+    if degree >= 1:
+        basis += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2.0 * zz - xx - yy),
+            -C2[0] * x * z,
+            C2[2] * (xx - yy),
+        ]
+        if degree >= 3:
+            basis += [
+                -C3[0] * y * (3.0 * xx - yy),
+                C3[1] * x * y * z,
+                -C3[2] * y * (4.0 * zz - xx - yy),
+                C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+                -C3[2] * x * (4.0 * zz - xx - yy),
+                C3[4] * z * (xx - yy),
+                -C3[0] * x * (xx - 3.0 * yy),
+            ]
+    return basis
+
+
+def view_colors(
+    sh: Float[Array, "n k 3"], means: Float[Array, "n 3"], camera_center: Float[Array, " 3"]
+) -> Float[Array, "3 n"]:
+    """Colors of Gaussians as a camera sees them: max(SH(direction) + 0.5, 0).
+
+    Args:
+        sh: coefficients, k = (degree + 1)^2.
+        means: centers in the world [m].
+        camera_center: in the world [m].
+
+    Returns:
+        RGB, one row per channel; it may exceed 1.
+    """
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
+    x, y, z = (means[:, i] - camera_center[i] for i in range(3))
+    squared = x * x + y * y + z * z
+    squared_safe = jnp.where(squared > 0.0, squared, 1.0)
+    inverse = jnp.where(squared > 0.0, 1.0 / jnp.sqrt(squared_safe), 0.0)
+    basis = harmonics(x * inverse, y * inverse, z * inverse, degree)
+    channels = [sum(b * sh[:, i, c] for i, b in enumerate(basis)) + 0.5 for c in range(3)]
+    return jnp.maximum(jnp.stack(channels), 0.0)

@@ -1,0 +1,154 @@
+"""EWA projection of 3D Gaussians to the image (Zwicker et al. 2001, Kerbl et al. 2023).
+
+Structure of arrays, the long axis last: XLA's CPU loops run along it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from r3jax.geometry.cameras import Camera, invert_pose
+from r3jax.splatting.config import ALPHA_MIN, DILATION, FRUSTUM_MARGIN, NEAR
+from r3jax.splatting.harmonics import view_colors
+from r3jax.splatting.scene import GaussianScene
+
+
+class ProjectedGaussians(eqx.Module):
+    """What compositing needs to know of each Gaussian, for one camera."""
+
+    center: Float[Array, "2 n"]
+    """Column and row [px]."""
+
+    conic: Float[Array, "3 n"]
+    """Inverse of the projected covariance: xx, xy, yy [1/px^2]."""
+
+    depth: Float[Array, " n"]
+    """z-depth of the center [m]."""
+
+    opacity: Float[Array, " n"]
+    """In [0, 1]."""
+
+    color: Float[Array, "3 n"]
+    """RGB, at least 0."""
+
+    reach: Float[Array, "2 n"]
+    """Half width and half height [px] of the box outside which alpha < 1/255; -1 where the
+    Gaussian is not drawn. Carries no gradient."""
+
+    @property
+    def is_drawn(self) -> Bool[Array, " n"]:
+        """True where the Gaussian may touch a pixel."""
+        return self.reach[0] >= 0.0
+
+
+def project_gaussians(
+    scene: GaussianScene,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    center_offsets: Float[Array, "n 2"],
+) -> ProjectedGaussians:
+    """Projects every Gaussian and evaluates its color.
+
+    Args:
+        scene: the Gaussians.
+        camera: intrinsics.
+        T_world_camera: camera-to-world pose.
+        center_offsets: added to the projected centers [px]; zeros, to differentiate by.
+
+    Returns:
+        All Gaussians; those outside the image or nearer than 0.01 m are marked as not drawn.
+    """
+    T_camera_world = invert_pose(T_world_camera)
+    x, y, z = _in_camera(scene.means, T_camera_world)
+    z_safe = jnp.where(z > NEAR, z, 1.0)
+    cov = _image_covariance(scene, camera, T_camera_world[:3, :3], x, y, z_safe)
+    a, b, c = cov
+    determinant = a * c - b * b
+    determinant_safe = jnp.where(determinant > 0.0, determinant, 1.0)
+    conic = jnp.stack([c, -b, a]) / determinant_safe[None, :]
+    center = jnp.stack(
+        [
+            camera.fx * x / z_safe + camera.cx + center_offsets[:, 0],
+            camera.fy * y / z_safe + camera.cy + center_offsets[:, 1],
+        ]
+    )
+    opacity = jax.nn.sigmoid(scene.opacity_logits)
+    valid = (z > NEAR) & (determinant > 0.0)
+    return ProjectedGaussians(
+        center=center,
+        conic=conic,
+        depth=z,
+        opacity=opacity,
+        color=view_colors(scene.sh, scene.means, T_world_camera[:3, 3]),
+        reach=jax.lax.stop_gradient(_reach(camera, center, a, c, opacity, valid)),
+    )
+
+
+def _in_camera(means: Float[Array, "n 3"], T: Float[Array, "4 4"]) -> tuple[Array, Array, Array]:
+    """Coordinates in the camera's frame [m], one array each."""
+    mx, my, mz = means[:, 0], means[:, 1], means[:, 2]
+    x, y, z = (T[i, 0] * mx + T[i, 1] * my + T[i, 2] * mz + T[i, 3] for i in range(3))
+    return x, y, z
+
+
+def _image_covariance(
+    scene: GaussianScene, camera: Camera, R: Float[Array, "3 3"], x: Array, y: Array, z: Array
+) -> tuple[Array, Array, Array]:
+    """J W S W^T J^T + 0.3 I as (xx, xy, yy) [px^2], with J the Jacobian of the projection.
+
+    J is taken at a point at most 30 % of half the image outside the image: further out the
+    linearization means nothing and would smear Gaussians over the whole picture.
+    """
+    rotation = rotation_rows(scene.quats)
+    scales = [jnp.exp(scene.log_scales[:, i]) for i in range(3)]
+    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+    u = jnp.clip(
+        x / z,
+        -camera.cx / camera.fx - margin_x,
+        _far(camera.width, camera.cx, camera.fx) + margin_x,
+    )
+    v = jnp.clip(
+        y / z,
+        -camera.cy / camera.fy - margin_y,
+        _far(camera.height, camera.cy, camera.fy) + margin_y,
+    )
+    fx_z, fy_z = camera.fx / z, camera.fy / z
+    # Rows of J R (2x3), then their products with the Gaussian's scaled axes.
+    row_x = [fx_z * (R[0, i] - u * R[2, i]) for i in range(3)]
+    row_y = [fy_z * (R[1, i] - v * R[2, i]) for i in range(3)]
+    along_x = [scales[j] * sum(row_x[i] * rotation[i][j] for i in range(3)) for j in range(3)]
+    along_y = [scales[j] * sum(row_y[i] * rotation[i][j] for i in range(3)) for j in range(3)]
+    xx = sum(p * p for p in along_x) + DILATION
+    xy = sum(p * q for p, q in zip(along_x, along_y, strict=True))
+    yy = sum(q * q for q in along_y) + DILATION
+    return jnp.asarray(xx), jnp.asarray(xy), jnp.asarray(yy)
+
+
+def rotation_rows(quats: Float[Array, "n 4"]) -> list[list[Array]]:
+    """Rotation matrices of quaternions wxyz of any length, as 3x3 lists of [n] arrays."""
+    squared = sum(quats[:, i] * quats[:, i] for i in range(4))
+    inverse = 1.0 / jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0))
+    w, x, y, z = (quats[:, i] * inverse for i in range(4))
+    return [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+
+
+def _reach(
+    camera: Camera, center: Array, xx: Array, yy: Array, opacity: Array, valid: Array
+) -> Float[Array, "2 n"]:
+    """The exact box of the ellipse on which alpha = 1/255: o exp(-s) = 1/255, s = d^T conic d / 2.
+
+    The largest |dx| on the ellipse s = s_max is sqrt(2 s_max cov_xx).
+    """
+    s_max = jnp.log(jnp.maximum(opacity, ALPHA_MIN) / ALPHA_MIN)
+    # A hair more, so that rounding never cuts off a pixel.
+    reach = 1e-3 + jnp.sqrt(2.002 * s_max[None, :] * jnp.stack([xx, yy]))
+    size = jnp.array([[camera.width], [camera.height]], dtype=jnp.float32)
+    inside = ((center + reach > 0.0) & (center - reach < size)).all(axis=0)
+    drawn = valid & inside & (opacity >= ALPHA_MIN)
+    return jnp.where(drawn[None, :], reach, -1.0)

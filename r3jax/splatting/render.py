@@ -1,0 +1,95 @@
+"""Renders a scene of Gaussians: one signature over all backends."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from r3jax.geometry.cameras import Camera, is_traced
+from r3jax.splatting.backend import Composite, find_backend
+from r3jax.splatting.config import RasterConfig, fitting_budget
+from r3jax.splatting.scene import GaussianScene
+
+
+class Rendering(eqx.Module):
+    """One rendered view."""
+
+    rgb: Float[Array, "H W 3"]
+    """Color over the background; it may exceed 1."""
+
+    depth: Float[Array, "H W"]
+    """Expected z-depth [m]: mean over the Gaussians by their weights; 0 where there is none."""
+
+    alpha: Float[Array, "H W"]
+    """Opacity of the pixel in [0, 1)."""
+
+    num_intersections: Int[Array, ""]
+    """Pairs of tile and Gaussian that the view needs."""
+
+    overflow: Int[Array, ""]
+    """How many of them found no room; if any, the images are NaN."""
+
+
+def render(
+    scene: GaussianScene,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    background: Float[Array, " 3"] | None = None,
+    config: RasterConfig | None = None,
+    *,
+    center_offsets: Float[Array, "n 2"] | None = None,
+) -> Rendering:
+    """Renders one view by EWA splatting (Kerbl et al. 2023).
+
+    Differentiable by the scene, the pose, the intrinsics and the background. The budget of
+    intersections is fixed while tracing: where a view needs more, `overflow` counts what found
+    no room and the images are NaN, because an image with missing Gaussians looks plausible.
+    Outside jit (and if the config leaves the budget open) it is raised until the view fits.
+
+    Args:
+        scene: the Gaussians.
+        camera: intrinsics.
+        T_world_camera: camera-to-world pose, OpenCV axes [m].
+        background: RGB behind everything; black by default.
+        config: backend and budget.
+        center_offsets: added to the projected centers [px]; zeros by default. Its gradient is
+            the gradient by the projected centers, which densification asks for.
+
+    Returns:
+        Color, expected depth and alpha.
+
+    Raises:
+        ValueError: shapes that do not fit together, or an unknown backend.
+        ImportError: the backend's packages are not installed.
+    """
+    config = RasterConfig() if config is None else config
+    if T_world_camera.shape != (4, 4):
+        raise ValueError(f"T_world_camera is a 4x4 matrix, got shape {T_world_camera.shape}")
+    background = jnp.zeros(3) if background is None else background
+    if center_offsets is None:
+        center_offsets = jnp.zeros((scene.capacity, 2))
+    rasterise = find_backend(config.backend)
+    composite = rasterise(scene, camera, T_world_camera, center_offsets, config)
+    is_open = config.max_intersections is None and not is_traced(composite.overflow)
+    while is_open and int(composite.overflow) > 0:
+        budget = fitting_budget(int(composite.num_intersections))
+        config = dataclasses.replace(config, max_intersections=budget)
+        composite = rasterise(scene, camera, T_world_camera, center_offsets, config)
+    return _finish(composite, background)
+
+
+def _finish(composite: Composite, background: Float[Array, " 3"]) -> Rendering:
+    """Puts the background behind, divides depth by alpha, spoils what overflowed."""
+    alpha = composite.alpha
+    covered = alpha > 0.0
+    depth = jnp.where(covered, composite.depth_sum / jnp.where(covered, alpha, 1.0), 0.0)
+    rgb = composite.rgb + (1.0 - alpha)[..., None] * background[None, None, :]
+    spoil = jnp.where(composite.overflow > 0, jnp.nan, 0.0)
+    return Rendering(
+        rgb=rgb + spoil,
+        depth=depth + spoil,
+        alpha=alpha + spoil,
+        num_intersections=composite.num_intersections,
+        overflow=composite.overflow,
+    )
