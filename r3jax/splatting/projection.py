@@ -104,16 +104,9 @@ def _image_covariance(
     scales = [jnp.exp(scene.log_scales[:, i]) for i in range(3)]
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
-    u = jnp.clip(
-        x / z,
-        -camera.cx / camera.fx - margin_x,
-        _far(camera.width, camera.cx, camera.fx) + margin_x,
-    )
-    v = jnp.clip(
-        y / z,
-        -camera.cy / camera.fy - margin_y,
-        _far(camera.height, camera.cy, camera.fy) + margin_y,
-    )
+    right, lower = (camera.width - camera.cx) / camera.fx, (camera.height - camera.cy) / camera.fy
+    u = jnp.clip(x / z, -camera.cx / camera.fx - margin_x, right + margin_x)
+    v = jnp.clip(y / z, -camera.cy / camera.fy - margin_y, lower + margin_y)
     fx_z, fy_z = camera.fx / z, camera.fy / z
     # Rows of J R (2x3), then their products with the Gaussian's scaled axes.
     row_x = [fx_z * (R[0, i] - u * R[2, i]) for i in range(3)]
