@@ -1,7 +1,7 @@
 """What a rasteriser backend takes and gives, and which one serves where."""
 
 import importlib.util
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -31,6 +31,7 @@ class Composite(eqx.Module):
     """How many of them found no room in the budget."""
 
 
+@runtime_checkable
 class Rasterise(Protocol):
     """A backend: differentiable by the scene, the pose, the intrinsics and `center_offsets`."""
 

@@ -23,13 +23,13 @@ def rasterise(
     projected = project_gaussians(scene, camera, T_world_camera, center_offsets)
     order = jnp.argsort(jnp.where(projected.is_drawn, projected.depth, jnp.inf))
     projected = jax.tree.map(lambda x: jnp.take(x, order, axis=-1), projected)
-    columns = jnp.arange(camera.width) + 0.5
+    columns = jnp.arange(camera.width, dtype=jnp.float32) + 0.5
 
     @jax.checkpoint
     def image_row(v: Float[Array, ""]) -> tuple[Array, Array, Array]:
         return jax.vmap(lambda u: composite_pixel(projected, u, v))(columns)
 
-    rgb, depth, alpha = jax.lax.map(image_row, jnp.arange(camera.height) + 0.5)
+    rgb, depth, alpha = jax.lax.map(image_row, jnp.arange(camera.height, dtype=jnp.float32) + 0.5)
     zero = jnp.zeros((), dtype=jnp.int32)
     return Composite(rgb=rgb, depth_sum=depth, alpha=alpha, num_intersections=zero, overflow=zero)
 
