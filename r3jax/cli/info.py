@@ -8,10 +8,10 @@ from rich.table import Table
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Info
 from r3jax.evaluation.summary import stage_times, summary
+from r3jax.files import write_atomic
 from r3jax.formats.errors import FormatError
 from r3jax.formats.recordings import is_recording, read_recording
 from r3jax.trace.errors import RunError
-from r3jax.trace.files import write_atomic
 from r3jax.trace.reader import read_run
 
 

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from r3jax.evaluation import figures, style
 from r3jax.evaluation.pictures import panorama_picture
 from r3jax.evaluation.summary import StageTime, stage_times, summary
+from r3jax.files import write_atomic
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
-from r3jax.trace.files import write_atomic
 from r3jax.trace.reader import Run
 
 _PAGE = Template(

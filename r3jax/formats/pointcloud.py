@@ -5,9 +5,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.files import write_atomic
 from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.state import MapState
-from r3jax.trace.files import write_atomic
 
 
 def voxel_points(map_state: MapState) -> tuple[np.ndarray, np.ndarray]:

@@ -7,12 +7,12 @@ import shutil
 from pathlib import Path
 from types import TracebackType
 
+from r3jax.files import append_line, sync_folder, write_atomic
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.checkpoints import save_checkpoint
 from r3jax.trace.errors import RecordingStopped, RunError
-from r3jax.trace.files import append_line, sync_folder, write_atomic
 from r3jax.trace.header import RunHeader, header_to_json
 from r3jax.trace.images import encode_png, to_integers
 from r3jax.trace.rows import EndRow, StepRow, to_json
