@@ -184,8 +184,9 @@ def area_average(image: np.ndarray, height: int, width: int) -> np.ndarray:
     if image.shape[:2] == (height, width):
         return image
     rows, columns = (_overlaps(n, m) for n, m in zip(image.shape[:2], (height, width), strict=True))
-    halfway = np.tensordot(rows, image.astype(np.float32), axes=(1, 0))  # [h, W, c]
-    return np.einsum("wx,hxc->hwc", columns, halfway, optimize=True)
+    # Two products of plain matrices: einsum is four times as slow.
+    channels = np.ascontiguousarray(image.transpose(2, 0, 1), dtype=np.float32)  # [c, H, W]
+    return (rows @ channels @ columns.T).transpose(1, 2, 0)
 
 
 def _overlaps(long: int, short: int) -> np.ndarray:
