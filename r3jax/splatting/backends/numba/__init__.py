@@ -1,0 +1,95 @@
+"""Rasteriser for CPUs: projection, binning, sort, compositing and all gradients in Numba."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r3jax.geometry.cameras import Camera, invert_pose
+from r3jax.splatting.backend import Composite
+from r3jax.splatting.backends.numba import records
+from r3jax.splatting.backends.numba.bridge import BACKWARD, FORWARD, num_workers, register
+from r3jax.splatting.config import TILE, RasterConfig
+from r3jax.splatting.scene import GaussianScene
+
+
+def rasterise(
+    scene: GaussianScene,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    center_offsets: Float[Array, "n 2"],
+    config: RasterConfig,
+) -> Composite:
+    """Composites the scene on black, on as many cores as the process may use.
+
+    The same view gives the same bits, images and gradients, on any number of cores. What
+    exceeds the budget is counted in `overflow`; the image is black then, its gradient 0. A
+    Gaussian with a NaN in its geometry is not drawn and gets gradient 0.
+
+    Raises:
+        RuntimeError: Numba has no threading layer that serves two renderings at once.
+    """
+    register()
+    T_camera_world = invert_pose(T_world_camera)
+    intrinsics = jnp.stack([camera.fx, camera.fy, camera.cx, camera.cy])
+    view = jnp.concatenate(
+        [T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3], T_world_camera[:3, 3], intrinsics]
+    )
+    cloud = (
+        scene.means,
+        scene.quats,
+        scene.log_scales,
+        scene.opacity_logits,
+        scene.sh.reshape(scene.capacity, -1),
+        center_offsets,
+    )
+    size = (camera.width, camera.height, config.budget(scene.capacity))
+    rgb, depth, alpha, totals = _composite(size, cloud, view)
+    return Composite(
+        rgb=rgb,
+        depth_sum=depth,
+        alpha=alpha,
+        num_intersections=totals[0],
+        overflow=totals[1],
+    )
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _composite(size, cloud, view):
+    return _composite_forward(size, cloud, view)[0]
+
+
+def _composite_forward(size, cloud, view):
+    width, height, budget = size
+    tiles = -(-width // TILE) * -(-height // TILE)
+    result = jax.ShapeDtypeStruct
+    shapes = [
+        result((height, width, 3), jnp.float32),
+        result((height, width), jnp.float32),
+        result((height, width), jnp.float32),
+        result((2,), jnp.int32),
+        result((cloud[0].shape[0], records.SIZE), jnp.float32),
+        result((budget,), jnp.int32),
+        result((budget,), jnp.int32),
+        result((budget,), jnp.uint8),
+        result((tiles + 1,), jnp.int32),
+        result((tiles,), jnp.int32),
+    ]
+    workers = np.array([num_workers()], dtype=np.int32)
+    call = jax.ffi.ffi_call(FORWARD, shapes, vmap_method="sequential")
+    rgb, depth, alpha, totals, *kept = call(*cloud, view, workers)
+    return (rgb, depth, alpha, totals), (cloud, view, (rgb, depth, alpha), kept)
+
+
+def _composite_backward(size, residuals, gradients):
+    cloud, view, images, kept = residuals
+    shapes = [jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in (*cloud, view)]
+    workers = np.array([num_workers()], dtype=np.int32)
+    call = jax.ffi.ffi_call(BACKWARD, shapes, vmap_method="sequential")
+    *g_cloud, g_view = call(*cloud, view, workers, *images, *kept, *gradients[:3])
+    return tuple(g_cloud), g_view
+
+
+_composite.defvjp(_composite_forward, _composite_backward)

@@ -1,0 +1,179 @@
+"""Lists of Gaussians by tile, near ones first: projection, counting, one sort by (tile, depth)."""
+
+import numpy as np
+from numba import prange
+
+from r3jax.splatting.backends.numba import records as at
+from r3jax.splatting.backends.numba.compiled import claim, inlined, kernel, parallel_kernel
+from r3jax.splatting.backends.numba.project import color_one, project_one
+from r3jax.splatting.backends.numba.spans import rows_in_column, tile_columns
+from r3jax.splatting.config import TILE
+
+_RADIX = 11  # bits a pass; three passes sort the 31 bits of a positive float
+
+
+@inlined
+def _tiles_of(record, width, height):
+    """Number of tiles that a Gaussian touches."""
+    first, last = tile_columns(record, width)
+    count = 0
+    for column in range(first, last + 1):
+        low, high = rows_in_column(record, column, height)
+        if low <= high:
+            count += high // TILE - low // TILE + 1
+    return count
+
+
+@kernel
+def _project_block(block, cloud, view, size, records, counts):
+    """Projects the Gaussians of a block; counts what is drawn and their intersections."""
+    means, quats, log_scales, logits, sh, offsets = cloud
+    width, height = size
+    integers = records.view(np.int32)
+    scratch, basis = np.empty(21, np.float32), np.empty(16, np.float32)
+    drawn, intersections = 0, 0
+    for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, means.shape[0])):
+        record, count = records[i], 0
+        if project_one(
+            means[i], quats[i], log_scales[i], logits[i], offsets[i],
+            view, width, height, scratch, record,
+        ):  # fmt: skip
+            count = _tiles_of(record, width, height)
+        if count > 0:
+            color_one(means[i], sh[i], view, basis, record)
+            drawn += 1
+            intersections += count
+        integers[i, at.COUNT] = count
+    counts[block, 0], counts[block, 1] = drawn, intersections
+
+
+@parallel_kernel
+def project_all(cloud, view, size, workers, records, counts):
+    """Projects all Gaussians, block by block."""
+    next_block = np.zeros(1, np.int64)
+    for _ in prange(workers):
+        block = claim(next_block)
+        while block < counts.shape[0]:
+            _project_block(block, cloud, view, size, records, counts)
+            block = claim(next_block)
+
+
+@kernel
+def sums_before(counts):
+    """Replaces the counts of the blocks by the sums of all earlier ones; returns the totals."""
+    drawn, intersections = 0, 0
+    for block in range(counts.shape[0]):
+        a, b = counts[block]
+        counts[block, 0], counts[block, 1] = drawn, intersections
+        drawn, intersections = drawn + a, intersections + b
+    return drawn, intersections
+
+
+@kernel
+def _emit_block(block, size, records, counts, keys, ids, tiles, rows):
+    """Writes the intersections of a block's Gaussians, and their depths as sort keys."""
+    width, height = size
+    columns = -(-width // TILE)
+    integers = records.view(np.int32)
+    drawn, slot = counts[block]
+    for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
+        if integers[i, at.COUNT] == 0:
+            continue
+        record = records[i]
+        # Depths are positive: their bits have the order of the numbers.
+        keys[drawn], ids[drawn] = integers[i, at.DEPTH], i
+        integers[i, at.START] = slot
+        drawn += 1
+        first, last = tile_columns(record, width)
+        for column in range(first, last + 1):
+            low, high = rows_in_column(record, column, height)
+            if low > high:
+                continue
+            for tile_row in range(low // TILE, high // TILE + 1):
+                top = max(low - tile_row * TILE, 0)
+                bottom = min(high - tile_row * TILE, TILE - 1)
+                tiles[slot] = tile_row * columns + column
+                rows[slot] = top | (bottom << 4)
+                slot += 1
+
+
+@parallel_kernel
+def emit_all(size, workers, records, counts, keys, ids, tiles, rows):
+    """Writes all intersections, contiguous for each Gaussian, in the order of the Gaussians."""
+    next_block = np.zeros(1, np.int64)
+    for _ in prange(workers):
+        block = claim(next_block)
+        while block < counts.shape[0]:
+            _emit_block(block, size, records, counts, keys, ids, tiles, rows)
+            block = claim(next_block)
+
+
+@kernel
+def sort_by_depth(keys, ids):
+    """Sorts `ids` by `keys`: least significant digits first, stable, equal depths keep order."""
+    n, buckets = keys.shape[0], 1 << _RADIX
+    starts = np.zeros((3, buckets), np.int32)
+    for i in range(n):
+        for digit in range(3):
+            starts[digit, (keys[i] >> (_RADIX * digit)) & (buckets - 1)] += 1
+    for digit in range(3):
+        total = np.int32(0)
+        for bucket in range(buckets):
+            count = starts[digit, bucket]
+            starts[digit, bucket] = total
+            total += count
+    other_keys, other_ids = np.empty_like(keys), np.empty_like(ids)
+    for digit in range(3):
+        for i in range(n):
+            bucket = (keys[i] >> (_RADIX * digit)) & (buckets - 1)
+            place = starts[digit, bucket]
+            starts[digit, bucket] = place + 1
+            other_keys[place], other_ids[place] = keys[i], ids[i]
+        keys, other_keys = other_keys, keys
+        ids, other_ids = other_ids, ids
+    return ids
+
+
+@inlined
+def _share(n, part, parts):
+    """The part-th of `parts` equal ranges of n items."""
+    return n * part // parts, n * (part + 1) // parts
+
+
+@parallel_kernel
+def list_by_tile(
+    order, records, tiles, rows, workers, tile_starts, list_ids, list_slots, list_rows
+):
+    """Deals the intersections to the lists of their tiles, in the order of depth.
+
+    Every worker counts, then deals, a range of the order; the ranges follow each other in each
+    list, so the lists do not depend on the number of workers.
+    """
+    integers = records.view(np.int32)
+    num_tiles, drawn = tile_starts.shape[0] - 1, order.shape[0]
+    places = np.zeros((workers, num_tiles), np.int32)
+    for worker in prange(workers):
+        first, last = _share(drawn, worker, workers)
+        for position in range(first, last):
+            i = order[position]
+            start = integers[i, at.START]
+            for slot in range(start, start + integers[i, at.COUNT]):
+                places[worker, tiles[slot]] += 1
+    total = np.int32(0)
+    for tile in range(num_tiles):
+        tile_starts[tile] = total
+        for worker in range(workers):
+            count = places[worker, tile]
+            places[worker, tile] = total
+            total += count
+    tile_starts[num_tiles] = total
+    for worker in prange(workers):
+        first, last = _share(drawn, worker, workers)
+        for position in range(first, last):
+            i = order[position]
+            start = integers[i, at.START]
+            for slot in range(start, start + integers[i, at.COUNT]):
+                place = places[worker, tiles[slot]]
+                places[worker, tiles[slot]] = place + 1
+                list_ids[place], list_slots[place] = i, slot
+                list_rows[place] = rows[slot]

@@ -1,0 +1,41 @@
+"""How the kernels of this backend are compiled, and the atomic counter that hands out their work."""
+
+import inspect
+from collections.abc import Callable
+
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+
+
+def kernel(function: Callable) -> Callable:
+    """Compiles a kernel to machine code; the disk keeps it for the next process.
+
+    Floating-point operations stay as written: two passes that must take the same decisions
+    (counting and listing intersections, blending and its gradient) then do.
+    """
+    # A type checker hooked into the import may have wrapped the function; Numba needs the bare one.
+    return njit(cache=True, error_model="numpy")(inspect.unwrap(function))
+
+
+def inlined(function: Callable) -> Callable:
+    """Compiles a small function into its callers."""
+    return njit(cache=True, error_model="numpy", forceinline=True)(inspect.unwrap(function))
+
+
+def parallel_kernel(function: Callable) -> Callable:
+    """Compiles a kernel whose `prange` loops share the cores that the process may use."""
+    return njit(cache=True, error_model="numpy", parallel=True)(inspect.unwrap(function))
+
+
+@intrinsic
+def claim(typingctx, counter):
+    """Next number of a counter (an int64 array of length 1) that all threads share."""
+    signature = types.int64(counter)
+
+    def codegen(context, builder, sig, args):
+        array = context.make_array(sig.args[0])(context, builder, args[0])
+        one = ir.Constant(ir.IntType(64), 1)
+        return builder.atomic_rmw("add", array.data, one, "monotonic")
+
+    return signature, codegen

@@ -1,0 +1,213 @@
+"""Gradient of projection and color, by hand, for the Gaussians that were drawn.
+
+Names: `g_x` is dL/dx. The order is that of `project.py`, backwards.
+"""
+
+import numpy as np
+from numba import prange
+
+from r3jax.splatting.backends.numba import records as at
+from r3jax.splatting.backends.numba.compiled import claim, inlined, kernel, parallel_kernel
+from r3jax.splatting.backends.numba.harmonics import basis_at, gradient_by_direction
+from r3jax.splatting.backends.numba.project import (
+    ONE,
+    TWO,
+    ZERO,
+    clamped_slope,
+    covariance_of,
+    direction_of,
+    image_axes,
+    in_camera,
+    jacobian_rows,
+    rotation_of,
+    sigmoid,
+)
+
+_HALF = np.float32(0.5)
+
+
+@inlined
+def _sum_slots(record, start, count, slots, sums):
+    """Adds the gradients of a Gaussian's intersections, in their order."""
+    for k in range(10):
+        sums[k] = ZERO
+    for slot in range(start, start + count):
+        for k in range(10):
+            sums[k] += slots[slot * at.GRADIENT_SIZE + k]
+
+
+@inlined
+def _conic_gradient(sums, xx, xy, yy):
+    """Gradients by the center (2) and by the covariance xx, xy, yy (3).
+
+    s = d^T K d / 2 with K the inverse of the covariance S; with M the sum of v d d^T and
+    v = -dL/ds, dL/dS = K M K / 2 and dL/dcenter = -K (sum of v d).
+    """
+    inverse = ONE / (xx * yy - xy * xy)
+    kxx, kxy, kyy = yy * inverse, -xy * inverse, xx * inverse
+    g_x, g_y = -(kxx * sums[1] + kxy * sums[3]), -(kxy * sums[1] + kyy * sums[3])
+    mxx, mxy, myy = sums[2], sums[4], sums[5]
+    ax, ay = kxx * mxx + kxy * mxy, kxx * mxy + kxy * myy  # first row of K M
+    bx, by = kxy * mxx + kyy * mxy, kxy * mxy + kyy * myy  # second row
+    g_xx, g_yy = _HALF * (ax * kxx + ay * kxy), _HALF * (bx * kxy + by * kyy)
+    g_xy = ax * kxy + ay * kyy
+    return g_x, g_y, g_xx, g_xy, g_yy
+
+
+@inlined
+def _quat_gradient(g, unit, inverse, g_quat):
+    """Writes the gradient by the quaternion, from that by the rotation matrix (9 numbers)."""
+    w, x, y, z = unit
+    a = TWO * (z * (g[3] - g[1]) + y * (g[2] - g[6]) + x * (g[7] - g[5]))
+    b = TWO * (y * (g[1] + g[3]) + z * (g[2] + g[6]) - TWO * x * (g[4] + g[8]) + w * (g[7] - g[5]))
+    c = TWO * (x * (g[1] + g[3]) + z * (g[5] + g[7]) - TWO * y * (g[0] + g[8]) + w * (g[2] - g[6]))
+    d = TWO * (x * (g[2] + g[6]) + y * (g[5] + g[7]) - TWO * z * (g[0] + g[4]) + w * (g[3] - g[1]))
+    # Only what is across the quaternion turns it; its length means nothing.
+    along = a * w + b * x + c * y + d * z
+    g_quat[0], g_quat[1] = (a - along * w) * inverse, (b - along * x) * inverse
+    g_quat[2], g_quat[3] = (c - along * y) * inverse, (d - along * z) * inverse
+
+
+@inlined
+def _shape_gradient(g_cov, log_scales, quat, rows, rotation, axes, unit, inverse, scratch, out):
+    """Writes the gradients by scales and rotation; leaves that by the rows of J R in scratch[:6].
+
+    Args:
+        out: where the gradients by `log_scales` (3) and by the quaternion (4) go.
+    """
+    g_xx, g_xy, g_yy = g_cov
+    g_rows, g_rotation = scratch[:6], scratch[6:15]
+    g_scales, g_quat = out
+    g_rows[:] = ZERO
+    for j in range(3):
+        ax, ay = axes[j], axes[3 + j]
+        g_ax, g_ay = TWO * g_xx * ax + g_xy * ay, TWO * g_yy * ay + g_xy * ax
+        g_scales[j] = g_ax * ax + g_ay * ay
+        scale = np.exp(log_scales[j])
+        for i in range(3):
+            g_rows[i] += scale * g_ax * rotation[3 * i + j]
+            g_rows[3 + i] += scale * g_ay * rotation[3 * i + j]
+            g_rotation[3 * i + j] = scale * (rows[i] * g_ax + rows[3 + i] * g_ay)
+    _quat_gradient(g_rotation, unit, inverse, g_quat)
+
+
+@inlined
+def _row_gradient(axis, g_row, row, ratio, slope, z, focal, view, g_view, g_center, point):
+    """Goes back through one row of J R and one coordinate of the center.
+
+    Args:
+        axis: 0 for x, 1 for y.
+        ratio: x/z; `slope` is the same, clamped.
+        g_center: dL/dcenter along the axis.
+
+    Returns:
+        Gradients by x (or y) and by z.
+    """
+    over_z = focal / z
+    g_over_z, g_slope = ZERO, ZERO
+    for i in range(3):
+        g_over_z += g_row[i] * row[i] / over_z
+        g_slope -= over_z * g_row[i] * view[6 + i]
+        g_view[3 * axis + i] += over_z * g_row[i]
+        g_view[6 + i] -= over_z * slope * g_row[i]
+    g_focal = g_over_z / z + g_center * ratio
+    g_middle = g_center
+    g_ratio = g_center * focal
+    if slope == ratio:
+        g_ratio += g_slope
+    else:  # clamped to a limit, which is +- (size) / focal - middle / focal
+        g_middle -= g_slope / focal
+        g_focal -= g_slope * slope / focal
+    g_view[15 + axis] += g_focal
+    g_view[17 + axis] += g_middle
+    return g_ratio / z, -(g_over_z * over_z + g_ratio * ratio) / z
+
+
+@inlined
+def _color_gradient(mean, sh, view, record, g_color, basis, g_basis, g_sh):
+    """Writes the gradient by the harmonics; returns that by the center, through the direction."""
+    x, y, z, inverse = direction_of(mean, view)
+    count = sh.shape[0] // 3
+    basis_at(x, y, z, count, basis)
+    red = g_color[0] if record[at.RED] > ZERO else ZERO
+    green = g_color[1] if record[at.GREEN] > ZERO else ZERO
+    blue = g_color[2] if record[at.BLUE] > ZERO else ZERO
+    for k in range(count):
+        b = basis[k]
+        g_sh[3 * k], g_sh[3 * k + 1], g_sh[3 * k + 2] = b * red, b * green, b * blue
+        g_basis[k] = red * sh[3 * k] + green * sh[3 * k + 1] + blue * sh[3 * k + 2]
+    dx, dy, dz = gradient_by_direction(x, y, z, count, g_basis)
+    along = dx * x + dy * y + dz * z
+    return (dx - along * x) * inverse, (dy - along * y) * inverse, (dz - along * z) * inverse
+
+
+@kernel
+def _gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
+    """Gradients of one Gaussian that was drawn; adds its share of the view's gradient."""
+    means, quats, log_scales, logits, sh, _ = cloud
+    g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
+    rotation, rows, axes = room[:9], room[9:15], room[15:21]
+    scratch, basis, g_basis = room[21:36], room[36:52], room[52:68]
+    x, y, z = in_camera(means[i], view)
+    fx, fy = view[15], view[16]
+    w, qx, qy, qz, inverse = rotation_of(quats[i], rotation)
+    u = clamped_slope(x / z, fx, view[17], size[0])
+    v = clamped_slope(y / z, fy, view[18], size[1])
+    jacobian_rows(view, u, v, fx / z, fy / z, rows)
+    image_axes(rows, rotation, log_scales[i], axes)
+    xx, xy, yy = covariance_of(axes)
+    g_u, g_v, g_xx, g_xy, g_yy = _conic_gradient(sums, xx, xy, yy)
+    g_offsets[i, 0], g_offsets[i, 1] = g_u, g_v
+    g_logits[i] = sums[0] * (ONE - sigmoid(logits[i]))
+    _shape_gradient(
+        (g_xx, g_xy, g_yy), log_scales[i], quats[i], rows, rotation, axes,
+        (w, qx, qy, qz), inverse, scratch, (g_scales[i], g_quats[i]),
+    )  # fmt: skip
+    point = means[i]
+    g_x, g_z = _row_gradient(0, scratch[:3], rows[:3], x / z, u, z, fx, view, g_view, g_u, point)
+    g_y, more = _row_gradient(1, scratch[3:6], rows[3:], y / z, v, z, fy, view, g_view, g_v, point)
+    g_z += more + sums[9]
+    away = _color_gradient(point, sh[i], view, record, sums[6:9], basis, g_basis, g_sh[i])
+    for k in range(3):
+        g_means[i, k] = view[k] * g_x + view[3 + k] * g_y + view[6 + k] * g_z + away[k]
+        g_view[k] += g_x * point[k]
+        g_view[3 + k] += g_y * point[k]
+        g_view[6 + k] += g_z * point[k]
+        g_view[12 + k] -= away[k]
+    g_view[9] += g_x
+    g_view[10] += g_y
+    g_view[11] += g_z
+
+
+@kernel
+def _gradient_of_block(block, cloud, records, slots, view, size, g_cloud, g_view):
+    """Gradients of a block of Gaussians; 0 for those that were not drawn."""
+    integers = records.view(np.int32)
+    room, sums = np.empty(68, np.float32), np.empty(10, np.float32)
+    g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
+    for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
+        count = integers[i, at.COUNT]
+        if count == 0:
+            g_means[i], g_quats[i], g_scales[i] = ZERO, ZERO, ZERO
+            g_logits[i], g_sh[i], g_offsets[i] = ZERO, ZERO, ZERO
+            continue
+        _sum_slots(records[i], integers[i, at.START], count, slots, sums)
+        _gradient_of_one(i, cloud, records[i], sums, view, size, room, g_cloud, g_view)
+
+
+@parallel_kernel
+def gradient_of_cloud(cloud, records, slots, view, size, workers, g_cloud, g_view):
+    """Gradients by all parameters, and by the view, summed in a fixed order."""
+    blocks = -(-records.shape[0] // at.BLOCK)
+    shares = np.zeros((blocks, at.VIEW_SIZE), np.float64)
+    next_block = np.zeros(1, np.int64)
+    for _ in prange(workers):
+        block = claim(next_block)
+        while block < blocks:
+            _gradient_of_block(block, cloud, records, slots, view, size, g_cloud, shares[block])
+            block = claim(next_block)
+    for k in range(at.VIEW_SIZE):
+        total = 0.0
+        for block in range(blocks):
+            total += shares[block, k]
+        g_view[k] = total
