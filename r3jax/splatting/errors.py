@@ -18,3 +18,25 @@ class ViewsError(ValueError):
 
 class TooLargeError(ValueError):
     """A training that would not fit in memory; says how much it needs and what would fit."""
+
+
+class CheckpointError(ValueError):
+    """A training that cannot go on from what is stored; names the folder and the reason."""
+
+    def __init__(self, path: Path, reason: str):
+        super().__init__(f"{path}: {reason}")
+        self.path = path
+        self.reason = reason
+
+
+class TrainingDiverged(ArithmeticError):
+    """The loss or a gradient is no longer finite; names the step."""
+
+    def __init__(self, step: int, loss: float, folder: Path | None):
+        kept = "" if folder is None else f"; the last good checkpoint stays in {folder}"
+        super().__init__(
+            f"training diverged in step {step}: the loss is {loss:g} or a gradient is not "
+            f"finite{kept}. Lower the learning rates, or look for views with a wrong pose"
+        )
+        self.step = step
+        self.folder = folder

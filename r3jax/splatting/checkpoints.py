@@ -1,0 +1,135 @@
+"""The state of a training on disk, saved with Orbax, and the settings that it belongs to."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from r3jax.files import write_atomic
+from r3jax.splatting.errors import CheckpointError
+from r3jax.splatting.train_step import TrainState
+from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.views import Views
+
+KEPT = 2
+"""Older checkpoints are deleted."""
+
+FORMAT_VERSION = 1
+"""Raised whenever older checkpoints can no longer be read."""
+
+_SETTINGS = "training.json"
+
+
+def settings_record(config: TrainConfig, views: Views, extent: float) -> dict[str, Any]:
+    """What must be the same for a training to go on: settings, views and extent.
+
+    The budget of intersections is left out: the result does not depend on it.
+    """
+    record = config.as_record()
+    del record["raster"]["max_intersections"]
+    digest = hashlib.sha256()
+    for array in (views.rgb, views.T_world_camera, *jax.tree.leaves(views.cameras)):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    seen = {"views": len(views), "width": views.width, "height": views.height}
+    seen |= {"views_hash": digest.hexdigest(), "extent": extent}
+    return {"format": FORMAT_VERSION} | seen | _flat(record)
+
+
+def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one level, `raster.backend` for one inside another."""
+    flat: dict[str, Any] = {}
+    for name, value in record.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def begin_checkpoints(folder: Path, settings: dict[str, Any]) -> None:
+    """Prepares a folder for a new training.
+
+    Raises:
+        CheckpointError: there is a training already.
+        OSError: the disk is full, not writable, ...
+    """
+    if _checkpoints(folder):
+        raise CheckpointError(
+            folder, "a training was stored here already: resume it, or choose another folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(folder / _SETTINGS, json.dumps(settings, indent=1).encode())
+
+
+def save_checkpoint(folder: Path, state: TrainState) -> None:
+    """Saves the state, then drops all but the newest two.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    import orbax.checkpoint as ocp
+
+    with ocp.StandardCheckpointer() as checkpointer:
+        # Orbax writes under a temporary name and renames: a checkpoint is whole or absent.
+        checkpointer.save((folder / f"{int(state.step):07d}").resolve(), state, force=True)
+        checkpointer.wait_until_finished()
+    for old in _checkpoints(folder)[:-KEPT]:
+        shutil.rmtree(old)
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.glob("[0-9]*") if p.is_dir() and p.name.isdigit())
+
+
+def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) -> TrainState:
+    """The newest state of a training with these settings.
+
+    Args:
+        folder: where it was saved.
+        settings: of the training that is to go on; see `settings_record`.
+        like: a state of the same shapes; its values are not used.
+
+    Raises:
+        CheckpointError: there is none, it belongs to other settings (the message names them), or
+            it cannot be read.
+    """
+    import orbax.checkpoint as ocp
+
+    found = _checkpoints(folder)
+    if not found:
+        raise CheckpointError(folder, "there is no checkpoint to resume from")
+    _check_settings(folder, settings)
+    newest = found[-1]
+    sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    to_shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            return checkpointer.restore(newest.resolve(), jax.tree.map(to_shape, like))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(
+            newest, f"cannot be read ({error}); delete it to fall back on the one before"
+        ) from None
+
+
+def _check_settings(folder: Path, settings: dict[str, Any]) -> None:
+    path = folder / _SETTINGS
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(stored, dict):
+            raise ValueError("not a table of settings")
+    except (OSError, ValueError) as error:
+        raise CheckpointError(path, f"cannot be read ({error})") from None
+    names = sorted(stored.keys() | settings.keys())
+    changed = [
+        f"{name} (stored {stored.get(name)}, now {settings.get(name)})"
+        for name in names
+        if stored.get(name) != settings.get(name)
+    ]
+    if changed:
+        raise CheckpointError(
+            folder, f"the checkpoint is of another training: {', '.join(changed)} differ"
+        )

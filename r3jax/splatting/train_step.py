@@ -1,0 +1,252 @@
+"""One step of training, and one refinement: pure functions of the state, jitted.
+
+Shape symbols: n rows of the scene, v views, b views per step.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from r3jax.geometry.cameras import invert_pose, project, transform
+from r3jax.splatting import density, mcmc
+from r3jax.splatting.config import NEAR
+from r3jax.splatting.density import DensityStatistics, empty_statistics
+from r3jax.splatting.losses import photometric_loss, psnr_of
+from r3jax.splatting.optimizer import Moments, adam_update, empty_moments, mean_rate
+from r3jax.splatting.render import render
+from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.training_config import Schedule, TrainConfig
+from r3jax.splatting.views import View, Views
+
+DONE, OVERFLOWN, DIVERGED = 0, 1, 2
+"""Outcomes of a step. The state only advances with the first."""
+
+_ORDER, _BACKGROUND, _NOISE, _REFINE = range(4)
+"""What a key is for."""
+
+
+class TrainState(eqx.Module):
+    """All that changes during training."""
+
+    scene: GaussianScene
+    """The Gaussians."""
+
+    moments: Moments
+    """Adam's."""
+
+    statistics: DensityStatistics
+    """Since the last refinement."""
+
+    step: Int[Array, ""]
+    """Steps done."""
+
+    dropped: Int[Array, ""]
+    """Gaussians that were to be born and found no unused row. Never decreases."""
+
+
+class StepInfo(eqx.Module):
+    """What a step has to report."""
+
+    outcome: Int[Array, ""]
+    """DONE; OVERFLOWN: the budget of intersections is too small; DIVERGED: the loss, a
+    gradient or a parameter is not finite. The state is unchanged but for DONE."""
+
+    loss: Float[Array, ""]
+    """Before the step."""
+
+    psnr: Float[Array, ""]
+    """Of this step's views, before the step [dB]."""
+
+    num_gaussians: Int[Array, ""]
+    """Rows in use."""
+
+    num_intersections: Int[Array, ""]
+    """Needed by the most demanding of this step's views."""
+
+
+class _ViewReport(eqx.Module):
+    """What the loss of one view reports besides its value."""
+
+    mse: Float[Array, ""]
+    num_intersections: Int[Array, ""]
+    overflow: Int[Array, ""]
+
+
+def start_state(scene: GaussianScene) -> TrainState:
+    """The state before the first step."""
+    return TrainState(
+        scene=scene,
+        moments=empty_moments(scene),
+        statistics=empty_statistics(scene.capacity),
+        step=jnp.zeros((), dtype=jnp.int32),
+        dropped=jnp.zeros((), dtype=jnp.int32),
+    )
+
+
+def _key(config: TrainConfig, purpose: int, number: Int[Array, ""]) -> PRNGKeyArray:
+    """A function of the seed and the step alone, so that a resumed run draws the same."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), purpose), number)
+
+
+def view_index(config: TrainConfig, number: Int[Array, ""], count: int) -> Int[Array, ""]:
+    """The view that is the `number`-th to be shown: a new random order in every epoch."""
+    order = jax.random.permutation(_key(config, _ORDER, number // count), count)
+    return order[number % count]
+
+
+@functools.partial(jax.jit, donate_argnames=("state",))
+def train_step(
+    state: TrainState,
+    views: Views,
+    extent: Float[Array, ""],
+    config: TrainConfig,
+    schedule: Schedule,
+) -> tuple[TrainState, StepInfo]:
+    """One step of the optimizer.
+
+    Args:
+        state: before; its buffers are given away.
+        views: all training views.
+        extent: of the cameras [m].
+        config: traced but for its structure; `config.raster` holds the budget.
+        schedule: traced.
+
+    Returns:
+        The state after, and what happened. Where a view needs more than the budget, or the loss
+        or a gradient is not finite, the state is that from before, step number included: to
+        repeat the step with a larger budget is to lose nothing.
+    """
+    degree = state.step // schedule.sh_every
+    loss, gradient, statistics, report = _gradients(state, views, degree, config)
+    if config.strategy == "mcmc":
+        extra, slope = jax.value_and_grad(mcmc.regularization)(state.scene, config)
+        loss, gradient = loss + extra, jax.tree.map(jnp.add, gradient, slope)
+    rate = mean_rate(config, extent, state.step + 1)
+    scene, moments = adam_update(state.scene, gradient, state.moments, rate, config)
+    if config.strategy == "mcmc":
+        scene = mcmc.perturbed(scene, rate, config, key=_key(config, _NOISE, state.step))
+    is_finite = jnp.isfinite(loss + _squared_size(gradient) + _squared_size(scene))
+    bad = jnp.where(report.overflow > 0, OVERFLOWN, DIVERGED)
+    outcome = jnp.where((report.overflow == 0) & is_finite, DONE, bad)
+    after = TrainState(scene, moments, statistics, state.step + 1, state.dropped)
+    info = StepInfo(
+        outcome=outcome,
+        loss=loss,
+        psnr=psnr_of(report.mse),
+        num_gaussians=jnp.sum(state.scene.is_alive, dtype=jnp.int32),
+        num_intersections=report.num_intersections,
+    )
+    keep = lambda new, old: jnp.where(outcome == DONE, new, old)
+    return jax.tree.map(keep, after, state), info
+
+
+def _squared_size(scene: GaussianScene) -> Float[Array, ""]:
+    """Sum of all squares: not finite if any entry is not, or would overflow Adam's moments."""
+    return jnp.asarray(sum(jnp.sum(x * x) for x in jax.tree.leaves(scene)))
+
+
+def _gradients(
+    state: TrainState, views: Views, degree: Int[Array, ""], config: TrainConfig
+) -> tuple[Float[Array, ""], GaussianScene, DensityStatistics, _ViewReport]:
+    """Loss and gradient, means over this step's views, which are taken one after the other."""
+    num = config.views_per_step
+    background = _background(config, state.step)
+
+    def add_view(carry, slot: Int[Array, ""]):
+        total, gradient, statistics, report = carry
+        view = views.view(view_index(config, state.step * num + slot, len(views)))
+        (loss, found), (slope, pull) = jax.value_and_grad(_view_loss, argnums=(0, 1), has_aux=True)(
+            state.scene, jnp.zeros((state.scene.capacity, 2)), view, background, degree, config
+        )
+        statistics = density.observe(
+            statistics, pull, _in_view(state.scene, view), views.width, views.height
+        )
+        report = _ViewReport(
+            mse=report.mse + found.mse / num,
+            num_intersections=jnp.maximum(report.num_intersections, found.num_intersections),
+            overflow=report.overflow + found.overflow,
+        )
+        gradient = jax.tree.map(lambda a, b: a + b / num, gradient, slope)
+        return (total + loss / num, gradient, statistics, report), None
+
+    zero = jnp.zeros((), dtype=jnp.int32)
+    start = (
+        jnp.zeros(()),
+        jax.tree.map(jnp.zeros_like, state.scene),
+        state.statistics,
+        _ViewReport(mse=jnp.zeros(()), num_intersections=zero, overflow=zero),
+    )
+    if num == 1:
+        return add_view(start, zero)[0]
+    return jax.lax.scan(add_view, start, jnp.arange(num))[0]
+
+
+def _view_loss(
+    scene: GaussianScene,
+    center_offsets: Float[Array, "n 2"],
+    view: View,
+    background: Float[Array, " 3"],
+    degree: Int[Array, ""],
+    config: TrainConfig,
+) -> tuple[Float[Array, ""], _ViewReport]:
+    rendering = render(
+        _with_degree(scene, degree),
+        view.camera,
+        view.T_world_camera,
+        background,
+        config.raster,
+        center_offsets=center_offsets,
+    )
+    loss = photometric_loss(rendering.rgb, view.rgb, config.lambda_dssim)
+    mse = jnp.mean((jnp.clip(rendering.rgb, 0.0, 1.0) - view.rgb) ** 2)
+    return loss, _ViewReport(mse, rendering.num_intersections, rendering.overflow)
+
+
+def _with_degree(scene: GaussianScene, degree: Int[Array, ""]) -> GaussianScene:
+    """Harmonics above the degree count as 0, and get no gradient."""
+    k = jnp.arange(scene.sh.shape[1])
+    sh = jnp.where((k < (degree + 1) ** 2)[None, :, None], scene.sh, 0.0)
+    return eqx.tree_at(lambda s: s.sh, scene, sh)
+
+
+def _in_view(scene: GaussianScene, view: View):
+    """True where the center lies in the image."""
+    pixels, z = project(view.camera, transform(invert_pose(view.T_world_camera), scene.means))
+    size = jnp.array([view.camera.width, view.camera.height], dtype=jnp.float32)
+    inside = (pixels > 0.0) & (pixels < size[None, :])
+    return scene.is_alive & (z > NEAR) & inside.all(axis=1)
+
+
+def _background(config: TrainConfig, step: Int[Array, ""]) -> Float[Array, " 3"]:
+    if config.background == "random":
+        return jax.random.uniform(_key(config, _BACKGROUND, step), (3,))
+    return jnp.full(3, 1.0 if config.background == "white" else 0.0)
+
+
+@functools.partial(jax.jit, donate_argnames=("state",))
+def refine_step(
+    state: TrainState, extent: Float[Array, ""], config: TrainConfig, schedule: Schedule
+) -> tuple[TrainState, density.Refinement]:
+    """Refines the Gaussians by the strategy of the config, and begins new statistics."""
+    key = _key(config, _REFINE, state.step)
+    if config.strategy == "mcmc":
+        found = mcmc.refine(state.scene, state.moments, config, key=key)
+    else:
+        was_reset = state.step > schedule.reset_every
+        found = density.refine(
+            state.scene, state.moments, state.statistics, extent, was_reset, config, key=key
+        )
+    scene, moments, refinement = found
+    statistics = empty_statistics(scene.capacity)
+    dropped = state.dropped + refinement.dropped
+    return TrainState(scene, moments, statistics, state.step, dropped), refinement
+
+
+@functools.partial(jax.jit, donate_argnames=("state",))
+def reset_step(state: TrainState, config: TrainConfig) -> TrainState:
+    """Resets the opacities."""
+    scene, moments = density.reset_opacities(state.scene, state.moments, config)
+    return TrainState(scene, moments, state.statistics, state.step, state.dropped)
