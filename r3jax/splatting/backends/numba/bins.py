@@ -70,20 +70,21 @@ def sums_before(counts):
 
 
 @kernel
-def _emit_block(block, size, records, counts, keys, ids, tiles, rows):
-    """Writes the intersections of a block's Gaussians, and their depths as sort keys."""
+def _emit_block(block, size, records, counts, drawn, tiles, rows):
+    """Writes the intersections of a block's Gaussians, and who they are."""
     width, height = size
+    keys, ids, starts = drawn
     columns = -(-width // TILE)
     integers = records.view(np.int32)
-    drawn, slot = counts[block]
+    number, slot = counts[block]
     for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
         if integers[i, at.COUNT] == 0:
             continue
         record = records[i]
         # Depths are positive: their bits have the order of the numbers.
-        keys[drawn], ids[drawn] = integers[i, at.DEPTH], i
+        keys[number], ids[number], starts[number] = integers[i, at.DEPTH], i, slot
         integers[i, at.START] = slot
-        drawn += 1
+        number += 1
         first, last = tile_columns(record, width)
         for column in range(first, last + 1):
             low, high = rows_in_column(record, column, height)
@@ -98,40 +99,49 @@ def _emit_block(block, size, records, counts, keys, ids, tiles, rows):
 
 
 @parallel_kernel
-def emit_all(size, workers, records, counts, keys, ids, tiles, rows):
-    """Writes all intersections, contiguous for each Gaussian, in the order of the Gaussians."""
+def emit_all(size, workers, records, counts, drawn, tiles, rows):
+    """Writes all intersections, contiguous for each Gaussian, in the order of the Gaussians.
+
+    `drawn` is written, too: of each Gaussian that is drawn its depth as a sort key, its row in
+    the scene, and where its intersections start.
+    """
     next_block = np.zeros(1, np.int64)
     for _ in prange(workers):
         block = claim(next_block)
         while block < counts.shape[0]:
-            _emit_block(block, size, records, counts, keys, ids, tiles, rows)
+            _emit_block(block, size, records, counts, drawn, tiles, rows)
             block = claim(next_block)
+    drawn[2][-1] = tiles.shape[0]
 
 
 @kernel
-def sort_by_depth(keys, ids):
-    """Sorts `ids` by `keys`: least significant digits first, stable, equal depths keep order."""
+def order_of(keys):
+    """Stable order of the keys: a radix sort, least significant digits first."""
     n, buckets = keys.shape[0], 1 << _RADIX
-    starts = np.zeros((3, buckets), np.int32)
+    places = np.zeros((3, buckets), np.int32)
     for i in range(n):
         for digit in range(3):
-            starts[digit, (keys[i] >> (_RADIX * digit)) & (buckets - 1)] += 1
+            places[digit, (keys[i] >> (_RADIX * digit)) & (buckets - 1)] += 1
     for digit in range(3):
         total = np.int32(0)
         for bucket in range(buckets):
-            count = starts[digit, bucket]
-            starts[digit, bucket] = total
+            count = places[digit, bucket]
+            places[digit, bucket] = total
             total += count
-    other_keys, other_ids = np.empty_like(keys), np.empty_like(ids)
+    order, other_keys, other = (
+        np.arange(n).astype(np.int32),
+        np.empty_like(keys),
+        np.empty(n, np.int32),
+    )
     for digit in range(3):
         for i in range(n):
             bucket = (keys[i] >> (_RADIX * digit)) & (buckets - 1)
-            place = starts[digit, bucket]
-            starts[digit, bucket] = place + 1
-            other_keys[place], other_ids[place] = keys[i], ids[i]
+            place = places[digit, bucket]
+            places[digit, bucket] = place + 1
+            other_keys[place], other[place] = keys[i], order[i]
         keys, other_keys = other_keys, keys
-        ids, other_ids = other_ids, ids
-    return ids
+        order, other = other, order
+    return order
 
 
 @inlined
@@ -141,23 +151,19 @@ def _share(n, part, parts):
 
 
 @parallel_kernel
-def list_by_tile(
-    order, records, tiles, rows, workers, tile_starts, list_ids, list_slots, list_rows
-):
+def list_by_tile(order, drawn, tiles, rows, workers, tile_starts, list_ids, list_slots, list_rows):
     """Deals the intersections to the lists of their tiles, in the order of depth.
 
     Every worker counts, then deals, a range of the order; the ranges follow each other in each
     list, so the lists do not depend on the number of workers.
     """
-    integers = records.view(np.int32)
-    num_tiles, drawn = tile_starts.shape[0] - 1, order.shape[0]
+    _, ids, starts = drawn
+    num_tiles = tile_starts.shape[0] - 1
     places = np.zeros((workers, num_tiles), np.int32)
     for worker in prange(workers):
-        first, last = _share(drawn, worker, workers)
-        for position in range(first, last):
-            i = order[position]
-            start = integers[i, at.START]
-            for slot in range(start, start + integers[i, at.COUNT]):
+        first, last = _share(order.shape[0], worker, workers)
+        for number in order[first:last]:
+            for slot in range(starts[number], starts[number + 1]):
                 places[worker, tiles[slot]] += 1
     total = np.int32(0)
     for tile in range(num_tiles):
@@ -168,11 +174,10 @@ def list_by_tile(
             total += count
     tile_starts[num_tiles] = total
     for worker in prange(workers):
-        first, last = _share(drawn, worker, workers)
-        for position in range(first, last):
-            i = order[position]
-            start = integers[i, at.START]
-            for slot in range(start, start + integers[i, at.COUNT]):
+        first, last = _share(order.shape[0], worker, workers)
+        for number in order[first:last]:
+            i = ids[number]
+            for slot in range(starts[number], starts[number + 1]):
                 place = places[worker, tiles[slot]]
                 places[worker, tiles[slot]] = place + 1
                 list_ids[place], list_slots[place] = i, slot

@@ -1,11 +1,31 @@
 """How the kernels of this backend are compiled, and the atomic counter that hands out their work."""
 
+import contextlib
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
+
+_FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
+
+
+def _forget_outdated_code() -> None:
+    """Deletes machine code on the disk that is older than any source of this package.
+
+    Numba compares a kernel with its own file only, not with the files of what it inlines.
+    """
+    here = Path(__file__).parent
+    newest = max(source.stat().st_mtime for source in here.glob("*.py"))
+    for index in here.glob("__pycache__/*.nbi"):
+        with contextlib.suppress(OSError):
+            if index.stat().st_mtime < newest:
+                index.unlink()
+
+
+_forget_outdated_code()
 
 
 def kernel(function: Callable) -> Callable:
@@ -21,6 +41,15 @@ def kernel(function: Callable) -> Callable:
 def inlined(function: Callable) -> Callable:
     """Compiles a small function into its callers."""
     return njit(cache=True, error_model="numpy", forceinline=True)(inspect.unwrap(function))
+
+
+def inlined_fast(function: Callable) -> Callable:
+    """The same for formulas that nothing has to repeat: LLVM may fuse and reorder them.
+
+    NaN and infinity keep their meaning.
+    """
+    compiler = njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FAST)
+    return compiler(inspect.unwrap(function))
 
 
 def parallel_kernel(function: Callable) -> Callable:

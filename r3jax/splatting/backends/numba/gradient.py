@@ -7,7 +7,7 @@ import numpy as np
 from numba import prange
 
 from r3jax.splatting.backends.numba import records as at
-from r3jax.splatting.backends.numba.compiled import claim, inlined, kernel, parallel_kernel
+from r3jax.splatting.backends.numba.compiled import claim, inlined_fast, kernel, parallel_kernel
 from r3jax.splatting.backends.numba.harmonics import basis_at, gradient_by_direction
 from r3jax.splatting.backends.numba.project import (
     ONE,
@@ -26,17 +26,21 @@ from r3jax.splatting.backends.numba.project import (
 _HALF = np.float32(0.5)
 
 
-@inlined
-def _sum_slots(record, start, count, slots, sums):
-    """Adds the gradients of a Gaussian's intersections, in their order."""
+@inlined_fast
+def _sum_slots(start, count, slots, sums):
+    """Adds the gradients of a Gaussian's intersections, in their order; is there any but 0?"""
     for k in range(10):
         sums[k] = ZERO
     for slot in range(start, start + count):
         for k in range(10):
             sums[k] += slots[slot * at.GRADIENT_SIZE + k]
+    some = False
+    for k in range(10):
+        some |= sums[k] != ZERO
+    return some
 
 
-@inlined
+@inlined_fast
 def _conic_gradient(sums, xx, xy, yy):
     """Gradients by the center (2) and by the covariance xx, xy, yy (3).
 
@@ -54,7 +58,7 @@ def _conic_gradient(sums, xx, xy, yy):
     return g_x, g_y, g_xx, g_xy, g_yy
 
 
-@inlined
+@inlined_fast
 def _quat_gradient(g, unit, inverse, g_quat):
     """Writes the gradient by the quaternion, from that by the rotation matrix (9 numbers)."""
     w, x, y, z = unit
@@ -68,7 +72,7 @@ def _quat_gradient(g, unit, inverse, g_quat):
     g_quat[2], g_quat[3] = (c - along * y) * inverse, (d - along * z) * inverse
 
 
-@inlined
+@inlined_fast
 def _shape_gradient(g_cov, log_scales, quat, rows, rotation, axes, unit, inverse, scratch, out):
     """Writes the gradients by scales and rotation; leaves that by the rows of J R in scratch[:6].
 
@@ -91,7 +95,7 @@ def _shape_gradient(g_cov, log_scales, quat, rows, rotation, axes, unit, inverse
     _quat_gradient(g_rotation, unit, inverse, g_quat)
 
 
-@inlined
+@inlined_fast
 def _row_gradient(axis, g_row, row, ratio, slope, z, focal, view, g_view, g_center, point):
     """Goes back through one row of J R and one coordinate of the center.
 
@@ -123,7 +127,7 @@ def _row_gradient(axis, g_row, row, ratio, slope, z, focal, view, g_view, g_cent
     return g_ratio / z, -(g_over_z * over_z + g_ratio * ratio) / z
 
 
-@inlined
+@inlined_fast
 def _color_gradient(mean, sh, view, record, g_color, basis, g_basis, g_sh):
     """Writes the gradient by the harmonics; returns that by the center, through the direction."""
     x, y, z, inverse = direction_of(mean, view)
@@ -186,13 +190,12 @@ def _gradient_of_block(block, cloud, records, slots, view, size, g_cloud, g_view
     room, sums = np.empty(68, np.float32), np.empty(10, np.float32)
     g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
     for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
-        count = integers[i, at.COUNT]
-        if count == 0:
+        count, start = integers[i, at.COUNT], integers[i, at.START]
+        if count > 0 and _sum_slots(start, count, slots, sums):
+            _gradient_of_one(i, cloud, records[i], sums, view, size, room, g_cloud, g_view)
+        else:
             g_means[i], g_quats[i], g_scales[i] = ZERO, ZERO, ZERO
             g_logits[i], g_sh[i], g_offsets[i] = ZERO, ZERO, ZERO
-            continue
-        _sum_slots(records[i], integers[i, at.START], count, slots, sums)
-        _gradient_of_one(i, cloud, records[i], sums, view, size, room, g_cloud, g_view)
 
 
 @parallel_kernel

@@ -6,7 +6,7 @@ The same functions in the same order as `r3jax.splatting.harmonics`.
 import numpy as np
 
 from r3jax.splatting import harmonics as shared
-from r3jax.splatting.backends.numba.compiled import inlined
+from r3jax.splatting.backends.numba.compiled import inlined_fast
 
 _C0, _C1 = np.float32(shared.C0), np.float32(shared.C1)
 _P, _Q, _R = (np.float32(c) for c in shared.C2)
@@ -14,7 +14,7 @@ _S, _T, _U, _V, _W = (np.float32(c) for c in shared.C3)
 _2, _3, _4, _6, _8 = (np.float32(i) for i in (2, 3, 4, 6, 8))
 
 
-@inlined
+@inlined_fast
 def basis_at(x, y, z, count, basis):
     """Writes the first `count` basis functions at the unit direction (x, y, z)."""
     basis[0] = _C0
@@ -37,7 +37,7 @@ def basis_at(x, y, z, count, basis):
             basis[15] = -_S * x * (xx - _3 * yy)
 
 
-@inlined
+@inlined_fast
 def gradient_by_direction(x, y, z, count, g):
     """Gradient by (x, y, z), seen as three free variables, of sum(g[k] basis[k])."""
     dx = dy = dz = np.float32(0.0)

@@ -8,7 +8,7 @@ from r3jax.splatting.backends.numba.bins import (
     emit_all,
     list_by_tile,
     project_all,
-    sort_by_depth,
+    order_of,
     sums_before,
 )
 from r3jax.splatting.backends.numba.compiled import kernel
@@ -44,13 +44,12 @@ def forward_pass(cloud, view, workers, images, totals, records, lists):
         tile_starts[:] = 0
         records.view(np.int32)[:, at.COUNT] = 0
     else:
-        keys, ids = np.empty(drawn, np.int32), np.empty(drawn, np.int32)
+        order_keys, ids = np.empty(drawn, np.int32), np.empty(drawn, np.int32)
+        who = order_keys, ids, np.empty(drawn + 1, np.int32)
         tiles, rows = np.empty(needed, np.int32), np.empty(needed, np.uint8)
-        emit_all(size, workers, records, counts, keys, ids, tiles, rows)
-        order = sort_by_depth(keys, ids)
-        list_by_tile(
-            order, records, tiles, rows, workers, tile_starts, list_ids, list_slots, list_rows
-        )
+        emit_all(size, workers, records, counts, who, tiles, rows)
+        order = order_of(order_keys)
+        list_by_tile(order, who, tiles, rows, workers, tile_starts, list_ids, list_slots, list_rows)
     composite_all(records, list_ids, list_rows, tile_starts, workers, rgb, depth, alpha, tile_ends)
 
 

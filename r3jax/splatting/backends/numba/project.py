@@ -4,7 +4,7 @@ import numpy as np
 
 from r3jax.splatting import config
 from r3jax.splatting.backends.numba import records as at
-from r3jax.splatting.backends.numba.compiled import inlined
+from r3jax.splatting.backends.numba.compiled import inlined_fast
 from r3jax.splatting.backends.numba.harmonics import basis_at
 
 NEAR = np.float32(config.NEAR)
@@ -16,7 +16,7 @@ HALF, ZERO, ONE, TWO = (np.float32(x) for x in (0.5, 0.0, 1.0, 2.0))
 _TWO_S_SCALE, _TWO_S_MORE = np.float32(2.002), np.float32(1e-4)
 
 
-@inlined
+@inlined_fast
 def in_camera(mean, view):
     """Coordinates of a center in the camera's frame [m]."""
     x = view[0] * mean[0] + view[1] * mean[1] + view[2] * mean[2] + view[9]
@@ -25,7 +25,7 @@ def in_camera(mean, view):
     return x, y, z
 
 
-@inlined
+@inlined_fast
 def clamped_slope(ratio, focal, middle, size):
     """x/z where the Jacobian is taken: at most 30 % of half the image outside it."""
     margin = MARGIN * np.float32(size)
@@ -33,7 +33,7 @@ def clamped_slope(ratio, focal, middle, size):
     return min(max(ratio, low), high)
 
 
-@inlined
+@inlined_fast
 def rotation_of(quat, rotation):
     """Writes the rotation matrix (9 numbers) of a quaternion wxyz; returns it at unit length.
 
@@ -55,7 +55,7 @@ def rotation_of(quat, rotation):
     return w, x, y, z, inverse
 
 
-@inlined
+@inlined_fast
 def jacobian_rows(view, u, v, fx_z, fy_z, rows):
     """Writes the two rows of J R (6 numbers): the image's axes seen from the world [px/m]."""
     for i in range(3):
@@ -63,7 +63,7 @@ def jacobian_rows(view, u, v, fx_z, fy_z, rows):
         rows[3 + i] = fy_z * (view[3 + i] - v * view[6 + i])
 
 
-@inlined
+@inlined_fast
 def image_axes(rows, rotation, log_scales, axes):
     """Writes the Gaussian's three axes in the image (6 numbers: x components, then y) [px]."""
     for j in range(3):
@@ -76,7 +76,7 @@ def image_axes(rows, rotation, log_scales, axes):
             )
 
 
-@inlined
+@inlined_fast
 def covariance_of(axes):
     """xx, xy, yy of the dilated covariance in the image [px^2]."""
     xx = axes[0] * axes[0] + axes[1] * axes[1] + axes[2] * axes[2] + DILATION
@@ -85,13 +85,13 @@ def covariance_of(axes):
     return xx, xy, yy
 
 
-@inlined
+@inlined_fast
 def sigmoid(logit):
     """1 / (1 + exp(-logit))."""
     return ONE / (ONE + np.exp(-logit))
 
 
-@inlined
+@inlined_fast
 def project_one(mean, quat, log_scales, logit, offset, view, width, height, scratch, record):
     """Writes the geometry of a Gaussian to its record.
 
@@ -128,7 +128,7 @@ def project_one(mean, quat, log_scales, logit, offset, view, width, height, scra
     return True
 
 
-@inlined
+@inlined_fast
 def direction_of(mean, view):
     """Unit vector from the camera's center to the Gaussian, and 1 / distance (0 at the center)."""
     x, y, z = mean[0] - view[12], mean[1] - view[13], mean[2] - view[14]
@@ -137,7 +137,7 @@ def direction_of(mean, view):
     return x * inverse, y * inverse, z * inverse, inverse
 
 
-@inlined
+@inlined_fast
 def color_one(mean, sh, view, basis, record):
     """Writes max(SH + 0.5, 0) to a record; `sh` is one Gaussian's [k * 3] coefficients."""
     x, y, z, _ = direction_of(mean, view)
