@@ -8,9 +8,9 @@ from pathlib import Path
 import tyro
 
 from r3jax.cli.errors import UserError
-from r3jax.cli.options import Demo, Explore, Info
+from r3jax.cli.options import Demo, Explore, Info, Train
 
-_COMMANDS = {"demo": Demo, "explore": Explore, "info": Info}
+_COMMANDS = {"demo": Demo, "explore": Explore, "train": Train, "info": Info}
 
 USER_ERROR = 2
 """Exit code where the user can mend it: an unknown name, a folder that exists, a broken file."""
@@ -34,19 +34,30 @@ def main(args: Sequence[str] | None = None) -> int:
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     _keep_compilations()
-    # Imported here, so that --help does not wait for JAX.
-    from r3jax.cli.explore import run_demo, run_explore
-    from r3jax.cli.info import run_info
-
     try:
-        if isinstance(command, Demo):
-            return run_demo(command)
-        if isinstance(command, Explore):
-            return run_explore(command)
-        return run_info(command)
+        return _run(command)
     except UserError as error:
         print(f"r3jax: {error}", file=sys.stderr)
         return USER_ERROR
+
+
+def _run(command: Demo | Explore | Train | Info) -> int:
+    """Imports what the command needs and nothing else, so that --help does not wait for JAX."""
+    if isinstance(command, Demo):
+        from r3jax.cli.explore import run_demo
+
+        return run_demo(command)
+    if isinstance(command, Explore):
+        from r3jax.cli.explore import run_explore
+
+        return run_explore(command)
+    if isinstance(command, Train):
+        from r3jax.cli.train import run_train
+
+        return run_train(command)
+    from r3jax.cli.info import run_info
+
+    return run_info(command)
 
 
 def _keep_compilations() -> None:
