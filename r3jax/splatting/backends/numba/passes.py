@@ -14,6 +14,7 @@ from r3jax.splatting.backends.numba.bins import (
 from r3jax.splatting.backends.numba.compiled import kernel
 from r3jax.splatting.backends.numba.forward import composite_all
 from r3jax.splatting.backends.numba.gradient import gradient_of_cloud
+from r3jax.splatting.backends.numba.memory import expect_writes
 
 
 @kernel
@@ -36,6 +37,7 @@ def forward_pass(cloud, view, workers, images, totals, records, lists):
     size = alpha.shape[1], alpha.shape[0]
     budget, n = list_ids.shape[0], records.shape[0]
     counts = np.empty((-(-n // at.BLOCK), 2), np.int64)
+    expect_writes(records)
     project_all(cloud, view, size, workers, records, counts)
     drawn, needed = sums_before(counts)
     most = np.int64(2**31 - 1)
@@ -59,5 +61,7 @@ def backward_pass(cloud, view, workers, images, records, lists, gradients, g_clo
     tile_starts, alpha = lists[3], images[2]
     size = alpha.shape[1], alpha.shape[0]
     slots = np.empty(tile_starts[-1] * at.GRADIENT_SIZE, np.float32)
+    expect_writes(slots)
+    expect_writes(g_cloud[4])  # harmonics, by far the largest
     gradient_of_all(lists, records, images, gradients, workers, slots)
     gradient_of_cloud(cloud, records, slots, view, size, workers, g_cloud, g_view)
