@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,15 @@ from rich.table import Table
 from r3jax.cli.captures import Capture, open_capture
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Evaluate
-from r3jax.evaluation import scores, style
+from r3jax.cli.selection import (
+    TestSet,
+    Training,
+    choose_views,
+    find_training,
+    frames_of,
+    mapped_views,
+)
+from r3jax.evaluation import style
 from r3jax.evaluation.contact_sheet import SheetView, contact_sheet
 from r3jax.evaluation.judge import Judgment, judge
 from r3jax.evaluation.lpips import load_lpips
@@ -24,11 +31,9 @@ from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
 from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
 from r3jax.files import write_atomic
 from r3jax.formats.errors import FormatError
-from r3jax.frame import Frame
 from r3jax.mapping.state import MapState
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.ply import read_scene
-from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import Views, load_views
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import package_versions
@@ -38,61 +43,18 @@ _NETWORKS = {"alex": "AlexNet", "vgg": "VGG16"}
 
 
 @dataclass(frozen=True)
-class Training:
-    """What is known of a model's training, from the train.json beside it."""
-
-    model: Path
-    """The PLY file."""
-
-    record: dict[str, Any]
-    """Empty if there is no train.json."""
-
-    is_here: bool
-    """True if the model was trained on the capture that is evaluated."""
-
-    @property
-    def train_views(self) -> list[int] | None:
-        """Numbers of the views trained on, in the capture; None if not known."""
-        return self.record.get("train_views") if self.is_here else None
-
-    @property
-    def background(self) -> np.ndarray:
-        """What the training had behind everything; black if that was random."""
-        is_white = self.record.get("config", {}).get("background") == "white"
-        return np.full(3, 1.0 if is_white else 0.0, dtype=np.float32)
-
-
-@dataclass(frozen=True)
-class TestSet:
-    """The views that judge."""
-
-    capture: Capture
-    numbers: list[int]
-    """In the capture."""
-
-    title: str
-    """As the table calls them."""
-
-    num_trained: int | None
-    """How many of them the model has seen; None if not known."""
-
-    def frames(self) -> Iterator[Frame]:
-        """Every frame in order, as recorded."""
-        return _frames(self.capture, self.numbers)
-
-
-@dataclass(frozen=True)
 class Outcome:
     """All that is shown and written."""
 
     training: Training
     test: TestSet
-    scene: GaussianScene
+    num_gaussians: int
     views: Views
     judgment: Judgment
     summaries: tuple[Summary, ...]
+
     state: MapState | None
-    """The map of the training views."""
+    """The map of the training views; None without one."""
 
 
 def run_evaluate(options: Evaluate) -> int:
@@ -101,10 +63,10 @@ def run_evaluate(options: Evaluate) -> int:
     Raises:
         UserError: no model, no test views, views that cannot be judged, a missing package.
     """
-    progress = Console(stderr=True)
     try:
-        outcome = _evaluate(options, progress)
-        folder = options.out or _default_folder(outcome)
+        capture = open_capture(options.path, options.up)
+        outcome = _evaluate(options, capture)
+        folder = options.out or _default_folder(capture, outcome.training)
         folder.mkdir(parents=True, exist_ok=True)
         written = _write(options, outcome, folder)
     except (ValueError, OSError, ImportError, RunError, FormatError) as error:
@@ -113,22 +75,23 @@ def run_evaluate(options: Evaluate) -> int:
     return 0
 
 
-def _evaluate(options: Evaluate, progress: Console) -> Outcome:
+def _evaluate(options: Evaluate, capture: Capture) -> Outcome:
     # What can be checked quickly comes first.
     if options.worst < 0:
         raise ValueError(f"--worst must not be negative, got {options.worst}")
-    capture = open_capture(options.path, options.up)
-    training = _find_training(options, capture)
-    test = _choose_views(options, capture, training)
+    training = find_training(options, capture)
+    test = choose_views(options, capture, training)
     lpips = None if options.lpips == "none" else load_lpips(options.lpips)
     scene = read_scene(training.model)
-    resolution = options.resolution or training.record.get("resolution")
+    progress = Console(stderr=True)
     with progress.status(f"reading {len(test.numbers)} views ..."):
+        resolution = options.resolution or training.record.get("resolution")
         views = load_views(test.frames(), resolution)
     state, expected = None, None
-    if not options.no_renderability and (seen := _seen(training, test, capture)):
-        with progress.status(f"mapping {len(seen)} training views ..."):
-            state = _map(capture, seen)
+    mapped = [] if options.no_renderability else mapped_views(training, test, capture)
+    if mapped:
+        with progress.status(f"mapping {len(mapped)} training views ..."):
+            state = _map(capture, mapped)
             expected = expected_renderability(state, test.frames())
     with _bar(progress) as bar:
         task = bar.add_task("", total=len(views))
@@ -143,112 +106,16 @@ def _evaluate(options: Evaluate, progress: Console) -> Outcome:
             on_view=lambda done: bar.update(task, completed=done),
         )
     summaries = summarize(judgment.rows, seed=options.seed)
-    return Outcome(training, test, scene, views, judgment, summaries, state)
-
-
-def _find_training(options: Evaluate, capture: Capture) -> Training:
-    """The model and what is known of it."""
-    model = options.model or capture.models / options.name / "scene.ply"
-    if model.is_dir():
-        model = model / "scene.ply"
-    if not model.is_file():
-        found = sorted(path.parent.name for path in capture.models.glob("*/scene.ply"))
-        known = f"there are: {', '.join(found)} (--name)" if found else "there is none yet"
-        raise UserError(
-            f"{model}: there is no such model; {known}; `r3jax train {capture.path}` makes one"
-        )
-    path = model.parent / "train.json"
-    try:
-        record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    except ValueError as error:
-        raise UserError(f"{path}: the file cannot be read ({one_line(error)})") from error
-    is_inside = capture.models.resolve() in model.resolve().parents
-    is_same = "data" in record and Path(record["data"]).resolve() == capture.path.resolve()
-    return Training(model, record, bool(record) and (is_inside or is_same))
-
-
-def _choose_views(options: Evaluate, capture: Capture, training: Training) -> TestSet:
-    """The views that `--views` means."""
-    spec, count = options.views, len(capture)
-    seen = training.train_views
-    if spec == "heldout":
-        numbers = _held_out(capture, training)
-        return TestSet(capture, numbers, "held-out views", 0)
-    if spec == "all" or spec.startswith("every:"):
-        step = 1 if spec == "all" else _whole_number(spec)
-        numbers = list(range(0, count, step))
-        if not numbers:
-            raise UserError(f"{capture.path} holds no views")
-        title = "all views" if step == 1 else f"views 0, {step}, {2 * step}, ..."
-        return TestSet(capture, numbers, title, _overlap(numbers, seen))
-    if not Path(spec).is_dir():
-        raise UserError(
-            f"--views takes heldout, all, every:N or the folder of another run, got {spec!r}"
-        )
-    other = open_capture(Path(spec), options.up)
-    if len(other) == 0:
-        raise UserError(f"{spec} holds no views")
-    is_same = other.path.resolve() == capture.path.resolve()
-    numbers = list(range(len(other)))
-    return TestSet(other, numbers, "the views", _overlap(numbers, seen) if is_same else 0)
-
-
-def _held_out(capture: Capture, training: Training) -> list[int]:
-    if not training.is_here:
-        why = "there is no train.json beside it" if not training.record else "it is of other data"
-        raise UserError(
-            f"{training.model}: which views of {capture.path} were held out is not known ({why}); "
-            "use --views all, every:N or another run"
-        )
-    numbers = [int(number) for number in training.record.get("test_views", [])]
-    if not numbers:
-        raise UserError(
-            f"{training.model} was trained on all views; train with --hold-out 8, or use --views "
-            "with another run of the place"
-        )
-    if max(numbers) >= len(capture):
-        raise UserError(
-            f"{training.model} holds out view {max(numbers)}, but {capture.path} has "
-            f"{len(capture)} views: it was trained on an earlier content; train it again"
-        )
-    return numbers
-
-
-def _whole_number(spec: str) -> int:
-    text = spec.removeprefix("every:")
-    if not text.isdecimal() or int(text) < 1:
-        raise UserError(f"--views every:N takes a whole number of at least 1, got {spec!r}")
-    return int(text)
-
-
-def _overlap(numbers: list[int], seen: list[int] | None) -> int | None:
-    return None if seen is None else len(set(numbers) & set(seen))
-
-
-def _seen(training: Training, test: TestSet, capture: Capture) -> list[int]:
-    """Views of the capture for the map: those trained on; none if the capture is other data.
-
-    Without a train.json all views but the tested ones, as a model of them most likely saw them.
-    """
-    if training.train_views is not None:
-        return [number for number in training.train_views if number < len(capture)]
-    if training.record:
-        return []
-    tested = set(test.numbers) if test.capture is capture else set()
-    return [number for number in range(len(capture)) if number not in tested]
+    return Outcome(training, test, scene.capacity, views, judgment, summaries, state)
 
 
 def _map(capture: Capture, numbers: list[int]) -> MapState:
     config = capture.run.header.config if capture.run is not None else {}
     return map_of(
-        _frames(capture, numbers),
+        frames_of(capture, numbers),
         voxel_size=float(config.get("voxel_size", 0.05)),
         max_range=float(config.get("max_range", 5.0)),
     )
-
-
-def _frames(capture: Capture, numbers: list[int]) -> Iterator[Frame]:
-    return (capture.source.frame(number) for number in numbers)
 
 
 def _bar(console: Console) -> Progress:
@@ -262,7 +129,136 @@ def _bar(console: Console) -> Progress:
     )
 
 
-def _default_folder(outcome: Outcome) -> Path:
-    run = outcome.test.capture.run
-    del run
-    raise NotImplementedError
+def _default_folder(capture: Capture, training: Training) -> Path:
+    return training.model.parent if capture.run is None else capture.path / "report"
+
+
+def _write(options: Evaluate, outcome: Outcome, folder: Path) -> dict[str, Path]:
+    """The files, under what they hold."""
+    written = {"rows": folder / f"evaluation.{options.rows}", "summary": folder / "evaluation.json"}
+    write_rows(written["rows"], outcome.judgment.rows)
+    record = json.dumps(_record(options, outcome), indent=1, allow_nan=False)
+    write_atomic(written["summary"], record.encode())
+    if options.worst:
+        written["worst views"] = folder / "evaluation.png"
+        write_atomic(written["worst views"], style.to_png(_sheet(options, outcome)))
+    return written
+
+
+def _record(options: Evaluate, outcome: Outcome) -> dict[str, Any]:
+    """Everything that the numbers depend on, and the numbers."""
+    summaries = {}
+    for summary in outcome.summaries:
+        plain = dataclasses.asdict(summary)
+        summaries[plain.pop("metric")["name"]] = plain
+    return {
+        "model": str(outcome.training.model),
+        "gaussians": outcome.num_gaussians,
+        "data": str(outcome.test.capture.path),
+        "views": options.views,
+        "numbers": outcome.test.numbers,
+        "trained_on": outcome.test.num_trained,
+        "width": outcome.views.width,
+        "height": outcome.views.height,
+        "lpips": None
+        if options.lpips == "none"
+        else {"network": _NETWORKS[options.lpips], "version": "0.1", "input": [-1, 1]},
+        "bootstrap_seed": options.seed,
+        "metrics": summaries,
+        "packages": package_versions(),
+    }
+
+
+def _sheet(options: Evaluate, outcome: Outcome):
+    """The contact sheet of the worst views."""
+    rows, renders = outcome.judgment.rows, outcome.judgment.renders
+    place = {row.view: i for i, row in enumerate(rows)}
+    lines = []
+    for row in worst_rows(rows, options.worst):
+        i, expected = place[row.view], None
+        if outcome.state is not None:
+            expected = expected_image(outcome.state, outcome.test.capture.source.frame(row.view))
+        lines.append(SheetView(row, np.asarray(outcome.views.rgb[i]), renders[i], expected))
+    psnr = outcome.summaries[0]
+    title = (
+        f"The worst {len(lines)} of {_described(outcome)}\n"
+        f"mean PSNR {psnr.mean:.2f} dB, median {psnr.median:.2f} dB"
+    )
+    return contact_sheet(lines, title)
+
+
+def _described(outcome: Outcome) -> str:
+    test, views = outcome.test, outcome.views
+    return f"{len(views)} {test.title} of {test.capture.path} at {views.width}x{views.height} px"
+
+
+def _show(console: Console, options: Evaluate, outcome: Outcome, written: dict[str, Path]) -> None:
+    rows = outcome.judgment.rows
+    console.print(_described(outcome), **_PLAIN)
+    console.print(f"model: {outcome.training.model}, {outcome.num_gaussians} Gaussians", **_PLAIN)
+    console.print(_table(outcome.summaries))
+    lpips = (
+        "no LPIPS"
+        if options.lpips == "none"
+        else f"LPIPS v0.1 with {_NETWORKS[options.lpips]} on [-1, 1]"
+    )
+    console.print(
+        "Renders rounded to 8 bits; SSIM with an 11x11 Gaussian window, sigma 1.5, data range 1; "
+        f"{lpips}. Brackets: 95 % bootstrap interval of the mean over views. The 5th percentile "
+        "is the bad tail (of LPIPS the 95th).",
+        style="dim",
+        highlight=False,
+        markup=False,
+    )
+    coverage = np.mean([row.coverage for row in rows])
+    holes = 1.0 - np.mean([row.measured for row in rows])
+    facts = f"filled by the model {100 * coverage:.1f} %, holes of the scan {100 * holes:.1f} %"
+    expected = [row.renderability for row in rows if row.renderability is not None]
+    if expected:
+        facts += f", mean renderability {np.mean(expected):.3f}"
+    console.print(facts, **_PLAIN)
+    for what, path in written.items():
+        console.print(f"{what}  {path}", **_PLAIN)
+    for warning in _warnings(outcome):
+        console.print(f"warning: {warning}", style="yellow", **_PLAIN)
+
+
+def _table(summaries: tuple[Summary, ...]) -> Table:
+    table = Table("", "mean", "", "median", "5th pct.", "worst", "view", "< 20 dB", box=None)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for summary in summaries:
+        show = lambda value, digits=summary.metric.decimals: f"{value:.{digits}f}"
+        low, high = summary.interval
+        poor = "" if summary.poor_share is None else f"{100 * summary.poor_share:.1f} %"
+        table.add_row(
+            summary.metric.title,
+            f"[bold]{show(summary.mean)}[/bold]",
+            f"\\[{show(low)}, {show(high)}]",
+            show(summary.median),
+            show(summary.percentile_5),
+            show(summary.worst),
+            str(summary.worst_view),
+            poor,
+        )
+    return table
+
+
+def _warnings(outcome: Outcome) -> list[str]:
+    """What makes the numbers mean less than they seem to."""
+    test, training = outcome.test, outcome.training
+    warnings = []
+    if test.num_trained:
+        warnings.append(
+            f"the model was trained on {test.num_trained} of these {len(test.numbers)} views; "
+            "this says how well it fits, not how well it predicts"
+        )
+    if test.num_trained is None:
+        warnings.append(
+            "it is not known whether the model was trained on these views (no train.json beside it)"
+        )
+    trained = training.record.get("resolution")
+    longer = max(outcome.views.width, outcome.views.height)
+    if trained is not None and longer != trained:
+        warnings.append(f"the model was trained at {trained} px and is judged at {longer} px")
+    return warnings

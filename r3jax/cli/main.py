@@ -8,9 +8,15 @@ from pathlib import Path
 import tyro
 
 from r3jax.cli.errors import UserError
-from r3jax.cli.options import Demo, Explore, Info, Train
+from r3jax.cli.options import Demo, Evaluate, Explore, Info, Train
 
-_COMMANDS = {"demo": Demo, "explore": Explore, "train": Train, "info": Info}
+_COMMANDS = {
+    "demo": Demo,
+    "explore": Explore,
+    "train": Train,
+    "evaluate": Evaluate,
+    "info": Info,
+}
 
 USER_ERROR = 2
 """Exit code where the user can mend it: an unknown name, a folder that exists, a broken file."""
@@ -41,7 +47,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return USER_ERROR
 
 
-def _run(command: Demo | Explore | Train | Info) -> int:
+def _run(command: Demo | Explore | Train | Evaluate | Info) -> int:
     """Imports what the command needs and nothing else, so that --help does not wait for JAX."""
     if isinstance(command, Demo):
         from r3jax.cli.explore import run_demo
@@ -55,6 +61,10 @@ def _run(command: Demo | Explore | Train | Info) -> int:
         from r3jax.cli.train import run_train
 
         return run_train(command)
+    if isinstance(command, Evaluate):
+        from r3jax.cli.evaluate import run_evaluate
+
+        return run_evaluate(command)
     from r3jax.cli.info import run_info
 
     return run_info(command)

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r3jax.evaluation.batches import in_batches
+
 LpipsNetwork = Literal["alex", "vgg"]
 
 _PACKAGE_NAMES = {"alex": "alexnet", "vgg": "vgg16"}
@@ -54,15 +56,11 @@ class Lpips(eqx.Module):
                 (AlexNet) or 16 px (VGG).
         """
         self._check(images, truth)
-        count, height, width, _ = images.shape
-        batch = min(count, max(1, _PIXELS_AT_A_TIME[self.network] // (height * width)))
-        distances = []
-        for start in range(0, count, batch):
-            first = min(start, count - batch)  # the last batch reaches back, to be a full one
-            part = slice(first, first + batch)
-            values = _distances(self, images[part], truth[part])
-            distances.append(np.asarray(values)[start - first :])
-        return np.concatenate(distances) if distances else np.zeros(0, dtype=np.float32)
+        if len(images) == 0:
+            return np.zeros(0, dtype=np.float32)
+        pixels = images.shape[1] * images.shape[2]
+        batch = max(1, _PIXELS_AT_A_TIME[self.network] // pixels)
+        return in_batches(functools.partial(_distances, self), batch, images, truth)
 
     def _check(self, images: Array, truth: Array) -> None:
         if images.shape != truth.shape:
@@ -74,7 +72,7 @@ class Lpips(eqx.Module):
                 f"{images.shape[2]} x {images.shape[1]}"
             )
         for name, values in (("images", images), ("truth", truth)):
-            if not values.size:
+            if len(values) == 0:
                 continue
             # In NumPy, whose minimum keeps a NaN; it makes the comparison false.
             low, high = float(np.asarray(values).min()), float(np.asarray(values).max())

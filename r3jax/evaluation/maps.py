@@ -1,0 +1,50 @@
+"""What a map of the training views expects of test views."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from r3jax.frame import Frame
+from r3jax.mapping.join import grow
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.update import integrate
+from r3jax.scoring.renderability import renderability, renderability_image
+
+_MAX_LOAD = 0.7
+
+
+def map_of(
+    frames: Iterable[Frame], *, voxel_size: float = 0.05, max_range: float = 5.0
+) -> MapState:
+    """The map that has seen these frames and no others; it grows as needed.
+
+    A run's own map has seen the held-out views too, and would praise what a model trained without
+    them cannot know.
+
+    Args:
+        frames: what the model was trained on.
+        voxel_size: edge of a voxel [m].
+        max_range: depth beyond it is ignored [m].
+    """
+    state = empty_map(voxel_size=voxel_size)
+    for frame in frames:
+        after = integrate(state, frame, max_range)
+        while int(after.num_occupied) > _MAX_LOAD * after.capacity:
+            state = grow(state, 2 * state.capacity)
+            after = integrate(state, frame, max_range)
+        state = after
+    return state
+
+
+def expected_renderability(state: MapState, frames: Iterable[Frame]) -> list[float]:
+    """R of each frame's view, in [0, 1].
+
+    The frames must be as recorded, not made smaller: a voxel's resolution is compared with the
+    one at which it was mapped.
+    """
+    return [float(renderability(state, f.camera, f.T_world_camera)) for f in frames]
+
+
+def expected_image(state: MapState, frame: Frame) -> np.ndarray:
+    """R of what each pixel of a frame's view sees, [h, w] in [0, 1]."""
+    return np.asarray(renderability_image(state, frame.camera, frame.T_world_camera))
