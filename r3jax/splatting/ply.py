@@ -129,7 +129,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:
         raise SceneFileError(path, "not a PLY file (it does not begin with 'ply')")
     byte_order, elements = "", []
     for _ in range(_MAX_HEADER_LINES):
-        line = file.readline(4096)
+        line = file.readline(1 << 16)
         words = line.decode("ascii", errors="replace").split()
         if not line:
             break
