@@ -49,7 +49,6 @@ def run_train(options: Train) -> int:
         with console.status(f"reading {len(capture)} views ..."):
             views = load_views(capture.frames(), options.resolution).take(training)
         folder.mkdir(parents=True, exist_ok=True)
-        _write_record(folder / "train.json", options, config, views, training, held_out)
         with TrainProgress(console, config.iterations) as progress:
             result = train.fit(
                 views,
@@ -59,6 +58,7 @@ def run_train(options: Train) -> int:
                 on_progress=progress.on_progress,
             )
         _write_model(folder, result)
+        _write_record(folder / "train.json", options, config, views, training, held_out)
     except (ValueError, ArithmeticError, OSError, ImportError, RunError, FormatError) as error:
         raise UserError(one_line(error)) from error
     _conclude(console, options, folder, result)
@@ -83,7 +83,8 @@ def _config(options: Train) -> TrainConfig:
 def _folder(options: Train, capture: Capture) -> Path:
     """The model's folder; one that is there is kept, unless the user says otherwise."""
     folder = (options.out or capture.models) / options.name
-    if (folder / "train.json").exists() and not (options.overwrite or options.resume):
+    in_use = folder.is_dir() and any(folder.iterdir())
+    if in_use and not (options.overwrite or options.resume):
         raise UserError(
             f"{folder} holds a model: --resume goes on with it, --overwrite replaces it, "
             "--name NAME makes another"

@@ -9,6 +9,13 @@ from string import Template
 from matplotlib.figure import Figure
 
 from r3jax.evaluation import figures, style
+from r3jax.evaluation.model_report import (
+    JudgedModel,
+    quality_note,
+    quality_table,
+    read_judged_model,
+    training_figure,
+)
 from r3jax.evaluation.pictures import panorama_picture
 from r3jax.evaluation.summary import StageTime, stage_times, summary
 from r3jax.files import write_atomic
@@ -111,13 +118,32 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
         write_atomic(folder / f"{name}.png", png)
         table = _stage_table(stage_times(run)) if name == "cost" else ""
         sections.append(_figure_section(name, png, table))
+    model = read_judged_model(run)
+    if model is not None:
+        # What came out of it all stands first.
+        sections[:0] = _model_sections(folder, model)
     sections.append(_settings_section(run))
     page = folder / "report.html"
-    write_atomic(page, _page(run, sections).encode())
+    write_atomic(page, _page(run, sections, model).encode())
     return page
 
 
-def _page(run: Run, sections: list[str]) -> str:
+def _model_sections(folder: Path, model: JudgedModel) -> list[str]:
+    """The trained model: numbers and curves, then the contact sheet of the worst views."""
+    note = html.escape(quality_note(model.evaluation))
+    curves = b""
+    if model.history:
+        curves = style.to_png(training_figure(model.history))
+        write_atomic(folder / "training.png", curves)
+    table = quality_table(model.evaluation)
+    sections = [_section("The splats trained on these views", note, curves, table)]
+    if model.sheet is not None:
+        note = "Ground truth, render, error, and what the map had expected; worst views first."
+        sections.append(_section("Renders", note, model.sheet, ""))
+    return sections
+
+
+def _page(run: Run, sections: list[str], model: JudgedModel | None) -> str:
     last = run.rows[-1]
     cards = {
         "views": str(len(run.rows)),
@@ -127,6 +153,8 @@ def _page(run: Run, sections: list[str]) -> str:
         "mean renderability": f"{last.coverage.mean_renderability:.2f}",
         "map in use": summary(run)["map"].split(", ")[1].removesuffix(" in use"),
     }
+    if model is not None:
+        cards["PSNR of test views"] = f"{model.evaluation['metrics']['psnr']['mean']:.1f} dB"
     card = '<div class="card"><b>{}</b><span>{}</span></div>'
     return _PAGE.substitute(
         title=html.escape(f"{run.header.policy.get('name')} in {run.header.scene.get('name')}"),
@@ -138,11 +166,14 @@ def _page(run: Run, sections: list[str]) -> str:
 
 def _figure_section(name: str, png: bytes, extra: str) -> str:
     title, note = _NOTES[name]
+    return _section(title, note, png, extra)
+
+
+def _section(title: str, note: str, png: bytes, extra: str) -> str:
+    """A title, a note, a picture (if it is not empty) and more."""
     data = base64.b64encode(png).decode()
-    return (
-        f'<section><h2>{title}</h2><p class="note">{note}</p>'
-        f'<img alt="{title}" src="data:image/png;base64,{data}">{extra}</section>'
-    )
+    image = f'<img alt="{title}" src="data:image/png;base64,{data}">' if png else ""
+    return f'<section><h2>{title}</h2><p class="note">{note}</p>{image}{extra}</section>'
 
 
 def _stage_table(stages: list[StageTime]) -> str:
