@@ -1,5 +1,6 @@
 """Real spherical harmonics up to degree 3, in the order and with the signs of 3DGS files."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -57,11 +58,42 @@ def view_colors(
     Returns:
         RGB, one row per channel; it may exceed 1.
     """
-    degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
     x, y, z = (means[:, i] - camera_center[i] for i in range(3))
     squared = x * x + y * y + z * z
     squared_safe = jnp.where(squared > 0.0, squared, 1.0)
     inverse = jnp.where(squared > 0.0, 1.0 / jnp.sqrt(squared_safe), 0.0)
-    basis = harmonics(x * inverse, y * inverse, z * inverse, degree)
-    channels = [sum(b * sh[:, i, c] for i, b in enumerate(basis)) + 0.5 for c in range(3)]
-    return jnp.maximum(jnp.stack(channels), 0.0)
+    return jnp.maximum(_sum_harmonics(sh, x * inverse, y * inverse, z * inverse) + 0.5, 0.0)
+
+
+@jax.custom_vjp
+def _sum_harmonics(
+    sh: Float[Array, "n k 3"], x: Float[Array, " n"], y: Float[Array, " n"], z: Float[Array, " n"]
+) -> Float[Array, "3 n"]:
+    """The sum of coefficient x basis at unit directions, for each channel."""
+    basis = harmonics(x, y, z, _degree(sh))
+    return jnp.stack([sum(b * sh[:, i, c] for i, b in enumerate(basis)) for c in range(3)])
+
+
+def _sum_harmonics_fwd(
+    sh: Array, x: Array, y: Array, z: Array
+) -> tuple[Array, tuple[Array, Array, Array, Array]]:
+    return _sum_harmonics(sh, x, y, z), (sh, x, y, z)
+
+
+def _sum_harmonics_bwd(
+    residuals: tuple[Array, Array, Array, Array], cotangent: Float[Array, "3 n"]
+) -> tuple[Array, Array, Array, Array]:
+    # Written out, for autodiff pads each of 48 columns to a whole array and adds them up, which
+    # takes seven times as long.
+    sh, x, y, z = residuals
+    basis, pull_back = jax.vjp(lambda x, y, z: harmonics(x, y, z, _degree(sh)), x, y, z)
+    by_sh = jnp.stack(basis, axis=-1)[:, :, None] * cotangent.T[:, None, :]
+    by_basis = [sum(cotangent[c] * sh[:, i, c] for c in range(3)) for i in range(len(basis))]
+    return by_sh, *pull_back(by_basis)
+
+
+_sum_harmonics.defvjp(_sum_harmonics_fwd, _sum_harmonics_bwd)
+
+
+def _degree(sh: Float[Array, "n k 3"]) -> int:
+    return {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
