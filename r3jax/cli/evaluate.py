@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
@@ -224,21 +225,21 @@ def _show(console: Console, options: Evaluate, outcome: Outcome, written: dict[s
 
 
 def _table(summaries: tuple[Summary, ...]) -> Table:
-    table = Table("", "mean", "", "median", "5th pct.", "worst", "view", "< 20 dB", box=None)
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = Table("", "mean", "", "median", "5th pct.", "worst (view)", "< 20 dB", box=None)
+    for column in table.columns:
+        column.no_wrap = True
+        column.justify = "left" if column is table.columns[0] else "right"
     for summary in summaries:
         show = lambda value, digits=summary.metric.decimals: f"{value:.{digits}f}"
         low, high = summary.interval
         poor = "" if summary.poor_share is None else f"{100 * summary.poor_share:.1f} %"
         table.add_row(
-            summary.metric.title,
+            escape(summary.metric.title),
             f"[bold]{show(summary.mean)}[/bold]",
-            f"\\[{show(low)}, {show(high)}]",
+            escape(f"[{show(low)}, {show(high)}]"),
             show(summary.median),
             show(summary.percentile_5),
-            show(summary.worst),
-            str(summary.worst_view),
+            f"{show(summary.worst)} ({summary.worst_view})",
             poor,
         )
     return table

@@ -91,7 +91,7 @@ def choose_views(options: Evaluate, capture: Capture, training: Training) -> Tes
         numbers = list(range(0, count, step))
         if not numbers:
             raise UserError(f"{capture.path} holds no views")
-        title = "all views" if step == 1 else f"views 0, {step}, {2 * step}, ..."
+        title = "views (all)" if step == 1 else f"views (one in {step})"
         return TestSet(capture, numbers, title, _overlap(numbers, seen))
     if not Path(spec).is_dir():
         raise UserError(
@@ -102,7 +102,7 @@ def choose_views(options: Evaluate, capture: Capture, training: Training) -> Tes
         raise UserError(f"{spec} holds no views")
     is_same = other.path.resolve() == capture.path.resolve()
     numbers = list(range(len(other)))
-    return TestSet(other, numbers, "the views", _overlap(numbers, seen) if is_same else 0)
+    return TestSet(other, numbers, "views", _overlap(numbers, seen) if is_same else 0)
 
 
 def _held_out(capture: Capture, training: Training) -> list[int]:

@@ -11,13 +11,21 @@ from matplotlib.image import AxesImage
 from r3jax.evaluation import style
 from r3jax.evaluation.scores import ViewRow
 
-ERROR_SCALE = 0.5
-"""Mean absolute error over RGB at which the colour of the error picture saturates. Fixed, so that
+ERROR_SCALE = 0.3
+"""Mean absolute error over RGB at which the color of the error picture saturates. Fixed, so that
 sheets can be compared."""
 
 _ERROR_MAP = "magma"
-_CELL, _CAPTION, _BAR = 2.1, 1.15, 0.75
-"""Width of a picture, of the column of captions, and height of the colour bars [inch]."""
+_NOTHING = "#d1d5db"
+_SCALES = {
+    "error": f"mean |error| over RGB, saturates at {ERROR_SCALE:g}",
+    "renderability": "R of the voxel seen (grey: none known)",
+}
+_MARGIN, _LINE, _HEADING, _CAPTION, _CELL, _GAP, _BAR, _BAR_TEXT = (
+    0.1, 0.2, 0.25, 0.95, 2.1, 0.06, 0.07, 0.4
+)  # fmt: skip
+"""Margin, line of the title, headings of the columns, width of the captions, width of a picture,
+space between pictures, height of a color bar and of the text below it [inch]."""
 
 
 @dataclass(frozen=True)
@@ -57,53 +65,65 @@ def contact_sheet(views: Sequence[SheetView], title: str) -> Figure:
     has_map = any(view.renderability is not None for view in views)
     titles = ["ground truth", "render", "error"] + ["renderability"] * has_map
     height, width = views[0].truth.shape[:2]
-    line = _CELL * height / width
-    lines = 1 + title.count("\n")
-    figure = style.new_figure(
-        _CAPTION + _CELL * len(titles), 0.3 * lines + 0.2 + line * len(views) + _BAR
+    cell, top = _CELL * height / width, _MARGIN + _LINE * (1 + title.count("\n")) + _HEADING
+    size = (
+        _MARGIN + _CAPTION + (_CELL + _GAP) * len(titles) + _MARGIN,
+        top + (cell + _GAP) * len(views) + _BAR + _BAR_TEXT,
     )
-    figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11, color=style.INK, fontweight="bold")
-    ratios = [_CAPTION / _CELL] + [1.0] * len(titles)
-    grid = figure.subplots(len(views), 1 + len(titles), squeeze=False, width_ratios=ratios)
-    for axes, name in zip(grid[0, 1:], titles, strict=True):
-        axes.set_title(name, fontsize=9, color=style.MUTED, loc="left", pad=3)
-    for axes, view in zip(grid, views, strict=True):
-        error, score = _draw_line(axes, view)
-    _color_bar(figure, error, grid[:, 3], f"mean |error| over RGB (saturates at {ERROR_SCALE:g})")
-    if score is not None:
-        _color_bar(figure, score, grid[:, 4], "R (0: unseen)")
+    figure = style.new_figure(*size)
+    figure.set_layout_engine("none")  # pictures of one size, with the same space between all
+
+    def place(line: int, column: int, height: float = cell, inset: float = 0.0) -> Axes:
+        """Axes for a picture, or for the bar below the last one."""
+        left = _MARGIN + _CAPTION + (_CELL + _GAP) * column + inset
+        lower = size[1] - top - (cell + _GAP) * line - height
+        wide = _CELL - 2.0 * inset
+        box = (left / size[0], lower / size[1], wide / size[0], height / size[1])
+        return style.blank(figure.add_axes(box))
+
+    figure.text(
+        _MARGIN / size[0], 1.0 - _MARGIN / size[1], title, va="top", fontsize=10, color=style.INK,
+        fontweight="bold", linespacing=1.3,
+    )  # fmt: skip
+    drawn = [
+        _draw_line([place(i, column) for column in range(len(titles))], view)
+        for i, view in enumerate(views)
+    ]
+    for column, (name, picture) in enumerate(zip(titles, drawn[0], strict=True)):
+        picture.axes.set_title(name, fontsize=9, color=style.MUTED, loc="left", pad=3)
+        if name in _SCALES:
+            # Narrower than the pictures, so that the numbers at the ends do not meet.
+            _color_bar(figure, picture, place(len(views), column, _BAR, 0.12), _SCALES[name])
     return figure
 
 
-def _draw_line(axes: np.ndarray, view: SheetView) -> tuple[AxesImage, AxesImage | None]:
-    """Draws one view; returns its two colour-mapped pictures."""
-    for one in axes:
-        _bare(one)
-    axes[0].text(0.0, 1.0, _caption(view.row), transform=axes[0].transAxes, va="top", fontsize=8.5,
-                 color=style.INK, linespacing=1.45)  # fmt: skip
-    axes[1].imshow(view.truth, interpolation="nearest")
-    axes[2].imshow(view.render, interpolation="nearest")
-    error = axes[3].imshow(
-        error_picture(view.truth, view.render),
-        cmap=_ERROR_MAP,
-        vmin=0.0,
-        vmax=ERROR_SCALE,
-        interpolation="nearest",
-    )
-    if len(axes) < 5:
-        return error, None
+def _draw_line(axes: list[Axes], view: SheetView) -> list[AxesImage]:
+    """Draws one view; returns its pictures."""
+    left = axes[0]
+    left.annotate(
+        _caption(view.row), (0.0, 1.0), xycoords="axes fraction", xytext=(-72.0 * _CAPTION, 0.0),
+        textcoords="offset points", va="top", fontsize=8, linespacing=1.45, color=style.INK,
+    )  # fmt: skip
+    error = error_picture(view.truth, view.render)
+    pictures = [
+        axes[0].imshow(view.truth, interpolation="nearest"),
+        axes[1].imshow(view.render, interpolation="nearest"),
+        axes[2].imshow(error, cmap=_ERROR_MAP, vmin=0.0, vmax=ERROR_SCALE, interpolation="nearest"),
+    ]
+    if len(axes) == 3:
+        return pictures
     height, width = view.truth.shape[:2]
-    nothing = np.full((height, width), np.nan)
-    score = axes[4].imshow(
-        nothing if view.renderability is None else view.renderability,
+    known = np.zeros((1, 1)) if view.renderability is None else view.renderability
+    expected = axes[3].imshow(
+        np.where(known > 0.0, known, np.nan),
         cmap=style.SCORE_MAP,
         vmin=0.0,
         vmax=1.0,
         interpolation="nearest",
         extent=(0, width, height, 0),
     )
-    return error, score
+    axes[3].set_facecolor(_NOTHING)
+    return [*pictures, expected]
 
 
 def _caption(row: ViewRow) -> str:
@@ -116,18 +136,10 @@ def _caption(row: ViewRow) -> str:
     return "\n".join(lines)
 
 
-def _bare(axes: Axes) -> None:
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def _color_bar(figure: Figure, image: AxesImage, axes: np.ndarray, label: str) -> None:
+def _color_bar(figure: Figure, image: AxesImage, axes: Axes, label: str) -> None:
     """A bar below a column of pictures."""
-    bar = figure.colorbar(
-        image, ax=list(axes), location="bottom", fraction=0.05, pad=0.01, aspect=22
-    )  # pyright: ignore[reportArgumentType]
+    bar = figure.colorbar(image, cax=axes, orientation="horizontal")
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    bar.set_label(label, fontsize=7.5, color=style.MUTED)
-    bar.ax.tick_params(labelsize=7.5, colors=style.MUTED, length=2)
+    bar.set_ticks(list(np.linspace(*image.get_clim(), 3)))
+    bar.set_label(label, fontsize=7, color=style.MUTED)
+    axes.tick_params(labelsize=7, colors=style.MUTED, length=2)

@@ -67,7 +67,7 @@ class Metric:
 
 METRICS = (
     Metric("psnr", "PSNR [dB]", 2),
-    Metric("psnr_measured", "PSNR without holes [dB]", 2),
+    Metric("psnr_measured", "– holes left out", 2),
     Metric("ssim", "SSIM", 3),
     Metric("lpips", "LPIPS", 3, lower_is_better=True),
 )
