@@ -225,7 +225,7 @@ def _show(console: Console, options: Evaluate, outcome: Outcome, written: dict[s
 
 
 def _table(summaries: tuple[Summary, ...]) -> Table:
-    table = Table("", "mean", "", "median", "5th pct.", "worst (view)", "< 20 dB", box=None)
+    table = Table("", "mean", "", "median", "5th %", "worst (view)", "<20 dB", box=None)
     for column in table.columns:
         column.no_wrap = True
         column.justify = "left" if column is table.columns[0] else "right"
