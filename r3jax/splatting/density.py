@@ -73,7 +73,9 @@ def observe(
     # Centers in units of half the image, as the threshold was chosen for (NDC).
     length = jnp.sqrt(jnp.sum((center_gradient * half[None, :]) ** 2, axis=1))
     seen = in_view | (length > 0.0)
-    return DensityStatistics(gradient=statistics.gradient + length, count=statistics.count + seen)
+    return DensityStatistics(
+        gradient=statistics.gradient + length, count=statistics.count + seen.astype(jnp.float32)
+    )
 
 
 def refine(
@@ -194,5 +196,5 @@ def reset_opacities(
     limit = jnp.log(config.reset_opacity / (1.0 - jnp.asarray(config.reset_opacity)))
     logits = jnp.minimum(scene.opacity_logits, limit)
     scene = eqx.tree_at(lambda s: s.opacity_logits, scene, logits)
-    logits_of = lambda m: (m.mu.opacity_logits, m.nu.opacity_logits)
+    logits_of = lambda m: (m.mean.opacity_logits, m.square.opacity_logits)
     return scene, eqx.tree_at(logits_of, moments, (jnp.zeros_like(logits),) * 2)

@@ -56,6 +56,7 @@ def perturbed(
     conjugate = scene.quats * jnp.array([[1.0, -1.0, -1.0, -1.0]])
     colored = rotated(scene.quats, variances * rotated(conjugate, normal))
     noise = (config.noise * rate_of_means * gate)[:, None] * colored
+    noise = jnp.where(jnp.isfinite(noise), noise, 0.0)  # variances overflow at scales of e^44 m
     return eqx.tree_at(lambda s: s.means, scene, scene.means + noise)
 
 

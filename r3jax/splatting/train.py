@@ -24,7 +24,7 @@ from r3jax.splatting.checkpoints import (
 from r3jax.splatting.config import fitting_budget
 from r3jax.splatting.errors import TrainingDiverged
 from r3jax.splatting.initialise import initialise
-
+from r3jax.splatting.memory import check_memory
 from r3jax.splatting.scene import GaussianScene, empty_scene
 from r3jax.splatting.train_step import (
     DIVERGED,
@@ -151,6 +151,7 @@ def fit(
     """
     config = TrainConfig() if config is None else config
     check_views(views)
+    check_memory(views, config)
     folder = None if folder is None else Path(folder)
     if resume and folder is None:
         raise ValueError("resume needs the folder with the checkpoints")
@@ -228,6 +229,7 @@ class _Loop:
             while self.step < iterations and not interrupted():
                 self._advance(self._next_stop())
             self._save()
+        self._check_finite()
         history = self._history()
         is_short = self.step < iterations
         return FitResult(self.state.scene, history, is_short, int(self.state.dropped))
@@ -283,8 +285,14 @@ class _Loop:
 
     def _save(self) -> None:
         if self.folder is not None and self.step != self.saved_step:
+            self._check_finite()
             save_checkpoint(self.folder, self.state)
             self.saved_step = self.step
+
+    def _check_finite(self) -> None:
+        """Stops if the latest update left the scene unusable; no step has noticed that yet."""
+        if not all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(self.state.scene)):
+            raise TrainingDiverged(self.step, float("nan"), self.folder)
 
     def _progress(self, infos: list[StepInfo]) -> Progress:
         iterations = self.run.config.iterations

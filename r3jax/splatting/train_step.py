@@ -119,18 +119,20 @@ def train_step(
         or a gradient is not finite, the state is that from before, step number included: to
         repeat the step with a larger budget is to lose nothing.
     """
-    degree = state.step // schedule.sh_every
-    loss, gradient, statistics, report = _gradients(state, views, degree, config)
+    loss, gradient, statistics, report = _gradients(state, views, config)
     if config.strategy == "mcmc":
         extra, slope = jax.value_and_grad(mcmc.regularization)(state.scene, config)
         loss, gradient = loss + extra, jax.tree.map(jnp.add, gradient, slope)
-    rate = mean_rate(config, extent, state.step + 1)
-    scene, moments = adam_update(state.scene, gradient, state.moments, rate, config)
-    if config.strategy == "mcmc":
-        scene = mcmc.perturbed(scene, rate, config, key=_key(config, _NOISE, state.step))
-    is_finite = jnp.isfinite(loss + _squared_size(gradient) + _squared_size(scene))
+    is_finite = jnp.isfinite(loss + _squared_size(gradient) + _squared_size(state.scene))
     bad = jnp.where(report.overflow > 0, OVERFLOWN, DIVERGED)
     outcome = jnp.where((report.overflow == 0) & is_finite, DONE, bad)
+    gradient = _up_to_degree(gradient, state.step // schedule.sh_every)
+    rate = mean_rate(config, extent, state.step + 1)
+    scene, moments = adam_update(
+        state.scene, gradient, state.moments, rate, config, outcome == DONE
+    )
+    if config.strategy == "mcmc":
+        scene = mcmc.perturbed(scene, rate, config, key=_key(config, _NOISE, state.step))
     after = TrainState(scene, moments, statistics, state.step + 1, state.dropped)
     info = StepInfo(
         outcome=outcome,
@@ -145,11 +147,11 @@ def train_step(
 
 def _squared_size(scene: GaussianScene) -> Float[Array, ""]:
     """Sum of all squares: not finite if any entry is not, or would overflow Adam's moments."""
-    return jnp.asarray(sum(jnp.sum(x * x) for x in jax.tree.leaves(scene)))
+    return jnp.asarray(sum(jnp.vdot(x, x) for x in jax.tree.leaves(scene)))
 
 
 def _gradients(
-    state: TrainState, views: Views, degree: Int[Array, ""], config: TrainConfig
+    state: TrainState, views: Views, config: TrainConfig
 ) -> tuple[Float[Array, ""], GaussianScene, DensityStatistics, _ViewReport]:
     """Loss and gradient, means over this step's views, which are taken one after the other."""
     num = config.views_per_step
@@ -159,7 +161,7 @@ def _gradients(
         total, gradient, statistics, report = carry
         view = views.view(view_index(config, state.step * num + slot, len(views)))
         (loss, found), (slope, pull) = jax.value_and_grad(_view_loss, argnums=(0, 1), has_aux=True)(
-            state.scene, jnp.zeros((state.scene.capacity, 2)), view, background, degree, config
+            state.scene, jnp.zeros((state.scene.capacity, 2)), view, background, config
         )
         statistics = density.observe(
             statistics, pull, _in_view(state.scene, view), views.width, views.height
@@ -189,11 +191,10 @@ def _view_loss(
     center_offsets: Float[Array, "n 2"],
     view: View,
     background: Float[Array, " 3"],
-    degree: Int[Array, ""],
     config: TrainConfig,
 ) -> tuple[Float[Array, ""], _ViewReport]:
     rendering = render(
-        _with_degree(scene, degree),
+        scene,
         view.camera,
         view.T_world_camera,
         background,
@@ -205,11 +206,11 @@ def _view_loss(
     return loss, _ViewReport(mse, rendering.num_intersections, rendering.overflow)
 
 
-def _with_degree(scene: GaussianScene, degree: Int[Array, ""]) -> GaussianScene:
-    """Harmonics above the degree count as 0, and get no gradient."""
-    k = jnp.arange(scene.sh.shape[1])
-    sh = jnp.where((k < (degree + 1) ** 2)[None, :, None], scene.sh, 0.0)
-    return eqx.tree_at(lambda s: s.sh, scene, sh)
+def _up_to_degree(gradient: GaussianScene, degree: Int[Array, ""]) -> GaussianScene:
+    """No gradient for harmonics above the degree: they stay as they are, 0 at first."""
+    k = jnp.arange(gradient.sh.shape[1])
+    sh = jnp.where((k < (degree + 1) ** 2)[None, :, None], gradient.sh, 0.0)
+    return eqx.tree_at(lambda s: s.sh, gradient, sh)
 
 
 def _in_view(scene: GaussianScene, view: View):
