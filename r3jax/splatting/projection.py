@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from r3jax.geometry.cameras import Camera, invert_pose
 from r3jax.splatting.config import ALPHA_MIN, DILATION, FRUSTUM_MARGIN, NEAR
 from r3jax.splatting.harmonics import view_colors
-from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
 
 
 class ProjectedGaussians(eqx.Module):
@@ -57,8 +57,10 @@ def project_gaussians(
         center_offsets: added to the projected centers [px]; zeros, to differentiate by.
 
     Returns:
-        All Gaussians; those outside the image or nearer than 0.01 m are marked as not drawn.
+        All Gaussians; those outside the image, nearer than 0.01 m or with a parameter that is
+        not a number are marked as not drawn.
     """
+    scene = without_nans(scene)
     T_camera_world = invert_pose(T_world_camera)
     x, y, z = _in_camera(scene.means, T_camera_world)
     z_safe = jnp.where(z > NEAR, z, 1.0)
@@ -74,14 +76,33 @@ def project_gaussians(
         ]
     )
     opacity = jax.nn.sigmoid(scene.opacity_logits)
-    valid = (z > NEAR) & (determinant > 0.0)
+    color = view_colors(scene.sh, scene.means, T_world_camera[:3, 3])
+    has_color = jnp.isfinite(color).all(axis=0)
+    valid = (z > NEAR) & (determinant > 0.0) & has_color
     return ProjectedGaussians(
         center=center,
         conic=conic,
         depth=z,
         opacity=opacity,
-        color=view_colors(scene.sh, scene.means, T_world_camera[:3, 3]),
+        color=jnp.where(has_color[None, :], color, 0.0),
         reach=jax.lax.stop_gradient(_reach(camera, center, a, c, opacity, valid)),
+    )
+
+
+def without_nans(scene: GaussianScene) -> GaussianScene:
+    """Puts Gaussians whose shape, place or opacity is not a number out of sight.
+
+    Not drawing them is not enough: 0 x NaN would spoil the gradient of the pose.
+    """
+    sound = ~jnp.isnan(scene.opacity_logits)
+    for x in (scene.means, scene.quats, scene.log_scales):
+        sound &= jnp.isfinite(x).all(axis=1)
+    return GaussianScene(
+        means=jnp.where(sound[:, None], scene.means, 0.0),
+        quats=jnp.where(sound[:, None], scene.quats, 1.0),
+        log_scales=jnp.where(sound[:, None], scene.log_scales, 0.0),
+        opacity_logits=jnp.where(sound, scene.opacity_logits, DEAD_LOGIT),
+        sh=scene.sh,
     )
 
 
