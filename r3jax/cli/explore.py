@@ -1,4 +1,4 @@
-"""`r3jax explore` and `r3jax demo`: set up a run, let it go, write what comes out of it."""
+"""`r3jax explore`: set up a run, let it go, write what comes out of it."""
 
 import dataclasses
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import Demo, Explore
+from r3jax.cli.options import Explore
 from r3jax.cli.progress import RunProgress
 from r3jax.evaluation.report import write_report
 from r3jax.exploration.budget import Budget, parse_budget
@@ -30,25 +30,10 @@ from r3jax.trace.header import RunHeader, camera_fields, package_versions
 from r3jax.trace.reader import Run, read_run
 from r3jax.trace.writer import RunWriter
 
-DEMO_SCENE = "flat"
 _PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
 """Text as it is: paths must stay whole for copying."""
 
 _EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
-
-
-def run_demo(options: Demo) -> int:
-    """Explores the embedded flat into `demo`, which it overwrites."""
-    return run_explore(
-        Explore(
-            scene=DEMO_SCENE,
-            budget=f"views:{options.views}",
-            name="demo",
-            out=options.out,
-            overwrite=True,
-            resolution=options.resolution,
-        )
-    )
 
 
 def run_explore(options: Explore) -> int:

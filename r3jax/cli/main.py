@@ -50,7 +50,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _run(command: Demo | Explore | Train | Evaluate | Info) -> int:
     """Imports what the command needs and nothing else, so that --help does not wait for JAX."""
     if isinstance(command, Demo):
-        from r3jax.cli.explore import run_demo
+        from r3jax.cli.demo import run_demo
 
         return run_demo(command)
     if isinstance(command, Explore):

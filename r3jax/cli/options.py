@@ -9,7 +9,7 @@ import tyro
 
 @dataclass(frozen=True)
 class Demo:
-    """Explore a small embedded flat with Ours-Pano; takes two to three minutes on two cores."""
+    """Explore a small embedded flat, train splats on the views, judge them; minutes on two cores."""
 
     out: Path = Path("runs")
     """Folder that holds the runs; the demo overwrites `demo` in it and nothing else."""
@@ -19,6 +19,12 @@ class Demo:
 
     resolution: int = 256
     """Width and height of the images [px]."""
+
+    train_resolution: int = 128
+    """Width and height of the images that are trained on [px]."""
+
+    iterations: int = 1000
+    """Steps of the training."""
 
 
 @dataclass(frozen=True)

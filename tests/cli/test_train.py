@@ -1,0 +1,115 @@
+"""`r3jax train` and `r3jax evaluate`, as a user meets them, on a small recording."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from r3jax.cli.main import main
+from r3jax.geometry.cameras import Camera, look_at
+from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.ply import read_scene
+from r3jax.splatting.render import render
+from tests.splatting.clouds import random_cloud
+
+WIDTH, HEIGHT, VIEWS = 40, 32, 10
+SMALL = {"iterations": 60, "gaussians": 300, "hold-out": 5}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Ten views round a cloud of Gaussians, with depth, in the layout of a recording."""
+    folder = tmp_path_factory.mktemp("recordings") / "cloud"
+    (folder / "images").mkdir(parents=True)
+    (folder / "depth").mkdir()
+    camera = Camera(WIDTH, HEIGHT, 36.0, 36.0, 20.0, 16.0)
+    poses = []
+    for i in range(VIEWS):
+        angle = 2 * np.pi * i / VIEWS
+        position = np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), 0.4])
+        pose = look_at(position, np.zeros(3))
+        config = RasterConfig(max_intersections=1 << 13)
+        image = render(random_cloud(0), camera, pose, config=config)
+        rgb = np.round(255 * np.clip(np.asarray(image.rgb), 0, 1)).astype(np.uint8)
+        depth = np.where(np.asarray(image.alpha) > 0.8, 1000 * np.asarray(image.depth), 0)
+        Image.fromarray(rgb).save(folder / "images" / f"{i:03d}.png")
+        Image.fromarray(depth.astype(np.uint16)).save(folder / "depth" / f"{i:03d}.png")
+        poses.append(np.asarray(pose, dtype=np.float64).reshape(-1))
+    np.savetxt(folder / "poses.txt", np.stack(poses))
+    # OpenCV's convention: pixel centers at whole numbers.
+    np.savetxt(folder / "K.txt", np.array([[36.0, 0, 19.5], [0, 36.0, 15.5], [0, 0, 1]]))
+    return folder
+
+
+def train(recording, out, *words, **changes):
+    """A short training; the same shapes as all others here, so that each part compiles once."""
+    options = SMALL | {"out": out, "up": "z"} | {k.replace("_", "-"): v for k, v in changes.items()}
+    given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    return main(["train", str(recording), *given, *words])
+
+
+@pytest.fixture(scope="module")
+def models(recording, tmp_path_factory):
+    """A folder with one trained model."""
+    out = tmp_path_factory.mktemp("models")
+    assert train(recording, out) == 0
+    return out
+
+
+def test_a_training_leaves_model_record_and_curve(models):
+    folder = models / "last"
+    scene = read_scene(folder / "scene.ply")
+    record = json.loads((folder / "train.json").read_text())
+    assert record["test_views"] == [0, 5]
+    assert len(record["train_views"]) == VIEWS - 2
+    assert record["resolution"] == WIDTH
+    assert record["config"]["iterations"] == 60
+    rows = list(csv.DictReader((folder / "history.csv").open()))
+    assert [int(row["step"]) for row in rows] == list(range(1, 61))
+    psnr = np.array([float(row["psnr"]) for row in rows])
+    assert psnr[-8:].mean() > psnr[:8].mean() + 1.0
+    assert int(rows[-1]["gaussians"]) == scene.capacity
+    assert (folder / "points.ply").stat().st_size > 15 * scene.capacity
+
+
+def test_an_existing_model_is_kept(recording, models, capsys):
+    before = (models / "last" / "scene.ply").read_bytes()
+    assert train(recording, models) == 2
+    message = capsys.readouterr().err
+    assert "--overwrite" in message
+    assert "--resume" in message
+    assert (models / "last" / "scene.ply").read_bytes() == before
+
+
+def test_resume_of_other_settings_is_refused(recording, models, capsys):
+    record = (models / "last" / "train.json").read_bytes()
+    assert train(recording, models, "--resume", seed=7) == 2
+    assert "seed" in capsys.readouterr().err
+    assert (models / "last" / "train.json").read_bytes() == record
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hold_out": 1}, "hold out nothing"),
+        ({"resolution": 3}, "--resolution must be at least 16"),
+        ({"iterations": 0}, "iterations must be at least 1"),
+        ({"capacity": 10}, "capacity 10 has no room"),
+        ({"gaussians": 10**9}, "GB"),
+    ],
+)
+def test_a_mistake_gets_one_line_and_no_model(recording, tmp_path, capsys, changes, message):
+    assert train(recording, tmp_path / "m", **changes) == 2
+    lines = [x for x in capsys.readouterr().err.splitlines() if x.startswith("r3jax:")]
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert not (tmp_path / "m" / "last" / "scene.ply").exists()
+
+
+def test_a_folder_that_is_neither_run_nor_recording(tmp_path, capsys):
+    assert main(["train", str(tmp_path)]) == 2
+    assert "neither a run" in capsys.readouterr().err
+    assert main(["train", str(tmp_path / "nowhere")]) == 2
+    assert "no such folder" in capsys.readouterr().err
