@@ -68,8 +68,8 @@ def judge(
 
     Raises:
         ValueError: no views, images smaller than the metrics' windows, `renderability` or
-            `numbers` that are not one per view, a scene that renders to values that are not
-            finite, a fixed budget that does not suffice.
+            `numbers` that are not one per view, parameters or renders that are not finite, a
+            fixed budget that does not suffice.
     """
     count = len(views)
     if count == 0:
@@ -77,6 +77,7 @@ def judge(
     for name, given in (("renderability", renderability), ("numbers", numbers)):
         if given is not None and len(given) != count:
             raise ValueError(f"{name} has {len(given)} entries for {count} views")
+    _check_scene(scene)
     config = RasterConfig() if config is None else config
     background = jnp.zeros(3) if background is None else background
     names = list(range(count)) if numbers is None else [int(number) for number in numbers]
@@ -103,6 +104,18 @@ def judge(
         for i in range(count)
     )
     return Judgment(rows, renders)
+
+
+def _check_scene(scene: GaussianScene) -> None:
+    """Rasterisers leave out what is not a number; judged like that, a broken scene looks whole."""
+    finite = np.ones(scene.capacity, dtype=bool)
+    for values in jax.tree.leaves(scene):
+        finite &= np.isfinite(np.asarray(values)).reshape(scene.capacity, -1).all(axis=1)
+    if not finite.all():
+        raise ValueError(
+            f"{np.sum(~finite)} of {scene.capacity} Gaussians have parameters that are not finite, "
+            f"the first in row {np.argmin(finite)}: did the training diverge?"
+        )
 
 
 class _Drawn(eqx.Module):
@@ -161,7 +174,7 @@ def _render_all(
         if int(drawn.num_broken) > 0:
             raise ValueError(
                 f"view {name} renders to values that are not finite at {int(drawn.num_broken)} "
-                "pixels: the scene holds NaN or infinite parameters (did its training diverge?)"
+                "pixels: look at the background and at the largest colors of the scene"
             )
         renders[i] = np.asarray(drawn.rgb)
         coverage[i] = float(drawn.coverage)
