@@ -9,7 +9,7 @@ import tyro
 
 @dataclass(frozen=True)
 class Demo:
-    """Explore a small embedded flat, train splats on the views, judge them; minutes on two cores."""
+    """Explore a small embedded flat, train splats on the views, judge them; takes minutes."""
 
     out: Path = Path("runs")
     """Folder that holds the runs; the demo overwrites `demo` in it and nothing else."""
