@@ -29,10 +29,10 @@ _LARGEST_OPACITY = 1.0 - 1e-6
 def regularization(scene: GaussianScene, config: TrainConfig) -> Float[Array, ""]:
     """Weighted mean opacity plus weighted mean scale [m] over the rows in use (eq. 10)."""
     alive = scene.is_alive
-    num = jnp.maximum(jnp.sum(alive), 1)
+    num = jnp.maximum(jnp.sum(alive), 1).astype(jnp.float32)
     opacity = jnp.sum(jnp.where(alive, jax.nn.sigmoid(scene.opacity_logits), 0.0))
     scale = jnp.sum(jnp.where(alive[:, None], jnp.exp(scene.log_scales), 0.0))
-    return config.opacity_weight * opacity / num + config.scale_weight * scale / (3 * num)
+    return config.opacity_weight * opacity / num + config.scale_weight * scale / (3.0 * num)
 
 
 def perturbed(
@@ -70,11 +70,13 @@ def refine(
     """
     key_move, key_grow = jax.random.split(key)
     is_faint = scene.is_alive & (jax.nn.sigmoid(scene.opacity_logits) <= config.prune_opacity)
+    has_solid = jnp.any(scene.is_alive & ~is_faint)  # else there is nowhere to move to
+    is_faint = is_faint & has_solid
     scene, moments = respawn(scene, moments, is_faint, config, key=key_move)
     num_alive = jnp.sum(scene.is_alive, dtype=jnp.int32)
-    wanted = (config.growth * num_alive).astype(jnp.int32)
+    wanted = (config.growth * num_alive.astype(jnp.float32)).astype(jnp.int32)
     free = ~scene.is_alive
-    born = jnp.minimum(wanted, jnp.sum(free, dtype=jnp.int32))
+    born = jnp.where(has_solid, jnp.minimum(wanted, jnp.sum(free, dtype=jnp.int32)), 0)
     scene, moments = respawn(
         scene, moments, free & (jnp.cumsum(free) <= born), config, key=key_grow
     )
@@ -92,13 +94,14 @@ def respawn(
 ) -> tuple[GaussianScene, Moments]:
     """Makes `rows` copies of other Gaussians, drawn by opacity, and shares the opacity out.
 
+    There must be others in use.
+
     A Gaussian that now stands N times gets the opacity and the scales of eq. 9. The moments of
     all that changed are forgotten.
     """
     opacity = jax.nn.sigmoid(scene.opacity_logits)
     weight = jnp.where(scene.is_alive & ~rows, opacity, 0.0)
     source = _drawn(weight, key)
-    rows = rows & (jnp.sum(weight) > 0.0)
     copies = jnp.zeros(scene.capacity, dtype=jnp.int32).at[source].add(rows.astype(jnp.int32))
     is_shared = copies > 0
     shared_opacity, factor = shared(opacity, copies + 1)

@@ -4,14 +4,11 @@ All rates and weights are traced: a sweep over them compiles once.
 """
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 
 from r3jax.splatting.config import RasterConfig
-
-Strategy = Literal["vanilla", "mcmc"]
-Background = Literal["black", "white", "random"]
 
 PAPER_ITERATIONS = 30_000
 """Iterations of the paper; longer runs keep its schedule, shorter ones squeeze it."""
@@ -51,7 +48,7 @@ class TrainConfig(eqx.Module):
     iterations: int = 30_000
     """Steps of the optimizer."""
 
-    strategy: Strategy = eqx.field(static=True, default="vanilla")
+    strategy: str = eqx.field(static=True, default="vanilla")
     """`vanilla`: clone, split, prune and reset (Kerbl et al. 2023). `mcmc`: relocation and noise
     within a fixed budget (Kheradmand et al. 2024)."""
 
@@ -67,7 +64,7 @@ class TrainConfig(eqx.Module):
     views_per_step: int = eqx.field(static=True, default=1)
     """Views whose losses are averaged for one step."""
 
-    background: Background = eqx.field(static=True, default="black")
+    background: str = eqx.field(static=True, default="black")
     """Behind everything; `random` draws a new color each step."""
 
     raster: RasterConfig = RasterConfig()
