@@ -14,29 +14,47 @@ from .scoring.renderability import (
     voxel_renderability,
 )
 from .scoring.utility import ViewUtility, view_utility
+from .splatting.config import RasterConfig
+from .splatting.ply import read_scene, write_scene
+from .splatting.render import Rendering, render
+from .splatting.scene import GaussianScene
+from .splatting.train import FitResult, fit
+from .splatting.training_config import TrainConfig
+from .splatting.views import Views, load_views
 
 __all__ = [
     "Camera",
+    "FitResult",
     "Frame",
+    "GaussianScene",
     "MapState",
     "OccupancyGrid",
     "Panorama",
+    "RasterConfig",
     "Renderability",
+    "Rendering",
     "ScoringConfig",
+    "TrainConfig",
     "ViewUtility",
+    "Views",
     "empty_grid",
     "empty_map",
+    "fit",
     "grow",
     "integrate",
     "integrate_depth",
     "integrate_points",
+    "load_views",
     "look_at",
     "lookup",
     "merge",
     "panorama",
     "pose_along",
+    "read_scene",
+    "render",
     "renderability",
     "renderability_image",
     "view_utility",
     "voxel_renderability",
+    "write_scene",
 ]

@@ -29,6 +29,7 @@ from r3jax.evaluation.contact_sheet import SheetView, contact_sheet
 from r3jax.evaluation.judge import Judgment, judge
 from r3jax.evaluation.lpips import load_lpips
 from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
+from r3jax.evaluation.report import write_report
 from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
 from r3jax.files import write_atomic
 from r3jax.formats.errors import FormatError
@@ -70,6 +71,9 @@ def run_evaluate(options: Evaluate) -> int:
         folder = options.out or _default_folder(capture, outcome.training)
         folder.mkdir(parents=True, exist_ok=True)
         written = _write(options, outcome, folder)
+        if capture.run is not None and folder == _default_folder(capture, outcome.training):
+            _, state, grid = capture.run.checkpoint()
+            written["report"] = write_report(capture.run, state, grid)
     except (ValueError, OSError, ImportError, RunError, FormatError) as error:
         raise UserError(one_line(error)) from error
     _show(Console(), options, outcome, written)
