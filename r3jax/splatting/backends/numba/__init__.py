@@ -1,7 +1,5 @@
 """Rasteriser for CPUs: projection, binning, sort, compositing and all gradients in Numba."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +24,7 @@ def rasterise(
 
     The same view gives the same bits, images and gradients, on any number of cores. What
     exceeds the budget is counted in `overflow`; the image is black then, its gradient 0. A
-    Gaussian with a NaN in its geometry is not drawn and gets gradient 0.
+    Gaussian with a parameter that is not a number is not drawn and gets gradient 0.
 
     Raises:
         RuntimeError: Numba has no threading layer that serves two renderings at once.
@@ -56,8 +54,7 @@ def rasterise(
     )
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _composite(size, cloud, view):
+def _images_and_totals(size, cloud, view):
     return _composite_forward(size, cloud, view)[0]
 
 
@@ -79,8 +76,9 @@ def _composite_forward(size, cloud, view):
     ]
     workers = np.array([num_workers()], dtype=np.int32)
     call = jax.ffi.ffi_call(FORWARD, shapes, vmap_method="sequential")
-    rgb, depth, alpha, totals, *kept = call(*cloud, view, workers)
-    return (rgb, depth, alpha, totals), (cloud, view, (rgb, depth, alpha), kept)
+    results = tuple(call(*cloud, view, workers))
+    rgb, depth, alpha, totals = results[:4]
+    return (rgb, depth, alpha, totals), (cloud, view, results[:3], results[4:])
 
 
 def _composite_backward(size, residuals, gradients):
@@ -88,8 +86,9 @@ def _composite_backward(size, residuals, gradients):
     shapes = [jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in (*cloud, view)]
     workers = np.array([num_workers()], dtype=np.int32)
     call = jax.ffi.ffi_call(BACKWARD, shapes, vmap_method="sequential")
-    *g_cloud, g_view = call(*cloud, view, workers, *images, *kept, *gradients[:3])
-    return tuple(g_cloud), g_view
+    by_all = tuple(call(*cloud, view, workers, *images, *kept, *gradients[:3]))
+    return by_all[:-1], by_all[-1]
 
 
+_composite = jax.custom_vjp(_images_and_totals, nondiff_argnums=(0,))
 _composite.defvjp(_composite_forward, _composite_backward)

@@ -39,10 +39,10 @@ def _project_block(block, cloud, view, size, records, counts):
             view, width, height, scratch, record,
         ):  # fmt: skip
             count = _tiles_of(record, width, height)
-        if count > 0:
-            color_one(means[i], sh[i], view, basis, record)
-            drawn += 1
-            intersections += count
+            if count > 0 and not color_one(means[i], sh[i], view, basis, record):
+                count = 0
+        drawn += count > 0
+        intersections += count
         integers[i, at.COUNT] = count
     counts[block, 0], counts[block, 1] = drawn, intersections
 

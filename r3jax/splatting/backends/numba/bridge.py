@@ -12,13 +12,13 @@ import os
 import threading
 
 import jax
-import numba
 import numpy as np
 from llvmlite import ir
-from numba import carray, cfunc, prange, types
-from numba.extending import intrinsic
+from numba import cfunc, get_num_threads, prange, types
+from numba.np.numpy_support import carray
+from numba.np.ufunc.parallel import threading_layer
 
-from r3jax.splatting.backends.numba.compiled import inlined, parallel_kernel
+from r3jax.splatting.backends.numba.compiled import inlined, intrinsic, parallel_kernel
 from r3jax.splatting.backends.numba.passes import backward_pass, forward_pass
 
 FORWARD, BACKWARD = "r3jax_splatting_forward", "r3jax_splatting_backward"
@@ -198,7 +198,7 @@ def require_threads() -> None:
         RuntimeError: its threading layer cannot serve two renderings at once.
     """
     _wake_up(np.zeros(8))
-    layer = numba.threading_layer()
+    layer = threading_layer()
     if layer == "workqueue":
         raise RuntimeError(
             "the numba rasteriser needs Numba's threading layer `omp` or `tbb`, but only "
@@ -209,7 +209,7 @@ def require_threads() -> None:
 
 def num_workers() -> int:
     """Threads that share the work: one for each core that the process may use."""
-    return min(numba.get_num_threads(), len(os.sched_getaffinity(0)))
+    return min(get_num_threads(), len(os.sched_getaffinity(0)))
 
 
 _lock = threading.Lock()

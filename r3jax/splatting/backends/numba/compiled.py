@@ -1,13 +1,13 @@
-"""How the kernels of this backend are compiled, and the atomic counter that hands out their work."""
+"""How the kernels are compiled, and the atomic counter that hands out their work."""
 
 import contextlib
 import inspect
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import extending, njit, types
 
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
@@ -26,6 +26,11 @@ def _forget_outdated_code() -> None:
 
 
 _forget_outdated_code()
+
+
+def intrinsic(function: Callable) -> Callable[..., Any]:
+    """Makes a function that kernels can call of one that emits LLVM instructions."""
+    return extending.intrinsic(inspect.unwrap(function))
 
 
 def kernel(function: Callable) -> Callable:

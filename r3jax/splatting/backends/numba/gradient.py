@@ -73,11 +73,10 @@ def _quat_gradient(g, unit, inverse, g_quat):
 
 
 @inlined_fast
-def _shape_gradient(g_cov, log_scales, quat, rows, rotation, axes, unit, inverse, scratch, out):
-    """Writes the gradients by scales and rotation; leaves that by the rows of J R in scratch[:6].
+def _shape_gradient(g_cov, log_scales, rows, rotation, axes, unit, inverse, scratch, out):
+    """Writes the gradients by scales (3) and quaternion (4) to the two arrays `out`.
 
-    Args:
-        out: where the gradients by `log_scales` (3) and by the quaternion (4) go.
+    That by the rows of J R stays in scratch[:6].
     """
     g_xx, g_xy, g_yy = g_cov
     g_rows, g_rotation = scratch[:6], scratch[6:15]
@@ -96,16 +95,11 @@ def _shape_gradient(g_cov, log_scales, quat, rows, rotation, axes, unit, inverse
 
 
 @inlined_fast
-def _row_gradient(axis, g_row, row, ratio, slope, z, focal, view, g_view, g_center, point):
+def _row_gradient(axis, g_row, row, ratio, slope, z, focal, view, g_view, g_center):
     """Goes back through one row of J R and one coordinate of the center.
 
-    Args:
-        axis: 0 for x, 1 for y.
-        ratio: x/z; `slope` is the same, clamped.
-        g_center: dL/dcenter along the axis.
-
-    Returns:
-        Gradients by x (or y) and by z.
+    `axis` is 0 for x, 1 for y; `ratio` is x/z and `slope` the same, clamped. Returns the
+    gradients by x (or y) and by z.
     """
     over_z = focal / z
     g_over_z, g_slope = ZERO, ZERO
@@ -164,12 +158,12 @@ def _gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
     g_offsets[i, 0], g_offsets[i, 1] = g_u, g_v
     g_logits[i] = sums[0] * (ONE - sigmoid(logits[i]))
     _shape_gradient(
-        (g_xx, g_xy, g_yy), log_scales[i], quats[i], rows, rotation, axes,
+        (g_xx, g_xy, g_yy), log_scales[i], rows, rotation, axes,
         (w, qx, qy, qz), inverse, scratch, (g_scales[i], g_quats[i]),
     )  # fmt: skip
     point = means[i]
-    g_x, g_z = _row_gradient(0, scratch[:3], rows[:3], x / z, u, z, fx, view, g_view, g_u, point)
-    g_y, more = _row_gradient(1, scratch[3:6], rows[3:], y / z, v, z, fy, view, g_view, g_v, point)
+    g_x, g_z = _row_gradient(0, scratch[:3], rows[:3], x / z, u, z, fx, view, g_view, g_u)
+    g_y, more = _row_gradient(1, scratch[3:6], rows[3:], y / z, v, z, fy, view, g_view, g_v)
     g_z += more + sums[9]
     away = _color_gradient(point, sh[i], view, record, sums[6:9], basis, g_basis, g_sh[i])
     for k in range(3):

@@ -9,9 +9,9 @@ import operator
 
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, models, overload, register_model
+from numba.extending import models, overload, register_model
 
-from r3jax.splatting.backends.numba.compiled import inlined
+from r3jax.splatting.backends.numba.compiled import inlined, intrinsic
 
 WIDTH = 16
 _FLOAT = ir.FloatType()

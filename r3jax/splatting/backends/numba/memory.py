@@ -1,4 +1,4 @@
-"""Large fresh arrays in large pages: the first write to 38 MB costs 10 000 page faults otherwise."""
+"""Large fresh arrays in large pages: else the first write to 38 MB costs 10 000 page faults."""
 
 import sys
 

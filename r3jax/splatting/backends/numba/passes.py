@@ -1,4 +1,4 @@
-"""The forward and the backward pass of a view, from the scene's arrays to images and gradients."""
+"""The forward and the backward pass of a view: from the scene's arrays to images and gradients."""
 
 import numpy as np
 
@@ -7,8 +7,8 @@ from r3jax.splatting.backends.numba.backward import gradient_of_all
 from r3jax.splatting.backends.numba.bins import (
     emit_all,
     list_by_tile,
-    project_all,
     order_of,
+    project_all,
     sums_before,
 )
 from r3jax.splatting.backends.numba.compiled import kernel

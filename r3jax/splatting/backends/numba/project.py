@@ -13,6 +13,7 @@ ALPHA_MIN = np.float32(config.ALPHA_MIN)
 MARGIN = np.float32(0.5 * config.FRUSTUM_MARGIN)
 LOG2_E = np.float32(np.log2(np.e))
 HALF, ZERO, ONE, TWO = (np.float32(x) for x in (0.5, 0.0, 1.0, 2.0))
+_BALL_SLACK = np.float32(1.01)
 _TWO_S_SCALE, _TWO_S_MORE = np.float32(2.002), np.float32(1e-4)
 
 
@@ -92,31 +93,53 @@ def sigmoid(logit):
 
 
 @inlined_fast
-def project_one(mean, quat, log_scales, logit, offset, view, width, height, scratch, record):
-    """Writes the geometry of a Gaussian to its record.
+def _are_finite(mean, quat, log_scales):
+    """Whether all parameters are numbers."""
+    total = quat[3]
+    for i in range(3):
+        total += abs(mean[i]) + abs(quat[i]) + abs(log_scales[i])
+    return abs(total) < np.inf
 
-    Args:
-        scratch: 21 numbers of room.
+
+@inlined_fast
+def _is_outside(center, row, two_s, log_scales, size):
+    """Whether not even a ball of the Gaussian's largest scale would reach the image.
+
+    Most of what is out of sight needs no covariance, then.
+    """
+    scale = np.exp(max(log_scales[0], log_scales[1], log_scales[2]))
+    squared = scale * scale * (row[0] * row[0] + row[1] * row[1] + row[2] * row[2]) + DILATION
+    reach = _BALL_SLACK * np.sqrt(two_s * squared)
+    return center + reach < ZERO or center - reach > np.float32(size)
+
+
+@inlined_fast
+def project_one(mean, quat, log_scales, logit, offset, view, width, height, scratch, record):
+    """Writes the geometry of a Gaussian to its record, with 21 numbers of scratch room.
 
     Returns:
         Whether it may touch a pixel. Comparisons are written so that NaN means no.
     """
     x, y, z = in_camera(mean, view)
     opacity = sigmoid(logit)
-    if not (z > NEAR and opacity >= ALPHA_MIN):
+    if not (z > NEAR and opacity >= ALPHA_MIN and _are_finite(mean, quat, log_scales)):
         return False
     fx, fy, cx, cy = view[15], view[16], view[17], view[18]
     center_x, center_y = fx * x / z + cx + offset[0], fy * y / z + cy + offset[1]
     rotation, rows, axes = scratch[:9], scratch[9:15], scratch[15:21]
-    rotation_of(quat, rotation)
     u, v = clamped_slope(x / z, fx, cx, width), clamped_slope(y / z, fy, cy, height)
     jacobian_rows(view, u, v, fx / z, fy / z, rows)
+    two_s = _TWO_S_SCALE * np.log(opacity / ALPHA_MIN) + _TWO_S_MORE
+    if _is_outside(center_x, rows[:3], two_s, log_scales, width) or _is_outside(
+        center_y, rows[3:], two_s, log_scales, height
+    ):
+        return False
+    rotation_of(quat, rotation)
     image_axes(rows, rotation, log_scales, axes)
     xx, xy, yy = covariance_of(axes)
     determinant = xx * yy - xy * xy
     if not (determinant > ZERO and determinant < np.inf):
         return False
-    two_s = _TWO_S_SCALE * np.log(opacity / ALPHA_MIN) + _TWO_S_MORE
     record[at.CENTER_X], record[at.CENTER_Y] = center_x, center_y
     record[at.A] = HALF * LOG2_E * yy / determinant
     record[at.B] = -LOG2_E * xy / determinant
@@ -139,7 +162,11 @@ def direction_of(mean, view):
 
 @inlined_fast
 def color_one(mean, sh, view, basis, record):
-    """Writes max(SH + 0.5, 0) to a record; `sh` is one Gaussian's [k * 3] coefficients."""
+    """Writes max(SH + 0.5, 0) to a record; `sh` is one Gaussian's [k * 3] coefficients.
+
+    Returns:
+        Whether the color is a number.
+    """
     x, y, z, _ = direction_of(mean, view)
     count = sh.shape[0] // 3
     basis_at(x, y, z, count, basis)
@@ -148,7 +175,9 @@ def color_one(mean, sh, view, basis, record):
         red += basis[k] * sh[3 * k]
         green += basis[k] * sh[3 * k + 1]
         blue += basis[k] * sh[3 * k + 2]
-    # `not <` keeps NaN, as the maximum of the reference does.
-    record[at.RED] = ZERO if red < ZERO else red
-    record[at.GREEN] = ZERO if green < ZERO else green
-    record[at.BLUE] = ZERO if blue < ZERO else blue
+    record[at.RED], record[at.GREEN], record[at.BLUE] = (
+        max(red, ZERO),
+        max(green, ZERO),
+        max(blue, ZERO),
+    )
+    return abs(red) + abs(green) + abs(blue) < np.inf
