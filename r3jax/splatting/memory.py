@@ -46,17 +46,8 @@ def training_bytes(width: int, height: int, config: TrainConfig, rows: int | Non
     rows = config.rows if rows is None else rows
     sh_floats = 3 * (config.sh_degree + 1) ** 2
     per_row = 4 * _COPIES * (_GEOMETRY_FLOATS + sh_floats) + _BYTES_PER_ROW
-    if not _has_own_harmonics(config):
-        # XLA keeps one array of all coefficients for the gradient of each of them.
-        per_row += 4 * sh_floats * sh_floats
     intersections = config.raster.budget(rows) * _BYTES_PER_INTERSECTION
     return rows * per_row + intersections + width * height * _BYTES_PER_PIXEL
-
-
-def _has_own_harmonics(config: TrainConfig) -> bool:
-    """True if the backend differentiates the harmonics itself, for one Gaussian at a time."""
-    backend = config.raster.backend
-    return backend == "numba" or (backend == "auto" and jax.default_backend() == "cpu")
 
 
 def free_bytes(device: Any = None) -> int | None:
