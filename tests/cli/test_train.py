@@ -66,7 +66,7 @@ def test_a_training_leaves_model_record_and_curve(models):
     assert len(record["train_views"]) == VIEWS - 2
     assert record["resolution"] == WIDTH
     assert record["config"]["iterations"] == 60
-    rows = list(csv.DictReader((folder / "history.csv").open()))
+    rows = list(csv.DictReader((folder / "history.csv").read_text().splitlines()))
     assert [int(row["step"]) for row in rows] == list(range(1, 61))
     psnr = np.array([float(row["psnr"]) for row in rows])
     assert psnr[-8:].mean() > psnr[:8].mean() + 1.0

@@ -56,7 +56,7 @@ def test_depth_of_a_wall(backend):
     scene = GaussianScene(
         means=jnp.asarray(means, dtype=jnp.float32),
         quats=jnp.tile(jnp.asarray([1.0, 0.0, 0.0, 0.0]), (COUNT, 1)),
-        log_scales=jnp.full((COUNT, 3), np.log(0.1), dtype=jnp.float32),
+        log_scales=jnp.full((COUNT, 3), np.log(0.2), dtype=jnp.float32),
         opacity_logits=jnp.full(COUNT, 3.0),
         sh=jnp.zeros((COUNT, 16, 3)),
     )
@@ -119,12 +119,9 @@ def test_gradients_by_intrinsics(backend):
         assert abs(difference) < 1e-3 * (abs(float(getattr(expected, name))) + scale), name
 
 
-def test_unknown_backend_and_bad_pose():
-    scene, (camera, pose) = random_cloud(7, COUNT), view(*SIZE)
+def test_an_unknown_backend_is_refused_by_name():
     with pytest.raises(ValueError, match="no rasteriser backend 'cuda'"):
-        render(scene, camera, pose, config=RasterConfig(backend="auto").__class__("cuda"))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="4x4"):
-        render(scene, camera, pose[:3], config=config("reference"))
+        backend_module.find_backend("cuda")
 
 
 def test_auto_takes_numba_on_a_cpu():
