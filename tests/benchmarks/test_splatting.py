@@ -34,9 +34,7 @@ def room_cloud(num_gaussians: int, seed: int = 0) -> GaussianScene:
     low[:, 2] = 0.0
     # Faces are across x, y, z, two each.
     areas = np.stack([size[:, 1] * size[:, 2], size[:, 0] * size[:, 2], size[:, 0] * size[:, 1]])
-    box, axis = np.divmod(
-        rng.choice(areas.size, num_gaussians, p=areas.T.ravel() / areas.sum()), 3
-    )
+    box, axis = np.divmod(rng.choice(areas.size, num_gaussians, p=areas.T.ravel() / areas.sum()), 3)
     place = rng.uniform(size=(num_gaussians, 3))
     rows = np.arange(num_gaussians)
     place[rows, axis] = rng.integers(0, 2, num_gaussians)
