@@ -31,7 +31,7 @@ _BYTES_PER_PIXEL = 400
 """The rendering, the loss and their gradients."""
 
 _RESERVE = 0.05
-"""Share of the free memory that is left alone."""
+"""Share of the free memory that is left alone, for the compiler (some 300 MB) among others."""
 
 
 def training_bytes(width: int, height: int, config: TrainConfig, rows: int | None = None) -> int:
