@@ -173,7 +173,7 @@ def _link(
 
 def pixel_offsets() -> tuple[Float[Array, " P"], Float[Array, " P"]]:
     """Centers of a tile's pixels, row by row, relative to its middle [px]."""
-    along = jnp.arange(TILE) - 0.5 * (TILE - 1)
+    along = jnp.arange(TILE, dtype=jnp.float32) - 0.5 * (TILE - 1)
     return jnp.tile(along, TILE), jnp.repeat(along, TILE)
 
 
