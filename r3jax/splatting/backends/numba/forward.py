@@ -78,13 +78,19 @@ def tile_is_finished(state):
     return not any_above(most, _ZERO)
 
 
+@inlined
+def _clear_tile(left, top, width, height, state):
+    """An empty tile: light passes the pixels of the image, and none beside it."""
+    state[:] = _ZERO
+    for y in range(min(TILE, height - top)):
+        state[TILE * y : TILE * y + min(TILE, width - left)] = _ONE
+
+
 @kernel
 def _composite_tile(first, last, left, top, records, list_ids, list_rows, state):
-    """Composites the list of one tile; returns how far it went."""
+    """Composites the list of one tile on its cleared state; returns how far it went."""
     flat = records.reshape(-1)
     lanes = lane_numbers()
-    state[:PIXELS] = _ONE
-    state[PIXELS:] = _ZERO
     for place in range(first, last):
         if (place - first) % CHECK_EVERY == CHECK_EVERY - 1 and tile_is_finished(state):
             return place
@@ -126,6 +132,7 @@ def composite_all(records, list_ids, list_rows, tile_starts, workers, rgb, depth
         tile = claim(next_tile)
         while tile < tile_ends.shape[0]:
             left, top = tile % columns * TILE, tile // columns * TILE
+            _clear_tile(left, top, alpha.shape[1], alpha.shape[0], state)
             tile_ends[tile] = _composite_tile(
                 tile_starts[tile], tile_starts[tile + 1], left, top,
                 records, list_ids, list_rows, state,

@@ -1,0 +1,294 @@
+"""Faults put into the kernels on purpose; every one must show in images, gradients or lists.
+
+The kernels run here as plain Python over NumPy, so that a fault costs no compilation; vectors of
+16 floats are arrays.
+"""
+
+import dataclasses
+import sys
+from types import ModuleType
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r3jax.geometry.cameras import invert_pose
+from r3jax.splatting import reference
+from r3jax.splatting.backends.numba import records
+from r3jax.splatting.config import ALPHA_MIN, TILE, RasterConfig
+from r3jax.splatting.projection import project_gaussians
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.splatting.clouds import random_cloud, safe_pixels, view
+
+PACKAGE = "r3jax.splatting.backends.numba"
+CHAIN = tuple(
+    f"{PACKAGE}.{name}"
+    for name in (
+        "harmonics", "spans", "project", "bins", "forward", "backward", "gradient", "passes",
+    )
+)  # fmt: skip
+COUNT, SIZE, BUDGET = 70, (40, 24), 1024
+
+
+def python_compiler() -> ModuleType:
+    """Stands for `compiled.py`: kernels stay Python, the counter needs no atomics."""
+    module = ModuleType(f"{PACKAGE}.compiled")
+    for name in ("kernel", "inlined", "inlined_fast", "parallel_kernel"):
+        setattr(module, name, lambda function: function)
+
+    def claim(counter):
+        counter[0] += 1
+        return int(counter[0]) - 1
+
+    module.__dict__["claim"] = claim
+    return module
+
+
+def numpy_lanes() -> ModuleType:
+    """Stands for `lanes.py`."""
+    single, module = np.float32, ModuleType(f"{PACKAGE}.lanes")
+
+    def store(array, index, value, count=TILE):
+        array[index : index + count] = value[:count]
+
+    module.__dict__.update(
+        load=lambda array, index: array[index : index + TILE].copy(),
+        store=store,
+        store12=lambda array, index, value: store(array, index, value, 12),
+        splat=lambda value: np.full(TILE, value, single),
+        lane_numbers=lambda: np.arange(TILE, dtype=single),
+        prefetch=lambda array, index: None,
+        any_above=lambda vector, level: bool((vector > level).any()),
+        fma=lambda a, b, c: single(1) * a * b + c,
+        quotient=lambda a, b: a / b,
+        keep_gt=lambda x, a, b: np.where(a > b, x, single(0)),
+        keep_ge=lambda x, a, b: np.where(a >= b, x, single(0)),
+        larger=lambda a, b: np.where(a > b, a, b),
+        smaller=lambda a, b: np.where(a < b, a, b),
+        exp2=np.exp2,
+        sums_of_10=lambda *v: np.array([x.sum() for x in v] + [0.0] * 6, single),
+    )
+    return module
+
+
+def no_advice() -> ModuleType:
+    """Stands for `memory.py`."""
+    module = ModuleType(f"{PACKAGE}.memory")
+    module.__dict__["expect_writes"] = lambda array: None
+    return module
+
+
+@pytest.fixture(autouse=True, scope="module")
+def plain_python():
+    doubles = python_compiler(), numpy_lanes(), no_advice()
+    with mock.patch.dict(sys.modules, {double.__name__: double for double in doubles}):
+        yield
+
+
+class Case:
+    """A view from within a cloud, some of it broad and solid, by the readable rasteriser."""
+
+    def __init__(self):
+        cloud, is_broad = random_cloud(2, COUNT), jnp.arange(COUNT) % 4 == 0
+        self.scene = dataclasses.replace(
+            cloud,
+            opacity_logits=jnp.where(is_broad, 6.0, cloud.opacity_logits),
+            log_scales=jnp.where(is_broad[:, None], -0.8, cloud.log_scales),
+        )
+        self.camera, self.pose = view(*SIZE, distance=0.6)
+        self.safe = safe_pixels(self.scene, self.camera, self.pose)
+        rng = np.random.default_rng(0)
+        shapes = ((3, *SIZE[::-1]), SIZE[::-1], SIZE[::-1])
+        weights = [(rng.standard_normal(s) * self.safe).astype(np.float32) for s in shapes]
+        self.weights = np.ascontiguousarray(np.moveaxis(weights[0], 0, -1)), *weights[1:]
+        self.rows = self.count_rows()
+
+        def loss(scene, view_numbers, offsets):
+            images = self.reference_images(scene, view_numbers, offsets)
+            pairs = zip(images, self.weights, strict=True)
+            return sum(jnp.sum(image * weight) for image, weight in pairs), images
+
+        pose = np.asarray(self.pose)
+        camera = [float(getattr(self.camera, name)) for name in ("fx", "fy", "cx", "cy")]
+        arguments = self.scene, (jnp.asarray(pose), jnp.asarray(camera)), jnp.zeros((COUNT, 2))
+        step = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True))
+        (_, self.images), (by_scene, by_view, by_offsets) = step(*arguments)
+        self.by_cloud = (*jax.tree.leaves(by_scene), by_offsets)
+        self.by_pose, self.by_camera = by_view
+
+    def reference_images(self, scene, view_numbers, offsets):
+        pose, (fx, fy, cx, cy) = view_numbers
+        camera = type(self.camera)(*SIZE, fx, fy, cx, cy)
+        result = reference.rasterise(scene, camera, pose, offsets, RasterConfig())
+        return result.rgb, result.depth_sum, result.alpha
+
+    def count_rows(self) -> int:
+        """Rows of tiles in which some pixel sees a Gaussian, over all Gaussians."""
+        zeros = jnp.zeros((COUNT, 2))
+        projected = project_gaussians(self.scene, self.camera, self.pose, zeros)
+        center, conic = np.asarray(projected.center), np.asarray(projected.conic)
+        total = 0
+        for i in np.flatnonzero(projected.is_drawn):
+            dx = center[0, i] - np.arange(SIZE[0]) - 0.5
+            dy = (center[1, i] - np.arange(SIZE[1]) - 0.5)[:, None]
+            s = 0.5 * (conic[0, i] * dx * dx + conic[2, i] * dy * dy) + conic[1, i] * dx * dy
+            seen = float(projected.opacity[i]) * np.exp(-s) >= ALPHA_MIN
+            columns = np.arange(SIZE[0]) // TILE
+            total += sum(seen[:, columns == c].any(axis=1).sum() for c in set(columns))
+        return total
+
+    def view_numbers(self, pose):
+        T = invert_pose(pose)
+        intrinsics = jnp.stack([getattr(self.camera, name) for name in ("fx", "fy", "cx", "cy")])
+        return jnp.concatenate([T[:3, :3].ravel(), T[:3, 3], pose[:3, 3], intrinsics])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def case():
+    global _case
+    _case = Case()
+    return _case
+
+
+_case: Case
+
+
+def dirty(shape, dtype=np.float64) -> np.ndarray:
+    """Memory as it may be: NaN, or -1."""
+    array = np.ndarray(shape, dtype)
+    array.view(np.uint8)[...] = 255
+    return array
+
+
+def arguments():
+    """The cloud's arrays and the numbers of the view, as the passes take them."""
+    cloud = tuple(np.array(x) for x in jax.tree.leaves(_case.scene))
+    cloud = (*cloud[:4], cloud[4].reshape(COUNT, -1), np.zeros((COUNT, 2), np.float32))
+    return cloud, np.array(_case.view_numbers(_case.pose))
+
+
+def forward(modules: Modules):
+    """Images, totals, records, lists."""
+    tiles = -(-SIZE[0] // TILE) * -(-SIZE[1] // TILE)
+    images = tuple(dirty(weight.shape, np.float32) for weight in _case.weights)
+    totals, table = dirty(2, np.int32), dirty((COUNT, records.SIZE), np.float32)
+    sizes = (BUDGET, np.int32), (BUDGET, np.int32), (BUDGET, np.uint8)
+    lists = tuple(dirty(*size) for size in (*sizes, (tiles + 1, np.int32), (tiles, np.int32)))
+    with mock.patch.object(np, "empty", dirty):
+        modules["passes"].forward_pass(*arguments(), 2, images, totals, table, lists)
+    return images, totals, table, lists
+
+
+def backward(modules: Modules):
+    """Gradients by the cloud, the pose and the camera."""
+    images, _, table, lists = forward(modules)
+    cloud, numbers = arguments()
+    by_cloud = tuple(dirty(x.shape, np.float32) for x in cloud)
+    by_view = dirty(records.VIEW_SIZE, np.float32)
+    with mock.patch.object(np, "empty", dirty):
+        modules["passes"].backward_pass(
+            cloud, numbers, 2, images, table, lists, _case.weights, by_cloud, by_view
+        )
+    _, pull_back = jax.vjp(_case.view_numbers, _case.pose)
+    return by_cloud, *pull_back(jnp.asarray(by_view)), by_view[15:]
+
+
+def assert_near(found, expected, tolerance: float) -> None:
+    off = np.linalg.norm(np.ravel(found) - np.ravel(expected))
+    assert off <= tolerance * np.linalg.norm(expected)  # fails for NaN
+
+
+def images_agree(modules: Modules) -> None:
+    images, totals, *_ = forward(modules)
+    assert totals[1] == 0
+    for found, expected in zip(images, _case.images, strict=True):
+        assert np.abs(found - np.asarray(expected))[_case.safe].max() < 1e-4
+
+
+def gradients_agree(modules: Modules) -> None:
+    by_cloud, by_pose, by_camera = backward(modules)
+    for found, expected in zip(by_cloud, _case.by_cloud, strict=True):
+        assert_near(found, expected, 1e-3)
+    assert_near(by_pose, _case.by_pose, 1e-3)
+    assert_near(by_camera, _case.by_camera, 1e-3)
+
+
+def lists_are_tight(modules: Modules) -> None:
+    """No row in which a pixel sees the Gaussian is left out, and hardly another is listed."""
+    _, totals, _, lists = forward(modules)
+    rows = lists[2][: totals[0]].astype(int)
+    listed = np.sum((rows >> 4) - (rows & 15) + 1)
+    # Between the centers of pixels an ellipse may pass unseen, and there is some slack.
+    assert _case.rows <= listed <= 1.01 * _case.rows
+
+
+MUTANTS = [
+    Mutant("harmonics", "_T * x * y * z", "_T * x * y", images_agree),
+    Mutant("harmonics", "- _8 * _U * yz * g[11]", "+ _8 * _U * yz * g[11]", gradients_agree),
+    Mutant("spans", "+ slope * slope / inverse", "", lists_are_tight),
+    Mutant("spans", "np.float32(TILE - 1)", "np.float32(TILE - 4)", images_agree),
+    Mutant("spans", "x = min(max(at_top, low), high)", "x = at_top", lists_are_tight),
+    Mutant("project", "axes[2] * axes[2] + DILATION", "axes[2] * axes[2]", images_agree),
+    Mutant("project", "min(max(ratio, low), high)", "ratio", images_agree),
+    Mutant(
+        "project", "_BALL_SLACK = np.float32(1.01)", "_BALL_SLACK = np.float32(0.2)", images_agree
+    ),
+    Mutant("project", "max(red, ZERO)", "red", images_agree),
+    Mutant("bins", "order, other = other, order", "", images_agree),
+    Mutant(
+        "bins",
+        "bottom = min(high - tile_row * TILE, TILE - 1)",
+        "bottom = TILE - 1",
+        lists_are_tight,
+    ),
+    Mutant("forward", "keep_ge(alpha, alpha, ALPHA_MIN)", "alpha", images_agree),
+    Mutant("forward", "smaller(alpha, splat(ALPHA_MAX))", "alpha", images_agree),
+    Mutant(
+        "forward",
+        "weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)",
+        "weight = before * alpha",
+        images_agree,
+    ),
+    Mutant("forward", "            return place", "            return first", gradients_agree),
+    Mutant("forward", "most = larger(most, load(state, k))", "most = load(state, k)", images_agree),
+    Mutant(
+        "backward",
+        "rest = load(state, PIXELS + k) - passed",
+        "rest = load(state, PIXELS + k)",
+        gradients_agree,
+    ),
+    Mutant(
+        "backward",
+        "keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)",
+        "keep_gt(v, weight, _ZERO)",
+        gradients_agree,
+    ),
+    Mutant(
+        "backward",
+        "store12(slots, list_slots[place] * at.GRADIENT_SIZE, splat(_ZERO))",
+        "pass",
+        gradients_agree,
+    ),
+    Mutant("gradient", "g_middle -= g_slope / focal", "pass", gradients_agree),
+    Mutant("gradient", "(a - along * w) * inverse", "a * inverse", gradients_agree),
+    Mutant("gradient", "g_view[12 + k] -= away[k]", "pass", gradients_agree),
+    Mutant("gradient", "g_z += more + sums[9]", "g_z += more", gradients_agree),
+    Mutant(
+        "gradient",
+        "blue = g_color[2] if record[at.BLUE] > ZERO else ZERO",
+        "blue = g_color[2]",
+        gradients_agree,
+    ),
+]
+
+
+@pytest.mark.parametrize("law", [images_agree, gradients_agree, lists_are_tight])
+def test_the_laws_hold(law):
+    law(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_faults_are_noticed(mutant):
+    assert_caught(CHAIN, mutant)
