@@ -66,7 +66,7 @@ def refine(
     """Moves faint Gaussians to solid ones, then adds new ones there.
 
     Returns:
-        The scene and the moments after. `dropped` counts the growth that found no unused row.
+        The scene and the moments after. Nothing is ever dropped: the capacity is the budget.
     """
     key_move, key_grow = jax.random.split(key)
     is_faint = scene.is_alive & (jax.nn.sigmoid(scene.opacity_logits) <= config.prune_opacity)
@@ -81,7 +81,7 @@ def refine(
         scene, moments, free & (jnp.cumsum(free) <= born), config, key=key_grow
     )
     moved = jnp.sum(is_faint, dtype=jnp.int32)
-    return scene, moments, Refinement(born, moved, wanted - born)
+    return scene, moments, Refinement(born, moved, jnp.zeros_like(born))
 
 
 def respawn(

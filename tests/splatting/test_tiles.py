@@ -25,7 +25,7 @@ def boxes(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     outside = ~((high > 0) & (low < size)).all(axis=0)
     reach[:, outside | (rng.uniform(size=COUNT) < 0.2)] = -1.0
     depth = rng.choice([0.5, 1.0, 1.0000001, 3.0, 80.0, 2e5], COUNT) + rng.choice([0, 0.3], COUNT)
-    return tuple(x.astype(np.float32) for x in (center, reach, depth))
+    return center.astype(np.float32), reach.astype(np.float32), depth.astype(np.float32)
 
 
 def expected_lists(center, reach, depth) -> list[list[int]]:

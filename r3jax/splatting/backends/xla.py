@@ -13,7 +13,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.backend import Composite
@@ -249,7 +249,7 @@ def _rows(
     return ids, stage(batch.go, gather, batch.middle, ids, splats)
 
 
-def _take(layout: Layout, x: Float[Array, "N ..."], i: Int[Array, ""]) -> Float[Array, "B ..."]:
+def _take(layout: Layout, x: Num[Array, "N ..."], i: Int[Array, ""]) -> Num[Array, "B ..."]:
     """The part of x that belongs to batch i."""
     return jax.lax.dynamic_slice_in_dim(x, i * layout.batch, layout.batch)
 
