@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.cameras import invert_pose
+from r3jax.splatting.backends.splax import load_splax
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.render import render
 from tests.benchmarks.test_splatting import SIZES, room_cloud, room_view
@@ -34,9 +35,7 @@ def ours(config: RasterConfig):
 
 def direct(scene, camera, pose):
     """The same loss through splax itself, for a camera whose principal point is the middle."""
-    import splax
-
-    image, _ = splax.render(
+    image, _ = load_splax().render(
         scene.means,
         scene.log_scales,
         scene.quats,

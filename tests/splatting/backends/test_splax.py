@@ -62,7 +62,7 @@ def rasterize_depth(
         reach=jnp.where(radii[order] > 0, 1.0, -1.0)[None, :] * jnp.ones((2, 1)),
     )
     assert tiles_so_far.shape == depths.shape
-    pixels = [jnp.arange(size) + jnp.float32(0.5) for size in img_shape]
+    pixels = [jnp.arange(size, dtype=jnp.float32) + 0.5 for size in img_shape]
     row = jax.vmap(reference.composite_pixel, (None, 0, None))
     rgb, depth, alpha = jax.vmap(row, (None, None, 0))(projected, pixels[1], pixels[0])
     depth = jnp.where(alpha > 0, depth / jnp.where(alpha > 0, alpha, 1.0), 0.0)
