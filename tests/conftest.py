@@ -1,5 +1,6 @@
 """Strict JAX, one hypothesis profile, and the shared data that some tests compare with."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -29,6 +30,20 @@ def shared_path(*parts: str) -> Path:
     if not path.exists():
         pytest.skip(f"needs ../shared/{'/'.join(parts)}, which is not here")
     return path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_mappings():
+    """Drops compiled code between files before the process runs out of memory mappings.
+
+    XLA's CPU compiler maps every computation; Linux allows 65 530 mappings a process (the
+    default of vm.max_map_count), the whole suite needs more, and LLVM aborts at the limit.
+    """
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > 20_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

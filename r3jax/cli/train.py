@@ -152,7 +152,15 @@ def _conclude(console: Console, options: Train, folder: Path, result: train.FitR
         )
     console.print(f"model  {folder / 'scene.ply'}", **_PLAIN)
     if options.hold_out and not result.interrupted:
-        console.print(f"next   r3jax evaluate {options.path}", **_PLAIN)
+        console.print(f"next   {_next_command(options, folder)}", **_PLAIN)
+
+
+def _next_command(options: Train, folder: Path) -> str:
+    """What judges this model."""
+    command = f"r3jax evaluate {options.path}"
+    if options.out is not None:
+        return f"{command} --model {folder}"
+    return command if options.name == Train.name else f"{command} --name {options.name}"
 
 
 class TrainProgress:

@@ -78,7 +78,7 @@ class FitResult(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Where training stands; given to `on_progress` every few steps."""
+    """Where training stands; given to `on_progress` every few steps, but the compiling first."""
 
     step: int
     """Steps done."""
@@ -221,6 +221,7 @@ class _Loop:
         self.saved_step = self.step if self.step else None
         self.infos: list[StepInfo] = []
         self.paces: list[float] = []
+        self.is_compiled = False
 
     def result(self) -> FitResult:
         """Trains to the end, or until Ctrl-C."""
@@ -236,6 +237,8 @@ class _Loop:
 
     def _next_stop(self) -> int:
         """The step up to which nothing but steps has to happen."""
+        if not self.is_compiled:
+            return self.step + 1
         config = self.run.config
         periods = [IN_FLIGHT, self.run.schedule.refine_every, self.run.schedule.reset_every]
         periods += [self.every] if self.folder is not None else []
@@ -262,6 +265,9 @@ class _Loop:
         if last.outcome == DIVERGED:
             raise TrainingDiverged(self.step + 1, float(last.loss), self.folder)
         self._after_step()
+        if not self.is_compiled:  # the pace of this step says nothing
+            self.is_compiled = True
+            return
         self.paces.append((time.perf_counter() - begin) / len(infos))
         if self.on_progress is not None:
             self.on_progress(self._progress(done))
@@ -272,6 +278,7 @@ class _Loop:
         raster = dataclasses.replace(self.run.config.raster, max_intersections=budget)
         config = dataclasses.replace(self.run.config, raster=raster)
         self.run = dataclasses.replace(self.run, config=config)
+        self.is_compiled = False
 
     def _after_step(self) -> None:
         """What the schedule wants after the step just done."""
@@ -303,7 +310,7 @@ class _Loop:
             psnr=float(np.mean([info.psnr for info in infos])),
             num_gaussians=int(infos[-1].num_gaussians),
             dropped=int(self.state.dropped),
-            # The median of the latest stretches: one that compiled does not count.
+            # The median: a stretch in which densification compiled does not count.
             seconds_left=float(np.median(self.paces[-10:])) * (iterations - self.step),
         )
 

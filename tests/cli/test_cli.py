@@ -153,11 +153,13 @@ def test_the_demo_overwrites_its_own_folder_only(tmp_path):
     for name in ("demo", "other"):
         with RunWriter(tmp_path / name, make_header()) as writer:
             writer.add(*make_view(0))
-    assert main(["demo", "--out", str(tmp_path), "--views", "2", "--resolution", "48"]) == 0
+    short = {"views": 4, "resolution": 48, "iterations": 20, "train-resolution": 32}
+    words = [word for name, value in short.items() for word in (f"--{name}", str(value))]
+    assert main(["demo", "--out", str(tmp_path), *words]) == 0
     demo = read_run(tmp_path / "demo")
     assert (demo.header.scene["name"], demo.header.policy["name"]) == ("flat", "ours-pano")
-    assert len(demo.rows) == 2
-    assert (tmp_path / "demo" / "report" / "report.html").exists()
+    assert len(demo.rows) == 4
+    assert "PSNR" in (tmp_path / "demo" / "report" / "report.html").read_text()
     assert read_run(tmp_path / "other").header == make_header()
 
 

@@ -74,6 +74,14 @@ def test_a_training_leaves_model_record_and_curve(models):
     assert (folder / "points.ply").stat().st_size > 15 * scene.capacity
 
 
+def test_the_hint_names_a_command_that_judges_the_model(recording, tmp_path, capsys):
+    assert train(recording, tmp_path, name="second") == 0
+    hint = capsys.readouterr().err.splitlines()[-1].split()
+    assert hint[:2] == ["next", "r3jax"]
+    assert main([*hint[2:], "--lpips", "none", "--worst", "0", "--up", "z"]) == 0
+    assert str(tmp_path / "second") in capsys.readouterr().out
+
+
 def test_an_existing_model_is_kept(recording, models, capsys):
     before = (models / "last" / "scene.ply").read_bytes()
     assert train(recording, models) == 2
