@@ -55,6 +55,7 @@ def run_train(options: Train) -> int:
                 config,
                 folder=folder / "checkpoints",
                 resume=options.resume,
+                overwrite=options.overwrite,
                 on_progress=progress.on_progress,
             )
         _write_model(folder, result)

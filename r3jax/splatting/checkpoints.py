@@ -50,17 +50,21 @@ def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def begin_checkpoints(folder: Path, settings: dict[str, Any]) -> None:
-    """Prepares a folder for a new training.
+def begin_checkpoints(folder: Path, settings: dict[str, Any], *, overwrite: bool = False) -> None:
+    """Prepares a folder for a new training; with `overwrite`, deletes the one that is there.
 
     Raises:
         CheckpointError: there is a training already.
         OSError: the disk is full, not writable, ...
     """
-    if _checkpoints(folder):
+    older = _checkpoints(folder)
+    if older and not overwrite:
         raise CheckpointError(
-            folder, "a training was stored here already: resume it, or choose another folder"
+            folder,
+            "a training was stored here already: resume it, overwrite it, or choose another folder",
         )
+    for old in older:
+        shutil.rmtree(old)
     folder.mkdir(parents=True, exist_ok=True)
     write_atomic(folder / _SETTINGS, json.dumps(settings, indent=1).encode())
 

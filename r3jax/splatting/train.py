@@ -121,6 +121,7 @@ def fit(
     scene: GaussianScene | None = None,
     folder: Path | str | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     checkpoint_every: int = 1000,
     on_progress: OnProgress | None = None,
 ) -> FitResult:
@@ -135,6 +136,8 @@ def fit(
         scene: Gaussians to begin with; by default they come from the views' depth.
         folder: where checkpoints go. None: none are written.
         resume: go on from the newest checkpoint of `folder`.
+        overwrite: delete the checkpoints of an earlier training in `folder`, just before the
+            first step.
         checkpoint_every: steps between two checkpoints; there is always one at the end.
         on_progress: called every few steps.
 
@@ -155,6 +158,8 @@ def fit(
     folder = None if folder is None else Path(folder)
     if resume and folder is None:
         raise ValueError("resume needs the folder with the checkpoints")
+    if resume and overwrite:
+        raise ValueError("resume goes on with the checkpoints, overwrite deletes them: choose one")
     extent = scene_extent(views)
     settings = settings_record(config, views, extent)
     if resume and folder is not None:
@@ -163,7 +168,7 @@ def fit(
     else:
         state = start_state(_first_scene(views, config, scene))
         if folder is not None:
-            begin_checkpoints(folder, settings)
+            begin_checkpoints(folder, settings, overwrite=overwrite)
     run = _Run(views, jnp.asarray(extent, dtype=jnp.float32), config, config.schedule())
     return _Loop(run, state, folder, checkpoint_every, on_progress).result()
 

@@ -91,6 +91,18 @@ def test_an_existing_model_is_kept(recording, models, capsys):
     assert (models / "last" / "scene.ply").read_bytes() == before
 
 
+def test_overwrite_replaces_a_model(recording, tmp_path, capsys):
+    scenes = []
+    for words in ([], ["--overwrite", "--seed", "3"]):
+        assert train(recording, tmp_path, *words) == 0
+        scenes.append((tmp_path / "last" / "scene.ply").read_bytes())
+    assert scenes[0] != scenes[1]
+    assert json.loads((tmp_path / "last" / "train.json").read_text())["config"]["seed"] == 3
+    assert train(recording, tmp_path, "--overwrite", "--resume") == 2
+    assert "choose one" in capsys.readouterr().err
+    assert (tmp_path / "last" / "scene.ply").read_bytes() == scenes[1]
+
+
 def test_resume_of_other_settings_is_refused(recording, models, capsys):
     record = (models / "last" / "train.json").read_bytes()
     assert train(recording, models, "--resume", seed=7) == 2

@@ -71,7 +71,7 @@ def test_another_budget_may_resume_but_other_settings_are_named(views, folder): 
 
 
 def test_a_new_training_does_not_bury_an_old_one(views, folder):  # noqa: F811
-    with pytest.raises(CheckpointError, match="resume it, or choose another folder"):
+    with pytest.raises(CheckpointError, match="resume it, overwrite it, or choose another folder"):
         fit(views, config(), folder=folder)
 
 
