@@ -43,7 +43,7 @@ class RasterConfig(eqx.Module):
     tiles_per_batch: int = eqx.field(static=True, default=16)
     """`xla`: tiles composited at a time."""
 
-    gaussians_per_chunk: int = eqx.field(static=True, default=32)
+    gaussians_per_chunk: int = eqx.field(static=True, default=64)
     """`xla`: Gaussians composited at a time in each tile."""
 
     def budget(self, num_gaussians: int) -> int:

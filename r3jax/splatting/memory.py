@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from r3jax.splatting.config import TILE
 from r3jax.splatting.errors import TooLargeError
 from r3jax.splatting.training_config import TrainConfig
 from r3jax.splatting.views import Views
@@ -30,6 +31,9 @@ _BYTES_PER_INTERSECTION = 64
 _BYTES_PER_PIXEL = 400
 """The rendering, the loss and their gradients."""
 
+_ARRAYS_PER_BATCH = 12
+"""Arrays of a number for each pixel and Gaussian of a batch that the gradient of `xla` holds."""
+
 _RESERVE = 0.05
 """Share of the free memory that is left alone, for the compiler (some 300 MB) among others."""
 
@@ -47,7 +51,12 @@ def training_bytes(width: int, height: int, config: TrainConfig, rows: int | Non
     sh_floats = 3 * (config.sh_degree + 1) ** 2
     per_row = 4 * _COPIES * (_GEOMETRY_FLOATS + sh_floats) + _BYTES_PER_ROW
     intersections = config.raster.budget(rows) * _BYTES_PER_INTERSECTION
-    return rows * per_row + intersections + width * height * _BYTES_PER_PIXEL
+    total = rows * per_row + intersections + width * height * _BYTES_PER_PIXEL
+    if config.raster.backend == "numba":
+        return total
+    tiles = min(config.raster.tiles_per_batch, -(-width // TILE) * -(-height // TILE))
+    pairs = tiles * TILE * TILE * config.raster.gaussians_per_chunk
+    return total + 4 * _ARRAYS_PER_BATCH * pairs
 
 
 def free_bytes(device: Any = None) -> int | None:
