@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,6 +30,9 @@ class PlannerState(eqx.Module):
     attempted: Bool[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
     """Frontier cells that were looked at on purpose (`frontier` policy)."""
 
+    memory: Any = None
+    """Arrays that one policy keeps beside the map: a pytree of its own."""
+
 
 @dataclass
 class Stopwatch:
@@ -45,10 +49,10 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
-def initial_state(camera: Camera, grid: OccupancyGrid) -> PlannerState:
+def initial_state(camera: Camera, grid: OccupancyGrid, memory: Any = None) -> PlannerState:
     """The memory of a robot that has not moved yet."""
     nowhere = jnp.zeros(grid.log_odds.shape, dtype=bool)
-    return PlannerState(camera=camera, trail=nowhere, attempted=nowhere)
+    return PlannerState(camera=camera, trail=nowhere, attempted=nowhere, memory=memory)
 
 
 def look_round(

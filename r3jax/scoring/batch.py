@@ -16,7 +16,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera, is_traced
 from r3jax.mapping.compact import positions_of_set
@@ -44,8 +44,8 @@ def score_views(
 ) -> ViewUtility:
     """`view_utility` of every pose; fields of shape [C]. Not to be called under jit."""
     poses = jnp.asarray(poses, dtype=jnp.float32)
-    voxels, cells = _near(state, grid, poses[:, :3, 3], config)
-    return _deal(functools.partial(_score_views, voxels, cells, camera, config), poses)
+    voxels, cells, _ = near(state, grid, poses[:, :3, 3], config)
+    return deal(functools.partial(_score_views, voxels, cells, camera, config), poses)
 
 
 def score_positions(
@@ -57,8 +57,8 @@ def score_positions(
 ) -> Panorama:
     """`panorama` of every position; fields of shape [C, ...]. Not to be called under jit."""
     positions = jnp.asarray(positions, dtype=jnp.float32)
-    voxels, cells = _near(state, grid, positions, config)
-    return _deal(functools.partial(_score_positions, voxels, cells, camera, config), positions)
+    voxels, cells, _ = near(state, grid, positions, config)
+    return deal(functools.partial(_score_positions, voxels, cells, camera, config), positions)
 
 
 @jax.jit
@@ -73,10 +73,14 @@ def _score_positions(voxels, cells, camera, config, positions):
     return jax.lax.map(score, positions)
 
 
-def _near(
+def near(
     state: MapState, grid: OccupancyGrid, positions: Float[Array, "C 3"], config: ScoringConfig
-) -> tuple[Voxels, Cells]:
-    """The voxels and unexplored cells that at least one of the positions may see."""
+) -> tuple[Voxels, Cells, Int[Array, " n"]]:
+    """The voxels and unexplored cells that at least one of the positions may see.
+
+    Returns:
+        Voxels and cells, padded with absent ones, and each voxel's row in the map (N: padding).
+    """
     if is_traced(state.key, positions):
         raise TypeError("score_views and score_positions choose sizes: call them outside jit")
     low, high = positions.min(axis=0), positions.max(axis=0)
@@ -116,15 +120,16 @@ def _count_near(state, grid, low, high, config):
 @functools.partial(jax.jit, static_argnames="sizes")
 def _gather_near(state, grid, low, high, config, sizes):
     voxels, cells = voxels_of(state, config.delta), cells_of(grid)
-    gathered = []
+    gathered, indices = [], []
     masks = _masks(voxels, cells, low, high, config)
     for items, mask, size in zip((voxels, cells), masks, sizes, strict=True):
         index = positions_of_set(mask, size)
         gathered.append(items.take(jnp.minimum(index, mask.shape[0] - 1), index < mask.shape[0]))
-    return tuple(gathered)
+        indices.append(index)
+    return *gathered, indices[0]
 
 
-def _deal(score: Callable[[Array], Scores], candidates: Float[Array, "C ..."]) -> Scores:
+def deal(score: Callable[[Array], Scores], candidates: Float[Array, "C ..."]) -> Scores:
     """Scores candidates in equal shares on all cores of a CPU; at once elsewhere."""
     num = candidates.shape[0]
     workers = min(len(os.sched_getaffinity(0)), num) if jax.default_backend() == "cpu" else 1

@@ -10,7 +10,7 @@ from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
-from r3jax.planning.policies.renderability import draw_positions
+from r3jax.planning.greedy import draw_positions
 from r3jax.planning.travel import plan_travel
 
 HOUSE = np.array([[0.0, 0.0, 0.0], [12.0, 12.0, 5.0]])  # 62 x 62 x 27 = 104k cells

@@ -4,7 +4,7 @@ A frontier cell that was looked at once is left alone until all others were: som
 window or behind a chair, never turn into known space.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -13,20 +13,12 @@ import numpy as np
 from jaxtyping import Array
 from scipy.spatial import KDTree
 
-from r3jax.frame import Frame
-from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import VIEW_DISTANCE, host_generator, in_plain_view, poses_along
-from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decision import (
-    PlannerState,
-    Stopwatch,
-    initial_state,
-    look_round,
-    settle,
-)
+from r3jax.planning.decision import PlannerState, Stopwatch, look_round, settle
 from r3jax.planning.explorable import mask_unexplorable
+from r3jax.planning.greedy import GreedyPolicy
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.travel import Travel
@@ -44,22 +36,11 @@ inside the picture of any camera with 52 degrees or more."""
 
 
 @dataclass(frozen=True)
-class Frontier:
+class Frontier(GreedyPolicy):
     """The nearest view of a frontier cell by path length; random views when none is left."""
 
-    config: PlannerConfig = field(default_factory=PlannerConfig)
-
     name = "frontier"
-
-    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
-        """The state before the first frame; nothing in it is random."""
-        del key
-        return initial_state(camera, grid)
-
-    def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
-        """The grid holds all that this policy needs of a frame."""
-        del map_state, frame
-        return state
+    source = "Yamauchi, CIRA 1997: the nearest frontier"
 
     def decide(
         self,

@@ -1,68 +1,42 @@
 """The floor of every table: any view that can be reached, chosen by chance."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.frame import Frame
-from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import host_generator, local_random, poses_along, random_directions
-from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decision import (
-    PlannerState,
-    Stopwatch,
-    initial_state,
-    look_round,
-    no_decision,
-    settle,
-)
-from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.planning.greedy import GreedyPolicy, Situation
 
 
 @dataclass(frozen=True)
-class Random:
+class Random(GreedyPolicy):
     """A random nearby view: the candidates of `ours` (without the frontier's), no score."""
 
-    config: PlannerConfig = field(default_factory=PlannerConfig)
-
     name = "random"
+    source = "the floor of every comparison"
 
-    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
-        """The state before the first frame; nothing in it is random."""
-        del key
-        return initial_state(camera, grid)
+    def draw(self, situation: Situation, *, key: Array) -> tuple[np.ndarray, Any]:
+        """Nearby positions, random directions."""
+        position_key, direction_key = jax.random.split(key)
+        config = self.config
+        positions = local_random(
+            situation.travel, config.num_candidates, config.radius, key=position_key
+        )
+        if len(positions) == 0:
+            return np.zeros((0, 4, 4)), situation.memory
+        directions = random_directions(len(positions), key=direction_key)
+        return poses_along(positions, directions), situation.memory
 
-    def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
-        """Chance needs no observation."""
-        del map_state, frame
-        return state
+    def score(
+        self, situation: Situation, poses: np.ndarray, *, key: Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """The lot that each candidate draws."""
+        del situation
+        return poses, {"lot": host_generator(key).random(len(poses))}
 
-    def decide(
-        self,
-        state: PlannerState,
-        map_state: MapState,
-        grid: OccupancyGrid,
-        T_world_camera: np.ndarray,
-        *,
-        key: Array,
-    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """One of the candidates; `total` is the lot each one drew."""
-        del map_state
-        stopwatch, config = Stopwatch(), self.config
-        position_key, direction_key, lot_key = jax.random.split(key, 3)
-        with stopwatch.part("travel"):
-            travel = look_round(state, grid, T_world_camera, config)
-        with stopwatch.part("candidates"):
-            positions = local_random(travel, config.num_candidates, config.radius, key=position_key)
-            if len(positions) == 0:
-                decision, info = no_decision(travel, config, stopwatch)
-                return decision, state, info
-            poses = poses_along(positions, random_directions(len(positions), key=direction_key))
-        with stopwatch.part("travel"):
-            path = travel.lengths(positions)
-        lots = host_generator(lot_key).random(len(positions))
-        return settle(state, travel, poses, {"path": path, "total": lots}, stopwatch)
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """The lot alone: paths cost nothing."""
+        return utilities["lot"]

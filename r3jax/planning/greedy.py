@@ -1,0 +1,172 @@
+"""What most policies are: draw candidates, score them, take the best. Each fills in the parts."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid, frontier
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import (
+    local_random,
+    poses_along,
+    random_directions,
+    region_of_interest,
+)
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.decision import (
+    PlannerState,
+    Stopwatch,
+    initial_state,
+    look_round,
+    net_utility,
+    no_decision,
+    settle,
+)
+from r3jax.planning.explorable import mask_unexplorable
+from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.planning.travel import Travel
+
+
+@dataclass(frozen=True)
+class Situation:
+    """All that a decision may depend on: what is known, where the robot is and can go."""
+
+    map_state: MapState
+
+    grid: OccupancyGrid
+    """As it is; for travel."""
+
+    scoring_grid: OccupancyGrid
+    """Without hopeless unexplored cells (`mask_unexplorable`); for utilities."""
+
+    travel: Travel
+    """Where the robot can go from here."""
+
+    camera: Camera
+    """Of every frame to come."""
+
+    memory: Any
+    """What the policy keeps beside the map."""
+
+
+@dataclass(frozen=True)
+class GreedyPolicy:
+    """Draws candidates, scores them, weighs the path, takes the best."""
+
+    config: PlannerConfig = field(default_factory=PlannerConfig)
+
+    name: ClassVar[str]
+    """As users write it."""
+
+    source: ClassVar[str]
+    """Where the rule comes from."""
+
+    def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
+        """What the policy keeps beside the map, before the first frame: nothing."""
+        del camera, grid
+
+    def draw(self, situation: Situation, *, key: Array) -> tuple[np.ndarray, Any]:
+        """Candidates, [C, 4, 4] float64 (C = 0: there is none), and the memory after."""
+        return random_views(situation, self.config, key=key), situation.memory
+
+    def score(
+        self, situation: Situation, poses: np.ndarray, *, key: Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """The candidates, turned if the policy turns them, and `utility` [C] among others."""
+        raise NotImplementedError
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """`total` of each candidate, from `utility` and `path` [C]: U_view."""
+        return net_utility(utilities["utility"], utilities["path"], self.config.lambda2)
+
+    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
+        """The state before the first frame; nothing in it is random."""
+        del key
+        return initial_state(camera, grid, self.first_memory(camera, grid))
+
+    def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
+        """The map holds all that most policies need of a frame."""
+        del map_state, frame
+        return state
+
+    def decide(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
+        """The candidate with the greatest total."""
+        stopwatch = Stopwatch()
+        draw_key, score_key = jax.random.split(key)
+        with stopwatch.part("travel"):
+            travel = look_round(state, grid, T_world_camera, self.config)
+        with stopwatch.part("candidates"):
+            masked = mask_unexplorable(grid, travel.reachable)
+            situation = Situation(map_state, grid, masked, travel, state.camera, state.memory)
+            poses, memory = self.draw(situation, key=draw_key)
+            situation = replace(situation, memory=memory)
+            state = replace(state, memory=memory)
+            if len(poses) == 0:
+                decision, info = no_decision(travel, self.config, stopwatch)
+                return decision, state, info
+        with stopwatch.part("scoring"):
+            poses, utilities = self.score(situation, poses, key=score_key)
+        with stopwatch.part("travel"):
+            utilities = utilities | {"path": travel.lengths(poses[:, :3, 3])}
+        utilities = utilities | {"total": self.weigh(utilities)}
+        return settle(state, travel, poses, utilities, stopwatch)
+
+
+def random_views(situation: Situation, config: PlannerConfig, *, key: Array) -> np.ndarray:
+    """C poses: local ones look anywhere, those drawn for the frontier look at it."""
+    position_key, direction_key = jax.random.split(key)
+    positions, aims = draw_positions(
+        situation.travel, situation.scoring_grid, config, key=position_key
+    )
+    if len(positions) == 0:
+        return np.zeros((0, 4, 4))
+    directions = random_directions(len(positions), key=direction_key)
+    is_aimed = np.isfinite(aims[:, :1])
+    return poses_along(positions, np.where(is_aimed, aims - positions, directions))
+
+
+def draw_positions(
+    travel: Travel, scoring_grid: OccupancyGrid, config: PlannerConfig, *, key: Array
+) -> tuple[np.ndarray, np.ndarray]:
+    """C positions: up to `num_frontier` in sight of the frontier, the others local.
+
+    Args:
+        travel: where the robot can go.
+        scoring_grid: the grid without hopeless unexplored cells (`mask_unexplorable`).
+        config: how many, and how near.
+        key: source of randomness.
+
+    Returns:
+        Positions [C, 3] and the frontier cell each one is meant for [C, 3] (NaN for local
+        ones), float64 [m]; [0, 3] if the robot can stop nowhere.
+    """
+    frontier_key, local_key = jax.random.split(key)
+    targets = np.asarray(frontier(scoring_grid))
+    positions, aims = region_of_interest(travel, targets, config.num_frontier, key=frontier_key)
+    local = local_random(
+        travel, config.num_candidates - len(positions), config.radius, key=local_key
+    )
+    positions = np.concatenate([positions, local])
+    aims = np.concatenate([aims, np.full_like(local, np.nan)])
+    if 0 < len(positions) < config.num_candidates:  # nothing local: repeat, to keep the shape
+        repeats = np.arange(config.num_candidates) % len(positions)
+        positions, aims = positions[repeats], aims[repeats]
+    return positions, aims
+
+
+ScoreViews = Callable[..., Any]
+"""`scoring.batch.score_views` or `score_positions`, or a stand-in for one of them."""

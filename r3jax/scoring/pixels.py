@@ -1,0 +1,136 @@
+"""What each pixel of a view would show of the map: the form in which other planners score views.
+
+Active-GS, ActiveGAMER and COVER render their map from every candidate and average over pixels.
+Here the rendering is the voxel depth buffer of `visibility`, at most `config.zbuffer_size` wide.
+
+Shape symbols: C candidates; h w pixels of the buffer; n voxels at hand; N rows of the map.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.scoring.batch import deal, near
+from r3jax.scoring.cells import Cells
+from r3jax.scoring.chunks import for_selected, select
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.views import PinholeView, pinhole_view
+from r3jax.scoring.visibility import DepthBuffer, candidates_of, depth_buffer, is_visible
+from r3jax.scoring.voxels import Voxels
+
+
+class PixelView(eqx.Module):
+    """One view of the map, pixel by pixel."""
+
+    hit: Bool[Array, "h w"]
+    """True where the map shows a voxel within the sensor's range."""
+
+    depth: Float[Array, "h w"]
+    """z-depth of the voxel's center [m]; inf where there is none."""
+
+    offset: Float[Array, "3 h w"]
+    """From the voxel's center to the camera [m]; meaningless where there is none."""
+
+    rows: Any
+    """What was asked for about the voxels, `[..., h, w]` each; meaningless where there is none."""
+
+    cells: Float[Array, ""]
+    """Visible unexplored cells of the coarse grid; pixels without a voxel hide nothing."""
+
+    cell_distance: Float[Array, ""]
+    """Sum of their distances from the camera [m]."""
+
+    max_range: Float[Array, ""]
+    """The sensor's range [m]."""
+
+
+Value = Callable[[PixelView], Any]
+"""Scores one view; a module-level function, so that it compiles once."""
+
+
+def score_pixels(
+    value: Value,
+    state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    poses: Float[Array | np.ndarray, "C 4 4"],
+    config: ScoringConfig,
+    rows: Any = (),
+) -> Any:
+    """`value` of every pose; fields of shape [C, ...]. Not to be called under jit.
+
+    Args:
+        value: what to make of a view.
+        state: the map.
+        grid: whose unexplored cells count.
+        camera: of the views.
+        poses: the candidates.
+        config: range, tolerance and size of the depth buffer.
+        rows: arrays `[..., N]` with something about each row of the map, which `value` finds in
+            `PixelView.rows`.
+    """
+    poses = jnp.asarray(poses, dtype=jnp.float32)
+    voxels, cells, index = near(state, grid, poses[:, :3, 3], config)
+    last = state.capacity - 1
+    rows = jax.tree.map(lambda x: jnp.asarray(x)[..., jnp.minimum(index, last)], rows)
+    return deal(functools.partial(_score, value, voxels, cells, camera, config, rows), poses)
+
+
+@functools.partial(jax.jit, static_argnames="value")
+def _score(value, voxels, cells, camera, config, rows, poses):
+    look = lambda pose: value(pixel_view(voxels, cells, camera, pose, config, rows))
+    return jax.lax.map(look, poses)
+
+
+def pixel_view(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+    rows: Any = (),
+) -> PixelView:
+    """One view of voxels and cells that are at hand; `rows` holds arrays `[..., n]`."""
+    view = pinhole_view(camera, T_world_camera, config)
+    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
+    num = voxels.count.shape[0]
+    hit = buffer.item < num
+    item = jnp.minimum(buffer.item, num - 1)
+    center = voxels.center_of(item.reshape(-1)).reshape(3, *item.shape)
+    offset = T_world_camera[:3, 3][:, None, None] - center
+    axis = T_world_camera[:3, 2][:, None, None]
+    count, distance = _unexplored(cells, view, buffer)
+    return PixelView(
+        hit=hit,
+        depth=jnp.where(hit, -jnp.sum(offset * axis, axis=0), jnp.inf),
+        offset=offset,
+        rows=jax.tree.map(lambda x: x[..., item], rows),
+        cells=count,
+        cell_distance=distance,
+        max_range=config.max_range,
+    )
+
+
+def _unexplored(
+    cells: Cells, view: PinholeView, buffer: DepthBuffer
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Number of unexplored cells whose center the view sees, and the sum of their distances."""
+
+    def add(index, valid, totals):
+        place = view.place(jnp.stack([cells.x[index], cells.y[index], cells.z[index]]))
+        is_seen = valid & is_visible(view, place, buffer.distance)
+        count = jnp.sum(is_seen, dtype=jnp.float32)
+        return totals[0] + count, totals[1] + jnp.sum(jnp.where(is_seen, place.distance, 0.0))
+
+    in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
+    start = jnp.zeros(()), jnp.zeros(())
+    return for_selected(select(cells.unexplored & in_view), add, start)
