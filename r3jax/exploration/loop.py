@@ -13,6 +13,7 @@ import jax
 from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
 from r3jax.exploration.step import start_state, step
 from r3jax.planning.policy import Policy
@@ -61,12 +62,13 @@ def explore(
 
     Raises:
         ValueError: a budget that is not understood, a start outside the scene's box.
+        OracleReadError: something beside the loop asked the simulator for a picture.
     """
     config = config or ExplorationConfig()
     budget = parse_budget(budget) if isinstance(budget, str) else budget
     init_key, key = jax.random.split(jax.random.key(seed))
     mission = Mission(
-        simulator,
+        GuardedSimulator(simulator),
         policy,
         budget,
         key,

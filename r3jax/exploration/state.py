@@ -11,11 +11,11 @@ import numpy as np
 from r3jax.exploration.budget import Budget
 from r3jax.exploration.clock import Clock
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.guard import GuardedSimulator
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.policy import Policy
-from r3jax.simulators.base import Simulator
 from r3jax.trace.rows import StepRow
 
 
@@ -98,7 +98,7 @@ class Stop:
 class Mission:
     """What stays the same over a run: `explore` makes it, `step` reads it."""
 
-    simulator: Simulator
+    simulator: GuardedSimulator
     policy: Policy
     budget: Budget
     key: jax.Array

@@ -135,7 +135,9 @@ def _look(
     """Takes the view at a pose, integrates it and measures what is known now."""
     mission.on_stage("render")
     begin = time.perf_counter()
-    frame = stored_form(mission.simulator.render(np.asarray(T_world_camera, dtype=np.float64)))
+    pose = np.asarray(T_world_camera, dtype=np.float64)
+    mission.simulator.commit(state.views, pose)
+    frame = stored_form(mission.simulator.render(pose))
     rendered = time.perf_counter()
     arrival = view_renderability(state.map_state, frame.camera, frame.T_world_camera)
     stages = stages | {"render": rendered - begin}
