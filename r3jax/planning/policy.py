@@ -92,11 +92,24 @@ class Policy(Protocol):
 
 def _registry() -> dict[str, Any]:
     """Every policy by name. Imported late: the policies import this module."""
+    from r3jax.planning.policies.cover import Cover
     from r3jax.planning.policies.frontier import Frontier
     from r3jax.planning.policies.random import Random
     from r3jax.planning.policies.renderability import Ours, OursPano
+    from r3jax.planning.policies.uniform import Uniform
+    from r3jax.planning.policies.unseen import Unseen, UnseenDepth
 
-    return {policy.name: policy for policy in (Ours, OursPano, Frontier, Random)}
+    known = (
+        Ours,
+        OursPano,
+        Cover,
+        Unseen,
+        UnseenDepth,
+        Frontier,
+        Uniform,
+        Random,
+    )
+    return {policy.name: policy for policy in known}
 
 
 def policy_names() -> tuple[str, ...]:
@@ -111,6 +124,15 @@ def describe(name: str) -> str:
         ValueError: no policy has that name.
     """
     return inspect.cleandoc(_policy_class(name).__doc__).splitlines()[0]
+
+
+def source_of(name: str) -> str:
+    """Where a policy's rule comes from, in a phrase.
+
+    Raises:
+        ValueError: no policy has that name.
+    """
+    return _policy_class(name).source
 
 
 def make_policy(name: str, **settings: Any) -> Policy:

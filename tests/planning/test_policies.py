@@ -19,7 +19,7 @@ from r3jax.planning.decision import net_utility
 from r3jax.planning.policies.frontier import Frontier
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policies.renderability import Ours, OursPano
-from r3jax.planning.policy import Outcome, Policy, describe, make_policy, policy_names
+from r3jax.planning.policy import Outcome, Policy, describe, make_policy, policy_names, source_of
 from r3jax.planning.travel import plan_travel
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 from tests.planning.test_travel import assert_inside
@@ -237,17 +237,19 @@ def test_the_trail_follows_the_robot(world):
 
 
 def test_the_registry_makes_what_it_names():
-    assert policy_names() == ("ours", "ours-pano", "frontier", "random")
+    known = {"ours", "ours-pano", "cover", "unseen", "unseen-depth", "frontier", "uniform"}
+    assert known | {"random"} <= set(policy_names())
     for name in policy_names():
         policy = make_policy(name, num_candidates=7, num_frontier=2)
         assert policy.name == name
         assert 20 < len(describe(name)) < 100
+        assert 10 < len(source_of(name)) < 80
     assert make_policy("ours", lambda2=0.1).config.lambda2 == 0.1
 
 
 def test_an_unknown_name_lists_the_known_ones():
-    for call in (make_policy, describe):
-        with pytest.raises(ValueError, match=r"'best'.*ours, ours-pano, frontier, random"):
+    for call in (make_policy, describe, source_of):
+        with pytest.raises(ValueError, match=r"'best'.*ours, ours-pano, .*random"):
             call("best")
     with pytest.raises(ValueError, match=r"no setting speed; known: num_candidates"):
         make_policy("ours", speed=1.0)

@@ -1,0 +1,98 @@
+"""COVER: look at what is known from directions in which it has not been seen.
+
+    utility = 1000 U_G / cells of the grid  +  1 - mean over the covered pixels of c
+    c       = max over the directions q_k from which the voxel was seen of (1 + <q_k, r>) / 2
+
+with r the direction from the pixel's voxel to the camera (NBV-Gym, CVPR 2026, which takes the
+view of the lowest mean). Ours are 64 direction bins a voxel instead of 128 a primitive, and
+visibility is the map's on both sides. The published rule knows no unknown space; so that it can
+explore at all it gets U_G, weighed as in Active-GS. Every table must say so.
+
+Shape symbols: C candidates; h w pixels; N rows of the map; W words of bins.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.planning.greedy import GreedyPolicy, Situation
+from r3jax.scoring.pixels import PixelView, score_pixels
+
+UNSEEN_WEIGHT = 1000.0
+"""Worth of a view that shows every cell of the grid, all unexplored (Active-GS)."""
+
+
+class SeenBins(eqx.Module):
+    """The directions from which voxels were seen, for the rows of a map or the pixels of a view."""
+
+    visited: UInt32[Array, "W ..."]
+    """Bit `k % 32` of word `k // 32` is set for each visited bin k."""
+
+    num_bins: int = eqx.field(static=True)
+    """Direction bins B."""
+
+
+def coverage_of_pixels(
+    seen: SeenBins, offset: Float[Array, "3 h w"], hit: Float[Array, "h w"]
+) -> Float[Array, ""]:
+    """Mean of c over the covered pixels, in [0, 1]; 1 where no pixel is covered.
+
+    A view that shows nothing of the map has no direction that could be new: it must not win over
+    views that have, so it counts as covered, and only its unexplored cells speak for it.
+
+    Args:
+        seen: the bins of each pixel's voxel.
+        offset: from the voxel to the camera [m].
+        hit: 1 for covered pixels, else 0.
+    """
+    length = jnp.sqrt(jnp.sum(offset * offset, axis=0))
+    x, y, z = offset / jnp.maximum(length, 1e-6)[None]
+    nearest = jnp.full_like(x, -1.0)
+    lattice = fibonacci_lattice(seen.num_bins).astype("float32").tolist()
+    for k, (q_x, q_y, q_z) in enumerate(lattice):
+        is_seen = (seen.visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
+        cosine = q_x * x + q_y * y + q_z * z
+        nearest = jnp.maximum(nearest, jnp.where(is_seen, cosine, -1.0))
+    total, num = jnp.sum(hit * 0.5 * (1.0 + nearest)), jnp.sum(hit)
+    return jnp.where(num > 0.0, jnp.clip(total / jnp.maximum(num, 1.0), 0.0, 1.0), 1.0)
+
+
+def _novelty_and_cells(view: PixelView) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """1 - mean c, and the visible unexplored cells."""
+    hit = view.hit.astype(jnp.float32)
+    return 1.0 - coverage_of_pixels(view.rows, view.offset, hit), view.cells
+
+
+@dataclass(frozen=True)
+class Cover(GreedyPolicy):
+    """Views of known surface from new directions, by the mean over pixels; unknown space added."""
+
+    name = "cover"
+    source = "COVER of NBV-Gym, CVPR 2026, plus unexplored cells"
+
+    def score(
+        self, situation: Situation, poses: np.ndarray, *, key: Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """New directions (`rendering`) and unexplored cells (`exploration`) of every pose."""
+        del key
+        state, grid = situation.map_state, situation.scoring_grid
+        novelty, cells = score_pixels(
+            _novelty_and_cells,
+            state,
+            grid,
+            situation.camera,
+            poses.astype(np.float32),
+            self.config.scoring,
+            SeenBins(state.visited, state.num_bins),
+        )
+        rendering = np.asarray(novelty, dtype=np.float64)
+        exploration = UNSEEN_WEIGHT * np.asarray(cells, dtype=np.float64) / grid.log_odds.size
+        return poses, {
+            "exploration": exploration,
+            "rendering": rendering,
+            "utility": exploration + rendering,
+        }

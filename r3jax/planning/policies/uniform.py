@@ -1,0 +1,116 @@
+"""Farthest point: spread the views evenly over free space and directions, blind to the scene.
+
+    distance(a, b) = |x_a - x_b|  +  angle between the viewing axes / (90 degrees per metre)
+
+The next view is the candidate whose nearest pose taken so far is farthest away (Gonzalez 1985).
+Candidates lie anywhere that the robot can go, not only near it, and paths cost nothing. POp-GS
+reports that even spreading beats FisherRF: a floor that a method must clear.
+
+Shape symbols: C candidates; K room for poses, of which `num` are in use.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import local_random, poses_along, random_directions
+from r3jax.planning.decision import PlannerState
+from r3jax.planning.greedy import GreedyPolicy, Situation
+
+METRES_PER_RADIAN = 2.0 / np.pi
+"""A quarter turn counts as much as a metre."""
+
+FIRST_ROOM = 256
+"""Poses that the memory holds before it doubles."""
+
+
+class PosesTaken(eqx.Module):
+    """Where views were taken, and which way they look. Doubles when it is full."""
+
+    position: Float[Array, "K 3"] = eqx.field(converter=jnp.asarray)
+    """Of the camera [m]; meaningless from `num` on."""
+
+    axis: Float[Array, "K 3"] = eqx.field(converter=jnp.asarray)
+    """Unit vector along which it looks; meaningless from `num` on."""
+
+    num: Int[Array, ""] = eqx.field(converter=jnp.asarray)
+    """Poses in use."""
+
+
+def no_poses(room: int = FIRST_ROOM) -> PosesTaken:
+    """The memory before the first view."""
+    nothing = np.zeros((room, 3), dtype=np.float32)
+    return PosesTaken(nothing, nothing, np.int32(0))
+
+
+def remember(taken: PosesTaken, T_world_camera: np.ndarray) -> PosesTaken:
+    """The poses with one more; none is ever lost."""
+    num, room = int(taken.num), len(taken.position)
+    growth = ((0, room if num == room else 0), (0, 0))
+    position, axis = (np.pad(np.asarray(x), growth) for x in (taken.position, taken.axis))
+    position[num], axis[num] = T_world_camera[:3, 3], T_world_camera[:3, 2]
+    return PosesTaken(position, axis, np.int32(num + 1))
+
+
+def nearest_taken(taken: PosesTaken, poses: np.ndarray) -> np.ndarray:
+    """Distance from each pose [C, 4, 4] to the nearest one taken, [C] float64; inf: none was.
+
+    Metres between the cameras plus a metre for every 90 degrees between their axes. Roll does not
+    count: the views have none.
+    """
+    num = int(taken.num)
+    if num == 0:
+        return np.full(len(poses), np.inf)
+    position, axis = (np.asarray(x, np.float64)[:num] for x in (taken.position, taken.axis))
+    apart = np.linalg.norm(poses[:, None, :3, 3] - position, axis=-1)
+    cosine = np.clip(poses[:, :3, 2] @ axis.T, -1.0, 1.0)
+    return (apart + METRES_PER_RADIAN * np.arccos(cosine)).min(axis=1)
+
+
+@dataclass(frozen=True)
+class Uniform(GreedyPolicy):
+    """Of random views in all reachable space, the one farthest from every view taken so far."""
+
+    name = "uniform"
+    source = "farthest-point sampling, Gonzalez 1985"
+
+    def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
+        """No pose."""
+        del camera, grid
+        return no_poses()
+
+    def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
+        """Remembers where the frame was taken."""
+        del map_state
+        return replace(state, memory=remember(state.memory, np.asarray(frame.T_world_camera)))
+
+    def draw(self, situation: Situation, *, key: Array) -> tuple[np.ndarray, Any]:
+        """Positions uniform over all cells where the robot may stop, random directions."""
+        position_key, direction_key = jax.random.split(key)
+        positions = local_random(
+            situation.travel, self.config.num_candidates, np.inf, key=position_key
+        )
+        if len(positions) == 0:
+            return np.zeros((0, 4, 4)), situation.memory
+        directions = random_directions(len(positions), key=direction_key)
+        return poses_along(positions, directions), situation.memory
+
+    def score(
+        self, situation: Situation, poses: np.ndarray, *, key: Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Distance to the nearest pose taken so far."""
+        del key
+        return poses, {"utility": nearest_taken(situation.memory, poses)}
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """The distance alone: paths cost nothing."""
+        return utilities["utility"]
