@@ -92,6 +92,7 @@ class Policy(Protocol):
 
 def _registry() -> dict[str, Any]:
     """Every policy by name. Imported late: the policies import this module."""
+    from r3jax.planning.policies.active_gs import ActiveGS, ActiveGSNoDepth
     from r3jax.planning.policies.cover import Cover
     from r3jax.planning.policies.frontier import Frontier
     from r3jax.planning.policies.random import Random
@@ -102,6 +103,8 @@ def _registry() -> dict[str, Any]:
     known = (
         Ours,
         OursPano,
+        ActiveGS,
+        ActiveGSNoDepth,
         Cover,
         Unseen,
         UnseenDepth,

@@ -32,7 +32,7 @@ class PixelView(eqx.Module):
     """One view of the map, pixel by pixel."""
 
     hit: Bool[Array, "h w"]
-    """True where the map shows a voxel within the sensor's range."""
+    """True where the map shows a voxel: within the sensor's range, if `reach` says no more."""
 
     depth: Float[Array, "h w"]
     """z-depth of the voxel's center [m]; inf where there is none."""
@@ -65,6 +65,7 @@ def score_pixels(
     poses: Float[Array | np.ndarray, "C 4 4"],
     config: ScoringConfig,
     rows: Any = (),
+    reach: float | None = None,
 ) -> Any:
     """`value` of every pose; fields of shape [C, ...]. Not to be called under jit.
 
@@ -77,17 +78,21 @@ def score_pixels(
         config: range, tolerance and size of the depth buffer.
         rows: arrays `[..., N]` with something about each row of the map, which `value` finds in
             `PixelView.rows`.
+        reach: voxels are shown up to this distance [m], by default the sensor's range. It does
+            not let a view see farther cells.
     """
     poses = jnp.asarray(poses, dtype=jnp.float32)
-    voxels, cells, index = near(state, grid, poses[:, :3, 3], config)
+    far = jnp.asarray(config.max_range if reach is None else reach, dtype=jnp.float32)
+    reaching = eqx.tree_at(lambda c: c.max_range, config, far)
+    voxels, cells, index = near(state, grid, poses[:, :3, 3], reaching)
     last = state.capacity - 1
     rows = jax.tree.map(lambda x: jnp.asarray(x)[..., jnp.minimum(index, last)], rows)
-    return deal(functools.partial(_score, value, voxels, cells, camera, config, rows), poses)
+    return deal(functools.partial(_score, value, voxels, cells, camera, config, rows, far), poses)
 
 
 @functools.partial(jax.jit, static_argnames="value")
-def _score(value, voxels, cells, camera, config, rows, poses):
-    look = lambda pose: value(pixel_view(voxels, cells, camera, pose, config, rows))
+def _score(value, voxels, cells, camera, config, rows, reach, poses):
+    look = lambda pose: value(pixel_view(voxels, cells, camera, pose, config, rows, reach))
     return jax.lax.map(look, poses)
 
 
@@ -98,10 +103,12 @@ def pixel_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
     rows: Any = (),
+    reach: Float[Array, ""] | None = None,
 ) -> PixelView:
     """One view of voxels and cells that are at hand; `rows` holds arrays `[..., n]`."""
     view = pinhole_view(camera, T_world_camera, config)
-    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
+    far = view if reach is None else eqx.tree_at(lambda v: v.max_range, view, reach)
+    buffer = depth_buffer(voxels, candidates_of(voxels, far), far, config)
     num = voxels.count.shape[0]
     hit = buffer.item < num
     item = jnp.minimum(buffer.item, num - 1)
