@@ -115,11 +115,14 @@ def _leaders(
 def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Bool[Array, "H W"]:
     """Pixels on depth edges, whose colour mixes foreground and background.
 
-    An edge is a step of more than a voxel between neighbors. Raw depth of a noisy sensor steps
-    by more than a voxel everywhere beyond 3 m (1 % of the depth is 4 cm at 4 m), which would
-    empty the far half of every frame; so the test runs on the 3x3 median, which keeps steps and
-    calms noise, and adds the pixels that stray from it. Pixels without a measurement do not
-    count as neighbors.
+    An edge is a step of more than a voxel between neighbors that is no slope: the pixel also
+    strays by more than a voxel from where its neighbors on both sides say that a plane runs. A
+    plane is linear in inverse depth, so a floor or a ceiling seen at a grazing angle, whose depth
+    changes by many voxels a pixel, has no edges. Raw depth of a noisy sensor steps by more than a voxel
+    everywhere beyond 3 m (1 % of the depth is 4 cm at 4 m), which would empty the far half of
+    every frame; so the test runs on the 3x3 median, which keeps steps and calms noise, and adds
+    the pixels that stray from it. Pixels without a measurement do not count as neighbors: beside
+    a hole the other neighbor's depth is compared.
 
     Args:
         depth: z-depth [m]; 0 no measurement, inf beyond range.
@@ -132,16 +135,27 @@ def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Boo
     median = _median9([jnp.where(value > 0.0, value, capped) for value in around])
     # A stray within two or three sigma of 1 % noise is no edge.
     is_edge = jnp.abs(capped - median) > voxel_size + 0.01 * capped
-    raw_limit = voxel_size + 0.06 * capped
-    beside = (1, 3, 5, 7)
-    for median_beside, raw_beside in zip(
-        [_neighborhood(median)[i] for i in beside], [around[i] for i in beside], strict=True
-    ):
-        # The median is 0 inside a hole: no neighbor.
-        is_edge |= (median_beside > 0.0) & (jnp.abs(median_beside - median) > voxel_size)
-        # What noise of 1 % cannot explain is an edge whatever the median says: thin parts.
-        is_edge |= (raw_beside > 0.0) & (jnp.abs(raw_beside - capped) > raw_limit)
+    is_edge |= _breaks(median, _neighborhood(median), voxel_size)
+    # What noise of 1 % cannot explain is an edge whatever the median says: thin parts.
+    is_edge |= _breaks(capped, around, voxel_size + 0.06 * capped)
     return (depth > 0.0) & is_edge
+
+
+def _breaks(
+    depth: Float[Array, "H W"], around: list[Float[Array, "H W"]], limit: Float[Array, "..."]
+) -> Bool[Array, "H W"]:
+    """Where the surface breaks by more than a limit [m], along its row or its column."""
+    inverse = lambda value: 1.0 / jnp.maximum(value, 1e-4)
+    is_break = jnp.zeros(depth.shape, dtype=bool)
+    for before, after in ((around[3], around[5]), (around[1], around[7])):
+        # A missing neighbor agrees with the pixel itself.
+        before, after = (jnp.where(value > 0.0, value, depth) for value in (before, after))
+        step = jnp.maximum(jnp.abs(before - depth), jnp.abs(after - depth))
+        # Exactly the step where one of the neighbors lies as deep as the pixel, 0 on a plane.
+        bend = jnp.abs(inverse(before) + inverse(after) - 2.0 * inverse(depth))
+        bend *= depth * jnp.maximum(jnp.maximum(before, after), depth)
+        is_break |= (step > limit) & (bend > limit)
+    return is_break
 
 
 def _neighborhood(image: Float[Array, "H W"]) -> list[Float[Array, "H W"]]:
