@@ -92,6 +92,7 @@ class Policy(Protocol):
 
 def _registry() -> dict[str, Any]:
     """Every policy by name. Imported late: the policies import this module."""
+    from r3jax.planning.policies.active_gamer import ActiveGamer
     from r3jax.planning.policies.active_gs import ActiveGS, ActiveGSNoDepth
     from r3jax.planning.policies.cover import Cover
     from r3jax.planning.policies.frontier import Frontier
@@ -105,6 +106,7 @@ def _registry() -> dict[str, Any]:
         OursPano,
         ActiveGS,
         ActiveGSNoDepth,
+        ActiveGamer,
         Cover,
         Unseen,
         UnseenDepth,
