@@ -185,12 +185,13 @@ def law_single_cells(modules: Modules) -> None:
         (3, -4.75, -1.25, 1.25): True,
         (3, -6.75, -1.25, 1.25): False,  # out of range
     }
-    for (pose, *center), is_seen in cases.items():
+    for (pose, *where), is_seen in cases.items():
+        center = np.array(where)
         unexplored = np.zeros(GRID_SHAPE, bool)
-        unexplored[tuple(np.floor((np.array(center) - GRID_ORIGIN) / CELL).astype(int))] = True
+        unexplored[tuple(np.floor((center - GRID_ORIGIN) / CELL).astype(int))] = True
         views = look(modules["pixels"], state, grid_where(unexplored))
         distance = np.linalg.norm(center - POSES[pose, :3, 3].astype(np.float64)) if is_seen else 0
-        assert float(views.cells[pose]) == is_seen, center
+        assert float(views.cells[pose]) == is_seen, where
         np.testing.assert_allclose(views.cell_distance[pose], distance, rtol=1e-6)
 
 
