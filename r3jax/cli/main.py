@@ -8,13 +8,14 @@ from pathlib import Path
 import tyro
 
 from r3jax.cli.errors import UserError
-from r3jax.cli.options import Demo, Evaluate, Explore, Info, Train
+from r3jax.cli.options import Demo, Evaluate, Explore, Info, Policies, Train
 
 _COMMANDS = {
     "demo": Demo,
     "explore": Explore,
     "train": Train,
     "evaluate": Evaluate,
+    "policies": Policies,
     "info": Info,
 }
 
@@ -47,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return USER_ERROR
 
 
-def _run(command: Demo | Explore | Train | Evaluate | Info) -> int:
+def _run(command: Demo | Explore | Train | Evaluate | Policies | Info) -> int:
     """Imports what the command needs and nothing else, so that --help does not wait for JAX."""
     if isinstance(command, Demo):
         from r3jax.cli.demo import run_demo
@@ -65,6 +66,10 @@ def _run(command: Demo | Explore | Train | Evaluate | Info) -> int:
         from r3jax.cli.evaluate import run_evaluate
 
         return run_evaluate(command)
+    if isinstance(command, Policies):
+        from r3jax.cli.policies import run_policies
+
+        return run_policies(command)
     from r3jax.cli.info import run_info
 
     return run_info(command)

@@ -113,6 +113,11 @@ class Info:
 
 
 @dataclass(frozen=True)
+class Policies:
+    """List who can choose views: every policy in a sentence, and where its rule comes from."""
+
+
+@dataclass(frozen=True)
 class Train:
     """Train 3D Gaussian splatting from scratch on a run or a recording."""
 
