@@ -56,8 +56,9 @@ def _slope(
     reach = 1
     while reach <= max(1, width // _PIXELS_PER_DEGREE):
         before, after = _shifted(inverse, -reach, axis), _shifted(inverse, reach, axis)
-        is_bent = jnp.abs(before + after - 2.0 * inverse) > limit
-        weight = jnp.where((before > 0.0) & (after > 0.0) & ~is_bent, float(reach), 0.0)
+        is_straight = jnp.abs(before + after - 2.0 * inverse) <= limit
+        is_pair = (before > 0.0) & (after > 0.0) & is_straight
+        weight = jnp.where(is_pair, float(reach), 0.0)
         rise, run = rise + weight * (after - before), run + 2.0 * reach * weight
         reach *= 2
     return rise / jnp.where(run > 0.0, run, 1.0)
