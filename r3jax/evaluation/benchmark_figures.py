@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from r3jax.evaluation import style
 from r3jax.evaluation.equal_terms import (
@@ -125,7 +126,7 @@ def sweep_figure(
             )
     if chosen is not None and chosen not in values:
         raise ValueError(f"{setting}={chosen} was not tried; tried were {list(values)}")
-    figure = style.new_figure(6.4, 4.2)
+    figure = style.new_figure(6.4, 3.9)
     axes = style.dress(figure.subplots(), x=setting, y=y_label)
     x, is_number = _places(values)
     order = np.argsort(x, kind="stable")
@@ -177,26 +178,26 @@ def latency_figure(latency: Samples, title: str = "") -> Figure:
     looks = looks_of(list(latency))
     figure, panels = _panels(len(latency), share=True)
     for axes, (method, (frames, samples)) in zip(panels, latency.items(), strict=True):
-        style.dress(axes, method, "key frames", "planning [ms]")
+        style.dress(axes, x="key frames", y="planning [ms]").label_outer()
+        axes.set_title(method, fontsize=11, color=style.INK, loc="left", fontweight="bold", pad=16)
         p50, p95, p99 = np.percentile(samples, [50, 95, 99], axis=1)
         color = looks[method].color
         band = axes.fill_between(frames, p50, p95, color=color, alpha=0.2, label="to p95")
         band.set_linewidth(0)
         axes.plot(frames, p50, color=color, linewidth=2.0, label="p50")
         axes.plot(frames, p99, color=color, linewidth=1.0, linestyle=":", label="p99")
-        axes.text(
-            0.97, 0.03, f"overall p50 {_of_all(samples, 50)}, p95 {_of_all(samples, 95)}, "
-            f"p99 {_of_all(samples, 99)} ms", transform=axes.transAxes, ha="right", fontsize=7,
-            color=style.MUTED,
+        overall = (f"{p} {np.percentile(samples, int(p[1:])):.3g}" for p in ("p50", "p95", "p99"))
+        axes.annotate(
+            f"all: {', '.join(overall)} ms", (0.0, 1.0), xycoords="axes fraction", xytext=(0, 4),
+            textcoords="offset points", fontsize=8, color=style.MUTED,
         )  # fmt: skip
     panels[0].set_yscale("log")
+    panels[0].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    panels[0].yaxis.set_major_formatter("{x:g}")
+    panels[0].yaxis.set_minor_locator(NullLocator())
     legend_below(figure, ["p50", "to p95", "p99"])
     figure.suptitle(title, fontsize=11, color=style.INK, fontweight="bold")
     return figure
-
-
-def _of_all(samples: np.ndarray, percentile: int) -> str:
-    return f"{np.percentile(samples, percentile):.3g}"
 
 
 def memory_figure(memory: Samples, title: str = "", limit: float | None = None) -> Figure:
@@ -207,7 +208,7 @@ def memory_figure(memory: Samples, title: str = "", limit: float | None = None) 
         title: what was measured (device memory, process memory).
         limit: bytes that must not be passed, as a line.
     """
-    figure = style.new_figure(6.8, 4.4)
+    figure = style.new_figure(6.8, 4.0)
     axes = style.dress(figure.subplots(), title, "key frames", "memory [MB]")
     for method, look in looks_of(list(memory)).items():
         frames, used = memory[method]
@@ -227,7 +228,7 @@ def _panels(count: int, *, share: bool = False) -> tuple[Figure, list[Axes]]:
     """A figure with so many panels, in lines of four."""
     columns = min(count, _PANELS_PER_LINE)
     lines = -(-count // columns)
-    figure = style.new_figure(max(5.6, 3.6 * columns), 3.2 * lines + 0.6)
+    figure = style.new_figure(max(5.6, 3.6 * columns), 3.2 * lines)
     grid = figure.subplots(lines, columns, squeeze=False, sharex=share, sharey=share)
     panels = list(grid.flat)
     for axes in panels[count:]:

@@ -1,7 +1,7 @@
 """One look per policy in every figure: color, marker and line. Ours are warm and thick.
 
 The colors are those of Okabe and Ito ("Color universal design", 2008), which people with any kind
-of color vision tell apart; the floor (frontier, uniform, random) goes from ink to light grey.
+of color vision tell apart; the floor (frontier, uniform, random) is ink, brown and light grey.
 Markers and dashes say the same again, for print.
 """
 
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from r3jax.evaluation import style
@@ -48,8 +49,8 @@ _POLICIES = {
     "cover": ("#CC79A7", "D"),
     "unseen": ("#009E73", "P"),
     "frontier": (style.INK, "X"),
-    "uniform": (style.MUTED, "d"),
-    "random": ("#a8b0bb", "."),
+    "uniform": ("#7a4a1e", "d"),
+    "random": ("#c3c9d1", "."),
 }
 _UNKNOWN = ("#8b5cf6", "*")
 _DASHES = ("-", "--", ":", "-.")
@@ -70,17 +71,37 @@ def looks_of(methods: Sequence[str]) -> dict[str, Look]:
     return looks
 
 
-def legend_below(figure: Figure, methods: Sequence[str]) -> None:
-    """One legend for all panels, below them; it takes the handles of the first panel."""
+def legend_below(figure: Figure, labels: Sequence[str]) -> None:
+    """One legend for all panels, below them; the figure grows by its height.
+
+    Args:
+        figure: whose axes have artists with these labels.
+        labels: in the order of the legend; those that no panel has are left out.
+    """
     found = {}
     for axes in figure.axes:
-        handles, labels = axes.get_legend_handles_labels()
-        found = dict(zip(labels, handles, strict=True)) | found
-    named = [method for method in methods if method in found]
-    # As wide as the figure allows at this size of letters, 0.085 inch each and 0.5 for the line.
-    widest = 0.085 * max(map(len, named)) + 0.5
-    columns = max(1, min(len(named), int(figure.get_figwidth() / widest)))
+        found = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True)) | found
+    named = [label for label in labels if label in found]
+    if not named:
+        return
+    columns = _columns_that_fit(named, figure.get_figwidth() - 0.3)
+    figure.set_figheight(figure.get_figheight() + _LEGEND_LINE * -(-len(named) // columns))
     figure.legend(
-        [found[method] for method in named], named, loc="outside lower center", ncols=columns,
-        fontsize=8, frameon=False, labelcolor=style.INK,
+        [found[label] for label in named], named, loc="outside lower center", ncols=columns,
+        fontsize=8, frameon=False, labelcolor=style.INK, columnspacing=1.4,
     )  # fmt: skip
+
+
+_LEGEND_LINE, _LETTER, _HANDLE = 0.19, 0.068, 0.55
+"""Height of a line, width of a letter, width of a handle with its spaces [inch], at 8 pt."""
+
+
+def _columns_that_fit(labels: Sequence[str], width: float) -> int:
+    """The fewest columns with the fewest lines that are no wider than that [inch]."""
+    for lines in range(1, len(labels)):
+        columns = -(-len(labels) // lines)
+        # As matplotlib fills them: one below the other, the first columns one longer.
+        filled = np.array_split([len(label) for label in labels], columns)
+        if sum(_LETTER * column.max() + _HANDLE for column in filled) <= width:
+            return columns
+    return 1

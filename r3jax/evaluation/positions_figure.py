@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from r3jax.evaluation import style
 
@@ -39,7 +40,7 @@ def positions_figure(
     scale = Normalize(1, max(2, *(len(found) for found in positions.values())))
     columns = min(len(positions), _PANELS_PER_LINE)
     lines = -(-len(positions) // columns)
-    figure = style.new_figure(max(4.6, 3.2 * columns + 0.8), 3.1 * lines + 0.5)
+    figure = style.new_figure(max(4.6, 3.2 * columns + 0.8), 2.7 * lines + 0.4)
     panels = []
     for i, (method, found) in enumerate(positions.items()):
         axes = figure.add_subplot(lines, columns, i + 1, projection="3d")
@@ -54,10 +55,14 @@ def positions_figure(
         for name, start, end in zip("xyz", low, high, strict=True):
             getattr(axes, f"set_{name}lim")(start, end)
             axis = getattr(axes, f"{name}axis")
-            axis.set_tick_params(labelsize=7, colors=style.MUTED, pad=-2)
+            if name != "z":  # its label would stand in the next panel
+                axis.set_label_text(f"{name} [m]", fontsize=7, color=style.MUTED)
+                axis.labelpad = -8
+            axis.set_tick_params(labelsize=7, colors=style.MUTED, pad=-3)
+            axis.set_major_locator(MaxNLocator(3 if name == "z" else 5, steps=[1, 2, 5, 10]))
             axis.set_pane_color("#f9fafb")
-        axes.set_box_aspect(high - low)
-        axes.set_title(method, fontsize=10, color=style.INK, fontweight="bold", pad=0)
+        axes.set_box_aspect(high - low, zoom=1.1)  # pyright: ignore[reportArgumentType]
+        axes.set_title(method, fontsize=10, color=style.INK, fontweight="bold", pad=-4)
         axes.view_init(elev=32, azim=-60)
     bar = figure.colorbar(
         ScalarMappable(scale, style.PATH_MAP), ax=panels, shrink=0.6, pad=0.04, aspect=30
