@@ -9,13 +9,20 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
 from r3jax.planning.config import PlannerConfig
+from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.policy import Decision, Outcome, PlanInfo
 from r3jax.planning.travel import Travel, plan_travel
+from r3jax.scoring.utility import visible_unexplored
+
+ENOUGH_LOOKS = 3
+"""So many views that should have shown a cell, and left it unexplored, and it is left alone: it
+lies behind a window, where the depth sensor fails, or where hits and passes cancel out."""
 
 
 class PlannerState(eqx.Module):
@@ -29,6 +36,9 @@ class PlannerState(eqx.Module):
 
     attempted: Bool[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
     """Frontier cells that were looked at on purpose (`frontier` policy)."""
+
+    looks: Int[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
+    """Views that should have shown each cell and left it unexplored."""
 
     memory: Any = None
     """Arrays that one policy keeps beside the map: a pytree of its own."""
@@ -52,15 +62,45 @@ class Stopwatch:
 def initial_state(camera: Camera, grid: OccupancyGrid, memory: Any = None) -> PlannerState:
     """The memory of a robot that has not moved yet."""
     nowhere = jnp.zeros(grid.log_odds.shape, dtype=bool)
-    return PlannerState(camera=camera, trail=nowhere, attempted=nowhere, memory=memory)
+    looks = jnp.zeros(grid.log_odds.shape, dtype=jnp.int32)
+    return PlannerState(camera=camera, trail=nowhere, attempted=nowhere, looks=looks, memory=memory)
 
 
-def look_round(
+def ways_from(
     state: PlannerState, grid: OccupancyGrid, T_world_camera: np.ndarray, config: PlannerConfig
 ) -> Travel:
     """Where the robot can go from here."""
     position = np.asarray(T_world_camera, dtype=np.float64)[:3, 3]
     return plan_travel(grid, position, config.safety_margin, np.asarray(state.trail))
+
+
+def look_round(
+    state: PlannerState,
+    map_state: MapState,
+    grid: OccupancyGrid,
+    T_world_camera: np.ndarray,
+    config: PlannerConfig,
+) -> tuple[PlannerState, Travel, OccupancyGrid]:
+    """Where the robot can go from here, and the grid without cells that are not worth a look.
+
+    Args:
+        state: the policy's memory.
+        map_state: the map, the view from here included.
+        grid: the grid, the same.
+        T_world_camera: where the latest view was taken.
+        config: the safety margin, and how far the camera sees.
+
+    Returns:
+        The memory with the view from here counted in, the ways, and the grid for scoring: cells
+        that no robot can look at, and those that several views left unexplored, are marked as
+        occupied in it (`mask_unexplorable`).
+    """
+    travel = ways_from(state, grid, T_world_camera, config)
+    pose = jnp.asarray(T_world_camera, dtype=jnp.float32)
+    visible = visible_unexplored(map_state, grid, state.camera, pose, config.scoring)
+    state = eqx.tree_at(lambda s: s.looks, state, state.looks + visible.astype(jnp.int32))
+    is_exhausted = np.asarray(state.looks) >= ENOUGH_LOOKS
+    return state, travel, mask_unexplorable(grid, travel.reachable, is_exhausted)
 
 
 def no_decision(

@@ -33,14 +33,23 @@ def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarr
     return _regions_that_touch(unexplored, ndimage.binary_dilation(open_space, _FACES))
 
 
-def mask_unexplorable(grid: OccupancyGrid, reached: np.ndarray) -> OccupancyGrid:
+def mask_unexplorable(
+    grid: OccupancyGrid, reached: np.ndarray, exhausted: np.ndarray | None = None
+) -> OccupancyGrid:
     """A copy of the grid for scoring, in which only explorable cells are left unexplored.
+
+    Args:
+        grid: the grid.
+        reached: cells the robot can come to, [X, Y, Z] bool.
+        exhausted: cells that were looked at in vain, [X, Y, Z] bool; None: there are none.
 
     The other unexplored cells are marked as occupied, so that the exploration utility, which
     counts visible unexplored cells, ignores them. Not for travel.
     """
     free, unexplored = np.asarray(grid.free), np.asarray(grid.unexplored)
     is_hopeless = unexplored & ~explorable_cells(free, unexplored, reached)
+    if exhausted is not None:
+        is_hopeless |= unexplored & exhausted
     log_odds = np.where(is_hopeless, np.float32(LOG_ODDS_LIMIT), np.asarray(grid.log_odds))
     return eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(log_odds))
 

@@ -28,7 +28,6 @@ from r3jax.planning.decision import (
     no_decision,
     settle,
 )
-from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.travel import Travel
 
@@ -43,7 +42,7 @@ class Situation:
     """As it is; for travel."""
 
     scoring_grid: OccupancyGrid
-    """Without hopeless unexplored cells (`mask_unexplorable`); for utilities."""
+    """Without unexplored cells that are not worth a look (`look_round`); for utilities."""
 
     travel: Travel
     """Where the robot can go from here."""
@@ -108,9 +107,8 @@ class GreedyPolicy:
         stopwatch = Stopwatch()
         draw_key, score_key = jax.random.split(key)
         with stopwatch.part("travel"):
-            travel = look_round(state, grid, T_world_camera, self.config)
+            state, travel, masked = look_round(state, map_state, grid, T_world_camera, self.config)
         with stopwatch.part("candidates"):
-            masked = mask_unexplorable(grid, travel.reachable)
             situation = Situation(map_state, grid, masked, travel, state.camera, state.memory)
             poses, memory = self.draw(situation, key=draw_key)
             situation = replace(situation, memory=memory)

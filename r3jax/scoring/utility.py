@@ -2,7 +2,8 @@
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -11,7 +12,7 @@ from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, visible_voxels
+from r3jax.scoring.visibility import candidates_of, depth_buffer, is_visible, visible_voxels
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
@@ -62,3 +63,20 @@ def utility_of_view(
     rendering = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, 1)[0]
     exploration = unexplored_by_direction(cells, view, buffer, position, 1)[0]
     return ViewUtility(exploration, rendering, config.lambda1 * exploration + rendering)
+
+
+@jax.jit
+def visible_unexplored(
+    state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+) -> Bool[Array, "X Y Z"]:
+    """The cells that U_G of a view counts."""
+    voxels, cells = voxels_of(state, config.delta), cells_of(grid)
+    view = pinhole_view(camera, T_world_camera, config)
+    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
+    place = view.place(jnp.stack([cells.x, cells.y, cells.z]))
+    is_seen = cells.unexplored & is_visible(view, place, buffer.distance)
+    return is_seen.reshape(grid.log_odds.shape)

@@ -15,7 +15,7 @@ from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decision import net_utility
+from r3jax.planning.decision import ENOUGH_LOOKS, initial_state, look_round, net_utility
 from r3jax.planning.policies.frontier import Frontier
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policies.renderability import Ours, OursPano
@@ -269,3 +269,26 @@ def test_an_unknown_name_lists_the_known_ones():
 def test_impossible_settings_are_named(setting, value):
     with pytest.raises(ValueError, match=setting):
         make_policy("ours", **{setting: value})
+
+
+def test_cells_looked_at_in_vain_are_left_alone():
+    """A window: the depth sensor learns nothing of what lies behind it, however often it looks."""
+    free, occupied = two_rooms()
+    known = (np.arange(25) < 18)[:, None, None]
+    grid = grid_of(free & known, occupied & known)
+    state = initial_state(CAMERA, grid)
+    pose = poses_along(center(14, 6, 4)[None], np.array([[1.0, 0.0, 0.0]]))[0]
+    config = PlannerConfig()
+    in_view = None
+    for look in range(ENOUGH_LOOKS):
+        state, _, masked = look_round(state, empty_map(64), grid, pose, config)
+        seen = np.asarray(state.looks) == look + 1
+        assert in_view is None or np.array_equal(seen, in_view)
+        in_view = seen
+        left = np.asarray(masked.unexplored)
+        assert left[in_view].any() == (look < ENOUGH_LOOKS - 1)
+    assert in_view.sum() > 50
+    assert np.asarray(masked.unexplored).any()  # what no view has shown still counts
+    away = poses_along(center(14, 6, 4)[None], np.array([[-1.0, 0.0, 0.0]]))[0]
+    state, _, _ = look_round(state, empty_map(64), grid, away, config)
+    assert not np.any((np.asarray(state.looks) > ENOUGH_LOOKS) & in_view)

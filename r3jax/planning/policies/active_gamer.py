@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.decision import PlannerState, Stopwatch, look_round, settle
+from r3jax.planning.decision import PlannerState, Stopwatch, settle, ways_from
 from r3jax.planning.greedy import GreedyPolicy, ScoreViews
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policy import Decision, PlanInfo
@@ -77,7 +77,7 @@ class ActiveGamer(GreedyPolicy):
         """The pool's best view; a random nearby one when no candidate can be reached."""
         stopwatch, config = Stopwatch(), self.config
         with stopwatch.part("travel"):
-            travel = look_round(state, grid, T_world_camera, config)
+            travel = ways_from(state, grid, T_world_camera, config)
         with stopwatch.part("candidates"):
             pools, draw = draw_candidates(state.memory, travel, config.num_candidates)
         state = replace(state, memory=pools)

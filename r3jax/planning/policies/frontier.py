@@ -17,7 +17,6 @@ from r3jax.mapping.occupancy import OccupancyGrid, frontier
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import VIEW_DISTANCE, host_generator, in_plain_view, poses_along
 from r3jax.planning.decision import PlannerState, Stopwatch, look_round, settle
-from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.greedy import GreedyPolicy
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policy import Decision, PlanInfo
@@ -55,9 +54,9 @@ class Frontier(GreedyPolicy):
         stopwatch, config = Stopwatch(), self.config
         target_key, random_key = jax.random.split(key)
         with stopwatch.part("travel"):
-            travel = look_round(state, grid, T_world_camera, config)
+            looked, travel, masked = look_round(state, map_state, grid, T_world_camera, config)
         with stopwatch.part("candidates"):
-            targets = np.asarray(frontier(mask_unexplorable(grid, travel.reachable)))
+            targets = np.asarray(frontier(masked))
             attempted = np.asarray(state.attempted)
             if not np.any(targets & ~attempted):
                 attempted = np.zeros_like(attempted)
@@ -74,7 +73,7 @@ class Frontier(GreedyPolicy):
         with stopwatch.part("travel"):
             path = travel.lengths(stops)
         utilities = {"path": path, "total": -path}
-        decision, state, info = settle(state, travel, poses, utilities, stopwatch)
+        decision, state, info = settle(looked, travel, poses, utilities, stopwatch)
         chosen = np.argmin(path)
         centers = travel.centers(np.moveaxis(np.indices(targets.shape), 0, -1))
         looked_at = attempted | _is_looked_at(centers, stops[chosen], aims[chosen])
