@@ -172,7 +172,7 @@ def latency_figure(latency: Samples, title: str = "") -> Figure:
     Line: median; band: to the 95th percentile; dotted: 99th percentile.
 
     Args:
-        latency: milliseconds [k, repeats] per method.
+        latency: milliseconds [k, repeats] per method, NaN where there are fewer repeats.
         title: above all, such as the machine.
     """
     looks = looks_of(list(latency))
@@ -180,13 +180,15 @@ def latency_figure(latency: Samples, title: str = "") -> Figure:
     for axes, (method, (frames, samples)) in zip(panels, latency.items(), strict=True):
         style.dress(axes, x="key frames", y="planning [ms]").label_outer()
         axes.set_title(method, fontsize=11, color=style.INK, loc="left", fontweight="bold", pad=16)
-        p50, p95, p99 = np.percentile(samples, [50, 95, 99], axis=1)
+        p50, p95, p99 = np.nanpercentile(samples, [50, 95, 99], axis=1)
         color = looks[method].color
         band = axes.fill_between(frames, p50, p95, color=color, alpha=0.2, label="to p95")
         band.set_linewidth(0)
         axes.plot(frames, p50, color=color, linewidth=2.0, label="p50")
         axes.plot(frames, p99, color=color, linewidth=1.0, linestyle=":", label="p99")
-        overall = (f"{p} {np.percentile(samples, int(p[1:])):.3g}" for p in ("p50", "p95", "p99"))
+        overall = (
+            f"{p} {np.nanpercentile(samples, int(p[1:])):.3g}" for p in ("p50", "p95", "p99")
+        )
         axes.annotate(
             f"all: {', '.join(overall)} ms", (0.0, 1.0), xycoords="axes fraction", xytext=(0, 4),
             textcoords="offset points", fontsize=8, color=style.MUTED,
@@ -212,7 +214,8 @@ def memory_figure(memory: Samples, title: str = "", limit: float | None = None) 
     axes = style.dress(figure.subplots(), title, "key frames", "memory [MB]")
     for method, look in looks_of(list(memory)).items():
         frames, used = memory[method]
-        axes.plot(frames, np.asarray(used) / 1e6, label=method, **look.line())
+        every = max(1, len(frames) // 12)  # markers, not beads
+        axes.plot(frames, np.asarray(used) / 1e6, label=method, markevery=every, **look.line())
     if limit is not None:
         axes.axhline(limit / 1e6, color=style.INK, linewidth=1.0, linestyle="--")
         axes.annotate(

@@ -13,14 +13,14 @@ Cell = Mapping[str, Any]
 """One record: the parsed JSON object."""
 
 POLICIES = (
-    "random", "uniform", "frontier", "unseen", "cover", "active_gamer", "active_gs", "ours",
-    "ours-pano",
+    "random", "uniform", "frontier", "unseen", "unseen-depth", "cover", "active-gamer",
+    "active-gs-no-depth", "active-gs", "ours", "ours-pano",
 )  # fmt: skip
 """Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""
 
 
 def method_name(cell: Cell) -> str:
-    """The policy with the settings it was given: `active_gs`, `active_gs (depth_factor=False)`."""
+    """The policy with the settings it was given: `active-gs`, `ours (lambda1=0.3)`."""
     settings = ", ".join(f"{name}={value}" for name, value in sorted(cell["settings"].items()))
     return f"{cell['policy']} ({settings})" if settings else cell["policy"]
 

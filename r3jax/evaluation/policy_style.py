@@ -24,8 +24,8 @@ class Look:
 
     color: str
     marker: str
-    dashes: str
-    """Style of the line: solid, and another for each further settings of the same policy."""
+    dashes: Any
+    """Style of the line, as matplotlib takes it."""
 
     width: float
     """Of the line [pt]."""
@@ -42,32 +42,39 @@ class Look:
 
 
 _POLICIES = {
-    "ours-pano": ("#D55E00", "o"),
-    "ours": ("#E69F00", "s"),
-    "active_gs": ("#0072B2", "^"),
-    "active_gamer": ("#56B4E9", "v"),
-    "cover": ("#CC79A7", "D"),
-    "unseen": ("#009E73", "P"),
-    "frontier": (style.INK, "X"),
-    "uniform": ("#7a4a1e", "d"),
-    "random": ("#c3c9d1", "."),
+    "ours-pano": ("#D55E00", "o", "-"),
+    "ours": ("#E69F00", "s", "-"),
+    "active-gs": ("#0072B2", "^", "-"),
+    "active-gs-no-depth": ("#0072B2", "<", "--"),
+    "active-gamer": ("#56B4E9", "v", "-"),
+    "cover": ("#CC79A7", "D", "-"),
+    "unseen": ("#009E73", "P", "--"),
+    "unseen-depth": ("#009E73", "p", "-"),
+    "frontier": (style.INK, "X", "-"),
+    "uniform": ("#7a4a1e", "d", "-"),
+    "random": ("#c3c9d1", "h", "-"),
 }
-_UNKNOWN = ("#8b5cf6", "*")
-_DASHES = ("-", "--", ":", "-.")
+"""Color, marker and dashes; the variants of one idea share a color."""
+
+_UNKNOWN = ("#8b5cf6", "*", "-")
+_DASHES = (":", "-.", (0, (5, 1, 1, 1, 1, 1)))
 
 
 def looks_of(methods: Sequence[str]) -> dict[str, Look]:
-    """The look of each method, as `equal_terms.method_name` writes it."""
+    """The look of each method, as `equal_terms.method_name` writes it.
+
+    The first settings of a policy look the same in every figure; others have other dashes.
+    """
     seen: dict[str, int] = {}
     looks = {}
     for method in methods:
         policy = method.partition(" (")[0]
-        color, marker = _POLICIES.get(policy, _UNKNOWN)
+        color, marker, dashes = _POLICIES.get(policy, _UNKNOWN)
         variant = seen[policy] = seen.get(policy, -1) + 1
-        is_ours = policy.startswith("ours")
-        looks[method] = Look(
-            color, marker, _DASHES[variant % len(_DASHES)], *((2.6, 4.0) if is_ours else (1.5, 3.0))
-        )
+        if variant:
+            dashes = _DASHES[(variant - 1) % len(_DASHES)]
+        width, order = (2.6, 4.0) if policy.startswith("ours") else (1.5, 3.0)
+        looks[method] = Look(color, marker, dashes, width, order)
     return looks
 
 

@@ -138,6 +138,7 @@ def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
     if absent:
         sentences.append(f"No record of {', '.join(absent)}.")
     machines, commits = (
-        ", ".join(sorted({c[key] for c in cells})) for key in ("machine", "commit")
+        ", ".join(sorted({str(c[key] or "unknown") for c in cells}))
+        for key in ("machine", "commit")
     )
     return (*sentences, f"Made on {machines} from commit {commits}.")

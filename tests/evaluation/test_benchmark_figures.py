@@ -119,16 +119,14 @@ def test_a_metric_that_some_lack():
 
 
 def test_every_method_has_its_own_look():
-    variants = ["active_gs", "active_gs (depth_factor=False)"]
-    looks = looks_of([*SKILL, variants[1]])
-    colors = [look.color for name, look in looks.items() if name not in variants[1:]]
-    assert len(set(colors)) == len(colors)
-    assert len({(look.color, look.dashes) for look in looks.values()}) == len(looks)
-    assert looks[variants[0]].color == looks[variants[1]].color
+    variants = ["ours", "ours (bins=32)", "ours (bins=8)"]
+    looks = looks_of([*SKILL, *variants[1:], "mine"])
+    assert len({(look.color, str(look.dashes)) for look in looks.values()}) == len(SKILL) + 3
+    assert len({look.color for name, look in looks.items() if name in variants}) == 1
+    assert len({looks[name].marker for name in SKILL}) == len(SKILL)
     assert looks_of(["ours"])["ours"] == looks["ours"]  # whoever else is drawn
     floor = max(look.width for name, look in looks.items() if not name.startswith("ours"))
     assert min(looks["ours"].width, looks["ours-pano"].width) > floor
-    assert "mine" in looks_of(["mine"])
 
 
 def seen_by(eye, color):
@@ -149,7 +147,8 @@ def test_colors_differ_without_red_or_green():
          [-0.011820, 0.042940, 0.968881]],
         np.eye(3),
     ])  # fmt: skip
-    policies = [look.color for look in looks_of([*SKILL, "cover", "mine"]).values()]
+    policies = sorted({look.color for look in looks_of([*SKILL, "mine"]).values()})
+    assert len(policies) == len(SKILL) + 1 - 2  # two share the color of their sibling
     for colors in (policies, OKABE_ITO):
         for eye in eyes:
             seen = [seen_by(eye, color) for color in colors]
@@ -199,6 +198,13 @@ def test_latency_shows_its_percentiles():
     assert_drawn_inside(figure)
 
 
+def test_latency_of_fewer_repeats():
+    samples = np.array([[1.0, 3.0, np.nan], [1.0, 2.0, 9.0]])
+    axes = latency_figure({"ours": (np.array([5, 15]), samples)}).axes[0]
+    np.testing.assert_allclose(lines_of(axes)["p50"], [[5, 15], [2.0, 2.0]])
+    assert axes.texts[0].get_text().startswith("all: p50 2, ")
+
+
 def test_memory_is_in_megabytes_from_zero():
     frames = np.arange(5)
     figure = memory_figure({"ours": (frames, 1e6 * frames)}, "device memory", limit=300e6)
@@ -212,7 +218,7 @@ def test_memory_is_in_megabytes_from_zero():
 
 
 def test_many_methods_fit():
-    named = [{**c, "settings": {"depth_factor": False}} for c in benchmark(("active_gs",))]
+    named = [{**c, "settings": {"pool_size": 9}} for c in benchmark(("active-gs",))]
     for scenes in (("flat",), ("flat", "house", "office", "gallery", "lounge")):
         figure = curve_figure(
             [*benchmark(scenes=scenes), *(c for c in named if c["scene"] in scenes)]

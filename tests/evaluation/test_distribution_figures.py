@@ -33,13 +33,13 @@ def ridges(axes):
 
 
 def test_a_ridge_for_every_method_and_snapshot():
-    cells = benchmark(("random", "active_gs", "ours"), snapshots=(30, 60))
+    cells = benchmark(("random", "active-gs", "ours"), snapshots=(30, 60))
     cells = [c for c in cells if (c["policy"], c["snapshot"]) != ("random", "views:30")]
     figure = ridge_figure(cells)
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["views:30", "views:60"]
     assert [len(ridges(axes)) for axes in figure.axes] == [2, 3]
     names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert names == ["ours", "active_gs", "random"]  # from below
+    assert names == ["ours", "active-gs", "random"]  # from below
     for axes, snapshot in zip(figure.axes, ("views:30", "views:60"), strict=True):
         dots = {int(line.get_ydata()[0]): line.get_xdata()[0] for line in axes.lines
                 if line.get_marker() == "."}  # fmt: skip

@@ -34,7 +34,7 @@ DIFFERENCES = [
 
 @pytest.mark.parametrize(("path", "value", "message"), DIFFERENCES)
 def test_unequal_terms_are_refused(path, value, message):
-    cells = benchmark(("active_gs", "ours"))
+    cells = benchmark(("active-gs", "ours"))
     check_equal_terms(cells)
     place = cells[-1]
     for name in path[:-1]:
@@ -65,10 +65,10 @@ def test_records_that_occur_twice_or_not_at_all():
 def test_names_and_orders_do_not_depend_on_the_order_of_records():
     cells = [
         record("ours-pano"), record("ours", settings={"pool": 9, "bins": 2}), record("ours"),
-        record("active_gs", "a"), record("random"), {**record(), "policy": "mine"},
+        record("active-gs", "a"), record("random"), {**record(), "policy": "mine"},
     ]  # fmt: skip
     assert method_name(cells[1]) == "ours (bins=2, pool=9)"
-    order = ["mine", "random", "active_gs", "ours", "ours (bins=2, pool=9)", "ours-pano"]
+    order = ["mine", "random", "active-gs", "ours", "ours (bins=2, pool=9)", "ours-pano"]
     assert methods_of(cells) == methods_of(cells[::-1]) == order
     assert scenes_of(cells) == ["a", "flat"]
     sizes = ["views:100", "views:30", "seconds:20.5", "views:9"]

@@ -14,7 +14,7 @@ from tests.evaluation.records import benchmark
 
 @pytest.fixture(scope="module")
 def tables():
-    cells = benchmark(("random", "active_gs", "ours", "ours-pano"))
+    cells = benchmark(("random", "active-gs", "ours", "ours-pano"))
     cells = [c for c in cells if (c["policy"], c["scene"]) != ("ours", "house")]
     return [
         quality_table(cells),

@@ -21,7 +21,7 @@ def fields(table):
 
 def fixed(**psnr):
     """One record of one view for each policy."""
-    return [record(policy.replace("_pano", "-pano"), psnr=[x]) for policy, x in psnr.items()]
+    return [record(policy.replace("_", "-"), psnr=[x]) for policy, x in psnr.items()]
 
 
 def law_quality(modules) -> None:
@@ -78,15 +78,15 @@ def law_gaps(modules) -> None:
     cells = [c for c in benchmark() if (c["policy"], c["scene"]) != ("ours", "house")]
     cells = [c for c in cells if (c["policy"], c["scene"], c["seed"]) != ("random", "flat", 2)]
     for cell in cells:
-        if cell["policy"] == "active_gs":
+        if cell["policy"] == "active-gs":
             cell["views"]["lpips"] = None
     found = fields(tables.quality_table(cells))
     assert [found["ours", "SSIM", c].value is None for c in ("flat", "house", "mean")] == [
         False, True, True,
     ]  # fmt: skip
     assert found["ours-pano", "PSNR [dB]", "mean"].rank == 1
-    assert found["active_gs", "LPIPS", "flat"].value is None
-    assert found["active_gs", "SSIM", "flat"].value is not None
+    assert found["active-gs", "LPIPS", "flat"].value is None
+    assert found["active-gs", "SSIM", "flat"].value is not None
     table = tables.tail_table(cells, resamples=50)
     assert all(e.value is None for key, e in fields(table).items() if key[0] == "ours")
     assert {row.labels[0]: row.seeds for row in table.rows} == {
@@ -128,18 +128,18 @@ def law_tails(modules) -> None:
 def law_difference(modules) -> None:
     """The reference minus the others, on the seeds that both have."""
     difference = modules["tables"].difference_table
-    cells = benchmark(("random", "active_gs", "ours"))
+    cells = benchmark(("random", "active-gs", "ours"))
     kept = [c for c in cells if (c["policy"], c["seed"]) != ("random", 1)]
     table = difference(kept, "ours", resamples=200)
     found = fields(table)
-    assert [row.labels for row in table.rows] == [("random",), ("active_gs",)]
+    assert [row.labels for row in table.rows] == [("random",), ("active-gs",)]
     assert [row.seeds for row in table.rows] == ["2", "3"]
 
     def mean(policy, scene, seeds):
         chosen = [c for c in cells if c["policy"] == policy and c["scene"] == scene]
         return np.mean([c["views"]["psnr"] for c in chosen if c["seed"] in seeds])
 
-    for policy, seeds in (("random", (0, 2)), ("active_gs", (0, 1, 2))):
+    for policy, seeds in (("random", (0, 2)), ("active-gs", (0, 1, 2))):
         gaps = [mean("ours", s, seeds) - mean(policy, s, seeds) for s in ("flat", "house")]
         entry = found[policy, "flat"]
         assert entry.value == pytest.approx(gaps[0])
@@ -164,7 +164,9 @@ def test_titles_and_notes_tell_the_terms():
     assert seeds == "2 seeds per cell, fewer than the 3 of the protocol."
     assert made == "Made on two cores from commit abc1234."
     assert quality_table(benchmark(("random", "ours"))).notes[1] == "3 seeds per cell."
-    assert quality_table([record()]).notes[1].startswith("1 seed per cell,")
+    single = quality_table([record(commit=None)]).notes
+    assert single[1].startswith("1 seed per cell,")
+    assert single[2] == "Made on two cores from commit unknown."
 
 
 def test_unequal_terms_and_unknown_names_are_refused():
