@@ -1,0 +1,333 @@
+"""The choice without the loop: what the utilities alone are worth.
+
+    python -m experiments.pool_selection --size smoke
+
+One pool of poses in the reachable free space of a scene, the same first views for all, and no path
+cost. A policy scores the whole pool, the best pose is taken, its frame joins the map, and so on.
+Vanilla 3DGS is then trained from scratch on each choice and judged on the scene's test views.
+
+The pool comes from the ground truth, the same for all; pictures come only from poses that were
+chosen. What is left out has no score of a pose: `frontier`, and `ours-pano`, which turns poses and
+so would have another pool. `active-gamer` is its gain, the empty pixels, without its lattice.
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from experiments.artefacts import (
+    markdown_table,
+    origin_of,
+    write_csv,
+    write_figure,
+    write_markdown,
+)
+from experiments.pool_figure import pool_figure
+from r3jax.benchmark.record import machine, source_commit
+from r3jax.evaluation.judge import judge
+from r3jax.evaluation.scores import summarize
+from r3jax.evaluation.test_views import load_view_set, render_view_set
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.step import integrate_growing
+from r3jax.files import write_atomic
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball, world_to_cell
+from r3jax.mapping.state import empty_map
+from r3jax.planning.candidates import host_generator, poses_along, random_directions
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.explorable import mask_unexplorable
+from r3jax.planning.greedy import Situation
+from r3jax.planning.policies.active_gamer import ActiveGamer, empty_share
+from r3jax.planning.policy import make_policy
+from r3jax.planning.travel import plan_travel
+from r3jax.scenes.registry import open_scene
+from r3jax.scoring.pixels import score_pixels
+from r3jax.simulators.base import Simulator
+from r3jax.simulators.free_space import GroundTruth
+from r3jax.splatting import train
+from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.views import Views, load_views
+
+NAME = "pool_selection"
+SCORED = (
+    "ours",
+    "active-gs",
+    "active-gs-no-depth",
+    "active-gamer",
+    "cover",
+    "unseen",
+    "unseen-depth",
+    "uniform",
+    "random",
+)
+"""Policies that give a pose a score."""
+
+SizeName = Literal["smoke", "small", "paper"]
+
+_integrate_depth = jax.jit(integrate_depth)
+_mark_free_ball = jax.jit(mark_free_ball)
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is chosen, trained and judged."""
+
+    scenes: tuple[str, ...]
+    seeds: tuple[int, ...]
+    pool: int
+    first: int
+    """Views that all choices begin with: the pool's first ones."""
+
+    snapshots: tuple[int, ...]
+    """Views at which a model is trained; the last is the number of views chosen."""
+
+    resolution: int
+    """Width and height of the images [px]."""
+
+    train_resolution: int
+    iterations: int
+    gaussians: int
+    test_views: int
+    """At most."""
+
+
+SIZES: dict[SizeName, Size] = {
+    "smoke": Size(("flat",), (0,), 64, 3, (8, 16), 128, 48, 300, 4_000, 60),
+    "small": Size(("flat", "office"), (0, 1), 250, 3, (30, 60), 256, 128, 2000, 20_000, 200),
+    "paper": Size(
+        ("flat", "apartment", "office", "gallery"),
+        (0, 1, 2),
+        500,
+        3,
+        (30, 60, 120, 300),
+        512,
+        512,
+        7000,
+        50_000,
+        1000,
+    ),
+}
+"""Ten minutes on two cores; three hours on two cores; many hours on a GPU."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Greedy choice from a pool of poses by each policy's utility, without paths."""
+
+    size: SizeName = "smoke"
+    """How much is done: `smoke` in minutes, `small` in hours, `paper` on GPUs."""
+
+    policies: tuple[str, ...] = SCORED
+    """Whose utility chooses."""
+
+    out: Path = Path("experiments/results")
+    """Folder of the results; they go into a folder named after the experiment and the size."""
+
+    work: Path = Path("runs/pool_selection")
+    """Folder of what is done already: it is not done again."""
+
+    def __post_init__(self) -> None:
+        """Refuses policies that have no score of a pose."""
+        unknown = sorted(set(self.policies) - set(SCORED))
+        if unknown or not self.policies:
+            raise ValueError(
+                f"--policies: {', '.join(unknown) or '(none given)'} cannot choose from a pool; "
+                f"known: {', '.join(SCORED)}"
+            )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One row of work: a policy chooses in a scene."""
+
+    policy: str
+    scene: str
+    seed: int
+    size: Size
+    commit: str | None
+
+    @property
+    def file_name(self) -> str:
+        """Where its record is kept."""
+        return f"{self.scene}-{self.policy}-{self.size.pool}poses-seed{self.seed}.json"
+
+
+def main(options: Options) -> Path:
+    """Chooses, trains and judges, writes the results, and returns their folder."""
+    records = list(_records(options))
+    folder = options.out / NAME / options.size
+    folder.mkdir(parents=True, exist_ok=True)
+    origin, rows = origin_of(f"experiments.{NAME}", records), result_rows(records)
+    write_csv(folder / "pool_selection.csv", rows, origin)
+    write_figure(folder / "pool_selection.png", pool_figure(rows), origin)
+    page = [f"# Choice from a pool ({options.size})", _READING, markdown_table(mean_rows(rows))]
+    page.append("![PSNR over views](pool_selection.png)")
+    write_markdown(folder / "pool_selection.md", page, origin)
+    print(f"results  {folder}")
+    return folder
+
+
+_READING = (
+    "PSNR over the test views: mean, 5th percentile, and the share of views under 20 dB; SSIM. "
+    "Means over scenes and seeds. `cover` has unexplored cells added (1000 U_G / cells, as in "
+    "Active-GS), without which it cannot explore."
+)
+
+
+def _records(options: Options) -> Iterator[dict[str, Any]]:
+    size, commit = SIZES[options.size], source_commit()
+    options.work.mkdir(parents=True, exist_ok=True)
+    for scene in size.scenes:
+        for seed in size.seeds:
+            for policy in options.policies:
+                choice, begin = Choice(policy, scene, seed, size, commit), time.perf_counter()
+                yield _kept_or_made(options.work, choice)
+                print(f"{choice.file_name} {time.perf_counter() - begin:.0f} s", flush=True)
+
+
+def _kept_or_made(work: Path, choice: Choice) -> dict[str, Any]:
+    asked = json.loads(json.dumps(dataclasses.asdict(choice)))
+    path = work / choice.file_name
+    if path.exists():
+        kept = json.loads(path.read_text())
+        if kept["flight"] == asked:
+            return kept
+    record = {"flight": asked, "machine": machine()} | make(choice, work / "test_views")
+    write_atomic(path, json.dumps(record).encode())
+    return record
+
+
+def make(choice: Choice, test_views: Path) -> dict[str, Any]:
+    """Chooses views, then trains and judges at every snapshot."""
+    size, seed = choice.size, choice.seed
+    camera = Camera.from_fov(size.resolution, size.resolution)
+    simulator = open_scene(choice.scene, camera=camera, seed=seed)
+    truth = GroundTruth(simulator)
+    poses = pool_of(truth, size.pool, key=jax.random.key(seed))
+    chosen, frames = choose(choice.policy, simulator, poses, size.first, size.snapshots[-1], seed)
+    view_set = load_view_set(test_views, truth, max_views=size.test_views)
+    tests = load_views(render_view_set(truth, view_set, size.resolution), size.train_resolution)
+    scores = {str(n): _train_and_judge(frames[:n], tests, choice) for n in size.snapshots}
+    return {"chosen": chosen, "scores": scores, "test_views_hash": view_set.hash}
+
+
+def pool_of(truth: GroundTruth, num: int, *, key: jax.Array) -> np.ndarray:
+    """Poses at random free places that a camera can reach, in random directions, [num, 4, 4]."""
+    place_key, direction_key = jax.random.split(key)
+    places = truth.free_positions((0.25, 0.25, 0.25), 0.3)
+    drawn = host_generator(place_key).choice(len(places), num, replace=num > len(places))
+    return poses_along(places[drawn], random_directions(num, key=direction_key))
+
+
+def choose(
+    name: str, simulator: Simulator, poses: np.ndarray, first: int, num: int, seed: int
+) -> tuple[list[int], list[Frame]]:
+    """Greedy choice of `num` of the poses [P, 4, 4], the first `first` of which are given.
+
+    Returns:
+        The numbers of the chosen poses in order, and their frames.
+    """
+    config = ExplorationConfig()
+    policy: Any = make_policy(name, num_candidates=len(poses), num_frontier=0)
+    grid = empty_grid(simulator.bounds, config.cell_size)
+    # Whatever the pool reaches counts as reachable: there is no robot that must get there.
+    cells = np.asarray(world_to_cell(grid, jnp.asarray(poses[:, :3, 3], jnp.float32)))
+    reached = np.zeros(grid.log_odds.shape, dtype=bool)
+    reached[tuple(cells.T)] = True
+    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
+    key = jax.random.key(seed)
+    state = policy.init(simulator.camera, grid, key=key)
+    chosen: list[int] = []
+    frames: list[Frame] = []
+    while len(chosen) < num:
+        best = len(chosen)
+        if best >= first:
+            travel = plan_travel(grid, poses[chosen[-1], :3, 3], PlannerConfig().safety_margin)
+            masked = mask_unexplorable(grid, reached)
+            where = Situation(map_state, grid, masked, travel, simulator.camera, state.memory)
+            totals = totals_of(policy, where, poses, key=jax.random.fold_in(key, best))
+            totals[chosen] = -np.inf
+            best = int(np.argmax(totals))
+        frame = simulator.render(poses[best])
+        map_state = integrate_growing(map_state, frame, config)
+        grid = _integrate_depth(grid, frame, config.max_range)
+        grid = _mark_free_ball(grid, frame.position, config.body_radius)
+        state = policy.observe(state, map_state, frame)
+        chosen.append(best)
+        frames.append(frame)
+    return chosen, frames
+
+
+def totals_of(policy: Any, where: Situation, poses: np.ndarray, *, key: jax.Array) -> np.ndarray:
+    """What a policy gives each pose if no path costs anything, [P] float64."""
+    if isinstance(policy, ActiveGamer):
+        state, grid, scoring = where.map_state, where.grid, policy.scoring_for(where.grid)
+        flat = poses.astype(np.float32)
+        return np.array(
+            score_pixels(empty_share, state, grid, where.camera, flat, scoring), np.float64
+        )
+    _, utilities = policy.score(where, poses, key=key)
+    return np.array(policy.weigh(utilities | {"path": np.zeros(len(poses))}), np.float64)
+
+
+def _train_and_judge(frames: list[Frame], tests: Views, choice: Choice) -> dict[str, float]:
+    """Metrics of a model that is trained from scratch on the frames."""
+    size = choice.size
+    config = TrainConfig(
+        iterations=size.iterations,
+        num_gaussians=size.gaussians,
+        capacity=2 * size.gaussians,
+        seed=choice.seed,
+    )
+    scene = train.fit(load_views(frames, size.train_resolution), config).scene
+    found = {s.metric.name: s for s in summarize(judge(scene, tests, config.raster).rows)}
+    psnr = found["psnr"]
+    return {
+        "psnr": psnr.mean,
+        "psnr_low": psnr.interval[0],
+        "psnr_high": psnr.interval[1],
+        "psnr_p5": psnr.percentile_5,
+        "poor_share": psnr.poor_share or 0.0,
+        "ssim": found["ssim"].mean,
+    }
+
+
+def result_rows(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row per scene, seed, policy and snapshot."""
+    return [
+        {name: record["flight"][name] for name in ("scene", "seed", "policy")}
+        | {"views": int(views)}
+        | {name: round(value, 4) for name, value in scores.items()}
+        for record in records
+        for views, scores in record["scores"].items()
+    ]
+
+
+def mean_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row per policy: means over scenes and seeds at each snapshot, the best policy first."""
+    snapshots = sorted({row["views"] for row in rows})
+    table = []
+    for policy in dict.fromkeys(row["policy"] for row in rows):
+        line: dict[str, Any] = {"policy": policy}
+        for views in snapshots:
+            own = [row for row in rows if (row["policy"], row["views"]) == (policy, views)]
+            mean = lambda name, own=own: float(np.mean([row[name] for row in own]))
+            line[f"PSNR at {views}"] = f"{mean('psnr'):.2f} [{mean('psnr_p5'):.2f}]"
+            line[f"under 20 dB at {views}"] = f"{100 * mean('poor_share'):.0f} %"
+            line[f"SSIM at {views}"] = f"{mean('ssim'):.3f}"
+        table.append((mean("psnr"), line))
+    return [line for _, line in sorted(table, key=lambda entry: -entry[0])]
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
