@@ -9,26 +9,18 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from r3jax.evaluation import style
 from r3jax.evaluation.equal_terms import (
+    EXPLORATION,
     Cell,
     check_equal_terms,
     method_name,
     methods_of,
     scenes_of,
-    snapshots_of,
-    view_values,
+    snapshot_kind,
+    values_by_seed,
 )
 from r3jax.evaluation.policy_style import OKABE_ITO, Look, legend_below, looks_of
 from r3jax.evaluation.scores import METRICS
 from r3jax.evaluation.table_parts import full_title
-
-EXPLORATION = {
-    "views": "views",
-    "seconds": "mission clock [s]",
-    "metres": "path [m]",
-    "known_share": "share of the box explored",
-    "mean_renderability": "mean renderability",
-}
-"""Quantities of a record's exploration, and their names on axes."""
 
 _PANELS_PER_LINE = 4
 
@@ -42,16 +34,14 @@ def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Fi
 
     Args:
         cells: records of one kind of snapshot (`views:N`, `seconds:S` or `metres:M`).
-        x: of `EXPLORATION`.
-        y: of `EXPLORATION`, or a metric, then its mean over the test views.
+        x: of `equal_terms.EXPLORATION`.
+        y: of `equal_terms.EXPLORATION`, or a metric, then its mean over the test views.
 
     Raises:
         ValueError: records not on equal terms, several kinds of snapshots, an unknown quantity.
     """
     check_equal_terms(cells, one_snapshot=False)
-    kinds = sorted({snapshot.partition(":")[0] for snapshot in snapshots_of(cells)})
-    if len(kinds) > 1:
-        raise ValueError(f"one figure shows snapshots of one kind, got {' and '.join(kinds)}")
+    snapshot_kind(cells)
     scenes, looks = scenes_of(cells), looks_of(methods_of(cells))
     x_label, y_label = _label(x), _label(y)
     figure, panels = _panels(len(scenes))
@@ -59,7 +49,7 @@ def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Fi
         style.dress(axes, scene, x_label, y_label)
         for method, look in looks.items():
             chosen = [c for c in cells if c["scene"] == scene and method_name(c) == method]
-            _draw_curve(axes, method, look, _by_seed(chosen, x), _by_seed(chosen, y))
+            _draw_curve(axes, method, look, values_by_seed(chosen, x), values_by_seed(chosen, y))
     legend_below(figure, list(looks))
     return figure
 
@@ -69,19 +59,6 @@ def _label(quantity: str) -> str:
     if quantity not in titles:
         raise ValueError(f"no quantity {quantity!r}; there are {', '.join(titles)}")
     return titles[quantity]
-
-
-def _by_seed(cells: Sequence[Cell], quantity: str) -> np.ndarray:
-    """Its values, [seeds, snapshots]; NaN where there is no record."""
-    seeds, snapshots = sorted({cell["seed"] for cell in cells}), snapshots_of(cells)
-    values = np.full((len(seeds), len(snapshots)), np.nan)
-    for cell in cells:
-        place = seeds.index(cell["seed"]), snapshots.index(cell["snapshot"])
-        if quantity in EXPLORATION:
-            values[place] = cell["exploration"][quantity]
-        elif (views := view_values(cell, quantity)) is not None and not np.isnan(views).all():
-            values[place] = np.nanmean(views)
-    return values
 
 
 def _draw_curve(axes: Axes, method: str, look: Look, x: np.ndarray, y: np.ndarray) -> None:

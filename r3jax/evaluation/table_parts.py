@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from r3jax.evaluation.equal_terms import Cell, seeds_by_method
+from r3jax.evaluation.equal_terms import Cell, seeds_by_method, snapshots_of
 from r3jax.evaluation.scores import METRICS, Metric
 from r3jax.evaluation.statistics import Estimate
 
@@ -129,7 +129,8 @@ def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
     told = f"{most}" if fewest == most else f"{fewest} to {most}"
     short = f", fewer than the {FEWEST_SEEDS} of the protocol" if fewest < FEWEST_SEEDS else ""
     sentences = [
-        f"{cell['snapshot']} on the {cell['clock']} clock, images of {cell['resolution']} px; "
+        f"{', '.join(snapshots_of(cells))} on the {cell['clock']} clock, "
+        f"images of {cell['resolution']} px; "
         f"{training['iterations']} iterations of training at {training['resolution']} px; "
         f"test views of {pixels} px.",
         f"{told} seed{'s' * (most > 1)} per cell{short}.",

@@ -233,7 +233,7 @@ def test_many_methods_fit():
 
 def test_mistakes_are_named():
     cells = [record(snapshot=30), record(snapshot=30) | {"snapshot": "seconds:30"}]
-    with pytest.raises(ValueError, match="one kind, got seconds and views"):
+    with pytest.raises(ValueError, match="of one kind, got seconds and views"):
         curve_figure(cells)
     with pytest.raises(ValueError, match="no quantity 'mse'; there are views, seconds"):
         curve_figure([record()], y="mse")
