@@ -21,7 +21,7 @@ class SurfaceDistance:
         """Cuts the mesh `vertices` [V, 3] [m], `faces` [F, 3] and builds the tree."""
         corners = vertices[faces].astype(np.float64)
         extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
-        self._pieces = _cut(corners, max(0.25, extent / 80.0))
+        self._pieces = cut_triangles(corners, max(0.25, extent / 80.0))
         centers = self._pieces.mean(axis=1)
         self._radius = float(np.linalg.norm(self._pieces - centers[:, None], axis=2).max())
         self._tree = KDTree(centers)
@@ -34,7 +34,7 @@ class SurfaceDistance:
         reach, nearest = reach.reshape(len(points), k), nearest.reshape(len(points), k)
         found = np.full(len(points), np.inf)
         for column in nearest.T:
-            found = np.minimum(found, _point_triangle(points, self._pieces[column]))
+            found = np.minimum(found, point_triangle(points, self._pieces[column]))
         # A piece that was not looked at is at least this far away.
         is_open = reach[:, -1] - self._radius < found
         if k < len(self._pieces):
@@ -42,11 +42,11 @@ class SurfaceDistance:
                 rest = self._tree.query_ball_point(points[i], found[i] + self._radius)
                 if rest:
                     point = np.broadcast_to(points[i], (len(rest), 3))
-                    found[i] = min(found[i], _point_triangle(point, self._pieces[rest]).min())
+                    found[i] = min(found[i], point_triangle(point, self._pieces[rest]).min())
         return found
 
 
-def _cut(corners: np.ndarray, longest: float) -> np.ndarray:
+def cut_triangles(corners: np.ndarray, longest: float) -> np.ndarray:
     """Halves triangles [n, 3, 3] at their longest edge until no edge is over `longest` [m]."""
     done = []
     while len(corners):
@@ -64,7 +64,7 @@ def _cut(corners: np.ndarray, longest: float) -> np.ndarray:
     return np.concatenate(done)
 
 
-def _point_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def point_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Distance of each point [n, 3] to its triangle [n, 3, 3]."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     edges = [_point_segment(points, p, q) for p, q in ((a, b), (b, c), (c, a))]

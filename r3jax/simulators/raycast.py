@@ -7,6 +7,7 @@ texture filter already does. A mirror's share of the colour comes from one refle
 Shape symbols: H W image size; n rays; F faces.
 """
 
+import copy
 import functools
 
 import jax
@@ -60,13 +61,11 @@ class RaycastSimulator:
         Raises:
             ValueError: settings out of range, or a start inside or too close to the mesh.
         """
-        if max_range is not None and not max_range > 0.0:
-            raise ValueError(f"max_range must be positive or None, got {max_range}")
         if not 0 <= supersample <= len(_SUBPIXELS):
             raise ValueError(f"supersample must be 0 to {len(_SUBPIXELS)}, got {supersample}")
         self.world = world
         self._camera = Camera.from_fov(512, 512, 60.0) if camera is None else camera
-        self._max_depth = np.float32(np.inf if max_range is None else max_range)
+        self._max_depth = _depth_limit(max_range)
         self._cull = cull_back_faces
         self._offsets = _SUBPIXELS[:supersample]
         self._seed = seed
@@ -106,6 +105,17 @@ class RaycastSimulator:
                 "a start_pose"
             )
         return self._start.copy()
+
+    def with_camera(self, camera: Camera, *, max_range: float | int | None) -> "RaycastSimulator":
+        """The same world in the same light through another camera; nothing is built again.
+
+        Raises:
+            ValueError: `max_range` is not positive.
+        """
+        other = copy.copy(self)
+        other._camera, other._max_depth = camera, _depth_limit(max_range)
+        other._pixels = other._pixel_directions()
+        return other
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Distances [n] of `points` [n, 3] to the mesh [m]. For tests: the loop never has it."""
@@ -267,6 +277,13 @@ class RaycastSimulator:
         flat = image.reshape(-1, 3)
         extra = colors.reshape(len(shifts), -1, 3).sum(axis=0)
         flat[pixels] = (flat[pixels] + extra) / np.float32(len(shifts) + 1)
+
+
+def _depth_limit(max_range: float | int | None) -> np.float32:
+    """The depth beyond which nothing is measured [m]."""
+    if max_range is not None and not max_range > 0.0:
+        raise ValueError(f"max_range must be positive or None, got {max_range}")
+    return np.float32(np.inf if max_range is None else max_range)
 
 
 def _is_edge(image: np.ndarray, face: np.ndarray) -> np.ndarray:

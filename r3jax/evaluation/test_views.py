@@ -1,0 +1,320 @@
+"""The referee's test views of a scene: fixed, stored with a hash, the same for every method.
+
+As in Replica-Dense: positions on a lattice of 1.0 x 1.0 x 0.75 m in the free space that a camera
+can reach from the start, and at each of them six views without roll along +x, -x, +y, -y, +z, -z.
+Views that show mostly void (out of a window, up where a scan has no ceiling) are left out.
+
+A set is computed once for a scene and settings, and read after that. Its hash covers everything
+in it, poses included, and poses are multiples of 0.1 mm: machines agree on it.
+
+Shape symbols: P positions; V views.
+"""
+
+import functools
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from r3jax.files import write_atomic
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera, pose_along
+
+SPACING = (1.0, 1.0, 0.75)
+"""Replica-Dense's lattice [m]."""
+
+MARGIN = 0.3
+"""The robot's radius [m]."""
+
+_FORMAT = 1
+_LOOKS = ("+x", "-x", "+y", "-y", "+z", "-z")
+_LEAST_SEEN = 0.5
+"""A view with less surface than this share of the picture is left out."""
+
+_SEED = 0
+"""Of the choice among positions where `max_views` is given."""
+
+
+@runtime_checkable
+class Truth(Protocol):
+    """What the referee asks of a world (`r3jax.simulators.free_space.GroundTruth`)."""
+
+    @property
+    def scene(self) -> str:
+        """The scene's name."""
+        ...
+
+    @property
+    def scene_hash(self) -> str:
+        """SHA-256 of what the scene shows."""
+        ...
+
+    def free_positions(self, spacing: Sequence[float | int], margin: float | int) -> np.ndarray:
+        """Reachable lattice points [P, 3] [m]."""
+        ...
+
+    def seen_share(self, poses: np.ndarray) -> np.ndarray:
+        """Share of a view that shows a surface, [V] in [0, 1]."""
+        ...
+
+    def frames(self, poses: np.ndarray, camera: Camera) -> Iterator[Frame]:
+        """Frames without noise at poses [V, 4, 4]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSet:
+    """Test views of one scene."""
+
+    scene: str
+    """The scene's name."""
+
+    scene_hash: str
+    """SHA-256 of what the scene shows: the views mean nothing in another one."""
+
+    spacing: tuple[float, float, float]
+    """Of the lattice [m]."""
+
+    margin: float
+    """Least distance to every surface [m]."""
+
+    max_views: int | None
+    """Views at most; None: all of the lattice."""
+
+    positions: np.ndarray
+    """Camera centre of each view [V, 3] [m] float64, multiples of 0.1 mm."""
+
+    looks: tuple[str, ...]
+    """Viewing direction of each view: "+x", "-x", ... [V]."""
+
+    def __len__(self) -> int:
+        return len(self.looks)
+
+    @functools.cached_property
+    def poses(self) -> np.ndarray:
+        """`T_world_camera` of each view, [V, 4, 4] float64."""
+        return poses_at(self.positions, self.looks)
+
+    @functools.cached_property
+    def hash(self) -> str:
+        """SHA-256 over the scene, the settings and the poses."""
+        digest = hashlib.sha256(json.dumps([self.scene, *_settings(self)]).encode())
+        # Whole numbers: no machine's floats, and no -0.0, get in.
+        digest.update(np.rint(self.poses * 1e4).astype("<i8").tobytes())
+        return digest.hexdigest()
+
+
+def compute_view_set(
+    truth: Truth,
+    *,
+    spacing: Sequence[float | int] = SPACING,
+    margin: float | int = MARGIN,
+    max_views: int | None = None,
+) -> ViewSet:
+    """Finds the test views of a scene.
+
+    Args:
+        truth: the scene.
+        spacing: of the lattice along x, y, z [m].
+        margin: least distance to every surface [m].
+        max_views: positions, with all of their views, are left out evenly until there are no
+            more views than this; None: keep all.
+
+    Raises:
+        ValueError: settings out of range, fewer than six views asked for, or none found.
+    """
+    if max_views is not None and max_views < len(_LOOKS):
+        raise ValueError(
+            f"max_views must be at least {len(_LOOKS)}, the views of one position; got {max_views}"
+        )
+    positions = truth.free_positions(spacing, margin)
+    if max_views is not None:
+        positions = positions[_evenly(positions, spacing, max_views // len(_LOOKS))]
+    centers, looks = np.repeat(positions, len(_LOOKS), axis=0), np.tile(_LOOKS, len(positions))
+    shows_something = np.zeros(0, dtype=bool)
+    if len(looks):
+        shows_something = truth.seen_share(poses_at(centers, looks)) >= _LEAST_SEEN
+    if not shows_something.any():
+        raise ValueError(
+            f"{truth.scene}: no test views: of a lattice of {tuple(spacing)} m, "
+            f"{len(positions)} points keep {margin} m from every surface and can be reached from "
+            "the start, and from none of them is there something to see; try a finer lattice or "
+            "a smaller margin"
+        )
+    x, y, z = (float(side) for side in spacing)
+    return ViewSet(
+        truth.scene,
+        truth.scene_hash,
+        (x, y, z),
+        float(margin),
+        max_views,
+        centers[shows_something],
+        tuple(looks[shows_something].tolist()),
+    )
+
+
+def load_view_set(
+    folder: str | Path,
+    truth: Truth,
+    *,
+    spacing: Sequence[float | int] = SPACING,
+    margin: float | int = MARGIN,
+    max_views: int | None = None,
+) -> ViewSet:
+    """The stored test views of a scene; computed and stored if they are not there yet.
+
+    Several processes may ask at once: whoever is first, all get the same views.
+
+    Args:
+        folder: where sets are kept; created if it is missing.
+        truth: the scene.
+        spacing: see `compute_view_set`.
+        margin: see `compute_view_set`.
+        max_views: see `compute_view_set`.
+
+    Raises:
+        ValueError: the stored file is damaged, was changed, or belongs to another scene; or see
+            `compute_view_set`.
+        OSError: the folder cannot be written.
+    """
+    wanted = (tuple(float(side) for side in spacing), float(margin), max_views)
+    settings = hashlib.sha256(json.dumps(wanted).encode()).hexdigest()
+    path = Path(folder) / f"{truth.scene}-{truth.scene_hash[:12]}-{settings[:8]}.json"
+    if not path.exists():
+        view_set = compute_view_set(truth, spacing=spacing, margin=margin, max_views=max_views)
+        _write(path, view_set)
+    view_set = read_view_set(path)
+    _check_scene(view_set, truth, str(path))
+    if (view_set.spacing, view_set.margin, view_set.max_views) != wanted:
+        raise ValueError(f"{path} was stored for other settings than {wanted}: {_AGAIN}")
+    return view_set
+
+
+def render_view_set(
+    truth: Truth, view_set: ViewSet, resolution: int, fov: float | int = 60.0
+) -> Iterator[Frame]:
+    """The truth at every test view: exact depth without limit of range.
+
+    Args:
+        truth: the scene.
+        view_set: its test views.
+        resolution: width and height [px].
+        fov: field of view [deg].
+
+    Raises:
+        ValueError: the views belong to another scene, or no such camera exists.
+    """
+    _check_scene(view_set, truth, "these test views")
+    return truth.frames(view_set.poses, Camera.from_fov(resolution, resolution, fov))
+
+
+def read_view_set(path: str | Path) -> ViewSet:
+    """Reads a stored set.
+
+    Raises:
+        ValueError: it is damaged, or its content does not give its hash.
+        OSError: it cannot be read.
+    """
+    path = Path(path)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record["format"] != _FORMAT:
+            raise ValueError(f"its format is {record['format']}, not {_FORMAT}")
+        view_set = _from_record(record)
+        matches = view_set.hash == record["hash"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not a set of test views ({error!r}): {_AGAIN}") from error
+    if not matches:
+        raise ValueError(f"{path} was changed: its content does not give its hash; {_AGAIN}")
+    return view_set
+
+
+_AGAIN = "delete the file and it is computed again"
+
+
+def poses_at(positions: np.ndarray, looks: Sequence[str] | np.ndarray) -> np.ndarray:
+    """Poses without roll, [V, 4, 4] float64, at positions [V, 3] [m] along "+x", "-x", ..."""
+    axes = {}
+    for look in _LOOKS:
+        direction = np.zeros(3, np.float32)
+        direction["xyz".index(look[1])] = 1.0 if look[0] == "+" else -1.0
+        # Entries are 0 or 1 up to rounding; adding 0 turns -0.0 into 0.0.
+        axes[look] = np.rint(pose_along(np.zeros(3, np.float32), direction)) + 0.0
+    poses = np.stack([axes[str(look)] for look in looks]).astype(np.float64)
+    poses[:, :3, 3] = positions
+    return poses
+
+
+def _evenly(positions: np.ndarray, spacing: Sequence[float | int], count: int) -> np.ndarray:
+    """Indices of `count` of the positions [P, 3], in order: every so-manieth along a Morton curve.
+
+    Neighbours along the curve are neighbours in space, so that each region keeps its share.
+    """
+    if count >= len(positions):
+        return np.arange(len(positions))
+    cells = np.rint((positions - positions.min(axis=0)) / np.asarray(spacing)).astype(np.int64)
+    bits = range(int(cells.max()).bit_length())
+    code = sum((cells[:, k] >> b & 1) << (3 * b + k) for b in bits for k in range(3))
+    first = np.random.default_rng(_SEED).random()
+    ranks = ((np.arange(count) + first) * len(positions) / count).astype(int)
+    return np.sort(np.argsort(code, kind="stable")[ranks])
+
+
+def _settings(view_set: ViewSet) -> list[Any]:
+    """Everything but the views, as JSON holds it."""
+    return [view_set.scene_hash, [*view_set.spacing], view_set.margin, view_set.max_views]
+
+
+def _check_scene(view_set: ViewSet, truth: Truth, what: str) -> None:
+    """Refuses views of another scene."""
+    if view_set.scene_hash != truth.scene_hash:
+        raise ValueError(
+            f"{what}: made for the scene {view_set.scene!r} with hash "
+            f"{view_set.scene_hash[:12]}, but {truth.scene!r} has {truth.scene_hash[:12]}: the "
+            "scene was changed, or these are another scene's views; compute them again"
+        )
+
+
+def _write(path: Path, view_set: ViewSet) -> None:
+    """Stores a set; a reader sees all of it or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [
+        json.dumps({"position": [round(x, 4) for x in position.tolist()], "look": look})
+        for position, look in zip(view_set.positions, view_set.looks, strict=True)
+    ]
+    head = {
+        "format": _FORMAT,
+        "scene": view_set.scene,
+        "scene_hash": view_set.scene_hash,
+        "spacing": view_set.spacing,
+        "margin": view_set.margin,
+        "max_views": view_set.max_views,
+        "hash": view_set.hash,
+    }
+    text = json.dumps(head)[:-1] + ',\n"views": [\n' + ",\n".join(lines) + "\n]}\n"
+    # A name of its own: two processes that write the same set must not share a temporary file.
+    own = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+    write_atomic(own, text.encode())
+    os.replace(own, path)
+
+
+def _from_record(record: dict[str, Any]) -> ViewSet:
+    """The set that a stored record describes."""
+    x, y, z = (float(side) for side in record["spacing"])
+    views = record["views"]
+    positions = np.array([view["position"] for view in views], dtype=np.float64).reshape(-1, 3)
+    return ViewSet(
+        str(record["scene"]),
+        str(record["scene_hash"]),
+        (x, y, z),
+        float(record["margin"]),
+        record["max_views"],
+        positions,
+        tuple(str(view["look"]) for view in views),
+    )
