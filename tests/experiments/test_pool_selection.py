@@ -1,0 +1,122 @@
+"""The choice from a pool: greedy, from chosen poses only, and the tables by hand."""
+
+import csv
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import pool_choice, pool_selection
+from experiments.pool_choice import SCORED, choose, pool_of
+from experiments.pool_selection import Options, mean_rows, result_rows
+from r3jax.geometry.cameras import Camera
+from r3jax.planning.policy import policy_names
+from r3jax.scenes.registry import open_scene
+from r3jax.simulators.free_space import GroundTruth
+
+POOL, FIRST, NUM = 12, 2, 6
+
+
+@pytest.fixture(scope="module")
+def flat():
+    simulator = open_scene("flat", camera=Camera.from_fov(48, 48))
+    return simulator, pool_of(GroundTruth(simulator), POOL, key=jax.random.key(0))
+
+
+class Spy:
+    """A simulator that remembers from where it was asked."""
+
+    def __init__(self, simulator):
+        self._simulator, self.asked = simulator, []
+        self.camera, self.bounds = simulator.camera, simulator.bounds
+
+    def render(self, pose):
+        self.asked.append(np.array(pose))
+        return self._simulator.render(pose)
+
+
+def test_the_pool_is_free_and_repeatable(flat):
+    simulator, poses = flat
+    assert poses.shape == (POOL, 4, 4)
+    clearance = GroundTruth(simulator)._simulator.clearance(poses[:, :3, 3])
+    assert clearance.min() > 0.29
+    again = pool_of(GroundTruth(simulator), POOL, key=jax.random.key(0))
+    np.testing.assert_array_equal(poses, again)
+    other = pool_of(GroundTruth(simulator), POOL, key=jax.random.key(1))
+    assert np.any(other != poses)
+
+
+@pytest.mark.parametrize("name", SCORED)
+def test_every_choice_begins_alike_and_takes_no_pose_twice(flat, name):
+    simulator, poses = flat
+    spy = Spy(simulator)
+    chosen, frames = choose(name, spy, poses, FIRST, NUM, seed=0)
+    assert chosen[:FIRST] == [0, 1]
+    assert len(set(chosen)) == len(frames) == NUM
+    # Pictures come from the chosen poses only, one each.
+    np.testing.assert_array_equal(np.stack(spy.asked), poses[chosen])
+
+
+def test_the_best_of_the_pool_is_taken(flat, monkeypatch):
+    simulator, poses = flat
+    totals = np.array([9.0, 8.0, 1.0, 5.0, 3.0, 7.0, 2.0, 0.0, 6.0, 4.0, -1.0, -2.0])
+    monkeypatch.setattr(pool_choice, "totals_of", lambda *args, **keys: totals.copy())
+    chosen, _ = choose("unseen", simulator, poses, FIRST, NUM, seed=0)
+    assert chosen == [0, 1, 5, 8, 3, 9]
+
+
+def test_what_has_no_score_is_refused():
+    assert set(policy_names()) - set(SCORED) == {"frontier", "ours-pano"}
+    with pytest.raises(ValueError, match=r"frontier cannot choose.*unseen-depth"):
+        Options(policies=("ours", "frontier"))
+    with pytest.raises(ValueError, match="none given"):
+        Options(policies=())
+
+
+def record(policy, seed, psnr):
+    scores = {
+        views: {"psnr": value, "psnr_p5": value - 5, "poor_share": 0.25, "ssim": 0.5}
+        for views, value in psnr.items()
+    }
+    flight = {"scene": "flat", "seed": seed, "policy": policy, "commit": "abc"}
+    return {"flight": flight, "machine": "m", "scores": scores, "chosen": []}
+
+
+RECORDS = [
+    record("ours", 0, {"10": 18.0, "20": 22.0}),
+    record("ours", 1, {"10": 20.0, "20": 23.0}),
+    record("random", 0, {"10": 21.0, "20": 24.0}),
+    record("random", 1, {"10": 15.0, "20": 20.0}),
+]
+
+
+def test_tables_by_hand():
+    rows = result_rows(RECORDS)
+    assert [row["views"] for row in rows] == [10, 20] * 4
+    table = mean_rows(rows)
+    assert [line["policy"] for line in table] == ["ours", "random"]
+    assert table[0]["PSNR at 10"] == "19.00 [14.00]"
+    assert table[1]["PSNR at 20"] == "22.00 [17.00]"
+    assert table[0]["under 20 dB at 10"] == "25 %"
+
+
+def test_results_say_where_they_come_from_and_are_kept(tmp_path, monkeypatch):
+    made = []
+
+    def stand_in(choice, folder):
+        made.append(choice.policy)
+        found = record(choice.policy, 0, {"8": 10.0, "16": 12.0})
+        return {name: found[name] for name in ("scores", "chosen")}
+
+    monkeypatch.setattr(pool_selection, "make", stand_in)
+    options = Options(policies=("ours", "unseen"), out=tmp_path / "out", work=tmp_path / "work")
+    folder = pool_selection.main(options)
+    assert pool_selection.main(options) == folder
+    assert made == ["ours", "unseen"]  # the second time nothing is made again
+    lines = (folder / "pool_selection.csv").read_text().splitlines()
+    assert [line.split(":")[0] for line in lines[:3]] == ["# command", "# machine", "# commit"]
+    rows = list(csv.DictReader(lines[3:]))
+    assert [(row["policy"], row["views"]) for row in rows][:2] == [("ours", "8"), ("ours", "16")]
+    assert (folder / "pool_selection.png").read_bytes().startswith(b"\x89PNG")
+    assert "| unseen | 12.00 [7.00]" not in (folder / "pool_selection.md").read_text()
+    assert "| unseen | 10.00 [5.00]" in (folder / "pool_selection.md").read_text()
