@@ -26,7 +26,7 @@ from r3jax.scenes.registry import open_scene, scene_hash
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RunError
-from r3jax.trace.header import RunHeader, camera_fields, package_versions
+from r3jax.trace.header import RunHeader, camera_fields, package_versions, plain_settings
 from r3jax.trace.reader import Run, read_run
 from r3jax.trace.writer import RunWriter
 
@@ -137,17 +137,6 @@ def _header(
         bounds=np.asarray(simulator.bounds).tolist(),
         packages=package_versions(),
     )
-
-
-def plain_settings(settings: Any) -> Any:
-    """Nested settings (dataclasses, modules, arrays) as what JSON can hold."""
-    if isinstance(settings, eqx.Module) or dataclasses.is_dataclass(settings):
-        return {name: plain_settings(value) for name, value in vars(settings).items()}
-    if isinstance(settings, str | bool | int | float | None):
-        return settings
-    if isinstance(settings, dict):
-        return {str(name): plain_settings(value) for name, value in settings.items()}
-    return np.asarray(settings).tolist()
 
 
 def _conclude(console: Console, path: Path, result: Result) -> None:

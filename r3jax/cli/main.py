@@ -8,13 +8,14 @@ from pathlib import Path
 import tyro
 
 from r3jax.cli.errors import UserError
-from r3jax.cli.options import Demo, Evaluate, Explore, Info, Policies, Train
+from r3jax.cli.options import Benchmark, Demo, Evaluate, Explore, Info, Policies, Train
 
 _COMMANDS = {
     "demo": Demo,
     "explore": Explore,
     "train": Train,
     "evaluate": Evaluate,
+    "benchmark": Benchmark,
     "policies": Policies,
     "info": Info,
 }
@@ -30,7 +31,8 @@ def main(args: Sequence[str] | None = None) -> int:
         args: the words after `r3jax`; None: those of this process.
 
     Returns:
-        The exit code: 0 done, 1 stopped by the disk, 2 wrong input, 130 interrupted.
+        The exit code: 0 done, 1 stopped by the disk or a cell failed, 2 wrong input, 130
+        interrupted.
     """
     command = tyro.extras.subcommand_cli_from_dict(
         _COMMANDS,
@@ -48,7 +50,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return USER_ERROR
 
 
-def _run(command: Demo | Explore | Train | Evaluate | Policies | Info) -> int:
+def _run(command: Demo | Explore | Train | Evaluate | Benchmark | Policies | Info) -> int:
     """Imports what the command needs and nothing else, so that --help does not wait for JAX."""
     if isinstance(command, Demo):
         from r3jax.cli.demo import run_demo
@@ -66,6 +68,10 @@ def _run(command: Demo | Explore | Train | Evaluate | Policies | Info) -> int:
         from r3jax.cli.evaluate import run_evaluate
 
         return run_evaluate(command)
+    if isinstance(command, Benchmark):
+        from r3jax.cli.benchmark import run_benchmark
+
+        return run_benchmark(command)
     if isinstance(command, Policies):
         from r3jax.cli.policies import run_policies
 

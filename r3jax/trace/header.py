@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import numpy as np
+
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.errors import RunError
 
@@ -59,6 +62,17 @@ def camera_fields(camera: Camera) -> dict[str, int | float]:
     """A camera as plain numbers."""
     traced = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
     return {"width": camera.width, "height": camera.height, **traced}
+
+
+def plain_settings(settings: Any) -> Any:
+    """Nested settings (dataclasses, modules, arrays) as what JSON can hold."""
+    if isinstance(settings, eqx.Module) or dataclasses.is_dataclass(settings):
+        return {name: plain_settings(value) for name, value in vars(settings).items()}
+    if isinstance(settings, str | bool | int | float | None):
+        return settings
+    if isinstance(settings, dict):
+        return {str(name): plain_settings(value) for name, value in settings.items()}
+    return np.asarray(settings).tolist()
 
 
 def package_versions() -> dict[str, str]:

@@ -1,0 +1,1 @@
+"""Where cells are run: processes on this machine, or jobs of a Slurm cluster."""

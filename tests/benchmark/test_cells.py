@@ -1,0 +1,128 @@
+"""Cells: what makes another one, what does not, and which conditions are refused."""
+
+import dataclasses
+
+import pytest
+
+from r3jax.benchmark.cells import Cell, identity, paths_of, snapshots_left
+from r3jax.benchmark.conditions import Conditions
+from r3jax.planning.policy import policy_names
+from tests.benchmark.tiny import CONDITIONS, SETTINGS
+
+CELL = Cell("flat", "a" * 64, "ours", 0, CONDITIONS, "b" * 64, 100, SETTINGS)
+
+CHANGES = {
+    "scene_hash": "c" * 64,
+    "policy": "ours-pano",
+    "seed": 1,
+    "test_views_hash": "d" * 64,
+    "num_test_views": 99,
+    "settings": SETTINGS | {"lambda2": 0.25},
+}
+
+CONDITION_CHANGES = {
+    "budget": "views:4",
+    "clock": "wall",
+    "resolution": 33,
+    "fov": 80.0,
+    "noise": 0.0,
+    "max_range": 4.0,
+    "voxel_size": 0.05,
+    "cell_size": 0.3,
+    "map_capacity": 1 << 12,
+    "train_resolution": 16,
+    "iterations": 31,
+    "gaussians": 201,
+    "capacity": 401,
+    "backend": "xla",
+    "lpips": "alex",
+}
+
+
+def test_every_field_is_either_changed_here_or_does_not_matter():
+    assert CHANGES.keys() | {"scene", "up", "conditions"} == {
+        field.name for field in dataclasses.fields(Cell)
+    }
+    assert CONDITION_CHANGES.keys() | {"snapshots"} == {
+        field.name for field in dataclasses.fields(Conditions)
+    }
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_field_makes_another_cell(name):
+    other = dataclasses.replace(CELL, **{name: CHANGES[name]})
+    assert other.name != CELL.name
+
+
+@pytest.mark.parametrize("name", CONDITION_CHANGES)
+def test_a_changed_condition_makes_another_cell(name):
+    changed = dataclasses.replace(CONDITIONS, **{name: CONDITION_CHANGES[name]})
+    assert dataclasses.replace(CELL, conditions=changed).name != CELL.name
+
+
+def test_the_identity_holds_every_setting_of_the_policy():
+    """The settings count as they act, not as they are given."""
+    before = identity(CELL)["planner"]
+    assert before["num_candidates"] == SETTINGS["num_candidates"]
+    assert before["radius"] == 0.5
+    given = dataclasses.replace(CELL, settings=SETTINGS | {"radius": 0.75})
+    assert identity(given)["planner"] == before | {"radius": 0.75}
+
+
+def test_where_a_mesh_lies_and_which_snapshots_are_asked_for_do_not_matter():
+    moved = dataclasses.replace(CELL, scene="mesh:/somewhere/house.glb", up="z")
+    assert moved.identity_hash == CELL.identity_hash
+    assert moved.name.startswith("house-ours-seed0-")
+    asked = dataclasses.replace(CONDITIONS, snapshots=("views:1",))
+    assert dataclasses.replace(CELL, conditions=asked).name == CELL.name
+
+
+def test_a_name_is_a_plain_folder_name():
+    odd = dataclasses.replace(CELL, scene="mesh:/a b/c:d é*.glb")
+    assert "/" not in odd.name
+    assert not set(odd.name) & set(" :*")
+
+
+def test_a_snapshot_is_left_until_its_record_is_there(tmp_path):
+    assert snapshots_left(tmp_path, CELL) == ("views:2", "views:3")
+    record = paths_of(tmp_path, CELL).record("views:2")
+    record.parent.mkdir(parents=True)
+    record.touch()
+    assert snapshots_left(tmp_path, CELL) == ("views:3",)
+    assert record == paths_of(tmp_path, CELL).record("views:2.0")
+
+
+@pytest.mark.parametrize("name", policy_names())
+def test_every_policy_sees_as_far_as_the_sensor_and_draws_as_many_candidates(name):
+    conditions = dataclasses.replace(CONDITIONS, max_range=3.5)
+    config = conditions.policy(name, {"num_candidates": 40, "scoring.lambda1": 8.0}).config
+    assert float(config.scoring.max_range) == 3.5
+    assert float(config.scoring.lambda1) == 8.0
+    assert config.num_candidates == 40
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"budget": "minutes:3"}, "minutes:3"),
+        ({"snapshots": ("views:4",)}, "views:4 lies beyond the budget views:3"),
+        ({"snapshots": ("views:2", "views:2.0")}, "twice"),
+        ({"resolution": 8}, "resolution must lie between 16 and 4096"),
+        ({"train_resolution": 64}, "more than the images have"),
+        ({"capacity": 100}, "capacity 100 has no room"),
+        ({"voxel_size": 0.0}, "voxel_size must be positive"),
+    ],
+)
+def test_conditions_that_cannot_work_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(CONDITIONS, **changes)
+
+
+@pytest.mark.parametrize("settings", [{"scoring.lambda9": 1}, {"scoring": 1}, {"lambda9": 1}])
+def test_settings_that_nobody_knows_are_refused(settings):
+    with pytest.raises(ValueError, match=r"lambda9|scoring\.NAME"):
+        CONDITIONS.policy("ours", settings)
+
+
+def test_without_snapshots_the_budget_is_one():
+    assert Conditions(budget="metres:5").snapshots == ("metres:5",)

@@ -1,0 +1,86 @@
+"""A benchmark so small that its cells take seconds: a box room, three views of 32 pixels."""
+
+import dataclasses
+import functools
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from r3jax.benchmark.cells import Cell
+from r3jax.benchmark.conditions import Conditions
+from r3jax.benchmark.judging import JudgingViews, judging_path, save_judging_views
+from r3jax.benchmark.run_cell import run_cell
+from r3jax.geometry.cameras import look_at
+from r3jax.scenes.registry import open_scene, scene_hash
+from r3jax.splatting.views import load_views
+
+CONDITIONS = Conditions(
+    budget="views:3",
+    snapshots=("views:2", "views:3"),
+    clock="model",
+    resolution=32,
+    fov=90.0,
+    voxel_size=0.1,
+    map_capacity=1 << 13,
+    train_resolution=32,
+    iterations=30,
+    gaussians=200,
+    capacity=400,
+    lpips="none",
+)
+
+SETTINGS = {"num_candidates": 10, "num_frontier": 3}
+
+
+@functools.cache
+def write_room(path: Path) -> str:
+    """A box room with a pillar and colors at random, as `mesh:<file>`."""
+    walls = trimesh.creation.box(extents=(4.0, 3.0, 2.4))
+    walls.invert()
+    pillar = trimesh.creation.box(extents=(0.3, 0.3, 2.4))
+    pillar.apply_translation((1.2, 0.6, 0.0))
+    mesh = trimesh.util.concatenate([walls.subdivide().subdivide(), pillar.subdivide()])
+    rng = np.random.default_rng(0)
+    mesh.visual.vertex_colors = rng.integers(0, 256, (len(mesh.vertices), 3), dtype=np.uint8)
+    mesh.export(path)
+    return f"mesh:{path}"
+
+
+def make_cells(
+    room: str, root: Path, policies=("random",), seeds=(0,), settings=SETTINGS, **changes
+) -> tuple[Cell, ...]:
+    """Cells of the room and, where they belong, four test views."""
+    conditions = dataclasses.replace(CONDITIONS, **changes)
+    simulator = open_scene(room, camera=conditions.camera, noise=0.0)
+    digest = scene_hash(simulator)
+    center = np.zeros(3)
+    corners = [np.array([x, y, 0.2]) for x in (-1.5, 0.8) for y in (-1.0, 1.0)]
+    poses = np.stack([np.asarray(look_at(corner, center)) for corner in corners])
+    frames = [simulator.render(pose.astype(np.float64)) for pose in poses]
+    views = load_views(frames, conditions.train_resolution)
+    path = judging_path(root, digest, "four", conditions)
+    save_judging_views(path, JudgingViews("four", poses, views))
+    return tuple(
+        Cell(room, digest, policy, seed, conditions, "four", len(poses), dict(settings))
+        for policy in policies
+        for seed in seeds
+    )
+
+
+def main() -> None:
+    """`python -m tests.benchmark.tiny ROOM ROOT STAGE`: one cell, until a stage that never ends."""
+    room, root, last_stage = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
+
+    def on_stage(stage: str) -> None:
+        print(stage, flush=True)
+        if stage.startswith(last_stage):
+            time.sleep(600)
+
+    run_cell(make_cells(room, root)[0], root, on_stage)
+
+
+if __name__ == "__main__":
+    main()

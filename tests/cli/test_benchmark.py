@@ -1,0 +1,131 @@
+"""`r3jax benchmark`, as a user meets it: a table at the end, nothing done twice, mistakes named."""
+
+import json
+import os
+
+import pytest
+
+from r3jax.benchmark import run_cell as running
+from r3jax.benchmark.record import CELLS
+from r3jax.cli.main import main
+from tests.benchmark.tiny import write_room
+
+SMALL = {"policies": "random,frontier", "budget": "views:3", "clock": "model", "resolution": 32}
+SMALL |= {"train-resolution": 32, "iterations": 30, "gaussians": 200, "capacity": 400}
+SMALL |= {"test-views": 6, "lpips": "none", "voxel-size": 0.1, "fov": 90, "jobs": 0}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return write_room(tmp_path_factory.mktemp("room") / "room.ply")
+
+
+def benchmark(room, out, *words, **changes):
+    options = {"scenes": room, "out": out} | SMALL
+    options |= {name.replace("_", "-"): value for name, value in changes.items()}
+    given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    settings = ["--settings", "num_candidates=10", "num_frontier=3"]
+    return main(["benchmark", *given, *settings, *words])
+
+
+@pytest.fixture(scope="module")
+def finished(room, tmp_path_factory):
+    """The folder of a finished benchmark of two cells with two snapshots each."""
+    out = tmp_path_factory.mktemp("out")
+    assert benchmark(room, out, snapshots="views:2,views:3") == 0
+    return out
+
+
+def read(out):
+    return [json.loads(line) for line in (out / CELLS).read_text().splitlines()]
+
+
+def test_every_cell_and_snapshot_has_its_line(finished):
+    records = read(finished)
+    assert sorted((r["policy"], r["snapshot"]) for r in records) == [
+        (policy, snapshot)
+        for policy in ("frontier", "random")
+        for snapshot in ("views:2", "views:3")
+    ]
+    assert {r["settings"]["num_candidates"] for r in records} == {10}
+    assert len({r["test_views"]["hash"] for r in records}) == 1
+    for record in records:
+        assert (finished / record["run"] / "run.json").exists()
+
+
+def test_the_same_words_again_do_nothing_and_show_the_table(room, finished, monkeypatch, capsys):
+    before = (finished / CELLS).read_bytes()
+    monkeypatch.setattr(running, "run_cell", lambda *a, **k: pytest.fail("done a second time"))
+    assert benchmark(room, finished, snapshots="views:2,views:3") == 0
+    assert (finished / CELLS).read_bytes() == before
+    captured = capsys.readouterr()
+    assert "2 cells, 2 of them done" in captured.err
+    for word in ("PSNR", "SSIM", "random", "frontier", "views:2", "views:3", "room"):
+        assert word in captured.out
+
+
+def test_another_setting_makes_another_cell_beside_the_first(room, finished, capsys):
+    before = read(finished)
+    assert benchmark(room, finished, policies="random", snapshots="views:2", iterations=20) == 0
+    after = read(finished)
+    assert len(after) == len(before) + 1
+    assert all(record in after for record in before)
+    captured = capsys.readouterr()
+    assert "1 cells, 0 of them done" in captured.err
+    assert "1/1 done" in captured.err
+    assert "frontier (" not in captured.out  # the table is of what was asked for
+
+
+def test_a_cell_that_fails_is_named_and_the_exit_code_says_so(room, tmp_path, capsys, monkeypatch):
+    judge = running.judge
+
+    def judge_one(*args, **kwargs):
+        if len(list(tmp_path.glob("cells/*/snapshot-*.json"))) == 1:
+            raise ArithmeticError("a bad day")
+        return judge(*args, **kwargs)
+
+    monkeypatch.setattr(running, "judge", judge_one)
+    assert benchmark(room, tmp_path) == 1
+    error = capsys.readouterr().err
+    assert "failed   room-frontier-seed0-" in error
+    assert "a bad day" in error
+    assert [record["policy"] for record in read(tmp_path)] == ["random"]
+    monkeypatch.undo()
+    assert benchmark(room, tmp_path) == 0
+    assert len(read(tmp_path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scenes": "castle"}, "unknown scene 'castle'"),
+        ({"scenes": ""}, "no scenes"),
+        ({"policies": "oracle"}, "unknown policy 'oracle'"),
+        ({"seeds": "0,x"}, "--seeds"),
+        ({"seeds": "1,1"}, "seeds holds something twice: 1, 1"),
+        ({"budget": "views"}, "views:100"),
+        ({"snapshots": "views:9"}, "views:9 lies beyond the budget"),
+        ({"train_resolution": 64}, "more than the images have"),
+        ({"test_views": 3}, "max_views must be at least 6"),
+        ({"jobs": -1}, "--jobs"),
+        ({"slurm": "partition"}, "--slurm takes NAME=VALUE"),
+    ],
+)
+def test_a_mistake_gets_one_line_and_starts_nothing(room, tmp_path, capsys, changes, message):
+    assert benchmark(room, tmp_path, **changes) == 2
+    lines = [x for x in capsys.readouterr().err.splitlines() if x.startswith("r3jax:")]
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert not (tmp_path / "cells").exists()
+
+
+@pytest.mark.parametrize("word", ["num_candidates=many", "nothing=1", "scoring.kappa=ball"])
+def test_a_setting_that_cannot_work_is_named(room, tmp_path, capsys, word):
+    assert benchmark(room, tmp_path, word) == 2
+    assert word.partition("=")[0].removeprefix("scoring.") in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_gets_one_line(room, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert benchmark(room, tmp_path / "file" / "out") == 2
+    assert f"{os.sep}file" in capsys.readouterr().err
