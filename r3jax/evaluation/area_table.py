@@ -14,6 +14,7 @@ from r3jax.evaluation.equal_terms import (
     scenes_of,
     snapshot_kind,
     values_by_seed,
+    with_short_names,
 )
 from r3jax.evaluation.table_parts import (
     Row,
@@ -50,6 +51,7 @@ def area_table(
     shown = metric_named(metric)
     check_equal_terms(cells, one_snapshot=False)
     snapshot_kind(cells)
+    told, cells = notes(cells), with_short_names(cells)
     if x not in EXPLORATION:
         raise ValueError(f"no budget {x!r}; there are {', '.join(EXPLORATION)}")
     scenes, methods, seeds = scenes_of(cells), methods_of(cells), seed_texts(cells)
@@ -80,7 +82,7 @@ def area_table(
         heads=("method",),
         columns=(*scenes, "mean"),
         rows=tuple(Row((m,), seeds[m], line) for m, line in zip(methods, entries, strict=True)),
-        notes=(*notes(cells), f"Range of {EXPLORATION[x]}: {', '.join(ranges)}."),
+        notes=(*told, f"Range of {EXPLORATION[x]}: {', '.join(ranges)}."),
     )
 
 

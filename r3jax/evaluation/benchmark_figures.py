@@ -17,6 +17,7 @@ from r3jax.evaluation.equal_terms import (
     scenes_of,
     snapshot_kind,
     values_by_seed,
+    with_short_names,
 )
 from r3jax.evaluation.policy_style import OKABE_ITO, Look, legend_below, looks_of
 from r3jax.evaluation.scores import METRICS
@@ -42,6 +43,7 @@ def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Fi
     """
     check_equal_terms(cells, one_snapshot=False)
     snapshot_kind(cells)
+    cells = with_short_names(cells)
     scenes, looks = scenes_of(cells), looks_of(methods_of(cells))
     x_label, y_label = _label(x), _label(y)
     figure, panels = _panels(len(scenes))

@@ -12,6 +12,7 @@ from r3jax.evaluation.equal_terms import (
     methods_of,
     scores_by_method,
     snapshots_of,
+    with_short_names,
 )
 from r3jax.evaluation.policy_style import OKABE_ITO, legend_below, looks_of
 from r3jax.evaluation.scores import POOR_PSNR
@@ -46,6 +47,7 @@ def ridge_figure(cells: Sequence[Cell], metric: str = "psnr") -> Figure:
     """
     shown = metric_named(metric)
     check_equal_terms(cells, one_snapshot=False)
+    cells = with_short_names(cells)
     methods, snapshots = methods_of(cells), snapshots_of(cells)
     looks, pooled = looks_of(methods), {}
     for snapshot in snapshots:

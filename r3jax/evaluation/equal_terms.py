@@ -5,6 +5,7 @@ A record (`Cell`) is one line of `cells.jsonl`: scene x policy x seed at one sna
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,42 @@ def method_name(cell: Cell) -> str:
     """The policy with the settings it was given: `active-gs`, `ours (lambda1=0.3)`."""
     settings = ", ".join(f"{name}={value}" for name, value in sorted(cell["settings"].items()))
     return f"{cell['policy']} ({settings})" if settings else cell["policy"]
+
+
+def shared_settings(cells: Sequence[Cell]) -> dict[str, Any]:
+    """Settings that were given to the policies of all records alike, by name."""
+    first = cells[0]["settings"]
+    missing = object()
+    return {
+        name: value
+        for name, value in sorted(first.items())
+        if all(cell["settings"].get(name, missing) == value for cell in cells)
+    }
+
+
+def with_short_names(cells: Sequence[Cell]) -> list[Cell]:
+    """The same records, with names as short as this set of them allows.
+
+    Settings that all share leave the methods' names, and a scene from a file is called by the
+    file's name without folder and suffix, unless two scenes would then be called the same.
+    """
+    shared = shared_settings(cells)
+    titles = {scene: _scene_title(scene) for scene in scenes_of(cells)}
+    if len(set(titles.values())) < len(titles):
+        titles = {scene: scene for scene in titles}
+    return [
+        {
+            **cell,
+            "scene": titles[cell["scene"]],
+            "settings": {k: v for k, v in cell["settings"].items() if k not in shared},
+        }
+        for cell in cells
+    ]
+
+
+def _scene_title(scene: str) -> str:
+    kind, colon, path = scene.partition(":")
+    return PurePath(path).stem if colon and kind == "mesh" else scene
 
 
 def check_equal_terms(cells: Sequence[Cell], *, one_snapshot: bool = True) -> None:
@@ -164,7 +201,9 @@ def seeds_by_method(cells: Sequence[Cell]) -> dict[str, dict[str, list[int]]]:
     scenes = scenes_of(cells)
     seeds = {method: {scene: [] for scene in scenes} for method in methods_of(cells)}
     for cell in sorted(cells, key=lambda cell: cell["seed"]):
-        seeds[method_name(cell)][cell["scene"]].append(cell["seed"])
+        known = seeds[method_name(cell)][cell["scene"]]
+        if cell["seed"] not in known:  # it has other snapshots too
+            known.append(cell["seed"])
     return seeds
 
 

@@ -3,7 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from r3jax.evaluation.equal_terms import Cell, seeds_by_method, snapshots_of
+from r3jax.evaluation.equal_terms import (
+    Cell,
+    seeds_by_method,
+    shared_settings,
+    snapshots_of,
+    with_short_names,
+)
 from r3jax.evaluation.scores import METRICS, Metric
 from r3jax.evaluation.statistics import Estimate
 
@@ -121,25 +127,36 @@ def seed_texts(cells: Sequence[Cell]) -> dict[str, str]:
 
 
 def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
-    """The terms that all records share, how many seeds, who made them, and what is not there."""
-    cell, seeds = cells[0], seeds_by_method(cells)
-    training, pixels = cell["training"], cell["test_views"]["resolution"]
-    counts = [len(found) for scenes in seeds.values() for found in scenes.values() if found]
-    fewest, most = min(counts), max(counts)
-    told = f"{most}" if fewest == most else f"{fewest} to {most}"
-    short = f", fewer than the {FEWEST_SEEDS} of the protocol" if fewest < FEWEST_SEEDS else ""
+    """The terms that all records share, how many seeds, who made them, and what is not there.
+
+    Args:
+        cells: of the whole table, with their full names.
+    """
+    cell, training = cells[0], cells[0]["training"]
     sentences = [
         f"{', '.join(snapshots_of(cells))} on the {cell['clock']} clock, "
         f"images of {cell['resolution']} px; "
         f"{training['iterations']} iterations of training at {training['resolution']} px; "
-        f"test views of {pixels} px.",
-        f"{told} seed{'s' * (most > 1)} per cell{short}.",
+        f"test views of {cell['test_views']['resolution']} px."
     ]
+    if shared := shared_settings(cells):
+        given = ", ".join(f"{name}={value}" for name, value in shared.items())
+        sentences.append(f"Settings of all policies: {given}.")
+    seeds = seeds_by_method(with_short_names(cells))
+    counts = [len(found) for scenes in seeds.values() for found in scenes.values() if found]
+    fewest, most = min(counts), max(counts)
+    told = f"{most}" if fewest == most else f"{fewest} to {most}"
+    short = f", fewer than the {FEWEST_SEEDS} of the protocol" if fewest < FEWEST_SEEDS else ""
+    sentences.append(f"{told} seed{'s' * (most > 1)} per cell{short}.")
     absent = [f"{m} in {s}" for m, by_scene in seeds.items() for s, n in by_scene.items() if not n]
     if absent:
         sentences.append(f"No record of {', '.join(absent)}.")
-    machines, commits = (
-        ", ".join(sorted({str(c[key] or "unknown") for c in cells}))
-        for key in ("machine", "commit")
-    )
+    machines = ", ".join(sorted({cell["machine"] or "an unknown machine" for cell in cells}))
+    commits = ", ".join(sorted({_short_commit(cell["commit"]) for cell in cells}))
     return (*sentences, f"Made on {machines} from commit {commits}.")
+
+
+def _short_commit(commit: str | None) -> str:
+    """Ten digits, and whether the source was changed after it."""
+    digits, hyphen, changed = (commit or "unknown").partition("-")
+    return f"{digits[:10]}{hyphen}{changed}"

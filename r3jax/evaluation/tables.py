@@ -12,6 +12,7 @@ from r3jax.evaluation.equal_terms import (
     scenes_of,
     scores_by_method,
     seeds_by_method,
+    with_short_names,
 )
 from r3jax.evaluation.scores import POOR_PSNR, Metric
 from r3jax.evaluation.statistics import RESAMPLES, Scores, mean_over_scenes, paired_difference
@@ -49,6 +50,7 @@ def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
         ValueError: the records were not made on equal terms (`check_equal_terms`).
     """
     check_equal_terms(cells)
+    told, cells = notes(cells), with_short_names(cells)
     scenes, methods, seeds = scenes_of(cells), methods_of(cells), seed_texts(cells)
     rows: dict[tuple[str, str], Row] = {}
     for name in PAPER_METRICS:
@@ -64,7 +66,7 @@ def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
         heads=("method", "metric"),
         columns=(*scenes, "mean"),
         rows=tuple(rows[method, name] for method in methods for name in PAPER_METRICS),
-        notes=notes(cells),
+        notes=told,
     )
 
 
@@ -104,6 +106,7 @@ def tail_table(
     """
     shown = metric_named(metric)
     check_equal_terms(cells)
+    told, cells = notes(cells), with_short_names(cells)
     scenes, methods, seeds = scenes_of(cells), methods_of(cells), seed_texts(cells)
     scores = scores_by_method(cells, metric)
     complete = [method for method in methods if set(scores.get(method, ())) == set(scenes)]
@@ -140,7 +143,7 @@ def tail_table(
         heads=("method",),
         columns=tuple(columns),
         rows=tuple(Row((method,), seeds[method], entries) for method, entries in lines),
-        notes=notes(cells),
+        notes=told,
     )
 
 
@@ -188,7 +191,7 @@ def difference_table(
 
     Args:
         cells: as in `quality_table`.
-        reference: a method's name as `equal_terms.method_name` writes it.
+        reference: a method as the tables call it.
         title: of the table; none given: snapshot, metric and reference.
         metric: column of the test views.
         resamples: of the bootstrap.
@@ -199,6 +202,7 @@ def difference_table(
     """
     shown = metric_named(metric)
     check_equal_terms(cells)
+    told, cells = notes(cells), with_short_names(cells)
     methods, scenes, seeds = methods_of(cells), scenes_of(cells), seeds_by_method(cells)
     if reference not in methods:
         raise ValueError(f"no record of {reference!r}; there are {', '.join(methods)}")
@@ -228,5 +232,5 @@ def difference_table(
         heads=("method",),
         columns=(*scenes, "mean"),
         rows=tuple(rows),
-        notes=notes(cells),
+        notes=told,
     )

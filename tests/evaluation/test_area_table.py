@@ -39,6 +39,7 @@ def test_areas_by_hand():
     assert table.notes[-1] == "Range of views: flat 10 to 60."
     assert table.title == "PSNR [dB]: area under the curve over views"
     assert "views:10, views:20, views:60 on the" in table.notes[0]
+    assert table.notes[1].startswith("1 to 2 seeds per cell")
 
 
 def test_all_methods_have_one_range():

@@ -10,8 +10,10 @@ from r3jax.evaluation.equal_terms import (
     scenes_of,
     scores_by_method,
     seeds_by_method,
+    shared_settings,
     snapshots_of,
     view_values,
+    with_short_names,
 )
 from tests.evaluation.records import benchmark, record
 
@@ -98,8 +100,27 @@ def test_scores_are_seeds_by_views():
 
 
 def test_seeds_tell_what_is_missing():
-    cells = [record(seed=1), record(seed=0), record("random", "house")]
+    cells = [record(seed=1), record(seed=0), record("random", "house"), record(snapshot=60)]
     assert seeds_by_method(cells) == {
         "random": {"flat": [], "house": [0]},
         "ours": {"flat": [0, 1], "house": []},
     }
+
+
+def test_names_are_as_short_as_the_set_allows():
+    cells = [
+        record("ours", "mesh:/a/room.ply", settings={"pool": 9, "bins": 2}),
+        record("ours", "mesh:/b/hall.obj", settings={"pool": 9, "bins": 4}),
+        record("random", settings={"pool": 9}),
+    ]
+    assert shared_settings(cells) == {"pool": 9}
+    short = with_short_names(cells)
+    assert methods_of(short) == ["random", "ours (bins=2)", "ours (bins=4)"]
+    assert [cell["scene"] for cell in short] == ["room", "hall", "flat"]
+    assert [cell["views"] for cell in short] == [cell["views"] for cell in cells]
+    assert cells[0]["settings"] == {"pool": 9, "bins": 2}  # the given records stay as they are
+    same = with_short_names([record(scene="mesh:/a/room.ply"), record(scene="mesh:/b/room.ply")])
+    assert scenes_of(same) == ["mesh:/a/room.ply", "mesh:/b/room.ply"]
+    other = [record(settings={"pool": 9}), record("random", settings={"pool": 8}), record("cover")]
+    assert shared_settings(other) == {}
+    assert methods_of(with_short_names(other)) == ["random (pool=8)", "cover", "ours (pool=9)"]

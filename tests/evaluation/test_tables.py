@@ -167,6 +167,11 @@ def test_titles_and_notes_tell_the_terms():
     single = quality_table([record(commit=None)]).notes
     assert single[1].startswith("1 seed per cell,")
     assert single[2] == "Made on two cores from commit unknown."
+    cells = benchmark(("random", "ours"), settings={"pool": 9}, commit="0123456789abc-dirty")
+    table = quality_table(cells)
+    assert [row.labels[0] for row in table.rows[::3]] == ["random", "ours"]
+    assert "Settings of all policies: pool=9." in table.notes
+    assert table.notes[-1].endswith("from commit 0123456789-dirty.")
 
 
 def test_unequal_terms_and_unknown_names_are_refused():
