@@ -212,7 +212,7 @@ def law_planes(modules: Modules) -> None:
         normal = np.array(plane) / np.linalg.norm(plane)
         depth = -1.5 / (normal[0] * u + normal[1] * v + normal[2])
         valid = (depth > 0.2) & (depth < 20.0)
-        is_inner = ndimage.binary_erosion(valid)
+        is_inner = np.asarray(ndimage.binary_erosion(valid), dtype=bool)
         found = units(modules, depth, valid)[is_inner[valid]]
         assert len(found) > 300
         np.testing.assert_allclose(found, np.tile(normal, (len(found), 1)), atol=3e-3)

@@ -29,13 +29,13 @@ PER_REGION = 5
 MIN_COSINE = 0.5
 """Between a region's normal and the direction to a candidate, at least."""
 
-_DRAWS = 64
+_DRAWS = 128
 """Places tried per region."""
 
 _BATCH = 32
 """Regions that are tried at once."""
 
-_MOST = 512
+_MOST = 256
 """Regions that are tried at all: the nearest."""
 
 _INSET = 0.25
@@ -145,19 +145,15 @@ def _draw(
     """Random places round cells, [R, _DRAWS, 3] [m], and which of them could do."""
     closest, farthest = VIEW_DISTANCE
     aims = travel.centers(cells)[:, None, :]
-    directions = rng.normal(size=(len(cells), _DRAWS, 3))
-    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-    # Into the half-space of the normal: the other half would be thrown away.
-    side = np.sum(directions * normals[:, None, :], axis=2, keepdims=True)
-    directions *= np.where(side < 0.0, -1.0, 1.0)
+    directions = _draw_directions(normals, rng)
     cubed = rng.uniform(closest**3, farthest**3, size=(len(cells), _DRAWS, 1))
     index = (aims + np.cbrt(cubed) * directions - travel.origin) / travel.cell_size
     stop = np.floor(index).astype(np.int64)
     middle = stop + 0.5
     places = travel.origin + np.clip(index, middle - _INSET, middle + _INSET) * travel.cell_size
-    shape = np.array(travel.goals.shape)
-    is_inside = np.all((stop >= 0) & (stop < shape), axis=2)
-    stop = np.clip(stop, 0, shape - 1)
+    size = np.array(travel.goals.shape)
+    is_inside = np.all((stop >= 0) & (stop < size), axis=2)
+    stop = np.clip(stop, 0, size - 1)
     is_good = is_inside & travel.goals[tuple(np.moveaxis(stop, 2, 0))]
     offset = places - aims
     distance = np.linalg.norm(offset, axis=2)
@@ -165,6 +161,17 @@ def _draw(
     cosine = np.sum(offset * normals[:, None, :], axis=2)
     has_side = np.any(normals != 0.0, axis=1, keepdims=True)
     return places, is_good & (~has_side | (cosine >= MIN_COSINE * distance))
+
+
+def _draw_directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Random unit vectors within 60 degrees of normals [R, 3], or anywhere: [R, _DRAWS, 3]."""
+    unit = lambda x: x / np.maximum(np.linalg.norm(x, axis=2, keepdims=True), 1e-12)
+    anywhere = rng.normal(size=(len(normals), _DRAWS, 3))
+    cosine = rng.uniform(MIN_COSINE, 1.0, size=(len(normals), _DRAWS, 1))
+    axis = normals[:, None, :]
+    across = unit(anywhere - np.sum(anywhere * axis, axis=2, keepdims=True) * axis)
+    around = cosine * axis + np.sqrt(1.0 - cosine * cosine) * across
+    return np.where(np.any(axis != 0.0, axis=2, keepdims=True), around, unit(anywhere))
 
 
 def _is_clear(travel: Travel, places: np.ndarray, cells: np.ndarray) -> np.ndarray:
