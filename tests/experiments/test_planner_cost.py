@@ -145,7 +145,8 @@ def test_a_mission_is_measured_once_and_shown_twice(tiny):
     names = {path.name for path in memory.iterdir()}
     assert {"steps.csv", "arrays.png", "memory.md"} <= names
     for path in (latency / "latency.png", memory / "arrays.png"):
-        described = Image.open(path).info["Description"]
+        with Image.open(path) as picture:
+            described = picture.info["Description"]
         assert "command: python -m experiments.planner_" in described
         assert "machine: " in described
         assert "commit: " in described
