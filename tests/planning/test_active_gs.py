@@ -255,12 +255,16 @@ def law_aims(modules: Modules) -> None:
         distance, side = np.linalg.norm(place - aim), side_of[travel.cell_of(aim)]
         assert 0.3 <= distance <= 2.0
         assert not side.any() or side @ (place - aim) >= 0.5 * distance - 1e-9
+    bare, axis = plan_travel(grid_of(*two_rooms()), START), np.array([0.6, 0.0, 0.8])
+    open_space = module.Regions(np.array([[5, 6, 3]]), axis[None])
+    for i in range(60):
+        places, aims = module.aimed_views(bare, open_space, 5, key=jax.random.key(i))
+        assert np.all((places - aims) @ axis >= 0.5 * np.linalg.norm(places - aims, axis=1))
     few, _ = module.aimed_views(travel, found, 7, key=KEY)
     assert len(few) == 7
     nothing = module.Regions(found.cells[:0], found.normals[:0])
     assert module.aimed_views(travel, nothing, AIMED, key=KEY)[0].shape == (0, 3)
     # A cell of a bare wall gets its five from the front and none from behind.
-    bare = plan_travel(grid_of(*two_rooms()), START)
     for side, expected in ((1.0, 5), (0.0, 5), (-1.0, 0)):
         one = module.Regions(np.array([[0, 6, 4]]), np.array([[side, 0.0, 0.0]]))
         assert len(module.aimed_views(bare, one, AIMED, key=KEY)[0]) == expected
