@@ -65,9 +65,13 @@ class GroundTruth:
         kind, colon, file = self._simulator.world.name.partition(":")
         return PurePath(file).stem if colon else kind
 
-    @functools.cached_property
+    @property
     def scene_hash(self) -> str:
         """SHA-256 of geometry, colours and lamps."""
+        return self._scene_hash
+
+    @functools.cached_property
+    def _scene_hash(self) -> str:
         return self._simulator.world.content_hash
 
     def free_positions(self, spacing: Sequence[float | int], margin: float | int) -> np.ndarray:
