@@ -84,11 +84,11 @@ def everything(view):
     return view
 
 
-def look(module, state, grid, poses=POSES):
+def look(module, state, grid, reach=None):
     """Views with two things about each row: its number, and its voxel index."""
     _, table = small_map()
     rows = {"row": np.arange(CAPACITY, dtype=np.int32), "index": table.T.astype(np.int32)}
-    return module.score_pixels(everything, state, grid, CAMERA, poses, CONFIG, rows)
+    return module.score_pixels(everything, state, grid, CAMERA, POSES, CONFIG, rows, reach)
 
 
 def rays(pose: np.ndarray) -> np.ndarray:
@@ -195,7 +195,21 @@ def law_single_cells(modules: Modules) -> None:
         np.testing.assert_allclose(views.cell_distance[pose], distance, rtol=1e-6)
 
 
-LAWS = [law_rows, law_rays, law_cells_as_in_utility, law_single_cells]
+def law_reach(modules: Modules) -> None:
+    """Voxels beyond the range show where nothing was before; cells beyond it never do."""
+    state, grid = small_map()[0], some_grid()
+    near, far = (look(modules["pixels"], state, grid, reach) for reach in (None, 8.0))
+    was_hit, is_hit = np.asarray(near.hit), np.asarray(far.hit)
+    assert np.all(is_hit[was_hit])
+    np.testing.assert_allclose(far.depth[was_hit], near.depth[was_hit], atol=1e-5)
+    distance = np.linalg.norm(np.asarray(far.offset), axis=1)[is_hit & ~was_hit]
+    assert len(distance) > 20
+    assert distance.min() > float(CONFIG.max_range) - STEP
+    assert distance.max() <= 8.0 + STEP
+    np.testing.assert_array_equal(far.cells, near.cells)
+
+
+LAWS = [law_rows, law_rays, law_cells_as_in_utility, law_single_cells, law_reach]
 CHAIN = ("r3jax.scoring.pixels",)
 MUTANTS = [
     Mutant("pixels", "jnp.minimum(index, last)]", "jnp.arange(index.shape[0])]", law_rows),
@@ -207,6 +221,8 @@ MUTANTS = [
     Mutant("pixels", "valid & is_visible", "is_visible", law_single_cells),
     Mutant("pixels", "cells.unexplored & in_view", "in_view", law_single_cells),
     Mutant("pixels", "place, buffer.distance)", "place, buffer.limit)", law_cells_as_in_utility),
+    Mutant("pixels", "far = view if reach is None", "far = view if True", law_reach),
+    Mutant("pixels", "_unexplored(cells, view", "_unexplored(cells, far", law_reach),
     Mutant("pixels", "is_seen, place.distance, 0.0", "is_seen, 1.0, 0.0", law_single_cells),
 ]  # fmt: skip
 
