@@ -252,7 +252,7 @@ def poses_at(positions: np.ndarray, looks: Sequence[str] | np.ndarray) -> np.nda
 
 
 def _evenly(positions: np.ndarray, spacing: Sequence[float | int], count: int) -> np.ndarray:
-    """Indices of `count` of the positions [P, 3], in order: every so-manieth along a Morton curve.
+    """Indices of `count` of the positions [P, 3], in order: evenly spaced along a Morton curve.
 
     Neighbours along the curve are neighbours in space, so that each region keeps its share.
     """
