@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.spatial import KDTree
+from trimesh.triangles import closest_point
 
+from r3jax.scenes.registry import open_world
 from r3jax.simulators import free_space
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.noise import NoisySimulator
@@ -212,6 +214,17 @@ def test_a_closed_cupboard_is_not_free_inside():
     found = truth_of(quads).free_positions(SPACING, 0.3)
     assert len(found) > 10
     assert not ((found > cupboard[0]) & (found < cupboard[1])).all(axis=1).any()
+
+
+def test_an_embedded_scene_keeps_the_margin_by_another_program_s_measure():
+    world = open_world("kitchen")
+    found = GroundTruth(RaycastSimulator(world, SMALL)).free_positions((1.0, 1.0, 0.75), 0.3)
+    assert len(found) > 20
+    triangles = world.vertices[world.faces]
+    for position in found:
+        at = np.broadcast_to(position, (len(triangles), 3))
+        nearest = closest_point(triangles, at)
+        assert np.linalg.norm(nearest - position, axis=1).min() >= 0.3 - 2e-4
 
 
 @pytest.mark.parametrize(
