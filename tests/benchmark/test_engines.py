@@ -116,8 +116,8 @@ def test_on_a_cluster_a_job_that_is_preempted_goes_on_with_its_cell(finished, ro
     engine.join()
     assert sorted(event.kind for event in events) == ["done", "failed", "started", "started"]
     assert "the file has changed meanwhile" in next(e.text for e in events if e.kind == "failed")
-    log = next((tmp_path / "slurm").glob(f"{job}_*log.err")).read_text()
-    assert "Calling checkpoint method" in log
+    logs = "".join(log.read_text() for log in (tmp_path / "slurm").glob(f"{job}_*log.*"))
+    assert f"Requeued job {job}" in logs
     assert_same_records(tmp_path, finished[0], finished[1][:1])
 
 
