@@ -5,6 +5,7 @@ Shape symbols: P poses of the pool.
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,13 @@ import numpy as np
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.step import integrate_growing
 from r3jax.frame import Frame
-from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball, world_to_cell
+from r3jax.mapping.occupancy import (
+    LOG_ODDS_LIMIT,
+    empty_grid,
+    integrate_depth,
+    mark_free_ball,
+    world_to_cell,
+)
 from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import host_generator, poses_along, random_directions
 from r3jax.planning.config import PlannerConfig
@@ -51,9 +58,25 @@ def pool_of(truth: GroundTruth, num: int, *, key: jax.Array) -> np.ndarray:
 
 
 def choose(
-    name: str, simulator: Simulator, poses: np.ndarray, first: int, num: int, seed: int
+    name: str,
+    simulator: Simulator,
+    poses: np.ndarray,
+    first: int,
+    num: int,
+    seed: int,
+    *,
+    known_cells: bool = False,
 ) -> tuple[list[int], list[Frame]]:
     """Greedy choice of `num` of the poses [P, 4, 4], the first `first` of which are given.
+
+    Args:
+        name: of the policy.
+        simulator: renders the chosen poses.
+        poses: the pool.
+        first: views that are not chosen but given.
+        num: views, the first ones included.
+        seed: of what the policy leaves to chance.
+        known_cells: True tells the utilities that no cell is unexplored: U_G is 0 everywhere.
 
     Returns:
         The numbers of the chosen poses in order, and their frames.
@@ -75,6 +98,9 @@ def choose(
         if best >= first:
             travel = plan_travel(grid, poses[chosen[-1], :3, 3], PlannerConfig().safety_margin)
             masked = mask_unexplorable(grid, reached)
+            if known_cells:
+                known = jnp.full_like(masked.log_odds, -LOG_ODDS_LIMIT)
+                masked = eqx.tree_at(lambda g: g.log_odds, masked, known)
             where = Situation(map_state, grid, masked, travel, simulator.camera, state.memory)
             totals = totals_of(policy, where, poses, key=jax.random.fold_in(key, best))
             totals[chosen] = -np.inf

@@ -103,6 +103,10 @@ class Options:
     policies: tuple[str, ...] = SCORED
     """Whose utility chooses."""
 
+    known_cells: bool = False
+    """Leave unexplored cells out of every utility: what the terms on known surfaces are worth.
+    With them U_G decides most choices, as its weight is large in all policies."""
+
     out: Path = Path("experiments/results")
     """Folder of the results; they go into a folder named after the experiment and the size."""
 
@@ -127,23 +131,25 @@ class Choice:
     scene: str
     seed: int
     size: Size
+    known_cells: bool
     commit: str | None
 
     @property
     def file_name(self) -> str:
         """Where its record is kept."""
-        return f"{self.scene}-{self.policy}-{self.size.pool}poses-seed{self.seed}.json"
+        kind = "known" if self.known_cells else "all"
+        return f"{self.scene}-{self.policy}-{self.size.pool}poses-{kind}-seed{self.seed}.json"
 
 
 def main(options: Options) -> Path:
     """Chooses, trains and judges, writes the results, and returns their folder."""
     records = list(_records(options))
-    folder = options.out / NAME / options.size
+    folder = options.out / NAME / (options.size + ("-known-cells" if options.known_cells else ""))
     folder.mkdir(parents=True, exist_ok=True)
     origin, rows = origin_of(f"experiments.{NAME}", records), result_rows(records)
     write_csv(folder / "pool_selection.csv", rows, origin)
     write_figure(folder / "pool_selection.png", pool_figure(rows), origin)
-    page = [f"# Choice from a pool ({options.size})", _READING, markdown_table(mean_rows(rows))]
+    page = [f"# Choice from a pool ({folder.name})", _READING, markdown_table(mean_rows(rows))]
     page.append("![PSNR over views](pool_selection.png)")
     write_markdown(folder / "pool_selection.md", page, origin)
     print(f"results  {folder}")
@@ -163,7 +169,8 @@ def _records(options: Options) -> Iterator[dict[str, Any]]:
     for scene in size.scenes:
         for seed in size.seeds:
             for policy in options.policies:
-                choice, begin = Choice(policy, scene, seed, size, commit), time.perf_counter()
+                begin = time.perf_counter()
+                choice = Choice(policy, scene, seed, size, options.known_cells, commit)
                 yield _kept_or_made(options.work, choice)
                 print(f"{choice.file_name} {time.perf_counter() - begin:.0f} s", flush=True)
 
@@ -187,7 +194,15 @@ def make(choice: Choice, test_views: Path) -> dict[str, Any]:
     simulator = open_scene(choice.scene, camera=camera, seed=seed)
     truth = GroundTruth(simulator)
     poses = pool_of(truth, size.pool, key=jax.random.key(seed))
-    chosen, frames = choose(choice.policy, simulator, poses, size.first, size.snapshots[-1], seed)
+    chosen, frames = choose(
+        choice.policy,
+        simulator,
+        poses,
+        size.first,
+        size.snapshots[-1],
+        seed,
+        known_cells=choice.known_cells,
+    )
     view_set = load_view_set(test_views, truth, max_views=size.test_views)
     tests = load_views(render_view_set(truth, view_set, size.resolution), size.train_resolution)
     scores = {str(n): _train_and_judge(frames[:n], tests, choice) for n in size.snapshots}

@@ -76,6 +76,20 @@ def test_the_best_of_the_pool_is_taken(flat, poses, monkeypatch):
     assert chosen == [0, 1, 5, 8, 3, 9]
 
 
+def test_unexplored_cells_can_be_left_out(flat, poses, monkeypatch):
+    seen = []
+
+    def spy(policy, where, poses, *, key):
+        seen.append(bool(where.scoring_grid.unexplored.any()))
+        assert where.grid.unexplored.any()
+        return np.zeros(len(poses))
+
+    monkeypatch.setattr(pool_choice, "totals_of", spy)
+    for known_cells in (False, True):
+        choose("unseen", flat, poses, FIRST, FIRST + 1, seed=0, known_cells=known_cells)
+    assert seen == [True, False]
+
+
 def test_what_has_no_score_is_refused():
     assert set(policy_names()) - set(SCORED) == {"frontier", "ours-pano"}
     with pytest.raises(ValueError, match=r"frontier cannot choose.*unseen-depth"):
