@@ -5,12 +5,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from r3jax.frame import Frame
-from r3jax.mapping.join import grow
+from r3jax.mapping.sighting import look
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.mapping.update import integrate
 from r3jax.scoring.renderability import renderability, renderability_image
-
-_MAX_LOAD = 0.7
 
 
 def map_of(
@@ -28,11 +25,7 @@ def map_of(
     """
     state = empty_map(voxel_size=voxel_size)
     for frame in frames:
-        after = integrate(state, frame, max_range)
-        while int(after.num_occupied) > _MAX_LOAD * after.capacity:
-            state = grow(state, 2 * state.capacity)
-            after = integrate(state, frame, max_range)
-        state = after
+        state = look(state, frame, max_range)
     return state
 
 

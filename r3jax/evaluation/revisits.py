@@ -9,12 +9,9 @@ from matplotlib.figure import Figure
 
 from r3jax.evaluation import style
 from r3jax.formats.recordings import Recording
-from r3jax.mapping.join import grow
+from r3jax.mapping.sighting import look
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.mapping.update import integrate
 from r3jax.scoring.renderability import renderability
-
-_MAX_LOAD = 0.7
 
 
 @dataclass(frozen=True)
@@ -55,11 +52,7 @@ def follow_recording(
     for index, frame in enumerate(recording.frames()):
         before = float(score(state, frame.camera, frame.T_world_camera))
         known = int(state.num_occupied)
-        after = integrate(state, frame, max_range)
-        while int(after.num_occupied) > _MAX_LOAD * after.capacity:
-            state = grow(state, 2 * state.capacity)
-            after = integrate(state, frame, max_range)
-        state = after
+        state = look(state, frame, max_range)
         if index > 0:
             step = recording.poses[index, :3, 3] - recording.poses[index - 1, :3, 3]
             metres += float(np.linalg.norm(step))

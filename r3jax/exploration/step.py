@@ -12,20 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.exploration.clock import timed
-from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
 from r3jax.frame import Frame
-from r3jax.mapping.join import grow
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
-from r3jax.mapping.state import MapState, empty_map
-from r3jax.mapping.update import integrate
+from r3jax.mapping.sighting import look
+from r3jax.mapping.state import empty_map
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.trace.images import frame_hash, stored_form
 from r3jax.trace.rows import StepRow, make_choice
-
-_MAX_LOAD = 0.7
-"""The table grows before more than this share of its rows is in use."""
 
 _integrate_depth = jax.jit(integrate_depth)
 _mark_free_ball = jax.jit(mark_free_ball)
@@ -51,18 +46,6 @@ def start_state(mission: Mission, init_key: jax.Array) -> LoopState:
     map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
     policy_state = mission.policy.init(simulator.camera, grid, key=init_key)
     return LoopState(0, map_state, grid, policy_state, pose)
-
-
-def integrate_growing(map_state: MapState, frame: Frame, config: ExplorationConfig) -> MapState:
-    """Integrates a frame; a table that would pass 70 % is doubled first, outside jit."""
-    after = integrate(map_state, frame, config.max_range)
-    while config.allow_growth and (
-        int(after.num_occupied) > _MAX_LOAD * after.capacity
-        or int(after.dropped) > int(map_state.dropped)
-    ):
-        map_state = grow(map_state, 2 * map_state.capacity)
-        after = integrate(map_state, frame, config.max_range)
-    return after
 
 
 def step(state: LoopState, mission: Mission) -> tuple[LoopState, View | Stop]:
@@ -188,7 +171,12 @@ def _map_frame(
     """The frame joins the map and the grid, and the policy is told."""
     config, repeat = mission.config, mission.clock.measures
     map_state, integrating = timed(
-        integrate_growing, state.map_state, frame, config, repeat_compiled=repeat
+        look,
+        state.map_state,
+        frame,
+        config.max_range,
+        allow_growth=config.allow_growth,
+        repeat_compiled=repeat,
     )
 
     def update_grid() -> OccupancyGrid:

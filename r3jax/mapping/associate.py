@@ -118,11 +118,13 @@ def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Boo
     An edge is a step of more than a voxel between neighbors that is no slope: the pixel also
     strays by more than a voxel from where its neighbors on both sides say that a plane runs. A
     plane is linear in inverse depth, so a floor or a ceiling seen at a grazing angle, whose depth
-    changes by many voxels a pixel, has no edges. Raw depth of a noisy sensor steps by more than a voxel
-    everywhere beyond 3 m (1 % of the depth is 4 cm at 4 m), which would empty the far half of
-    every frame; so the test runs on the 3x3 median, which keeps steps and calms noise, and adds
-    the pixels that stray from it. Pixels without a measurement do not count as neighbors: beside
-    a hole the other neighbor's depth is compared.
+    changes by many voxels a pixel, has no edges.
+
+    Raw depth of a noisy sensor steps by more than a voxel everywhere beyond 3 m (1 % of the
+    depth is 4 cm at 4 m), which would empty the far half of every frame; so the test runs on the
+    3x3 median, which keeps steps and calms noise, and adds the pixels that stray from it.
+    Pixels without a measurement do not count as neighbors: beside a hole the other neighbor's
+    depth is compared.
 
     Args:
         depth: z-depth [m]; 0 no measurement, inf beyond range.

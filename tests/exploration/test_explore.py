@@ -16,8 +16,8 @@ from r3jax.exploration.clock import ModelClock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import StopReason
 from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball
+from r3jax.mapping.sighting import look
 from r3jax.mapping.state import empty_map
-from r3jax.mapping.update import integrate
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.exploration.toys import UPPER, BoxRoom, Wander
@@ -77,12 +77,12 @@ def test_replaying_the_files_rebuilds_map_and_grid_bit_for_bit(recorded):
     map_state = empty_map(CONFIG.capacity, CONFIG.voxel_size, CONFIG.num_bins)
     grid = empty_grid(simulator.bounds, CONFIG.cell_size)
     ball = jax.jit(mark_free_ball)
-    look = jax.jit(integrate_depth)
+    add_to_grid = jax.jit(integrate_depth)
     start = jnp.asarray(simulator.start_pose[:3, 3], jnp.float32)
     grid = ball(grid, start, CONFIG.start_radius)
     for frame in run.frames():
-        map_state = integrate(map_state, frame, CONFIG.max_range)
-        grid = ball(look(grid, frame, CONFIG.max_range), frame.position, CONFIG.body_radius)
+        map_state = look(map_state, frame, CONFIG.max_range)
+        grid = ball(add_to_grid(grid, frame, CONFIG.max_range), frame.position, CONFIG.body_radius)
     assert_trees_equal(map_state, result.state.map_state)
     assert_trees_equal(grid, result.state.grid)
     step, stored_map, stored_grid = run.checkpoint()

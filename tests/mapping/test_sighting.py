@@ -1,0 +1,160 @@
+"""Voxels that a frame looked at: against a loop in float64, and what must not change."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera, look_at
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.geometry.voxels import unpack, voxel_center
+from r3jax.mapping import sighting as real
+from r3jax.mapping.sighting import look
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.update import integrate, integrate_points
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+
+WIDTH, HEIGHT, CAPACITY, VOXEL = 24, 18, 2048, 0.05  # one shape: one compile
+CAMERA = Camera(WIDTH, HEIGHT, 20.0, 22.0, 11.0, 9.5)
+REACH = 3.0
+mark = jax.jit(real.mark_seen)
+
+
+def cloud_map(seed: int = 0) -> MapState:
+    """Voxels strewn through a box, seen once from a corner."""
+    points = np.random.default_rng(seed).uniform([-1, -1, -1], [3.5, 1, 1], (900, 3))
+    return integrate_points(
+        empty_map(CAPACITY, VOXEL),
+        jnp.asarray(points, jnp.float32),
+        jnp.full((900, 3), 0.5),
+        jnp.array([-2.0, -1.5, 1.0]),
+        jnp.float32(20.0),
+    )
+
+
+def frame_of(seed: int = 0) -> Frame:
+    """A wall with a step, a slope, a hole and a part out of range, seen along x."""
+    depth = np.full((HEIGHT, WIDTH), 1.6, np.float32)
+    depth[:, 14:] = 2.4
+    depth[12:] += np.arange(WIDTH, dtype=np.float32) / 8
+    depth[2:5, 3:7] = 0.0
+    depth[:2] = np.inf
+    eye = np.random.default_rng(seed).uniform(-0.2, 0.2, 3)
+    pose = look_at(jnp.asarray(eye, jnp.float32), jnp.array([3.0, 0.1, 0.0]))
+    return Frame(rgb=np.zeros((HEIGHT, WIDTH, 3), np.float32), depth=depth,
+                 T_world_camera=pose, camera=CAMERA)  # fmt: skip
+
+
+def centers_of(state: MapState) -> np.ndarray:
+    return np.float64(voxel_center(jnp.stack(unpack(state.key[0], state.key[1])), state.voxel_size))
+
+
+def judged_by_hand(state: MapState, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows are seen, voxel by voxel, and which lie too near a limit to be sure of."""
+    centers, T = centers_of(state), np.linalg.inv(np.float64(frame.T_world_camera))
+    depth = np.asarray(frame.depth)
+    seen, unsure = np.zeros(CAPACITY, bool), np.zeros(CAPACITY, bool)
+    for row in np.flatnonzero(np.asarray(state.occupied)):
+        x, y, z = T[:3, :3] @ centers[:, row] + T[:3, 3]
+        if z <= 1e-3:
+            continue
+        u, v = 20.0 * x / z + 11.0, 22.0 * y / z + 9.5
+        reach = np.linalg.norm([x, y, z])
+        unsure[row] = min(u % 1, 1 - u % 1, v % 1, 1 - v % 1) < 1e-3 or abs(reach - REACH) < 1e-3
+        if not (0 <= u < WIDTH and 0 <= v < HEIGHT) or reach > REACH:
+            continue
+        i, j = int(v), int(u)
+        around = depth[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
+        limit = around.max() + VOXEL
+        unsure[row] |= abs(z - limit) < 1e-3
+        seen[row] = depth[i, j] > 0 and z <= limit
+    return seen, unsure
+
+
+def bins_by_hand(state: MapState, frame: Frame) -> np.ndarray:
+    """The bin of the lattice nearest to the direction from each voxel to the camera."""
+    offset = np.float64(frame.position)[:, None] - centers_of(state)
+    return np.argmax(np.float64(fibonacci_lattice(64)) @ offset, axis=0)
+
+
+def has_bin(state: MapState, bins: np.ndarray) -> np.ndarray:
+    words = np.asarray(state.visited)
+    return (words[bins // 32, np.arange(CAPACITY)] >> (bins % 32).astype(np.uint32)) & 1 == 1
+
+
+def law_seen(modules: Modules) -> None:
+    update = jax.jit(modules["sighting"].mark_seen)
+    for seed in range(3):
+        before, frame = cloud_map(seed), frame_of(seed)
+        after = update(before, frame, REACH)
+        seen, unsure = judged_by_hand(before, frame)
+        bins = bins_by_hand(before, frame)
+        fresh = ~has_bin(before, bins)
+        sure = np.asarray(before.occupied) & ~unsure & fresh
+        assert 50 < (seen & sure).sum() < sure.sum() - 50
+        np.testing.assert_array_equal(has_bin(after, bins)[sure], seen[sure])
+        distance = np.linalg.norm(np.float64(frame.position)[:, None] - centers_of(before), axis=0)
+        best = np.maximum(np.asarray(before.resolution), float(CAMERA.focal) / distance)
+        expected = np.where(seen, best, np.asarray(before.resolution))
+        sure = np.asarray(before.occupied) & ~unsure
+        np.testing.assert_allclose(np.asarray(after.resolution)[sure], expected[sure], rtol=1e-5)
+        np.testing.assert_array_equal(
+            np.bitwise_and(np.asarray(after.visited), np.asarray(before.visited)), before.visited
+        )
+        for name in ("key", "count", "mean", "m2", "dropped"):
+            np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
+def test_what_is_seen_is_what_a_loop_says():
+    law_seen({"sighting": real})
+
+
+def test_marking_twice_changes_nothing():
+    once = mark(cloud_map(), frame_of(), REACH)
+    twice = mark(once, frame_of(), REACH)
+    jax.tree.map(np.testing.assert_array_equal, once, twice)
+
+
+def test_a_frame_without_measurements_says_nothing():
+    frame = frame_of()
+    blind = Frame(rgb=frame.rgb, depth=np.zeros((HEIGHT, WIDTH), np.float32),
+                  T_world_camera=frame.T_world_camera, camera=CAMERA)  # fmt: skip
+    before = cloud_map()
+    jax.tree.map(np.testing.assert_array_equal, before, mark(before, blind, REACH))
+
+
+@pytest.mark.parametrize("allow_growth", [True, False])
+def test_look_integrates_marks_and_grows(allow_growth):
+    frame = frame_of()
+    small = empty_map(64, VOXEL)
+    after = look(small, frame, REACH, allow_growth=allow_growth)
+    if not allow_growth:
+        assert after.capacity == 64
+        assert int(after.dropped) > 0
+        return
+    assert int(after.dropped) == 0
+    assert int(after.num_occupied) <= 0.7 * after.capacity
+    plain = integrate(empty_map(after.capacity, VOXEL), frame, REACH)
+    assert int(after.num_occupied) == int(plain.num_occupied)
+    assert float(after.count.sum()) == float(plain.count.sum())
+
+
+CHAIN = ("r3jax.mapping.sighting",)
+MUTANTS = [
+    Mutant("sighting", "z <= measured + state.voxel_size", "z <= measured", law_seen),
+    Mutant("sighting", "jnp.where(frame.depth > 0.0, farthest, 0.0)", "farthest", law_seen),
+    Mutant("sighting", "before | words", "words", law_seen),
+    Mutant("sighting", "(u < camera.width)", "(u < camera.height)", law_seen),
+    Mutant("sighting", "<= max_range * max_range", "< jnp.inf", law_seen),
+    Mutant("sighting", "jax.lax.max, (3, 3)", "jax.lax.max, (1, 1)", law_seen),
+]
+
+
+def test_law_holds_without_a_fault():
+    law_seen(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
