@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.step import integrate_growing
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import (
     LOG_ODDS_LIMIT,
@@ -20,6 +19,7 @@ from r3jax.mapping.occupancy import (
     mark_free_ball,
     world_to_cell,
 )
+from r3jax.mapping.sighting import look
 from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import host_generator, poses_along, random_directions
 from r3jax.planning.config import PlannerConfig
@@ -106,7 +106,7 @@ def choose(
             totals[chosen] = -np.inf
             best = int(np.argmax(totals))
         frame = simulator.render(poses[best])
-        map_state = integrate_growing(map_state, frame, config)
+        map_state = look(map_state, frame, config.max_range)
         grid = _integrate_depth(grid, frame, config.max_range)
         grid = _mark_free_ball(grid, frame.position, config.body_radius)
         state = policy.observe(state, map_state, frame)
