@@ -39,7 +39,7 @@ def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]
         max_range: voxels farther from the camera than this are not seen [m].
     """
     num = state.capacity
-    seen = _is_seen(state, frame, jnp.asarray(max_range, dtype=jnp.float32))
+    seen = looked_at(state, frame, jnp.asarray(max_range, dtype=jnp.float32))
     size = min(num, CHUNK)
     rows = positions_of_set(seen, -(-num // size) * size)
     count = jnp.sum(seen, dtype=jnp.int32)
@@ -72,8 +72,8 @@ def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]
     )
 
 
-def _is_seen(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:
-    """Occupied voxels whose center projects onto a measurement that is no nearer."""
+def looked_at(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:
+    """Voxels within range whose center projects onto a measurement that is no nearer."""
     camera, T = frame.camera, invert_pose(frame.T_world_camera)
     center = voxel_center(jnp.stack(unpack(state.key[0], state.key[1])), state.voxel_size)
     along = lambda i: T[i, 0] * center[0] + T[i, 1] * center[1] + T[i, 2] * center[2] + T[i, 3]

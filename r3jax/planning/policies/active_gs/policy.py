@@ -24,6 +24,7 @@ from r3jax.planning.candidates import host_generator, local_random, poses_along,
 from r3jax.planning.decision import PlannerState
 from r3jax.planning.greedy import GreedyPolicy, Situation
 from r3jax.planning.policies.active_gs.confidence import aligned, no_sightings, see
+from r3jax.planning.policies.active_gs.glance import glance
 from r3jax.planning.policies.active_gs.regions import aimed_views, low_confidence, regions_of
 from r3jax.scoring.pixels import PixelView, Value, score_pixels
 
@@ -70,8 +71,10 @@ class ActiveGS(GreedyPolicy):
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
         """Directions, distances and normals of the frame's voxels."""
-        seen = see(state.memory, map_state, frame, self.config.scoring.max_range)
-        return replace(state, memory=seen)
+        reach = self.config.scoring.max_range
+        before = aligned(state.memory, map_state)
+        touched = see(before, map_state, frame, reach)
+        return replace(state, memory=glance(before, touched, map_state, frame, reach))
 
     def draw(self, situation: Situation, *, key: Array) -> tuple[np.ndarray, Any]:
         """Up to `num_frontier` views of regions of interest; the others local, turned anyhow."""
