@@ -1,0 +1,42 @@
+"""The paper's table of one kind of budget: quality, tails and differences, from records."""
+
+from pathlib import Path
+
+from experiments.artefacts import Origin, write_markdown
+from experiments.suite import Records
+from r3jax.evaluation.equal_terms import methods_of, snapshots_of
+from r3jax.evaluation.table_formats import to_csv, to_latex, to_markdown
+from r3jax.evaluation.table_parts import Table
+from r3jax.evaluation.tables import difference_table, quality_table, tail_table
+from r3jax.files import write_atomic
+
+REFERENCE = "ours-pano"
+"""The method that the others are compared with on the same views."""
+
+
+def write_tables(folder: Path, name: str, records: Records, origin: Origin) -> None:
+    """Writes the tables of the last snapshot: Markdown, LaTeX and CSV each.
+
+    Args:
+        folder: where to.
+        name: of the page.
+        records: of all snapshots.
+        origin: command, machine, commit.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    last = snapshots_of(records)[-1]
+    tables = tables_of([record for record in records if record["snapshot"] == last])
+    for kind, table in tables.items():
+        write_atomic(folder / f"{kind}.tex", to_latex(table).encode())
+        comment = "".join(f"# {line}\n" for line in origin.lines())
+        write_atomic(folder / f"{kind}.csv", (comment + to_csv(table)).encode())
+    pages = [to_markdown(table) for table in tables.values()]
+    write_markdown(folder / f"{name}.md", pages, origin)
+
+
+def tables_of(records: Records) -> dict[str, Table]:
+    """Quality, tails, and differences where the reference was run."""
+    tables = {"quality": quality_table(records), "tails": tail_table(records)}
+    if REFERENCE in methods_of(records):
+        tables["differences"] = difference_table(records, REFERENCE)
+    return tables

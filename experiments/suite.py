@@ -1,0 +1,159 @@
+"""The comparison that several tables and figures share: cells of the benchmark in three sizes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from experiments.artefacts import Origin, command_line
+from r3jax.benchmark.conditions import Conditions
+from r3jax.benchmark.engines.events import Event
+from r3jax.benchmark.engines.local import run_in_processes
+from r3jax.benchmark.engines.slurm import run_on_cluster
+from r3jax.benchmark.plan import Request, cells_left, make_plan
+from r3jax.benchmark.record import collect, machine, read_records, source_commit
+from r3jax.planning.policy import policy_names
+from r3jax.scenes.registry import scene_names
+
+HOUSE = "mesh:../shared/scenes/aws_small_house/aws_small_house.glb"
+
+Records = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What every experiment of this kind is asked."""
+
+    size: Literal["smoke", "small", "paper"] = "smoke"
+    """`smoke`: minutes. `small`: hours on two cores. `paper`: the paper's protocol, for GPUs."""
+
+    out: Path = Path("experiments/results")
+    """Folder of the tables and figures."""
+
+    work: Path = Path("runs/experiments")
+    """Folder of the cells; what is done there is not done again."""
+
+    scenes: tuple[str, ...] = ()
+    """Scenes other than the size's."""
+
+    policies: tuple[str, ...] = ()
+    """Policies other than the size's."""
+
+    engine: Literal["local", "slurm"] = "local"
+    """Processes on this machine, or an array job."""
+
+    jobs: int = 1
+    """Cells at a time; more than one slow each other's wall clock down."""
+
+
+@dataclass(frozen=True)
+class _Size:
+    """Scenes, policies, seeds and conditions; budgets are those of the experiment."""
+
+    scenes: tuple[str, ...]
+    policies: tuple[str, ...]
+    seeds: tuple[int, ...]
+    max_test_views: int | None
+    conditions: Conditions
+
+
+_SIZES = {
+    "smoke": _Size(
+        scenes=("flat",),
+        policies=("random", "active-gs", "ours", "ours-pano"),
+        seeds=(0,),
+        max_test_views=30,
+        conditions=Conditions(
+            resolution=128, train_resolution=64, iterations=300, gaussians=5_000, capacity=10_000
+        ),
+    ),
+    "small": _Size(
+        scenes=("flat", "office", HOUSE),
+        policies=policy_names(),
+        seeds=(0, 1),
+        max_test_views=120,
+        conditions=Conditions(
+            resolution=256,
+            train_resolution=128,
+            iterations=1500,
+            gaussians=20_000,
+            capacity=40_000,
+        ),
+    ),
+    "paper": _Size(
+        scenes=tuple(scene_names()),
+        policies=policy_names(),
+        seeds=(0, 1, 2),
+        max_test_views=None,
+        conditions=Conditions(
+            resolution=512,
+            train_resolution=512,
+            iterations=30_000,
+            gaussians=200_000,
+            capacity=1_000_000,
+        ),
+    ),
+}
+
+_AMOUNTS = {
+    ("smoke", "views"): (10, 20),
+    ("small", "views"): (30, 60),
+    ("paper", "views"): (60, 120, 180, 240, 300),
+    ("smoke", "seconds"): (8, 16),
+    ("small", "seconds"): (60, 120),
+    ("paper", "seconds"): (60, 120, 180, 240, 300),
+}
+"""Snapshots by size and unit; the last one is the budget."""
+
+
+def request_of(options: Options, unit: Literal["views", "seconds"]) -> Request:
+    """What the benchmark is asked for."""
+    size = _SIZES[options.size]
+    snapshots = tuple(f"{unit}:{amount}" for amount in _AMOUNTS[options.size, unit])
+    # Seconds are measured on this machine; views cost the same whatever the machine.
+    clock = "wall" if unit == "seconds" else "model"
+    return Request(
+        scenes=options.scenes or size.scenes,
+        policies=options.policies or size.policies,
+        seeds=size.seeds,
+        max_test_views=size.max_test_views,
+        conditions=replace(size.conditions, budget=snapshots[-1], snapshots=snapshots, clock=clock),
+    )
+
+
+def run_suite(options: Options, unit: Literal["views", "seconds"]) -> tuple[Path, Records]:
+    """Runs what is left of the cells.
+
+    Returns:
+        The folder of the cells, and their records.
+
+    Raises:
+        SystemExit: a cell failed; the others are done, and the same command tries it again.
+    """
+    root = options.work / f"{options.size}-{unit}"
+    root.mkdir(parents=True, exist_ok=True)
+    cells = make_plan(request_of(options, unit), root)
+    left, failed = cells_left(root, cells), []
+
+    def report(event: Event) -> None:
+        if event.kind in ("done", "failed"):
+            print(f"{event.cell.name}: {event.kind} {event.text}", flush=True)
+        if event.kind == "failed":
+            failed.append(event.cell.name)
+
+    print(f"{len(cells)} cells, {len(cells) - len(left)} of them done", flush=True)
+    if left and options.engine == "slurm":
+        run_on_cluster(left, root, report, jobs=options.jobs)
+    elif left:
+        run_in_processes(left, root, report, jobs=options.jobs)
+    collect(root)
+    if failed:
+        raise SystemExit(f"failed: {', '.join(failed)}; see error.txt in {root / 'cells'}")
+    return root, read_records(root, cells)
+
+
+def origin(module: str, records: Records) -> Origin:
+    """Where a result comes from: the records tell machine and commit."""
+    machines = sorted({record["machine"] for record in records} or {machine()})
+    commits = sorted({record["commit"] or "unknown" for record in records} or {source_commit()})
+    return Origin(command_line(module), " and ".join(machines), " and ".join(commits))
