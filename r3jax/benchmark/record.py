@@ -55,6 +55,11 @@ def make_record(
         "snapshot": snapshot,
         "clock": conditions.clock,
         "resolution": conditions.resolution,
+        "sensing": {
+            name: getattr(conditions, name)
+            for name in ("fov", "noise", "max_range", "voxel_size", "cell_size")
+        },
+        "lpips_network": conditions.lpips,
         "training": {
             "iterations": conditions.iterations,
             "resolution": conditions.train_resolution,

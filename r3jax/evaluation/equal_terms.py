@@ -74,8 +74,9 @@ def _scene_title(scene: str) -> str:
 def check_equal_terms(cells: Sequence[Cell], *, one_snapshot: bool = True) -> None:
     """Refuses records that were not made on equal terms.
 
-    All must share the format, the clock, the resolutions of exploration and test views, and all
-    settings of training but its seed; those of one scene also the scene itself and its test
+    All must share the format, the clock, the resolutions of exploration and test views, the sensor
+    and the size of voxels and cells, the network of LPIPS, and all settings of training but its
+    seed; those of one scene also the scene itself and its test
     views; and each scene, method, seed and snapshot may occur once.
 
     Args:
@@ -93,6 +94,9 @@ def check_equal_terms(cells: Sequence[Cell], *, one_snapshot: bool = True) -> No
         "the resolution of exploration": lambda cell: cell["resolution"],
         "the resolution of the test views": lambda cell: cell["test_views"]["resolution"],
     }
+    everywhere["the network of LPIPS"] = lambda cell: cell["lpips_network"]
+    for name in sorted({name for cell in cells for name in cell["sensing"]}):
+        everywhere[f"the exploration's {name}"] = lambda cell, name=name: cell["sensing"].get(name)
     if one_snapshot:
         everywhere["the snapshot"] = lambda cell: cell["snapshot"]
     for name in sorted({name for cell in cells for name in cell["training"]} - {"seed"}):

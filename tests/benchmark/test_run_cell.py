@@ -27,6 +27,8 @@ SCHEMA = {
     "snapshot": str,
     "clock": str,
     "resolution": int,
+    "sensing": dict.fromkeys(("fov", "noise", "max_range", "voxel_size", "cell_size"), float),
+    "lpips_network": str,
     "training": dict.fromkeys(("iterations", "resolution", "gaussians", "capacity", "seed"), int)
     | {"strategy": str},
     "test_views": {"hash": str, "count": int, "resolution": int},

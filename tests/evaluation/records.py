@@ -29,6 +29,10 @@ def record(
         "format": 1, "scene": scene, "scene_hash": f"hash of {scene}", "policy": policy,
         "settings": {}, "seed": seed, "budget": f"views:{budget}", "snapshot": f"views:{snapshot}",
         "clock": "model", "resolution": 256,
+        "sensing": {
+            "fov": 60.0, "noise": 0.01, "max_range": 5.0, "voxel_size": 0.05, "cell_size": 0.2,
+        },
+        "lpips_network": "alex",
         "training": {
             "iterations": 2000, "resolution": 128, "gaussians": 20000, "capacity": 40000,
             "strategy": "vanilla", "seed": seed,
