@@ -4,7 +4,7 @@ import csv
 import io
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,9 +38,16 @@ def command_line(module: str) -> str:
 
 def origin_of(module: str, records: Sequence[dict[str, Any]]) -> Origin:
     """The origin of a result that was made of missions, some of them perhaps elsewhere."""
-    machines = sorted({record["machine"] for record in records})
-    commits = sorted({record["flight"]["commit"] or "unknown" for record in records})
-    return Origin(command_line(module), " and ".join(machines), " and ".join(commits))
+    machines = [record["machine"] for record in records]
+    return joint_origin(module, machines, [record["flight"]["commit"] for record in records])
+
+
+def joint_origin(module: str, machines: Iterable[str], commits: Iterable[str | None]) -> Origin:
+    """The origin of a result whose parts came from these machines and commits."""
+    sources = {commit or "unknown" for commit in commits}
+    return Origin(
+        command_line(module), " and ".join(sorted(set(machines))), " and ".join(sorted(sources))
+    )
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, Any]], origin: Origin) -> None:

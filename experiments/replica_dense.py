@@ -1,9 +1,10 @@
 """The paper's table of one kind of budget: quality, tails and differences, from records."""
 
 from pathlib import Path
+from typing import Literal
 
 from experiments.artefacts import Origin, write_markdown
-from experiments.suite import Records
+from experiments.suite import Options, Records, origin, run_suite
 from r3jax.evaluation.equal_terms import methods_of, snapshots_of
 from r3jax.evaluation.table_formats import to_csv, to_latex, to_markdown
 from r3jax.evaluation.table_parts import Table
@@ -12,6 +13,15 @@ from r3jax.files import write_atomic
 
 REFERENCE = "ours-pano"
 """The method that the others are compared with on the same views."""
+
+
+def make_tables(options: Options, name: str, unit: Literal["views", "seconds"]) -> Path:
+    """Runs the cells of one kind of budget, writes the tables, and returns their folder."""
+    _, records = run_suite(options, unit)
+    folder = options.out / name / options.size
+    write_tables(folder, name, records, origin(f"experiments.{name}", records))
+    print(f"results  {folder}")
+    return folder
 
 
 def write_tables(folder: Path, name: str, records: Records, origin: Origin) -> None:

@@ -1,26 +1,14 @@
 """The paper's table at a budget of views: methods x SSIM, PSNR, LPIPS by scenes, and the tails.
 
-python -m experiments.replica_dense_views --size smoke
-"""
+    python -m experiments.replica_dense_views --size smoke
 
-from pathlib import Path
+What is done in `--work` is not done again.
+"""
 
 import tyro
 
-from experiments.replica_dense import write_tables
-from experiments.suite import Options, origin, run_suite
-
-NAME = "replica_dense_views"
-
-
-def main(options: Options) -> Path:
-    """Runs the cells, writes the tables, and returns their folder."""
-    _, records = run_suite(options, "views")
-    folder = options.out / NAME / options.size
-    write_tables(folder, NAME, records, origin(f"experiments.{NAME}", records))
-    print(f"results  {folder}")
-    return folder
-
+from experiments.replica_dense import make_tables
+from experiments.suite import Options
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    make_tables(tyro.cli(Options, description=__doc__), "replica_dense_views", "views")

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from experiments.artefacts import Origin, command_line
+from experiments.artefacts import Origin, joint_origin
 from r3jax.benchmark.conditions import Conditions
 from r3jax.benchmark.engines.events import Event
 from r3jax.benchmark.engines.local import run_in_processes
 from r3jax.benchmark.engines.slurm import run_on_cluster
 from r3jax.benchmark.plan import Request, cells_left, make_plan
-from r3jax.benchmark.record import collect, machine, read_records, source_commit
+from r3jax.benchmark.record import collect, read_records
 from r3jax.planning.policy import policy_names
 from r3jax.scenes.registry import scene_names
 
@@ -154,6 +154,5 @@ def run_suite(options: Options, unit: Literal["views", "seconds"]) -> tuple[Path
 
 def origin(module: str, records: Records) -> Origin:
     """Where a result comes from: the records tell machine and commit."""
-    machines = sorted({record["machine"] for record in records} or {machine()})
-    commits = sorted({record["commit"] or "unknown" for record in records} or {source_commit()})
-    return Origin(command_line(module), " and ".join(machines), " and ".join(commits))
+    machines = [record["machine"] for record in records]
+    return joint_origin(module, machines, [record["commit"] for record in records])
