@@ -15,6 +15,10 @@ from r3jax.trace.header import plain_settings
 IDENTITY_VERSION = 1
 """Raised when results of an older version of this package must not be taken over."""
 
+_LATER = {"drop_edges": True}
+"""Settings of the loop that came after the first cells, with the values that these had: they count
+only where they differ, so that what was done before stays done."""
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -73,7 +77,9 @@ def identity(cell: Cell) -> dict[str, Any]:
     default is another cell. Snapshots do not count: each has its own record.
     """
     conditions = dataclasses.asdict(cell.conditions)
-    del conditions["snapshots"]
+    for name in ("snapshots", "loop", "trainer"):  # the latter are among those that they are of
+        del conditions[name]
+    exploration = dataclasses.asdict(cell.conditions.exploration_config())
     policy = cell.conditions.policy(cell.policy, cell.settings)
     return {
         "version": IDENTITY_VERSION,
@@ -83,7 +89,7 @@ def identity(cell: Cell) -> dict[str, Any]:
         "given": plain_settings(cell.settings),
         "seed": cell.seed,
         "conditions": conditions,
-        "exploration": dataclasses.asdict(cell.conditions.exploration_config()),
+        "exploration": {k: v for k, v in exploration.items() if (k, v) not in _LATER.items()},
         "training": cell.conditions.train_config(cell.seed).as_record(),
         "test_views": {"hash": cell.test_views_hash, "count": cell.num_test_views},
     }

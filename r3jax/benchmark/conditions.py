@@ -1,6 +1,6 @@
 """What all cells of a benchmark have in common, in one place: that is what makes it fair."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from r3jax.exploration.budget import Budget, parse_budget
@@ -14,6 +14,12 @@ from r3jax.splatting.training_config import TrainConfig
 
 _SCORING = "scoring."
 """Prefix of the settings that go to `ScoringConfig`."""
+
+OWN_OF_LOOP = ("voxel_size", "cell_size", "max_range", "capacity", "clock")
+"""Fields of `ExplorationConfig` for which `Conditions` has fields of its own."""
+
+OWN_OF_TRAINER = ("iterations", "num_gaussians", "capacity", "raster", "seed")
+"""The same of `TrainConfig`; the seed is the cell's."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,12 @@ class Conditions:
     lpips: Literal["alex", "vgg", "none"] = "alex"
     """Network of LPIPS; `none` leaves it out."""
 
+    loop: dict[str, Any] = field(default_factory=dict)
+    """Further settings of `ExplorationConfig` by name; those at their defaults are left out."""
+
+    trainer: dict[str, Any] = field(default_factory=dict)
+    """Further settings of `TrainConfig` by name; those at their defaults are left out."""
+
     def __post_init__(self) -> None:
         """Refuses what cannot work, before anything is started."""
         if not self.snapshots:
@@ -91,6 +103,8 @@ class Conditions:
                 f"train_resolution {self.train_resolution} is more than the images have: "
                 f"resolution is {self.resolution}"
             )
+        object.__setattr__(self, "loop", _further(self.loop, ExplorationConfig, OWN_OF_LOOP))
+        object.__setattr__(self, "trainer", _further(self.trainer, TrainConfig, OWN_OF_TRAINER))
         # Each refuses what it cannot work with.
         _ = self.exploration_config(), self.train_config(0)
 
@@ -107,6 +121,7 @@ class Conditions:
             max_range=self.max_range,
             capacity=self.map_capacity,
             clock=self.clock,
+            **self.loop,
         )
 
     def train_config(self, seed: int) -> TrainConfig:
@@ -117,6 +132,7 @@ class Conditions:
             capacity=self.capacity,
             raster=RasterConfig(backend=self.backend),
             seed=seed,
+            **self.trainer,
         )
 
     def policy(self, name: str, settings: dict[str, Any]) -> Policy:
@@ -146,6 +162,18 @@ class Conditions:
             return make_policy(name, scoring=ScoringConfig(**scoring), **planner)
         except TypeError as error:  # a text where a number belongs
             raise ValueError(f"policy {name!r} with {settings}: {error}") from None
+
+
+def _further(given: dict[str, Any], config: type, own: tuple[str, ...]) -> dict[str, Any]:
+    """The given settings of a config that are not its defaults, in the order of its fields."""
+    known = {field.name: field.default for field in fields(config) if field.name not in own}
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise ValueError(
+            f"{config.__name__} has no further setting {', '.join(unknown)}; there are "
+            f"{', '.join(known)}"
+        )
+    return {k: given[k] for k, default in known.items() if k in given and given[k] != default}
 
 
 def snapshot_slug(snapshot: str) -> str:

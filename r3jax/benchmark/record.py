@@ -58,7 +58,8 @@ def make_record(
         "sensing": {
             name: getattr(conditions, name)
             for name in ("fov", "noise", "max_range", "voxel_size", "cell_size")
-        },
+        }
+        | conditions.loop,
         "lpips_network": conditions.lpips,
         "training": {
             "iterations": conditions.iterations,
@@ -67,7 +68,8 @@ def make_record(
             "capacity": conditions.capacity,
             "strategy": conditions.train_config(cell.seed).strategy,
             "seed": cell.seed,
-        },
+        }
+        | conditions.trainer,
         "test_views": {
             "hash": cell.test_views_hash,
             "count": cell.num_test_views,

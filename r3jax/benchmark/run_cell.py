@@ -207,7 +207,14 @@ def _do_snapshot(
     scene = _train(cell, paths, run, len(steps), snapshot, on_stage)
     on_stage("mapping its views")
     frames = (run.frame(row.step) for row in steps)
-    state = map_of(frames, voxel_size=conditions.voxel_size, max_range=conditions.max_range)
+    loop = conditions.exploration_config()
+    state = map_of(
+        frames,
+        voxel_size=loop.voxel_size,
+        max_range=loop.max_range,
+        num_bins=loop.num_bins,
+        drop_edges=loop.drop_edges,
+    )
     camera = conditions.camera
     expected = [float(renderability(state, camera, jnp.asarray(T))) for T in judging.poses]
     on_stage("judging")

@@ -11,7 +11,12 @@ from r3jax.scoring.renderability import renderability, renderability_image
 
 
 def map_of(
-    frames: Iterable[Frame], *, voxel_size: float = 0.05, max_range: float = 5.0
+    frames: Iterable[Frame],
+    *,
+    voxel_size: float = 0.05,
+    max_range: float = 5.0,
+    num_bins: int = 64,
+    drop_edges: bool = True,
 ) -> MapState:
     """The map that has seen these frames and no others; it grows as needed.
 
@@ -22,10 +27,12 @@ def map_of(
         frames: what the model was trained on.
         voxel_size: edge of a voxel [m].
         max_range: depth beyond it is ignored [m].
+        num_bins: direction bins per voxel.
+        drop_edges: False lets pixels on depth edges in.
     """
-    state = empty_map(voxel_size=voxel_size)
+    state = empty_map(voxel_size=voxel_size, num_bins=num_bins)
     for frame in frames:
-        state = look(state, frame, max_range)
+        state = look(state, frame, max_range, drop_edges=drop_edges)
     return state
 
 

@@ -22,6 +22,9 @@ class ExplorationConfig:
     allow_growth: bool = True
     """Double the table before it is 70 % full. If not, what finds no row is counted."""
 
+    drop_edges: bool = True
+    """Keep pixels on depth edges, whose color mixes two surfaces, out of the map."""
+
     cell_size: float = 0.2
     """Edge of a cell of the coarse grid [m]."""
 
@@ -54,7 +57,7 @@ class ExplorationConfig:
         for name in ("voxel_size", "cell_size", "max_range", "speed"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("num_probes", "checkpoint_every", "max_still_views"):
+        for name in ("num_bins", "num_probes", "checkpoint_every", "max_still_views"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.capacity < 2 or self.capacity & (self.capacity - 1):

@@ -176,6 +176,7 @@ def _map_frame(
         frame,
         config.max_range,
         allow_growth=config.allow_growth,
+        drop_edges=config.drop_edges,
         repeat_compiled=repeat,
     )
 

@@ -96,7 +96,12 @@ _mark_seen = jax.jit(mark_seen)
 
 
 def look(
-    state: MapState, frame: Frame, max_range: float = np.inf, *, allow_growth: bool = True
+    state: MapState,
+    frame: Frame,
+    max_range: float = np.inf,
+    *,
+    allow_growth: bool = True,
+    drop_edges: bool = True,
 ) -> MapState:
     """A frame joins the map (`integrate`), and what it looked at counts as seen (`mark_seen`).
 
@@ -107,12 +112,13 @@ def look(
         frame: the frame.
         max_range: measurements beyond this z-depth are ignored, as are voxels farther away [m].
         allow_growth: False keeps the capacity; what finds no row is counted in `dropped`.
+        drop_edges: False lets pixels on depth edges in.
     """
-    after = integrate(state, frame, max_range)
+    after = integrate(state, frame, max_range, drop_edges)
     while allow_growth and (
         int(after.num_occupied) > _MAX_LOAD * after.capacity
         or int(after.dropped) > int(state.dropped)
     ):
         state = grow(state, 2 * state.capacity)
-        after = integrate(state, frame, max_range)
+        after = integrate(state, frame, max_range, drop_edges)
     return _mark_seen(after, frame, max_range)

@@ -36,6 +36,8 @@ CONDITION_CHANGES = {
     "capacity": 401,
     "backend": "xla",
     "lpips": "alex",
+    "loop": {"num_bins": 32},
+    "trainer": {"sh_degree": 1},
 }
 
 
@@ -111,6 +113,11 @@ def test_every_policy_sees_as_far_as_the_sensor_and_draws_as_many_candidates(nam
         ({"train_resolution": 64}, "more than the images have"),
         ({"capacity": 100}, "capacity 100 has no room"),
         ({"voxel_size": 0.0}, "voxel_size must be positive"),
+        ({"loop": {"num_bins": 0}}, "num_bins must be at least 1"),
+        ({"loop": {"bins": 32}}, "ExplorationConfig has no further setting bins; there are num_"),
+        ({"loop": {"voxel_size": 0.1}}, "no further setting voxel_size"),
+        ({"trainer": {"sh_degree": 4}}, "sh_degree must be 0, 1, 2 or 3"),
+        ({"trainer": {"seed": 1}}, "TrainConfig has no further setting seed"),
     ],
 )
 def test_conditions_that_cannot_work_are_refused(changes, message):
@@ -122,6 +129,29 @@ def test_conditions_that_cannot_work_are_refused(changes, message):
 def test_settings_that_nobody_knows_are_refused(settings):
     with pytest.raises(ValueError, match=r"lambda9|scoring\.NAME"):
         CONDITIONS.policy("ours", settings)
+
+
+def test_further_settings_reach_the_loop_and_the_trainer():
+    given = {"loop": {"num_bins": 96, "drop_edges": False}, "trainer": {"lambda_dssim": 0.5}}
+    changed = dataclasses.replace(CONDITIONS, **given)
+    loop, trainer = changed.exploration_config(), changed.train_config(3)
+    assert (loop.num_bins, loop.drop_edges, loop.voxel_size) == (96, False, 0.1)
+    assert (trainer.lambda_dssim, trainer.seed, trainer.iterations) == (0.5, 3, 30)
+
+
+def test_a_setting_at_its_default_is_the_same_cell_as_one_that_was_not_given():
+    given = {"loop": {"num_bins": 64, "drop_edges": True}, "trainer": {"sh_degree": 3}}
+    same = dataclasses.replace(CONDITIONS, **given)
+    assert same == CONDITIONS
+    assert dataclasses.replace(CELL, conditions=same).name == CELL.name
+
+
+def test_cells_from_before_the_edge_filter_could_be_left_out_keep_their_names():
+    assert "drop_edges" not in identity(CELL)["exploration"]
+    kept = dataclasses.replace(CONDITIONS, loop={"drop_edges": False})
+    without = identity(dataclasses.replace(CELL, conditions=kept))
+    assert without["exploration"] == identity(CELL)["exploration"] | {"drop_edges": False}
+    assert without["conditions"] == identity(CELL)["conditions"]
 
 
 def test_without_snapshots_the_budget_is_one():

@@ -198,6 +198,7 @@ def test_a_map_knows_what_it_was_shown_and_no_more():
     assert max(scores[2:]) < 0.05
     np.testing.assert_allclose(expected_image(state, frames[0]).mean(), scores[0], rtol=1e-5)
     assert int(map_of(frames, voxel_size=0.2, max_range=1.0).num_occupied) == 0
+    assert map_of(frames[:1], voxel_size=0.2, num_bins=96).num_bins == 96
 
 
 def test_a_map_grows_instead_of_dropping(monkeypatch):

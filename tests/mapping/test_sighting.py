@@ -140,6 +140,15 @@ def test_look_integrates_marks_and_grows(allow_growth):
     assert float(after.count.sum()) == float(plain.count.sum())
 
 
+def test_look_lets_edges_in_if_told():
+    frame = frame_of()
+    after = look(empty_map(64, VOXEL), frame, REACH, drop_edges=False)
+    plain = integrate(empty_map(after.capacity, VOXEL), frame, REACH, False)
+    np.testing.assert_array_equal(after.count, plain.count)
+    filtered = integrate(empty_map(after.capacity, VOXEL), frame, REACH)
+    assert int(filtered.num_occupied) < int(after.num_occupied)
+
+
 CHAIN = ("r3jax.mapping.sighting",)
 MUTANTS = [
     Mutant("sighting", "z <= measured + state.voxel_size", "z <= measured", law_seen),
