@@ -1,11 +1,12 @@
-"""A Slurm cluster of one node on this machine, from nothing and without systemd.
+r"""A Slurm cluster of one node on this machine, from nothing and without systemd.
 
 Needs munged, slurmctld and slurmd (Debian: `apt-get install slurm-wlm munge`); root is not
 needed, and nothing outside its own folder is read or written. A benchmark on it, by hand:
 
     eval "$(python -m tests.slurm.cluster start /tmp/cluster)"
-    r3jax benchmark --engine slurm --jobs 2 --scenes two_rooms --policies random,ours \
-        --budget views:4 --resolution 48 --iterations 50 --test-views 4 --lpips none --out out
+    r3jax benchmark --engine slurm --jobs 2 --scenes flat --policies random,ours \
+        --budget views:4 --resolution 48 --train-resolution 48 --iterations 50 \
+        --test-views 6 --lpips none --out /tmp/benchmark
     python -m tests.slurm.cluster stop /tmp/cluster
 
 The folder holds slurm.conf, keys, state and the daemons' logs. There is no accounting database,
