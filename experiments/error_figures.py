@@ -20,7 +20,6 @@ from experiments.error_analysis import (
 )
 from experiments.error_terms import KAPPAS, PRODUCTS, column
 from r3jax.evaluation import style
-from r3jax.evaluation.distribution_figures import density
 from r3jax.evaluation.policy_style import OKABE_ITO, legend_below
 from r3jax.evaluation.statistics import Estimate
 
@@ -104,38 +103,39 @@ def _draw_points(axes: Axes, models: SceneModels, predictor: str, error: str) ->
 def distribution_figure(scenes: Sequence[SceneModels]) -> Figure:
     """How R, coverage and PSNR spread over views and models: a line per scene, a color per budget.
 
-    Areas are equal; a tick marks each median.
+    Histograms, as a smoothed density would reach beyond 0 and 1; a line marks each median.
     """
     shown = {SCORE: TITLES[SCORE], COVERAGE: TITLES[COVERAGE], "psnr": ERRORS["psnr"]}
-    figure = style.new_figure(10.8, 2.3 * len(scenes) + 0.4)
+    figure = style.new_figure(10.8, 2.4 * len(scenes) + 0.3)
     panels = figure.subplots(len(scenes), len(shown), squeeze=False, sharex="col")
     for line, models in zip(panels, scenes, strict=True):
         for axes, (name, title) in zip(line, shown.items(), strict=True):
-            first = axes is line[0]
-            style.dress(axes, models.scene if first else "", title)
-            axes.grid(visible=False, axis="y")
-            axes.set_yticks([])
-            axes.spines["left"].set_visible(False)
-            _draw_densities(axes, models, name)
+            is_first = axes is line[0]
+            style.dress(axes, models.scene if is_first else "", title)
+            if is_first:
+                axes.set_ylabel("views [%]", fontsize=9, color=style.MUTED)
+            everywhere = np.concatenate([other.columns[name].ravel() for other in scenes])
+            top = 1.0 if name in TITLES else float(np.nanmax(everywhere))
+            edges = np.linspace(min(0.0, float(np.nanmin(everywhere))), top, _BARS + 1)
+            _draw_histograms(axes, models, name, edges)
             axes.tick_params(labelbottom=True)
     legend_below(figure, [budget_name(snapshot) for snapshot in budget_colors(scenes[0])])
     return figure
 
 
-def _draw_densities(axes: Axes, models: SceneModels, name: str) -> None:
-    low, high = np.nanmin(models.columns[name]), np.nanmax(models.columns[name])
-    margin = 0.08 * (high - low) + 1e-3
-    grid = np.linspace(low - margin, high + margin, 300)
+_BARS = 20
+"""Of a histogram."""
+
+
+def _draw_histograms(axes: Axes, models: SceneModels, name: str, edges: np.ndarray) -> None:
     for snapshot, color in budget_colors(models).items():
         mine = np.array([other == snapshot for other in models.snapshots])
         values = models.columns[name][mine].ravel()
         values = values[~np.isnan(values)]
-        height = density(values, grid)
-        axes.fill_between(grid, height, color=color, alpha=0.25, linewidth=0)
-        axes.plot(grid, height, color=color, linewidth=1.6, label=budget_name(snapshot))
-        middle = float(np.median(values))
-        axes.vlines(middle, 0.0, np.interp(middle, grid, height), color=color, linewidth=1.6)
-    axes.set_ylim(bottom=0.0)
+        share = 100.0 * np.histogram(values, edges)[0] / len(values)
+        axes.stairs(share, edges, color=color, alpha=0.2, fill=True)
+        axes.stairs(share, edges, color=color, linewidth=1.6, label=budget_name(snapshot))
+        axes.axvline(float(np.median(values)), color=color, linewidth=1.4, linestyle="--")
 
 
 def term_figure(models: SceneModels) -> Figure:
