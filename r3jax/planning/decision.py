@@ -34,9 +34,6 @@ class PlannerState(eqx.Module):
     trail: Bool[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
     """Cells that the robot has come through: the way back if it finds itself shut in."""
 
-    attempted: Bool[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
-    """Frontier cells that were looked at on purpose (`frontier` policy)."""
-
     looks: Int[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
     """Views that should have shown each cell and left it unexplored."""
 
@@ -63,7 +60,7 @@ def initial_state(camera: Camera, grid: OccupancyGrid, memory: Any = None) -> Pl
     """The memory of a robot that has not moved yet."""
     nowhere = jnp.zeros(grid.log_odds.shape, dtype=bool)
     looks = jnp.zeros(grid.log_odds.shape, dtype=jnp.int32)
-    return PlannerState(camera=camera, trail=nowhere, attempted=nowhere, looks=looks, memory=memory)
+    return PlannerState(camera=camera, trail=nowhere, looks=looks, memory=memory)
 
 
 def ways_from(
@@ -120,7 +117,7 @@ def settle(
     poses: np.ndarray,
     utilities: dict[str, np.ndarray],
     stopwatch: Stopwatch,
-) -> tuple[Decision, PlannerState, PlanInfo]:
+) -> tuple[int, Decision, PlannerState, PlanInfo]:
     """Takes the candidate of the greatest `total` and finds the way to it.
 
     Args:
@@ -130,6 +127,9 @@ def settle(
         utilities: per candidate, [C] each; `total` and `path` among them. A candidate whose
             path is infinite is never taken.
         stopwatch: what took how long.
+
+    Returns:
+        Which candidate it is, the decision, the memory with the way counted in, and the info.
     """
     with stopwatch.part("travel"):
         is_reachable = np.isfinite(utilities["path"])
@@ -145,7 +145,7 @@ def settle(
     )
     info = PlanInfo(Outcome.MOVED, len(poses), int(is_reachable.sum()), stopwatch.seconds)
     trail = jnp.asarray(np.asarray(state.trail) | travel.cells_along(waypoints))
-    return decision, eqx.tree_at(lambda s: s.trail, state, trail), info
+    return best, decision, eqx.tree_at(lambda s: s.trail, state, trail), info
 
 
 def net_utility(utility: np.ndarray, path: np.ndarray, lambda2: float) -> np.ndarray:

@@ -1,5 +1,6 @@
 """What most policies are: draw candidates, score them, take the best. Each fills in the parts."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -13,6 +14,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import (
+    host_generator,
     local_random,
     poses_along,
     random_directions,
@@ -30,6 +32,8 @@ from r3jax.planning.decision import (
 )
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.travel import Travel
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.pixels import Value, score_pixels
 
 
 @dataclass(frozen=True)
@@ -53,9 +57,26 @@ class Situation:
     memory: Any
     """What the policy keeps beside the map."""
 
+    notes: Any = None
+    """What `draw` noted of the candidates."""
+
 
 @dataclass(frozen=True)
-class GreedyPolicy:
+class Drawn:
+    """The candidates of one decision."""
+
+    poses: np.ndarray
+    """[C, 4, 4] float64; C = 0: there is none."""
+
+    memory: Any
+    """What the policy keeps beside the map, after drawing."""
+
+    notes: Any = None
+    """What `score`, `weigh` and `conclude` need to know of the candidates; kept no longer."""
+
+
+@dataclass(frozen=True)
+class GreedyPolicy(ABC):
     """Draws candidates, scores them, weighs the path, takes the best."""
 
     config: PlannerConfig = field(default_factory=PlannerConfig)
@@ -70,19 +91,26 @@ class GreedyPolicy:
         """What the policy keeps beside the map, before the first frame: nothing."""
         del camera, grid
 
-    def draw(self, situation: Situation, *, key: Array) -> tuple[np.ndarray, Any]:
-        """Candidates, [C, 4, 4] float64 (C = 0: there is none), and the memory after."""
-        return random_views(situation, self.config, key=key), situation.memory
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """The candidates: those of Ours, unless the policy has its own."""
+        return Drawn(random_views(situation, self.config, key=key), situation.memory)
 
+    @abstractmethod
     def score(
         self, situation: Situation, poses: np.ndarray, *, key: Array
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """The candidates, turned if the policy turns them, and `utility` [C] among others."""
-        raise NotImplementedError
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """`total` of each candidate, from `utility` and `path` [C]: U_view."""
         return net_utility(utilities["utility"], utilities["path"], self.config.lambda2)
+
+    def conclude(
+        self, situation: Situation, poses: np.ndarray, utilities: dict[str, np.ndarray], best: int
+    ) -> Any:
+        """The memory after candidate `best` was chosen."""
+        del poses, utilities, best
+        return situation.memory
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
         """The state before the first frame; nothing in it is random."""
@@ -110,18 +138,59 @@ class GreedyPolicy:
             state, travel, masked = look_round(state, map_state, grid, T_world_camera, self.config)
         with stopwatch.part("candidates"):
             situation = Situation(map_state, grid, masked, travel, state.camera, state.memory)
-            poses, memory = self.draw(situation, key=draw_key)
-            situation = replace(situation, memory=memory)
-            state = replace(state, memory=memory)
-            if len(poses) == 0:
+            drawn = self.draw(situation, key=draw_key)
+            if len(drawn.poses) == 0:
                 decision, info = no_decision(travel, self.config, stopwatch)
-                return decision, state, info
+                return decision, replace(state, memory=drawn.memory), info
+            situation = replace(situation, memory=drawn.memory, notes=drawn.notes)
         with stopwatch.part("scoring"):
-            poses, utilities = self.score(situation, poses, key=score_key)
+            poses, utilities = self.score(situation, drawn.poses, key=score_key)
         with stopwatch.part("travel"):
             utilities = utilities | {"path": travel.lengths(poses[:, :3, 3])}
         utilities = utilities | {"total": self.weigh(utilities)}
-        return settle(state, travel, poses, utilities, stopwatch)
+        best, decision, state, info = settle(state, travel, poses, utilities, stopwatch)
+        memory = self.conclude(situation, poses, utilities, best)
+        return decision, replace(state, memory=memory), info
+
+
+def free_views(situation: Situation, num: int, radius: float, *, key: Array) -> np.ndarray:
+    """`num` views from safe places within `radius` of the robot, looking anywhere.
+
+    Returns:
+        [num, 4, 4] float64; [0, 4, 4] if the robot can stop nowhere.
+    """
+    position_key, direction_key = jax.random.split(key)
+    positions = local_random(situation.travel, num, radius, key=position_key)
+    if len(positions) == 0:
+        return np.zeros((0, 4, 4))
+    return poses_along(positions, random_directions(num, key=direction_key))
+
+
+def draw_lots(num: int, *, key: Array) -> dict[str, np.ndarray]:
+    """A `lot` for each of `num` candidates, where nothing else tells them apart."""
+    return {"lot": host_generator(key).random(num)}
+
+
+def score_by_pixels(
+    situation: Situation,
+    value: Value,
+    poses: np.ndarray,
+    scoring: ScoringConfig,
+    rows: Any = (),
+    reach: float | None = None,
+) -> list[np.ndarray]:
+    """`score_pixels` of a situation: each number that `value` gives of a view, [C] float64."""
+    numbers = score_pixels(
+        value,
+        situation.map_state,
+        situation.scoring_grid,
+        situation.camera,
+        poses.astype(np.float32),
+        scoring,
+        rows,
+        reach,
+    )
+    return [np.asarray(number, dtype=np.float64) for number in numbers]
 
 
 def random_views(situation: Situation, config: PlannerConfig, *, key: Array) -> np.ndarray:

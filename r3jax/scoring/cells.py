@@ -3,6 +3,9 @@
 Shape symbols: X Y Z cells of the grid; c cells at hand; B bins of the panorama.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -68,12 +71,32 @@ def unexplored_by_direction(
         num_bins: bins of the Fibonacci lattice; 1 counts over all directions.
     """
 
-    def count(index, valid, total):
-        points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
-        is_seen = valid & is_visible(view, view.place(points), buffer.distance)
+    def count(points, place, is_seen, total):
+        del place
         weight = is_seen.astype(jnp.float32)
         return total + sum_by_direction(points, weight, position, num_bins)
 
+    return over_visible(cells, view, buffer, count, jnp.zeros(num_bins, dtype=jnp.float32))
+
+
+def over_visible(
+    cells: Cells, view: View, buffer: DepthBuffer, add: Callable[..., Any], start: Any
+) -> Any:
+    """Adds something up over the unexplored cells whose center the view sees.
+
+    Args:
+        cells: of the coarse grid.
+        view: where from.
+        buffer: what hides.
+        add: from centers [3, n] [m], where they fall (`View.place`), which of them are seen [n]
+            and the total so far to the total with them.
+        start: the total of nothing.
+    """
+
+    def of_chunk(index, valid, total):
+        points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
+        place = view.place(points)
+        return add(points, place, valid & is_visible(view, place, buffer.distance), total)
+
     in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
-    start = jnp.zeros(num_bins, dtype=jnp.float32)
-    return for_selected(select(cells.unexplored & in_view), count, start)
+    return for_selected(select(cells.unexplored & in_view), of_chunk, start)

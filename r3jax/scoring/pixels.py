@@ -20,11 +20,10 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.batch import deal, near
-from r3jax.scoring.cells import Cells
-from r3jax.scoring.chunks import for_selected, select
+from r3jax.scoring.cells import Cells, over_visible
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.views import PinholeView, pinhole_view
-from r3jax.scoring.visibility import DepthBuffer, candidates_of, depth_buffer, is_visible
+from r3jax.scoring.visibility import DepthBuffer, candidates_of, depth_buffer
 from r3jax.scoring.voxels import Voxels
 
 
@@ -132,12 +131,9 @@ def _unexplored(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Number of unexplored cells whose center the view sees, and the sum of their distances."""
 
-    def add(index, valid, totals):
-        place = view.place(jnp.stack([cells.x[index], cells.y[index], cells.z[index]]))
-        is_seen = valid & is_visible(view, place, buffer.distance)
+    def add(points, place, is_seen, totals):
+        del points
         count = jnp.sum(is_seen, dtype=jnp.float32)
         return totals[0] + count, totals[1] + jnp.sum(jnp.where(is_seen, place.distance, 0.0))
 
-    in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
-    start = jnp.zeros(()), jnp.zeros(())
-    return for_selected(select(cells.unexplored & in_view), add, start)
+    return over_visible(cells, view, buffer, add, (jnp.zeros(()), jnp.zeros(())))

@@ -215,8 +215,8 @@ MUTANTS = [
         law_nearer_of_equal_gains,
     ),
     Mutant("active_gamer", "jnp.mean(~view.hit", "jnp.mean(view.hit", LAWS[2]),
-    Mutant("active_gamer", "score_of(gain, draw.distance)", "score_of(gain, path)", law_decision),
-    Mutant("active_gamer", "int(np.argmax(total))", "0", law_decision),
+    Mutant("active_gamer", 'utilities["distance"])', 'utilities["path"])', law_decision),
+    Mutant("active_gamer", 'utilities["utility"], best)', 'utilities["utility"], 0)', law_decision),
     Mutant("active_gamer", "max_range=extent", "", law_decision),
 ]
 

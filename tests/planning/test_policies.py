@@ -196,7 +196,7 @@ def test_frontier_goes_to_the_unknown_and_then_looks_elsewhere(world):
     assert goal[0, 3] > center(13, 0, 0)[0]
     assert decision.utilities["path"].argmin() == 0
     # Nothing is learned from that look: the next one is at another part of the frontier.
-    attempted = np.asarray(state.attempted)
+    attempted = np.asarray(state.memory)
     assert attempted[17].any()
     target = np.argwhere(attempted & np.asarray(world[1].free))
     state_after = state
@@ -204,9 +204,9 @@ def test_frontier_goes_to_the_unknown_and_then_looks_elsewhere(world):
         decision, state_after, _ = decide(
             policy, world, goal[:3, 3], state_after, key=jax.random.key(i)
         )
-        fresh = np.asarray(state_after.attempted) & ~attempted
+        fresh = np.asarray(state_after.memory) & ~attempted
         assert fresh[17].any()
-        attempted = np.asarray(state_after.attempted)
+        attempted = np.asarray(state_after.memory)
     assert len(target) < attempted.sum()
 
 

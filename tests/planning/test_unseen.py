@@ -96,7 +96,12 @@ MUTANTS = [
     Mutant("unseen", "view.cell_distance / view", "view.cell_distance * view", law_single_cells),
     Mutant("unseen", "depth if weighted else cells", "depth", law_single_cells),
     Mutant("unseen", "weighted=True", "weighted=False", law_single_cells),
-    Mutant("unseen", "situation.scoring_grid", "situation.grid", law_hopeless_cells_do_not_count),
+    Mutant(
+        "greedy",
+        "situation.scoring_grid,\n        situation.camera",
+        "situation.grid,\n        situation.camera",
+        law_hopeless_cells_do_not_count,
+    ),
     Mutant("unseen", "if not utility.any()", "if utility.any()", law_counts_are_exploration),
     Mutant("unseen", "if not utility.any()", "if False", law_lots_where_nothing_is_unseen),
 ]
@@ -115,7 +120,13 @@ def test_unexplored_cells(law):
 
 @each(MUTANTS)
 def test_faults_are_noticed(mutant):
-    assert_caught(("r3jax.planning.policies.unseen",), mutant)
+    assert_caught(
+        (
+            "r3jax.planning.greedy",
+            "r3jax.planning.policies.unseen",
+        ),
+        mutant,
+    )
 
 
 @pytest.mark.parametrize("policy_class", [Unseen, UnseenDepth])

@@ -210,7 +210,7 @@ def law_reach(modules: Modules) -> None:
 
 
 LAWS = [law_rows, law_rays, law_cells_as_in_utility, law_single_cells, law_reach]
-CHAIN = ("r3jax.scoring.pixels",)
+CHAIN = ("r3jax.scoring.cells", "r3jax.scoring.pixels")
 MUTANTS = [
     Mutant("pixels", "jnp.minimum(index, last)]", "jnp.arange(index.shape[0])]", law_rows),
     Mutant("pixels", "x[..., item], rows", "x[..., item + 1], rows", law_rows),
@@ -218,9 +218,9 @@ MUTANTS = [
     Mutant("pixels", "-jnp.sum(offset * axis", "jnp.sum(offset * axis", law_rows),
     Mutant("pixels", "jnp.minimum(buffer.item, num - 1)", "jnp.minimum(buffer.item, 40)", law_rays),
     Mutant("pixels", "buffer.item < num", "buffer.item <= num", law_rays),
-    Mutant("pixels", "valid & is_visible", "is_visible", law_single_cells),
-    Mutant("pixels", "cells.unexplored & in_view", "in_view", law_single_cells),
-    Mutant("pixels", "place, buffer.distance)", "place, buffer.limit)", law_cells_as_in_utility),
+    Mutant("cells", "valid & is_visible", "is_visible", law_single_cells),
+    Mutant("cells", "cells.unexplored & in_view", "in_view", law_single_cells),
+    Mutant("cells", "place, buffer.distance)", "place, buffer.limit)", law_cells_as_in_utility),
     Mutant("pixels", "far = view if reach is None", "far = view if True", law_reach),
     Mutant("pixels", "_unexplored(cells, view", "_unexplored(cells, far", law_reach),
     Mutant("pixels", "is_seen, place.distance, 0.0", "is_seen, 1.0, 0.0", law_single_cells),

@@ -30,10 +30,14 @@ from jaxtyping import Array, Float
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.decision import PlannerState, Stopwatch, settle, ways_from
-from r3jax.planning.greedy import GreedyPolicy, ScoreViews
-from r3jax.planning.policies.random import Random
-from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.planning.greedy import (
+    Drawn,
+    GreedyPolicy,
+    ScoreViews,
+    Situation,
+    draw_lots,
+    free_views,
+)
 from r3jax.planning.pool import Pools, dismiss, draw_candidates, empty_pools
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.pixels import PixelView, score_pixels
@@ -65,34 +69,40 @@ class ActiveGamer(GreedyPolicy):
         del camera
         return empty_pools(grid.log_odds.shape, float(grid.cell_size))
 
-    def decide(
-        self,
-        state: PlannerState,
-        map_state: MapState,
-        grid: OccupancyGrid,
-        T_world_camera: np.ndarray,
-        *,
-        key: Array,
-    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """The pool's best view; a random nearby one when no candidate can be reached."""
-        stopwatch, config = Stopwatch(), self.config
-        with stopwatch.part("travel"):
-            travel = ways_from(state, grid, T_world_camera, config)
-        with stopwatch.part("candidates"):
-            pools, draw = draw_candidates(state.memory, travel, config.num_candidates)
-        state = replace(state, memory=pools)
-        if draw is None:
-            return Random(config).decide(state, map_state, grid, T_world_camera, key=key)
-        with stopwatch.part("scoring"):
-            gain = self._gain(state.camera, map_state, grid, draw.poses)
-        with stopwatch.part("travel"):
-            path = travel.lengths(draw.poses[:, :3, 3])
-        total = score_of(gain, draw.distance)
-        utilities = {"utility": gain, "distance": draw.distance, "path": path, "total": total}
-        decision, state, info = settle(state, travel, draw.poses, utilities, stopwatch)
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """The pool's candidates, noted where they stand in it; any nearby view if there is none."""
+        num = self.config.num_candidates
+        pools, found = draw_candidates(situation.memory, situation.travel, num)
+        if found is None:
+            return Drawn(free_views(situation, num, self.config.radius, key=key), pools)
+        return Drawn(found.poses, pools, notes=found)
+
+    def score(
+        self, situation: Situation, poses: np.ndarray, *, key: Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Gain and distance of the pool's candidates; lots for others."""
+        if situation.notes is None:
+            return poses, draw_lots(len(poses), key=key)
+        gain = self._gain(situation.camera, situation.map_state, situation.grid, poses)
+        return poses, {"utility": gain, "distance": situation.notes.distance}
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """The score of the paper, or the lots: the path itself costs nothing."""
+        if "lot" in utilities:
+            return utilities["lot"]
+        return score_of(utilities["utility"], utilities["distance"])
+
+    def conclude(
+        self, situation: Situation, poses: np.ndarray, utilities: dict[str, np.ndarray], best: int
+    ) -> Pools:
+        """The chosen candidate leaves the pool, and those that are worth nothing."""
+        del poses
+        pools, found = situation.memory, situation.notes
+        if found is None:
+            return pools
         of_stage = list(pools.of_stage)
-        of_stage[draw.stage] = dismiss(of_stage[draw.stage], draw, gain, int(np.argmax(total)))
-        return decision, replace(state, memory=replace(pools, of_stage=tuple(of_stage))), info
+        of_stage[found.stage] = dismiss(of_stage[found.stage], found, utilities["utility"], best)
+        return replace(pools, of_stage=tuple(of_stage))
 
     def scoring_for(self, grid: OccupancyGrid) -> ScoringConfig:
         """The settings of the score: what the map holds counts at any distance within the box."""

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float, UInt32
 
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.planning.greedy import GreedyPolicy, Situation
-from r3jax.scoring.pixels import PixelView, score_pixels
+from r3jax.planning.greedy import GreedyPolicy, Situation, score_by_pixels
+from r3jax.scoring.pixels import PixelView
 
 UNSEEN_WEIGHT = 1000.0
 """Worth of a view that shows every cell of the grid, all unexplored (Active-GS)."""
@@ -79,18 +79,12 @@ class Cover(GreedyPolicy):
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """New directions (`rendering`) and unexplored cells (`exploration`) of every pose."""
         del key
-        state, grid = situation.map_state, situation.scoring_grid
-        novelty, cells = score_pixels(
-            _novelty_and_cells,
-            state,
-            grid,
-            situation.camera,
-            poses.astype(np.float32),
-            self.config.scoring,
-            SeenBins(state.visited, state.num_bins),
+        state = situation.map_state
+        seen = SeenBins(state.visited, state.num_bins)
+        rendering, cells = score_by_pixels(
+            situation, _novelty_and_cells, poses, self.config.scoring, seen
         )
-        rendering = np.asarray(novelty, dtype=np.float64)
-        exploration = UNSEEN_WEIGHT * np.asarray(cells, dtype=np.float64) / grid.log_odds.size
+        exploration = UNSEEN_WEIGHT * cells / situation.grid.log_odds.size
         return poses, {
             "exploration": exploration,
             "rendering": rendering,

@@ -5,21 +5,18 @@ window or behind a chair, never turn into known space.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from scipy.spatial import KDTree
 
+from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier
-from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import VIEW_DISTANCE, host_generator, in_plain_view, poses_along
-from r3jax.planning.decision import PlannerState, Stopwatch, look_round, settle
-from r3jax.planning.greedy import GreedyPolicy
-from r3jax.planning.policies.random import Random
-from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_lots, free_views
 from r3jax.planning.travel import Travel
 
 _MAX_TARGETS = 300
@@ -41,51 +38,58 @@ class Frontier(GreedyPolicy):
     name = "frontier"
     source = "Yamauchi, CIRA 1997: the nearest frontier"
 
-    def decide(
-        self,
-        state: PlannerState,
-        map_state: MapState,
-        grid: OccupancyGrid,
-        T_world_camera: np.ndarray,
-        *,
-        key: Array,
-    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """A view of the nearest frontier; `total` is minus the path length."""
-        stopwatch, config = Stopwatch(), self.config
+    def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Array:
+        """Frontier cells that were looked at on purpose, [X, Y, Z] bool: none."""
+        del camera
+        return jnp.zeros(grid.log_odds.shape, dtype=bool)
+
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """Views of the nearest frontier cells not looked at yet; if there is none, any nearby.
+
+        The notes are True where views of the frontier were found.
+        """
         target_key, random_key = jax.random.split(key)
-        with stopwatch.part("travel"):
-            looked, travel, masked = look_round(state, map_state, grid, T_world_camera, config)
-        with stopwatch.part("candidates"):
-            targets = np.asarray(frontier(masked))
-            attempted = np.asarray(state.attempted)
-            if not np.any(targets & ~attempted):
-                attempted = np.zeros_like(attempted)
-            stops, aims = nearest_views(
-                travel, targets & ~attempted, config.num_candidates, key=target_key
-            )
+        num = self.config.num_candidates
+        targets, attempted = np.asarray(frontier(situation.scoring_grid)), situation.memory
+        if not np.any(targets & ~np.asarray(attempted)):
+            attempted = jnp.zeros_like(attempted)
+        fresh = targets & ~np.asarray(attempted)
+        stops, aims = nearest_views(situation.travel, fresh, num, key=target_key)
         if len(stops) == 0:
-            everything = Random(config)
-            return everything.decide(state, map_state, grid, T_world_camera, key=random_key)
-        with stopwatch.part("candidates"):
-            # Always as many as can be asked for, so that nothing compiles again.
-            padding = np.arange(config.num_candidates) % len(stops)
-            poses = poses_along(stops[padding], (aims - stops)[padding])[: len(stops)]
-        with stopwatch.part("travel"):
-            path = travel.lengths(stops)
-        utilities = {"path": path, "total": -path}
-        decision, state, info = settle(looked, travel, poses, utilities, stopwatch)
-        chosen = np.argmin(path)
-        centers = travel.centers(np.moveaxis(np.indices(targets.shape), 0, -1))
-        looked_at = attempted | _is_looked_at(centers, stops[chosen], aims[chosen])
-        state = eqx.tree_at(lambda s: s.attempted, state, jnp.asarray(looked_at))
-        return decision, state, info
+            anywhere = free_views(situation, num, self.config.radius, key=random_key)
+            return Drawn(anywhere, situation.memory, notes=False)
+        # Always as many as can be asked for, so that nothing compiles again.
+        padding = np.arange(num) % len(stops)
+        poses = poses_along(stops[padding], (aims - stops)[padding])[: len(stops)]
+        return Drawn(poses, attempted, notes=True)
+
+    def score(
+        self, situation: Situation, poses: np.ndarray, *, key: Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Nothing: the path alone decides; lots where no frontier is in reach."""
+        return poses, {} if situation.notes else draw_lots(len(poses), key=key)
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """Minus the path length, or the lots."""
+        return utilities.get("lot", -utilities["path"])
+
+    def conclude(
+        self, situation: Situation, poses: np.ndarray, utilities: dict[str, np.ndarray], best: int
+    ) -> Any:
+        """The cells that the chosen view of the frontier shows count as looked at."""
+        del utilities
+        if not situation.notes:
+            return situation.memory
+        cells = np.moveaxis(np.indices(situation.memory.shape), 0, -1)
+        centers = situation.travel.centers(cells)
+        return situation.memory | jnp.asarray(_is_looked_at(centers, poses[best]))
 
 
-def _is_looked_at(centers: np.ndarray, place: np.ndarray, aim: np.ndarray) -> np.ndarray:
-    """Which cells a view from `place` to `aim` shows, walls left aside: [X, Y, Z] bool."""
-    offset, axis = centers - place, aim - place
+def _is_looked_at(centers: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+    """Which cells a view shows, walls left aside: [X, Y, Z] bool."""
+    offset = centers - T_world_camera[:3, 3]
     distance = np.linalg.norm(offset, axis=-1)
-    along = offset @ (axis / np.linalg.norm(axis))
+    along = offset @ T_world_camera[:3, 2]
     return (along >= _ATTEMPT_COSINE * distance) & (distance <= _ATTEMPT_REACH)
 
 

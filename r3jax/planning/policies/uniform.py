@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -22,9 +21,8 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.candidates import local_random, poses_along, random_directions
 from r3jax.planning.decision import PlannerState
-from r3jax.planning.greedy import GreedyPolicy, Situation
+from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, free_views
 
 METRES_PER_RADIAN = 2.0 / np.pi
 """A quarter turn counts as much as a metre."""
@@ -93,16 +91,10 @@ class Uniform(GreedyPolicy):
         del map_state
         return replace(state, memory=remember(state.memory, np.asarray(frame.T_world_camera)))
 
-    def draw(self, situation: Situation, *, key: Array) -> tuple[np.ndarray, Any]:
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """Positions uniform over all cells where the robot may stop, random directions."""
-        position_key, direction_key = jax.random.split(key)
-        positions = local_random(
-            situation.travel, self.config.num_candidates, np.inf, key=position_key
-        )
-        if len(positions) == 0:
-            return np.zeros((0, 4, 4)), situation.memory
-        directions = random_directions(len(positions), key=direction_key)
-        return poses_along(positions, directions), situation.memory
+        views = free_views(situation, self.config.num_candidates, np.inf, key=key)
+        return Drawn(views, situation.memory)
 
     def score(
         self, situation: Situation, poses: np.ndarray, *, key: Array

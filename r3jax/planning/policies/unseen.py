@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array, Float
 
-from r3jax.planning.candidates import host_generator
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.greedy import GreedyPolicy, Situation
-from r3jax.scoring.pixels import PixelView, score_pixels
+from r3jax.planning.greedy import GreedyPolicy, Situation, draw_lots, score_by_pixels
+from r3jax.scoring.pixels import PixelView
 
 
 def _cells_and_distance(view: PixelView) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -35,18 +34,10 @@ def unseen_utilities(
         key: draws lots as utilities where no candidate shows an unexplored cell. Without them
             the path alone would decide, and the robot would stay where it is.
     """
-    cells, depth = score_pixels(
-        _cells_and_distance,
-        situation.map_state,
-        situation.scoring_grid,
-        situation.camera,
-        poses.astype(np.float32),
-        config.scoring,
-    )
-    cells, depth = (np.asarray(values, dtype=np.float64) for values in (cells, depth))
+    cells, depth = score_by_pixels(situation, _cells_and_distance, poses, config.scoring)
     utility = depth if weighted else cells
     if not utility.any():
-        utility = host_generator(key).random(len(poses))
+        utility = draw_lots(len(poses), key=key)["lot"]
     return {"cells": cells, "depth": depth, "utility": utility}
 
 

@@ -20,13 +20,19 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.candidates import host_generator, local_random, poses_along, random_directions
+from r3jax.planning.candidates import local_random, poses_along, random_directions
 from r3jax.planning.decision import PlannerState
-from r3jax.planning.greedy import GreedyPolicy, Situation
+from r3jax.planning.greedy import (
+    Drawn,
+    GreedyPolicy,
+    Situation,
+    draw_lots,
+    score_by_pixels,
+)
 from r3jax.planning.policies.active_gs.confidence import aligned, no_sightings, see
 from r3jax.planning.policies.active_gs.glance import glance
 from r3jax.planning.policies.active_gs.regions import aimed_views, low_confidence, regions_of
-from r3jax.scoring.pixels import PixelView, Value, score_pixels
+from r3jax.scoring.pixels import PixelView, Value
 
 EXPLORATION_WEIGHT = 1000.0
 """Of the share of all cells that are unexplored and in view."""
@@ -76,7 +82,7 @@ class ActiveGS(GreedyPolicy):
         touched = see(before, map_state, frame, reach)
         return replace(state, memory=glance(before, touched, map_state, frame, reach))
 
-    def draw(self, situation: Situation, *, key: Array) -> tuple[np.ndarray, Any]:
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """Up to `num_frontier` views of regions of interest; the others local, turned anyhow."""
         aim_key, local_key, direction_key = jax.random.split(key, 3)
         config, travel, grid = self.config, situation.travel, situation.scoring_grid
@@ -91,36 +97,28 @@ class ActiveGS(GreedyPolicy):
         )
         positions = np.concatenate([places, local])
         if len(positions) == 0:
-            return np.zeros((0, 4, 4)), seen
+            return Drawn(np.zeros((0, 4, 4)), seen)
         directions = random_directions(len(local), key=direction_key)
         directions = np.concatenate([aims - places, directions])
         # Nothing local: repeats keep the shape.
         repeats = np.arange(config.num_candidates) % len(positions)
-        return poses_along(positions[repeats], directions[repeats]), seen
+        return Drawn(poses_along(positions[repeats], directions[repeats]), seen)
 
     def score(
         self, situation: Situation, poses: np.ndarray, *, key: Array
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """U of every pose, its two parts, and lots in case that every U is zero."""
-        grid, scoring = situation.scoring_grid, self.config.scoring
-        cells, rendering = score_pixels(
-            self.rendering,
-            situation.map_state,
-            grid,
-            situation.camera,
-            poses.astype(np.float32),
-            scoring,
-            rows=situation.memory.confidence,
-            reach=_REACH * float(scoring.max_range),
+        scoring, confidence = self.config.scoring, situation.memory.confidence
+        reach = _REACH * float(scoring.max_range)
+        cells, rendering = score_by_pixels(
+            situation, self.rendering, poses, scoring, confidence, reach
         )
-        exploration = np.asarray(cells, dtype=np.float64) / grid.log_odds.size
-        rendering = np.asarray(rendering, dtype=np.float64)
+        exploration = cells / situation.grid.log_odds.size
         return poses, {
             "exploration": exploration,
             "rendering": rendering,
             "utility": EXPLORATION_WEIGHT * exploration + rendering,
-            "lot": host_generator(key).random(len(poses)),
-        }
+        } | draw_lots(len(poses), key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """The share of the utility less that of the path; the lots where nothing is of use."""
