@@ -1,20 +1,22 @@
 """Writes that are either complete or not there."""
 
 import os
+import secrets
 from pathlib import Path
 
 
 def write_atomic(path: Path, data: bytes) -> None:
     """Writes a file under a temporary name, flushes it to the disk, then renames it.
 
-    A reader sees the old file or the new one, never a part.
+    A reader sees the old file or the new one, never a part. Of several writers at once, the last
+    to rename wins; each has a temporary name of its own, on whatever machine it runs.
 
     Raises:
         OSError: the disk is full, not writable, ...; nothing is left behind then.
     """
-    temporary = path.with_name(f".{path.name}.partial")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     try:
-        with open(temporary, "wb") as file:
+        with open(temporary, "xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
