@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments.artefacts import Origin, joint_origin
+from r3jax.benchmark.cells import Cell
 from r3jax.benchmark.conditions import Conditions
 from r3jax.benchmark.engines.events import Event
 from r3jax.benchmark.engines.local import run_in_processes
@@ -133,6 +134,22 @@ def run_suite(options: Options, unit: Literal["views", "seconds"]) -> tuple[Path
     root = options.work / f"{options.size}-{unit}"
     root.mkdir(parents=True, exist_ok=True)
     cells = make_plan(request_of(options, unit), root)
+    run_cells(cells, root, engine=options.engine, jobs=options.jobs)
+    return root, read_records(root, cells)
+
+
+def run_cells(cells: Sequence[Cell], root: Path, *, engine: str = "local", jobs: int = 1) -> None:
+    """Runs what is left of the cells, and says so line by line.
+
+    Args:
+        cells: what to do.
+        root: folder of the benchmark.
+        engine: `local` or `slurm`.
+        jobs: cells at a time.
+
+    Raises:
+        SystemExit: a cell failed; the others are done, and the same command tries it again.
+    """
     left, failed = cells_left(root, cells), []
 
     def report(event: Event) -> None:
@@ -142,14 +159,13 @@ def run_suite(options: Options, unit: Literal["views", "seconds"]) -> tuple[Path
             failed.append(event.cell.name)
 
     print(f"{len(cells)} cells, {len(cells) - len(left)} of them done", flush=True)
-    if left and options.engine == "slurm":
-        run_on_cluster(left, root, report, jobs=options.jobs)
+    if left and engine == "slurm":
+        run_on_cluster(left, root, report, jobs=jobs)
     elif left:
-        run_in_processes(left, root, report, jobs=options.jobs)
+        run_in_processes(left, root, report, jobs=jobs)
     collect(root)
     if failed:
         raise SystemExit(f"failed: {', '.join(failed)}; see error.txt in {root / 'cells'}")
-    return root, read_records(root, cells)
 
 
 def origin(module: str, records: Records) -> Origin:

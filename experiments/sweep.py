@@ -1,0 +1,199 @@
+"""Any setting of any config, tried as a grid or at random: by default the curve of lambda1.
+
+    python -m experiments.sweep --size smoke
+    python -m experiments.sweep --vary lambda1=4,8,16,32 --vary map.voxel_size=0.05,0.1
+    python -m experiments.sweep --vary lambda1=1..256:log --vary radius=0.3..2 --random 20
+    python -m experiments.sweep --list
+
+Every point is explored, trained and judged in scenes for tuning, which are none of those that
+the committed tables report: nothing is tuned on the test views of a table. The best point is the
+one with the highest mean PSNR over the test views at the end of the budget.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from experiments.artefacts import markdown_table
+from experiments.settings import known_settings, with_settings
+from experiments.suite import Options as SuiteOptions
+from experiments.suite import origin, request_of, run_cells
+from experiments.sweep_choice import Trial
+from experiments.sweep_page import Sweep, write_page
+from experiments.sweep_space import (
+    Axis,
+    Point,
+    grid_points,
+    parse_axes,
+    random_points,
+    with_default,
+)
+from r3jax.benchmark.cells import Cell
+from r3jax.benchmark.plan import Request, make_plan
+from r3jax.benchmark.record import read_records
+from r3jax.scenes.registry import scene_names
+
+NAME = "sweep"
+
+SizeName = Literal["smoke", "small", "paper"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is tried, where, and how often."""
+
+    size: SizeName = "smoke"
+    """`smoke`: minutes. `small`: an hour or two on two cores. `paper`: for GPUs and clusters."""
+
+    vary: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """`NAME=A,B,C`, or `NAME=LOW..HIGH[:log]` with --random; may be given several times. By
+    default lambda1, with the values of the size."""
+
+    random: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Try so many points at random instead of all combinations."""
+
+    seed: int = 0
+    """Of the random points."""
+
+    policy: str = "ours-pano"
+    """Who chooses the views."""
+
+    scenes: tuple[str, ...] = ()
+    """Scenes other than the size's."""
+
+    seeds: tuple[int, ...] = ()
+    """Seeds of the missions other than the size's; two or more show what chance does."""
+
+    budget: str | None = None
+    """Budget other than the size's, such as `views:60`."""
+
+    out: Path = Path("experiments/results")
+    """Folder of the page, its table and its figures."""
+
+    work: Path = Path("runs/experiments")
+    """Folder of the cells; what is done there is not done again."""
+
+    engine: Literal["local", "slurm"] = "local"
+    """Processes on this machine, or an array job."""
+
+    jobs: int = 1
+    """Cells at a time; budgets in views are not touched by it."""
+
+    list: bool = False
+    """Only list the settings, with their defaults and a sentence each."""
+
+
+@dataclass(frozen=True)
+class _Size:
+    scenes: tuple[str, ...]
+    seeds: tuple[int, ...]
+    budget: str
+    values: str
+    """Of lambda1."""
+
+
+REPORTED = request_of(SuiteOptions(size="small"), "views").scenes
+"""Scenes of the committed tables: nothing may be chosen by their test views."""
+
+_SIZES: dict[SizeName, _Size] = {
+    "smoke": _Size(("gallery",), (0,), "views:10", "4,16,64"),
+    "small": _Size(("apartment", "gallery"), (0, 1), "views:30", "1,4,16,64,256"),
+    "paper": _Size(
+        tuple(scene for scene in scene_names() if scene not in REPORTED),
+        (0, 1, 2),
+        "views:300",
+        "1,2,4,8,16,32,64,128,256",
+    ),
+}
+
+
+def main(options: Options) -> Path | None:
+    """Runs what is left of the sweep, writes its results, and returns their folder."""
+    if options.list:
+        print_settings(options)
+        return None
+    try:
+        axes, points = points_of(options)
+        request, root = request_for(options), options.work / f"{options.size}-{NAME}"
+        root.mkdir(parents=True, exist_ok=True)
+        cells = cells_of(make_plan(request, root), points)
+    except ValueError as error:
+        raise SystemExit(f"sweep: {error}") from None
+    run_cells(in_rounds(cells), root, engine=options.engine, jobs=options.jobs)
+    trials = [
+        Trial(point, last_records(root, own)) for point, own in zip(points, cells, strict=True)
+    ]
+    sweep = Sweep(options.policy, tuple(axis.setting for axis in axes), tuple(trials))
+    folder = options.out / NAME / folder_name(options, axes)
+    records = [record for trial in trials for record in trial.records]
+    write_page(folder, sweep, REPORTED, origin(f"experiments.{NAME}", records))
+    print(f"results  {folder}")
+    return folder
+
+
+def print_settings(options: Options) -> None:
+    """Every setting that --vary takes."""
+    known = known_settings(request_for(options).conditions)
+    rows = [
+        {"setting": s.name, "default": str(s.default), "what it is": s.sentence}
+        for s in known.values()
+    ]
+    print(markdown_table(rows))
+
+
+def request_for(options: Options) -> Request:
+    """The benchmark without anything varied: the conditions of the tables of the same size."""
+    size = _SIZES[options.size]
+    scenes, budget = options.scenes or size.scenes, options.budget or size.budget
+    suite = SuiteOptions(size=options.size, scenes=scenes, policies=(options.policy,))
+    request = request_of(suite, "views")
+    # The model clock: a budget in seconds would otherwise depend on the machine's load.
+    conditions = replace(
+        request.conditions, budget=budget, snapshots=(budget,), clock="model", lpips="none"
+    )
+    return replace(request, seeds=options.seeds or size.seeds, conditions=conditions)
+
+
+def points_of(options: Options) -> tuple[tuple[Axis, ...], tuple[Point, ...]]:
+    """What is swept, and the points to try, that of the defaults among them.
+
+    Raises:
+        ValueError: a setting or a value that does not exist.
+    """
+    words = options.vary or (f"lambda1={_SIZES[options.size].values}",)
+    axes = parse_axes(words, known_settings(request_for(options).conditions))
+    if options.random is None:
+        return axes, with_default(grid_points(axes), axes)
+    return axes, with_default(random_points(axes, options.random, options.seed), axes)
+
+
+def cells_of(plain: tuple[Cell, ...], points: tuple[Point, ...]) -> list[list[Cell]]:
+    """The cells of every point: those of the plan under other settings.
+
+    Raises:
+        ValueError: a point that cannot work.
+    """
+    return [[with_settings(cell, point) for cell in plain] for point in points]
+
+
+def in_rounds(cells: list[list[Cell]]) -> list[Cell]:
+    """All points with the first seed, then with the next: cut short, it is a sweep of fewer."""
+    return sorted((cell for own in cells for cell in own), key=lambda cell: cell.seed)
+
+
+def last_records(root: Path, cells: list[Cell]) -> list[dict]:
+    """The cells' records at the end of the budget."""
+    return [r for r in read_records(root, cells) if r["snapshot"] == cells[0].conditions.budget]
+
+
+def folder_name(options: Options, axes: tuple[Axis, ...]) -> str:
+    """Another folder for another sweep."""
+    names = "-".join(axis.setting.short for axis in axes)
+    kind = "" if options.random is None else "-random"
+    return f"{options.size}-{options.policy}-{names}{kind}"
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
