@@ -68,7 +68,7 @@ def seen_pixels(
 
     def look(seen, frame):
         limit, T = frame
-        # Coordinate by coordinate: XLA makes one loop of it on a CPU, 4 times as quick as a product.
+        # Coordinate by coordinate: on a CPU XLA then makes one loop, in a quarter of the time.
         right, down, ahead = (T[i, 0] * x + T[i, 1] * y + T[i, 2] * z + T[i, 3] for i in range(3))
         per_z = 1.0 / jnp.maximum(ahead, 1e-3)
         column, row = camera.fx * right * per_z + camera.cx, camera.fy * down * per_z + camera.cy
