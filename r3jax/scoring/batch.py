@@ -2,16 +2,16 @@
 
 Candidates of a step lie close together, so what none of them can see is left out once for all.
 XLA runs the loops of one score on one core; on a CPU the candidates are therefore dealt out to as
-many threads as the process may use.
+many threads as the process may use. Where there are several devices, they share the candidates.
 
 Shape symbols: C candidates; n voxels; c cells.
 """
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.panorama import Panorama, panorama_of
+from r3jax.scoring.sharding import padded_to, score_on_devices
 from r3jax.scoring.utility import ViewUtility, utility_of_view
 from r3jax.scoring.voxels import Voxels, voxels_of
 
@@ -129,15 +130,27 @@ def _gather_near(state, grid, low, high, config, sizes):
     return *gathered, indices[0]
 
 
-def deal(score: Callable[[Array], Scores], candidates: Float[Array, "C ..."]) -> Scores:
-    """Scores candidates in equal shares on all cores of a CPU; at once elsewhere."""
+def deal(
+    score: "functools.partial[Scores]",
+    candidates: Float[Array, "C ..."],
+    devices: Sequence[Any] | None = None,
+) -> Scores:
+    """Scores candidates in equal shares on all devices; a CPU alone: on all of its cores.
+
+    Args:
+        score: of any number of candidates; a jitted function with all but the last argument.
+        candidates: what to score.
+        devices: of JAX, where to; by default all of this process.
+    """
     num = candidates.shape[0]
+    devices = (jax.local_devices() if devices is None else devices)[:num]
+    if len(devices) > 1:
+        scores = score_on_devices(score.func, score.args, candidates, devices)
+        return jax.tree.map(lambda x: x[:num], jax.device_put(scores, devices[0]))
     workers = min(len(os.sched_getaffinity(0)), num) if jax.default_backend() == "cpu" else 1
     if workers < 2:
         return score(candidates)
-    share = -(-num // workers)
-    padding = jnp.broadcast_to(candidates[-1:], (share * workers - num, *candidates.shape[1:]))
-    shares = jnp.split(jnp.concatenate([candidates, padding]), workers)
+    shares = jnp.split(padded_to(workers, candidates), workers)
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda part: jax.block_until_ready(score(part)), shares))
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays)[:num], *parts)
