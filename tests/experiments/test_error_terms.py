@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -99,29 +100,37 @@ def test_terms_against_float64(state, poses, columns):
         assert gap.max() > 1e-4, f"kappa makes no difference to {product}"
 
 
-def _oracle(state, T):
+@jax.jit
+def _shown(state, T):
+    """The map's row that each pixel shows, and the rows' centers."""
     voxels = voxels_of(state)
-    view = pinhole_view(CONDITIONS.camera, jnp.asarray(T), CONFIG)
-    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, CONFIG)
-    items = np.asarray(buffer.item).ravel()
+    view = pinhole_view(CONDITIONS.camera, T, CONFIG)
+    return depth_buffer(voxels, candidates_of(voxels, view), view, CONFIG).item, voxels.center
+
+
+def _oracle(state, T):
+    items, center = (np.asarray(x) for x in _shown(state, jnp.asarray(T)))
+    items, center = items.ravel(), center.astype(np.float64).T
     shown, times = np.unique(items[items < state.capacity], return_counts=True)
     lattice = fibonacci_lattice(64).astype(np.float64)
-    center = np.asarray(voxels.center, np.float64).T
+    visited, count, deviation, best = (
+        np.asarray(x) for x in (state.visited, state.count, state.m2, state.resolution)
+    )
     rows = {name: [] for name in ("cover", *(column(p, k) for p in PRODUCTS for k in KAPPAS))}
     for row in shown:
         offset = T[:3, 3].astype(np.float64) - center[row]
         distance = np.linalg.norm(offset)
         r = offset / distance
-        words = [int(word) for word in np.asarray(state.visited[:, row])]
+        words = [int(word) for word in visited[:, row]]
         q = lattice[[words[k // 32] >> (k % 32) & 1 == 1 for k in range(64)]]
         dots = q @ r
         rows["cover"].append((1.0 + dots.max()) / 2.0)
         e1 = np.cross([0.0, 0.0, 1.0], r) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], r))
         plane = q[dots > 0.0] @ np.stack([e1, np.cross(r, e1)], axis=1)
         inside = len(plane) and np.all((plane.min(axis=0) <= 0.0) & (plane.max(axis=0) >= 0.0))
-        n, m2 = float(state.count[row]), float(state.m2[row])
+        n, m2 = float(count[row]), float(deviation[row])
         delta = 1.0 if n <= 1 else np.clip(1 - np.sqrt(2 / 1.5) * np.sqrt(m2 / (n - 1)), 0, 1)
-        ratio = min(1.0, float(state.resolution[row]) * distance / float(CONDITIONS.camera.focal))
+        ratio = min(1.0, float(best[row]) * distance / float(CONDITIONS.camera.focal))
         for kappa in KAPPAS:
             power = 1.0 if inside or kappa == "one" else 2.0
             b = float(np.clip(dots.max(), 0.0, 1.0)) ** power

@@ -1,13 +1,15 @@
-"""Seen pixels: a wall by hand, and a room against float64 rays' ends."""
+"""Seen pixels: a wall by hand, any poses against float64, faults put in on purpose."""
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from experiments.seen_pixels import recorded, seen_pixels
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.splatting.views import View
+from tests.mutants import Mutant, assert_caught, each, load
 
+CHAIN = ("experiments.seen_pixels",)
 SIZE = 24
 CAMERA = Camera.from_fov(SIZE, SIZE, 90.0)
 WALL = 2.0  # x of the wall [m]
@@ -27,24 +29,37 @@ def view(pose, depth):
     return View(jnp.full((SIZE, SIZE, 3), 0.5), depth, pose, CAMERA)
 
 
-def seen(test, frames, max_range=5.0, tolerance=0.05):
-    found = seen_pixels(test, recorded(frames), jnp.float32(max_range), jnp.float32(tolerance))
-    return np.asarray(found)
+def asked(modules):
+    m = modules["seen_pixels"]
+
+    def seen(test, frames, max_range=5.0):
+        limits = jnp.float32(max_range), jnp.float32(0.05)
+        return np.asarray(m.seen_pixels(test, m.recorded(frames), *limits))
+
+    return seen
 
 
-def test_a_wall_is_seen_where_the_frame_has_looked():
-    """The frame stands 1 m to the left: it sees the wall's points with y in [-1, 3]."""
+def law_wall(modules) -> None:
+    """Seen is what a frame has looked at.
+
+    The frame stands 1 m to the left: it sees the wall's points with y in [-1, 3].
+    """
+    seen = asked(modules)
     test = view(look((0.0, 0.0, 0.0)), WALL)
     frames = [frame(look((0.0, 1.0, 0.0)), WALL)]
     y = -WALL * (np.arange(SIZE) + 0.5 - SIZE / 2) / (SIZE / 2)  # the image's x points to -y
     np.testing.assert_array_equal(seen(test, frames), np.tile(y > -1.0, (SIZE, 1)))
-    # Two frames see what one or the other sees; one that looks away sees nothing.
-    both = [*frames, frame(look((0.0, -1.0, 0.0)), WALL)]
-    assert seen(test, both).all()
-    assert not seen(test, [frame(look((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), WALL)]).any()
+    # Two frames see what one or the other sees.
+    assert seen(test, [*frames, frame(look((0.0, -1.0, 0.0)), WALL)]).all()
+    # One that looks away sees nothing, not even the point straight behind it.
+    half = WALL / SIZE
+    behind = view(look((0.0, half, half)), WALL)
+    assert not seen(behind, [frame(look((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), WALL)]).any()
 
 
-def test_what_stands_before_hides_and_noise_does_not():
+def law_hidden(modules) -> None:
+    """What stands before the wall hides it; the sensor's noise does not."""
+    seen = asked(modules)
     test = view(look((0.0, 0.0, 0.0)), WALL)
     for depth, expected in ((WALL - 0.2, False), (WALL - 0.04, True), (WALL + 0.3, True)):
         assert np.all(seen(test, [frame(look((0.0, 0.0, 0.0)), depth)]) == expected)
@@ -56,13 +71,15 @@ def test_what_stands_before_hides_and_noise_does_not():
     np.testing.assert_array_equal(seen(test, [frame(look((0.0, 0.0, 0.0)), depth)]), expected)
 
 
-def test_holes_and_range():
+def law_holes(modules) -> None:
+    """Without a depth, here or there, or beyond the range, nothing is seen."""
+    seen = asked(modules)
     here = look((0.0, 0.0, 0.0))
     holes = np.full((SIZE, SIZE), WALL)
     holes[:, :5], holes[:, 5:9] = 0.0, np.inf
     whole = [frame(here, WALL)]
     np.testing.assert_array_equal(seen(view(here, holes), whole), holes == WALL)
-    assert not seen(view(here, WALL), [frame(here, 0.0)]).any()  # no measurement, nothing seen
+    assert not seen(view(here, 0.04), [frame(here, 0.0)]).any()  # no measurement, nothing seen
     distance = WALL * np.linalg.norm(
         np.stack(np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / (SIZE / 2)] * 2)), axis=0
     )
@@ -71,6 +88,7 @@ def test_holes_and_range():
 
 
 def test_any_poses_against_float64():
+    seen = asked(load(CHAIN))
     rng = np.random.default_rng(0)
     frames = [
         frame(look(rng.uniform(-1, 1, 3), rng.normal(size=3)), rng.uniform(0.5, 4, (SIZE, SIZE)))
@@ -101,3 +119,26 @@ def test_any_poses_against_float64():
     assert 0.1 < expected.mean() < 0.9
     assert doubtful.mean() < 0.1
     np.testing.assert_array_equal(seen(test, frames)[~doubtful], expected[~doubtful])
+
+
+MUTANTS = [
+    Mutant("seen_pixels", "(ahead <= measured + tolerance)", "(measured > -1.0)", law_hidden),
+    Mutant("seen_pixels", "(measured > 0.0) &", "", law_holes),
+    Mutant("seen_pixels", "measured + tolerance", "measured", law_hidden),
+    Mutant("seen_pixels", "_limit(f.depth), 0.0)", "f.depth, 0.0)", law_hidden),
+    Mutant("seen_pixels", "seen | (inside", "(inside", law_wall),
+    Mutant("seen_pixels", "(ahead > 1e-3) & (column >= 0.0)", "(column >= 0.0)", law_wall),
+    Mutant("seen_pixels", "invert_pose(f.T_world_camera)", "f.T_world_camera", law_wall),
+    Mutant("seen_pixels", "<= max_range * max_range", "<= 100.0 * max_range", law_holes),
+    Mutant("seen_pixels", "known & seen", "seen", law_holes),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("law", [law_wall, law_hidden, law_holes])
+def test_laws_hold_without_a_fault(law):
+    law(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
