@@ -42,6 +42,8 @@ from experiments.error_figures import (
 )
 from experiments.error_terms import PRODUCTS, SMALLEST_SHARE, column
 from experiments.suite import Options, origin, run_suite
+from r3jax.benchmark.record import source_commit
+from r3jax.evaluation.table_parts import notes
 
 NAME = "renderability_vs_error"
 
@@ -57,18 +59,30 @@ def main(options: Options) -> Path:
     root, records = run_suite(options, "views")
     folder = options.out / NAME / options.size
     scenes = list(scene_models(root, records))
-    write_page(folder, scenes, origin(f"experiments.{NAME}", records))
+    terms = (*notes(records), f"Compared at commit {source_commit() or 'unknown'}.")
+    write_page(folder, scenes, terms, origin(f"experiments.{NAME}", records))
     print(f"results  {folder}")
     return folder
 
 
-def write_page(folder: Path, scenes: Sequence[SceneModels], source: Origin) -> None:
-    """Writes all numbers, the pictures, and the page that shows them scene by scene."""
+def write_page(
+    folder: Path, scenes: Sequence[SceneModels], terms: Sequence[str], source: Origin
+) -> None:
+    """Writes all numbers, the pictures, and the page that shows them scene by scene.
+
+    Args:
+        folder: where to.
+        scenes: with their models.
+        terms: sentences on how the models were made.
+        source: command, machine, commit.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "views.csv", [row for m in scenes for row in view_rows(m)], source)
     numbers = [row for models in scenes for row in correlation_rows(models)]
     write_csv(folder / "correlations.csv", numbers, source)
-    page = ["# Renderability against the error", _READING, _agreement(scenes)]
+    methods = ", ".join(dict.fromkeys(method for m in scenes for method in m.methods))
+    page = ["# Renderability against the error", _READING]
+    page.append(" ".join([_agreement(scenes), f"Models of {methods}.", *terms]))
     for name, figure in (
         ("distributions", distribution_figure(scenes)),
         ("models", model_figure(scenes)),

@@ -143,7 +143,7 @@ def rows_of(path):
 def written(flat, tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     office = models_of([disguised("office", snapshot=n) for n in (30, 60)], "office")
-    renderability_vs_error.write_page(folder, [flat, office], SOURCE)
+    renderability_vs_error.write_page(folder, [flat, office], ("Trained briefly.",), SOURCE)
     return folder
 
 
@@ -182,6 +182,7 @@ def test_the_page_shows_its_pictures(written):
             assert SOURCE.commit in picture.info["Description"]
             assert min(picture.size) > 200
     assert "differs by more than 0 " in page
+    assert "Models of ours. Trained briefly." in page
     assert SOURCE.commit in page
 
 
