@@ -1,6 +1,5 @@
 """The page of a sweep: the curve, every point, the choice, and what scenes left out say."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,7 +213,10 @@ def _interval(estimate: Estimate, sign: str = "") -> str:
 
 def _short(value: Value) -> Value:
     """Without the digits that nobody reads."""
-    return float(f"{value:.4g}") if isinstance(value, float) and math.isfinite(value) else value
+    if not isinstance(value, float):
+        return value
+    rounded = float(f"{value:.4g}")
+    return int(rounded) if rounded.is_integer() else rounded
 
 
 def _text(value: Value) -> str:
