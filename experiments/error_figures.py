@@ -133,7 +133,8 @@ def _draw_histograms(axes: Axes, models: SceneModels, name: str, edges: np.ndarr
         values = models.columns[name][mine].ravel()
         values = values[~np.isnan(values)]
         share = 100.0 * np.histogram(values, edges)[0] / len(values)
-        axes.stairs(share, edges, color=color, alpha=0.2, fill=True)
+        if len(set(models.snapshots)) <= 2:  # more of them would only make mud
+            axes.stairs(share, edges, color=color, alpha=0.2, fill=True)
         axes.stairs(share, edges, color=color, linewidth=1.6, label=budget_name(snapshot))
         axes.axvline(float(np.median(values)), color=color, linewidth=1.4, linestyle="--")
 
@@ -203,7 +204,7 @@ def model_figure(scenes: Sequence[SceneModels]) -> Figure:
     for (left, right), models in zip(panels, scenes, strict=True):
         style.dress(left, models.scene, "mean coverage of the model", "Spearman with PSNR")
         coverage = models.columns[COVERAGE].mean(axis=1)
-        for predictor, color, marker in ((COVERAGE, style.INK, "D"), (SCORE, OKABE_ITO[2], "o")):
+        for predictor, color, marker in ((COVERAGE, style.INK, "D"), (SCORE, OKABE_ITO[5], "o")):
             left.scatter(
                 coverage, models.sample("spearman", predictor, "psnr")[:, 0], s=22, color=color,
                 marker=marker, alpha=0.75, linewidths=0, label=f"by {TITLES[predictor]}",
