@@ -1,0 +1,124 @@
+"""How any setting of any config reaches a cell, its run and its record."""
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.settings import find_setting, known_settings, with_settings
+from r3jax.benchmark.cells import Cell, paths_of
+from r3jax.benchmark.conditions import Conditions
+from r3jax.benchmark.record import read_records
+from r3jax.benchmark.run_cell import run_cell
+from r3jax.exploration.clock import _compilations
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.state import empty_map
+from r3jax.mapping.update import integrate_points
+from r3jax.trace.reader import read_run
+from tests.benchmark.tiny import CONDITIONS, SETTINGS, make_cells, write_room
+from tests.planning.rooms import center, grid_of, pose_at
+
+KNOWN = known_settings(Conditions())
+CELL = Cell("flat", "a" * 64, "ours", 0, CONDITIONS, "b" * 64, 100)
+
+ODD = {
+    "policy.kappa": "one", "policy.delta": "pairwise", "training.strategy": "mcmc",
+    "training.background": "white", "training.sh_degree": 1,
+}  # fmt: skip
+
+
+def changed(setting):
+    """Another value that can work."""
+    if setting.name in ODD:
+        return ODD[setting.name]
+    if setting.kind is bool:
+        return not setting.default
+    return 7 if setting.default is None else 2 * setting.default
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_every_setting_makes_another_cell_and_its_default_the_same(name):
+    here = known_settings(CONDITIONS)[name]
+    assert here.sentence
+    assert find_setting(name, KNOWN) == KNOWN[name]
+    other = with_settings(CELL, {name: changed(here)})
+    assert other.name != CELL.name
+    assert with_settings(CELL, {name: here.default}).name == CELL.name
+    assert with_settings(other, {name: here.default}).name == CELL.name
+
+
+def test_the_range_of_the_scores_follows_that_of_the_sensor_unless_it_is_given():
+    both = {"sensor.max_range": 3.0, "policy.max_range": 5.0}
+    assert with_settings(CELL, both).settings["scoring.max_range"] == 5.0
+    cell = with_settings(CELL, {"sensor.max_range": 3.0, "policy.max_range": 3.0})
+    assert cell == with_settings(CELL, {"sensor.max_range": 3.0})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"policy.kappa": "ball"}, "kappa must be"),
+        ({"policy.num_candidates": 2, "policy.num_frontier": 3}, "num_frontier must lie"),
+        ({"map.voxel_size": 0.0}, "voxel_size must be positive"),
+        ({"training.gaussians": 500}, "capacity 400 has no room"),
+    ],
+)
+def test_a_point_that_cannot_work_is_refused_before_anything_is_run(values, message):
+    with pytest.raises(ValueError, match=message):
+        with_settings(CELL, values)
+
+
+def test_settings_are_in_the_map_in_the_run_and_in_the_record(tmp_path):
+    room = write_room(tmp_path / "room.ply")
+    values = {
+        "map.voxel_size": 0.2,
+        "map.num_bins": 96,
+        "map.drop_edges": False,
+        "policy.lambda1": 4.0,
+        "training.lambda_dssim": 0.0,
+    }
+    (plain,) = make_cells(room, tmp_path, snapshots=("views:3",))
+    cell = with_settings(plain, values)
+    run_cell(cell, tmp_path)
+    run = read_run(paths_of(tmp_path, cell).run)
+    assert {k: run.header.config[k] for k in ("voxel_size", "num_bins", "drop_edges")} == {
+        "voxel_size": 0.2, "num_bins": 96, "drop_edges": False,
+    }  # fmt: skip
+    assert run.header.policy["settings"]["scoring"]["lambda1"] == 4.0
+    state = run.checkpoint()[1]
+    assert (state.num_bins, float(state.voxel_size)) == (96, pytest.approx(0.2))
+    (found,) = read_records(tmp_path, [cell])
+    assert found["settings"] == SETTINGS | {"scoring.lambda1": 4.0}
+    assert found["sensing"]["num_bins"] == 96
+    assert found["sensing"]["drop_edges"] is False
+    assert found["sensing"]["voxel_size"] == 0.2
+    assert found["training"]["lambda_dssim"] == 0.0
+
+
+@pytest.mark.parametrize("name", ["ours", "ours-pano"])
+def test_a_sweep_over_numbers_compiles_once(name):
+    free = np.zeros((12, 12, 10), dtype=bool)
+    free[2:10, 2:10, 2:8] = True
+    grid, pose, key = grid_of(free), pose_at(center(5, 5, 4)), jax.random.key(0)
+    walls = np.stack([center(x, y, z) for x in (1, 10) for y in range(10) for z in range(8)])
+    state = integrate_points(
+        empty_map(1 << 10), walls, np.full(walls.shape, 0.5, np.float32), pose[:3, 3]
+    )
+
+    def decide(**given):
+        few = {"num_candidates": 6, "num_frontier": 2, "scoring.panorama_size": 32}
+        policy = CONDITIONS.policy(
+            name, few | {k.replace("_of_", "."): v for k, v in given.items()}
+        )
+        memory = policy.init(Camera.from_fov(24, 24, 60.0), grid, key=key)
+        decision, _, _ = policy.decide(memory, state, grid, pose, key=key)
+        return decision
+
+    first = decide(scoring_of_lambda1=1.0)
+    decide(scoring_of_lambda1=16.0)  # what is compiled a step later, too
+    before = _compilations.count
+    others = [decide(scoring_of_lambda1=x, lambda2=y) for x, y in [(4.0, 0.1), (999.5, 0.0)]]
+    decide(radius=0.8, scoring_of_tolerance=1.0, scoring_of_max_range=3.0)
+    assert _compilations.count == before
+    utility = [d.utilities["utility"] for d in (first, *others)]
+    assert np.all(utility[2] > utility[1])
+    assert np.all(utility[1] > utility[0])
