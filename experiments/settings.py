@@ -44,7 +44,7 @@ _OF_CONDITIONS = {
 }
 """Settings for which `Conditions` has fields, by name."""
 
-_OF_MISSION = ("speed", "num_probes", "checkpoint_every", "max_still_views")
+_OF_MISSION = ("speed", "num_probes", "max_still_views")
 """Fields of `ExplorationConfig` that concern neither the map nor the grid."""
 
 

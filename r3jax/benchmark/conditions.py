@@ -15,8 +15,11 @@ from r3jax.splatting.training_config import TrainConfig
 _SCORING = "scoring."
 """Prefix of the settings that go to `ScoringConfig`."""
 
-OWN_OF_LOOP = ("voxel_size", "cell_size", "max_range", "capacity", "clock")
-"""Fields of `ExplorationConfig` for which `Conditions` has fields of its own."""
+OWN_OF_LOOP = ("voxel_size", "cell_size", "max_range", "capacity", "clock", "checkpoint_every")
+"""Fields of `ExplorationConfig` that `Conditions` decides."""
+
+_CHECKPOINT_EVERY = 25
+"""Views between two checkpoints: frames and rows rebuild what comes after the last one."""
 
 OWN_OF_TRAINER = ("iterations", "num_gaussians", "capacity", "raster", "seed")
 """The same of `TrainConfig`; the seed is the cell's."""
@@ -121,6 +124,7 @@ class Conditions:
             max_range=self.max_range,
             capacity=self.map_capacity,
             clock=self.clock,
+            checkpoint_every=_CHECKPOINT_EVERY,
             **self.loop,
         )
 

@@ -127,10 +127,8 @@ def _finished_run(path: Path) -> Run | None:
 
 
 def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
-    """Explores from the start, whatever lies there of an exploration that was cut off."""
+    """Explores, or goes on with the exploration that was cut off."""
     conditions = cell.conditions
-    if paths.run.exists():
-        shutil.rmtree(paths.run)
     on_stage("opening the scene")
     simulator = open_scene(
         cell.scene,
@@ -166,7 +164,8 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
         packages=package_versions(),
     )
     on_stage("exploring")
-    with RunWriter(paths.run, header) as recorder:
+    recorder, begun = _begin_or_resume(paths.run, header)
+    with recorder:
         result = explore(
             simulator,
             policy,
@@ -174,6 +173,7 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
             seed=cell.seed,
             config=config,
             recorder=recorder,
+            resume=begun,
             on_step=lambda row: on_stage(f"exploring, {row.step + 1} views"),
         )
     if result.reason is StopReason.INTERRUPTED:
@@ -181,6 +181,16 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
     if result.reason.value not in _COMPLETE:
         raise CellError(f"the exploration ended early: {result.message}")
     return read_run(paths.run)
+
+
+def _begin_or_resume(path: Path, header: RunHeader) -> tuple[RunWriter, Run | None]:
+    """A new run, or what was recorded of the one that lies there."""
+    try:
+        return RunWriter.resume(path)
+    except RunError:  # none, or its header was never written: nothing was recorded
+        if path.exists():
+            shutil.rmtree(path)
+        return RunWriter(path, header), None
 
 
 def steps_within(run: Run, snapshot: str) -> tuple[StepRow, ...]:

@@ -46,8 +46,8 @@ class ExplorationConfig:
     num_probes: int = 16
     """Views that mean renderability is averaged over."""
 
-    checkpoint_every: int = 25
-    """Views between two stored maps; the last one is always stored."""
+    checkpoint_every: int = 1
+    """Views between two stored states of the loop; the last one is always stored."""
 
     max_still_views: int = 100
     """So many views in a row without moving end the run: the policy is stuck."""

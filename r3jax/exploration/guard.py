@@ -18,8 +18,13 @@ class OracleReadError(RuntimeError):
 class GuardedSimulator:
     """A `Simulator` that renders the poses of one run, each once and in order."""
 
-    def __init__(self, simulator: Simulator):
-        """Wraps `simulator`, which is reachable through the guard only from here on."""
+    def __init__(self, simulator: Simulator, views: int = 0):
+        """Wraps `simulator`, which is reachable through the guard only from here on.
+
+        Args:
+            simulator: the world.
+            views: pictures of the run that were taken before, by a process that was killed.
+        """
         render = simulator.render
 
         def render_committed(T_world_camera: np.ndarray) -> Frame:
@@ -32,7 +37,7 @@ class GuardedSimulator:
         self._camera, self._bounds = simulator.camera, np.array(simulator.bounds)
         self._start_pose = np.array(simulator.start_pose)
         self._pose: np.ndarray | None = None
-        self.views = 0
+        self.views = views
 
     @property
     def camera(self) -> Camera:

@@ -1,7 +1,7 @@
 """The exploration loop: step until the budget is spent, and record every view.
 
 A run that is interrupted, or whose disk is full, ends like any other: with the reason, and with
-everything recorded before complete.
+everything recorded before complete. It goes on from there as if nothing had happened.
 """
 
 import time
@@ -14,11 +14,13 @@ from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
+from r3jax.exploration.resume import continued, state_tables
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
 from r3jax.exploration.step import start_state, step
 from r3jax.planning.policy import Policy
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RecordingStopped
+from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow
 from r3jax.trace.writer import RunWriter
 
@@ -41,6 +43,7 @@ def explore(
     seed: int = 0,
     config: ExplorationConfig | None = None,
     recorder: RunWriter | None = None,
+    resume: Run | None = None,
     on_step: Callable[[StepRow], None] | None = None,
     on_stage: Callable[[str], None] | None = None,
 ) -> Result:
@@ -53,6 +56,8 @@ def explore(
         seed: all randomness follows from it: step k uses `fold_in(key, k)`.
         config: settings of the loop.
         recorder: where the run is written; None keeps nothing.
+        resume: what was recorded of this run before it was cut off; None for a new run. Under
+            the model clock the result is the one of a run that was never cut off, bit for bit.
         on_step: called with the row of every view.
         on_stage: called with the name of what happens next.
 
@@ -62,13 +67,14 @@ def explore(
 
     Raises:
         ValueError: a budget that is not understood, a start outside the scene's box.
+        RunError: a recorded frame that is needed to go on is missing or broken.
         OracleReadError: something beside the loop asked the simulator for a picture.
     """
     config = config or ExplorationConfig()
     budget = parse_budget(budget) if isinstance(budget, str) else budget
     init_key, key = jax.random.split(jax.random.key(seed))
     mission = Mission(
-        GuardedSimulator(simulator),
+        GuardedSimulator(simulator, views=0 if resume is None else len(resume.rows)),
         policy,
         budget,
         key,
@@ -78,6 +84,8 @@ def explore(
     )
     state = start_state(mission, init_key)
     rows: list[StepRow] = []
+    if resume is not None:
+        state, rows = continued(resume, mission, state), list(resume.rows)
     try:
         stop: Stop | None = None
         while stop is None:
@@ -106,11 +114,11 @@ def explore(
 
 
 def _record(recorder: RunWriter, view: View, state: LoopState, config: ExplorationConfig) -> None:
-    """Writes one view; the map follows every few views."""
+    """Writes one view, and begins to write the state after it."""
     begin = time.perf_counter()
     recorder.add(view.row, view.frame)
     if state.views % config.checkpoint_every == 0:
-        recorder.checkpoint(view.row.step, state.map_state, state.grid)
+        recorder.checkpoint(view.row.step, state_tables(state))
     seconds = time.perf_counter() - begin
     recorder.add_timings(view.row.step, view.stages | {"record": seconds})
 
@@ -119,7 +127,7 @@ def _finish(recorder: RunWriter, state: LoopState, stop: Stop) -> Stop:
     """Writes the last map and how the run ended; a full disk may refuse even that."""
     try:
         if state.views > 0:
-            recorder.checkpoint(state.views - 1, state.map_state, state.grid)
+            recorder.checkpoint(state.views - 1, state_tables(state))
         recorder.finish(stop.reason.value, stop.message)
     except RecordingStopped as error:
         unsaid = f"{stop.message}; the end could not be recorded ({error.reason})"

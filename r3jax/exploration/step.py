@@ -5,6 +5,7 @@ is not on the mission clock.
 """
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 
 import jax
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.exploration.clock import timed
+from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
 from r3jax.frame import Frame
@@ -40,12 +42,33 @@ def start_state(mission: Mission, init_key: jax.Array) -> LoopState:
             f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
             f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
         )
-    grid = empty_grid(np.stack([lower, upper]), config.cell_size)
-    position = jnp.asarray(pose[:3, 3], dtype=jnp.float32)
-    grid = _mark_free_ball(grid, position, config.start_radius)
+    grid = first_grid(np.stack([lower, upper]), [pose], config)
     map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
     policy_state = mission.policy.init(simulator.camera, grid, key=init_key)
     return LoopState(0, map_state, grid, policy_state, pose)
+
+
+def first_grid(
+    bounds: np.ndarray, starts: Iterable[np.ndarray], config: ExplorationConfig
+) -> OccupancyGrid:
+    """The grid before the first view: the ball round each start is free, all else unexplored.
+
+    Args:
+        bounds: box of the world, [2, 3] [m].
+        starts: start poses, [4, 4] each; several cameras may start at several places.
+        config: size of the cells and of the ball.
+    """
+    grid = empty_grid(bounds, config.cell_size)
+    for pose in starts:
+        position = jnp.asarray(pose[:3, 3], dtype=jnp.float32)
+        grid = _mark_free_ball(grid, position, config.start_radius)
+    return grid
+
+
+def add_to_grid(grid: OccupancyGrid, frame: Frame, config: ExplorationConfig) -> OccupancyGrid:
+    """The grid after a frame: what its rays went through, and where the camera stands."""
+    grid = _integrate_depth(grid, frame, config.max_range)
+    return _mark_free_ball(grid, frame.position, config.body_radius)
 
 
 def step(state: LoopState, mission: Mission) -> tuple[LoopState, View | Stop]:
@@ -130,17 +153,7 @@ def _look(
     mapping = mission.clock.charge("mapping", sum(mapping_stages.values()))
     length = 0.0 if choice is None else choice[0].length
     charged = {"planning": planning, "mapping": mapping, "flight": length / mission.config.speed}
-    # The recorded pose (float32) is the pose from here on: a run read back goes on the same way.
-    pose = np.asarray(frame.T_world_camera, dtype=np.float64)
-    state = replace(
-        state,
-        views=state.views + 1,
-        T_world_camera=pose,
-        seconds=state.seconds + sum(charged.values()),
-        metres=state.metres + length,
-        radians=state.radians + _angle_between(state.T_world_camera, pose),
-        still_views=state.still_views + 1 if length < 0.01 else 0,
-    )
+    state = _arrive(state, frame, length, charged)
     mission.on_stage("measure")
     begin = time.perf_counter()
     coverage = measure_coverage(
@@ -165,6 +178,50 @@ def _look(
     return state, View(row, frame, stages)
 
 
+def relive(
+    state: LoopState, mission: Mission, row: StepRow, frame: Frame, *, decide: bool = True
+) -> LoopState:
+    """The state after a view that was recorded: as `step` leaves it, without the simulator.
+
+    Args:
+        state: before the view.
+        mission: what the run was asked for.
+        row: what the trace says of the view.
+        frame: its frame, read back.
+        decide: ask the policy again, for what it remembers of its decision. Policies are pure:
+            the same state and key give the same decision. False for a policy that did not
+            choose this view.
+    """
+    if decide and row.choice is not None:
+        _, policy_state, _ = mission.policy.decide(
+            state.policy_state,
+            state.map_state,
+            state.grid,
+            state.T_world_camera,
+            key=jax.random.fold_in(mission.key, state.views),
+        )
+        state = replace(state, policy_state=policy_state)
+    state, _ = _map_frame(state, mission, frame)
+    return _arrive(state, frame, 0.0 if row.choice is None else row.choice.length, row.charged)
+
+
+def _arrive(state: LoopState, frame: Frame, length: float, charged: dict[str, float]) -> LoopState:
+    """One view more: the pose is the frame's, and the totals count the way to it.
+
+    The recorded pose (float32) is the pose from here on: a run read back goes on the same way.
+    """
+    pose = np.asarray(frame.T_world_camera, dtype=np.float64)
+    return replace(
+        state,
+        views=state.views + 1,
+        T_world_camera=pose,
+        seconds=state.seconds + sum(charged.values()),
+        metres=state.metres + length,
+        radians=state.radians + _angle_between(state.T_world_camera, pose),
+        still_views=state.still_views + 1 if length < 0.01 else 0,
+    )
+
+
 def _map_frame(
     state: LoopState, mission: Mission, frame: Frame
 ) -> tuple[LoopState, dict[str, float]]:
@@ -180,11 +237,7 @@ def _map_frame(
         repeat_compiled=repeat,
     )
 
-    def update_grid() -> OccupancyGrid:
-        grid = _integrate_depth(state.grid, frame, config.max_range)
-        return _mark_free_ball(grid, frame.position, config.body_radius)
-
-    grid, gridding = timed(update_grid, repeat_compiled=repeat)
+    grid, gridding = timed(add_to_grid, state.grid, frame, config, repeat_compiled=repeat)
     policy_state, observing = timed(
         mission.policy.observe, state.policy_state, map_state, frame, repeat_compiled=repeat
     )

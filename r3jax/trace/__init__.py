@@ -3,9 +3,10 @@
     runs/NAME/
       run.json         format version, settings, seed, package versions, scene and its hash
       trace.jsonl      one row per view, then one row that says how the run ended
+      history.jsonl    when processes began to write, and how earlier ones ended
       timings.jsonl    seconds that each stage took on this machine, per view
       frames/000042.png, 000042.depth.png     8-bit RGB; uint16 depth at 1/5000 m
-      checkpoints/     map and grid (Orbax), the last three
+      checkpoints/     state of the loop: map, grid, policy, totals (Orbax), the last three
       report/  models/  exports/
 
 `trace.jsonl` holds nothing that depends on the machine unless the mission clock does: under

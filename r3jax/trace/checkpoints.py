@@ -1,10 +1,17 @@
-"""Snapshots of the map and the grid, saved with Orbax."""
+"""The loop's state on disk after every view, saved with Orbax in the background.
 
+A checkpoint holds tables of named arrays: `map`, `grid`, `policy` and `loop`. It is a short cut,
+never the only copy: frames and rows rebuild all of it. Checkpoints of earlier versions of this
+package hold `map` and `grid` only.
+"""
+
+import contextlib
+import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -13,64 +20,143 @@ from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
 
 KEPT = 3
-"""Older snapshots are deleted."""
+"""Older checkpoints are deleted."""
+
+Tables = Mapping[str, Mapping[str, np.ndarray]]
+"""Named arrays, by table."""
+
+_DISCARDED = ".discarded-"
 
 
-def _arrays(state: MapState | OccupancyGrid) -> dict[str, Any]:
-    return {name: value for name, value in vars(state).items() if isinstance(value, jax.Array)}
+class CheckpointWriter:
+    """Saves checkpoints one after the other; each is whole or absent."""
+
+    def __init__(self, folder: Path):
+        """Makes the folder and clears away what a killed process left behind.
+
+        Raises:
+            OSError: the folder cannot be made.
+        """
+        import orbax.checkpoint as ocp
+
+        self._folder = folder.resolve()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for entry in self._folder.iterdir():
+            if not entry.name.isdigit():
+                shutil.rmtree(entry, ignore_errors=True)
+        self._checkpointer = ocp.AsyncCheckpointer(ocp.PyTreeCheckpointHandler())
+
+    def save(self, step: int, tables: Tables) -> None:
+        """Starts to save the state after view `step`; waits for the one before to be whole.
+
+        Raises:
+            OSError: this one or the one before could not be written.
+        """
+        import orbax.checkpoint as ocp
+
+        self.wait()
+        tree = {name: _storable(table) for name, table in tables.items() if table}
+        try:
+            # Orbax writes under a temporary name and renames.
+            self._checkpointer.save(
+                self._folder / f"{step:06d}", args=ocp.args.PyTreeSave(tree), force=True
+            )
+        except (ValueError, RuntimeError) as error:
+            raise OSError(f"the checkpoint of view {step} failed: {error}") from error
+
+    def wait(self) -> None:
+        """Returns when what was begun is whole, and nothing but the newest three is kept.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        try:
+            self._checkpointer.wait_until_finished()
+        except (ValueError, RuntimeError) as error:  # how Orbax's storage reports a full disk
+            raise OSError(f"a checkpoint failed: {error}") from error
+        for step in checkpoint_steps(self._folder)[:-KEPT]:
+            # Out of sight first: a checkpoint that is half deleted must not look like one.
+            discarded = self._folder / f"{_DISCARDED}{step:06d}"
+            (self._folder / f"{step:06d}").rename(discarded)
+            shutil.rmtree(discarded, ignore_errors=True)
+
+    def close(self) -> None:
+        """Waits and frees the threads. What `wait` would say of the last one is lost."""
+        with contextlib.suppress(OSError):
+            self.wait()
+        self._checkpointer.close()
 
 
-def save_checkpoint(folder: Path, step: int, map_state: MapState, grid: OccupancyGrid) -> None:
-    """Saves the state after view `step`, then drops all but the newest three.
+def checkpoint_steps(folder: Path) -> list[int]:
+    """The views after which a state is stored, oldest first."""
+    found = folder.glob("[0-9]*")
+    return sorted(int(p.name) for p in found if p.is_dir() and p.name.isdigit())
+
+
+def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]:
+    """The tables that were stored after view `step`.
 
     Raises:
-        OSError: the disk is full, not writable, ...
+        RunError: it is not there, or it cannot be read.
     """
+    import jax
     import orbax.checkpoint as ocp
 
-    folder.mkdir(exist_ok=True)
-    state = {
-        "map": _arrays(map_state) | {"num_bins": np.asarray(map_state.num_bins)},
-        "grid": _arrays(grid),
-    }
-    with ocp.StandardCheckpointer() as checkpointer:
-        # Orbax writes under a temporary name and renames: a snapshot is whole or absent.
-        checkpointer.save((folder / f"{step:06d}").resolve(), state, force=True)
-        checkpointer.wait_until_finished()
-    for old in _snapshots(folder)[:-KEPT]:
-        shutil.rmtree(old)
+    path = (folder / f"{step:06d}").resolve()
+    try:
+        with ocp.PyTreeCheckpointer() as checkpointer:
+            tree = checkpointer.metadata(path).item_metadata.tree
+            # NumPy: device arrays would cut 64-bit numbers short.
+            as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
+            tables = checkpointer.restore(path, args=ocp.args.PyTreeRestore(restore_args=as_numpy))
+    except Exception as error:  # whatever a damaged file makes Orbax's storage raise
+        raise RunError(path, f"the checkpoint cannot be read ({error})") from None
+    if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
+        raise RunError(path, "the checkpoint does not hold tables of arrays")
+    return {name: _stored(table) for name, table in tables.items()}
 
 
-def _snapshots(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.glob("[0-9]*") if p.is_dir() and p.name.isdigit())
+def _storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Orbax refuses arrays without elements: their names say what they are."""
+    named = lambda name, x: name if x.size else f"{name} empty {x.dtype.str} {list(x.shape)}"
+    return {named(name, x): x if x.size else np.zeros(1, np.uint8) for name, x in table.items()}
+
+
+def _stored(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Inverse of `_storable`."""
+    arrays = {}
+    for full_name, array in table.items():
+        name, is_empty, rest = full_name.partition(" empty ")
+        if is_empty:
+            dtype, _, shape = rest.partition(" ")
+            array = np.zeros(json.loads(shape), np.dtype(dtype))
+        arrays[name] = np.asarray(array)
+    return arrays
 
 
 def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
-    """The newest snapshot: its step, the map and the grid.
+    """The newest stored map and grid, and the view after which they were stored.
 
     Raises:
         RunError: there is none, or it cannot be read.
     """
-    import orbax.checkpoint as ocp
-
-    snapshots = _snapshots(folder)
-    if not snapshots:
+    steps = checkpoint_steps(folder)
+    if not steps:
         raise RunError(folder, "the run has no checkpoint")
-    newest = snapshots[-1]
+    tables = load_checkpoint(folder, steps[-1])
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            target = _abstract(checkpointer.metadata(newest.resolve()))
-            state = checkpointer.restore(newest.resolve(), target)
-        arrays = jax.tree.map(jnp.asarray, state)
-        num_bins = int(arrays["map"].pop("num_bins"))
-        map_state = MapState(**arrays["map"], num_bins=num_bins)
-        return int(newest.name), map_state, OccupancyGrid(**arrays["grid"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunError(newest, f"the checkpoint cannot be read ({error})") from None
+        arrays: dict[str, Any] = {name: jnp.asarray(x) for name, x in tables["map"].items()}
+        num_bins = int(arrays.pop("num_bins"))
+        grid = {name: jnp.asarray(x) for name, x in tables["grid"].items()}
+        return steps[-1], MapState(**arrays, num_bins=num_bins), OccupancyGrid(**grid)
+    except (ValueError, KeyError, TypeError) as error:
+        path = folder / f"{steps[-1]:06d}"
+        raise RunError(path, f"the checkpoint cannot be read ({error})") from None
 
 
-def _abstract(metadata: Any) -> Any:
-    """Shapes and types of what was saved, all on the first device."""
-    sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    to_shape = lambda m: jax.ShapeDtypeStruct(m.shape, m.dtype, sharding=sharding)
-    return jax.tree.map(to_shape, metadata.item_metadata.tree)
+def map_tables(map_state: MapState, grid: OccupancyGrid) -> dict[str, dict[str, np.ndarray]]:
+    """The tables `map` and `grid` of a checkpoint."""
+    from r3jax.trace.arrays import named_arrays
+
+    num_bins = {"num_bins": np.asarray(map_state.num_bins)}
+    return {"map": named_arrays(map_state) | num_bins, "grid": named_arrays(grid)}

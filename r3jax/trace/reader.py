@@ -5,11 +5,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.trace.checkpoints import read_checkpoint
+from r3jax.trace.checkpoints import checkpoint_steps, load_checkpoint, read_checkpoint
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import RunHeader, read_header
 from r3jax.trace.images import content_hash, from_integers, read_png
@@ -74,6 +76,18 @@ class Run:
         """The newest stored map and grid, and the view after which they were stored."""
         return read_checkpoint(self.path / "checkpoints")
 
+    def checkpoint_steps(self) -> list[int]:
+        """The views after which a state is stored, oldest first."""
+        return checkpoint_steps(self.path / "checkpoints")
+
+    def load_checkpoint(self, step: int) -> dict[str, dict[str, np.ndarray]]:
+        """The arrays of a stored state, by table.
+
+        Raises:
+            RunError: there is none for that view, or it cannot be read.
+        """
+        return load_checkpoint(self.path / "checkpoints", step)
+
 
 def read_run(path: Path | str) -> Run:
     """Reads a run folder; a run that was cut off reads up to its last complete row.
@@ -85,7 +99,7 @@ def read_run(path: Path | str) -> Run:
     header = read_header(path / "run.json")
     rows: list[StepRow] = []
     end: EndRow | None = None
-    for number, line in enumerate(_complete_lines(path / "trace.jsonl"), start=1):
+    for number, line in enumerate(complete_lines(path / "trace.jsonl"), start=1):
         try:
             row = from_json(line)
         except (ValueError, RecursionError) as error:
@@ -102,7 +116,7 @@ def read_run(path: Path | str) -> Run:
     return Run(path, header, tuple(rows), end, _read_timings(path / "timings.jsonl"))
 
 
-def _complete_lines(path: Path) -> list[str]:
+def complete_lines(path: Path) -> list[str]:
     """Lines that end in a newline: a power cut may have torn the last one."""
     try:
         text = path.read_bytes().decode("utf-8", errors="replace")
@@ -118,7 +132,7 @@ def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
     if not path.exists():
         return ()
     timings = []
-    for line in _complete_lines(path):
+    for line in complete_lines(path):
         try:
             plain = json.loads(line)
             timings.append({str(k): float(v) for k, v in plain.items()})

@@ -1,26 +1,28 @@
 """Writes a run folder, complete after every view."""
 
 import contextlib
+import datetime
 import fcntl
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
 from r3jax.files import append_line, sync_folder, write_atomic
 from r3jax.frame import Frame
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
-from r3jax.trace.checkpoints import save_checkpoint
+from r3jax.trace.checkpoints import CheckpointWriter, Tables
 from r3jax.trace.errors import RecordingStopped, RunError
-from r3jax.trace.header import RunHeader, header_to_json
+from r3jax.trace.header import RunHeader, header_to_json, package_versions, read_header
 from r3jax.trace.images import encode_png, to_integers
-from r3jax.trace.rows import EndRow, StepRow, to_json
+from r3jax.trace.reader import Run, complete_lines, read_run
+from r3jax.trace.rows import EndRow, StepRow, from_json, to_json
 
 _CONTENT = (
     "run.json",
     "trace.jsonl",
     "timings.jsonl",
+    "history.jsonl",
     "transforms.json",
     "frames",
     "checkpoints",
@@ -47,17 +49,68 @@ class RunWriter:
                 written by another process, or cannot be made.
         """
         self.path = Path(path)
-        self.views = 0
         try:
             if self.path.exists():
                 _clear(self.path, overwrite=overwrite)
             for name in ("frames", "report"):
                 (self.path / name).mkdir(parents=True, exist_ok=True)
             write_atomic(self.path / "run.json", header_to_json(header).encode())
-            self._lock = _lock(self.path / "run.json")
             (self.path / "trace.jsonl").touch()
+            self._lock = _lock(self.path)
+            self._begin(header, views=0)
         except OSError as error:
             raise RunError(self.path, f"cannot make the run folder ({error.strerror})") from error
+
+    @classmethod
+    def resume(cls, path: Path | str, header: RunHeader | None = None) -> tuple["RunWriter", Run]:
+        """Goes on with a run that was cut off, interrupted or finished.
+
+        What the killed process left half written is cleared away: the torn end of the trace, and
+        files under temporary names. The row that says how the run ended moves to history.jsonl.
+
+        Args:
+            path: the run folder.
+            header: replaces run.json, to give the run another budget; None keeps it.
+
+        Returns:
+            The writer, and the run as it was recorded so far.
+
+        Raises:
+            RunError: not a run, damaged, being written by another process, or not writable.
+        """
+        writer = cls.__new__(cls)
+        writer.path = Path(path)
+        read_header(writer.path / "run.json")  # says what is wrong before anything is touched
+        try:
+            writer._lock = _lock(writer.path)
+            with contextlib.ExitStack() as on_failure:
+                on_failure.callback(writer._lock.close)
+                run = read_run(writer.path)
+                _mend(writer.path)
+                if header is not None:
+                    write_atomic(writer.path / "run.json", header_to_json(header).encode())
+                on_failure.pop_all()
+            writer._begin(header or run.header, views=len(run.rows))
+        except OSError as error:
+            raise RunError(
+                writer.path, f"cannot go on with the run ({error.strerror or error})"
+            ) from error
+        return writer, replace(run, header=header or run.header, end=None)
+
+    def _begin(self, header: RunHeader, *, views: int) -> None:
+        self.views = views
+        begin = {
+            "kind": "begin",
+            "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "views": views,
+            "budget": header.budget,
+            "packages": package_versions(),
+        }
+        with contextlib.ExitStack() as on_failure:
+            on_failure.callback(self._lock.close)
+            append_line(self.path / "history.jsonl", json.dumps(begin))
+            self._checkpoints = CheckpointWriter(self.path / "checkpoints")
+            on_failure.pop_all()
 
     def add(self, row: StepRow, frame: Frame) -> None:
         """Stores one view: the images first, then the row, so that a row's images exist.
@@ -84,14 +137,23 @@ class RunWriter:
         with self._guarded(), open(self.path / "timings.jsonl", "a", encoding="utf-8") as file:
             file.write(line + "\n")
 
-    def checkpoint(self, step: int, map_state: MapState, grid: OccupancyGrid) -> None:
-        """Stores the map and the grid as they are after view `step`."""
+    def checkpoint(self, step: int, tables: Tables) -> None:
+        """Begins to store the state after view `step`: `exploration.resume.state_tables`.
+
+        Raises:
+            RecordingStopped: the disk refused this checkpoint or the one before.
+        """
         with self._guarded():
-            save_checkpoint(self.path / "checkpoints", step, map_state, grid)
+            self._checkpoints.save(step, tables)
 
     def finish(self, outcome: str, message: str) -> None:
-        """Stores how the run ended."""
+        """Stores how the run ended.
+
+        Raises:
+            RecordingStopped: the disk refused this, or a checkpoint that was under way.
+        """
         with self._guarded():
+            self._checkpoints.wait()
             append_line(self.path / "trace.jsonl", to_json(EndRow(outcome, message, self.views)))
 
     @contextlib.contextmanager
@@ -106,8 +168,11 @@ class RunWriter:
             ) from error
 
     def close(self) -> None:
-        """Frees the lock."""
-        self._lock.close()
+        """Frees the threads and the lock."""
+        try:
+            self._checkpoints.close()
+        finally:
+            self._lock.close()
 
     def __enter__(self) -> "RunWriter":
         """The writer itself."""
@@ -123,15 +188,35 @@ class RunWriter:
         self.close()
 
 
-def _lock(path: Path):
+def _lock(folder: Path):
     """An exclusive lock that dies with the process, so that none is ever stale."""
-    file = open(path, "rb")  # noqa: SIM115 (held open on purpose: closing it frees the lock)
+    path = folder / "lock"
+    file = open(path, "ab")  # noqa: SIM115 (held open on purpose: closing it frees the lock)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         file.close()
-        raise RunError(path, "another process is writing this run") from None
+        raise RunError(folder, "another process is writing this run") from None
     return file
+
+
+def _mend(path: Path) -> None:
+    """Leaves the whole rows of views in the trace, and nothing half written anywhere."""
+    trace = path / "trace.jsonl"
+    lines = complete_lines(trace)
+    views = [line for line in lines if isinstance(from_json(line), StepRow)]
+    for line in lines:
+        if line not in views:
+            append_line(path / "history.jsonl", line)
+    whole = "".join(f"{line}\n" for line in views).encode()
+    if trace.read_bytes() != whole:
+        write_atomic(trace, whole)
+    timings = path / "timings.jsonl"
+    if timings.exists() and not timings.read_bytes().endswith(b"\n"):
+        write_atomic(timings, "".join(f"{line}\n" for line in complete_lines(timings)).encode())
+    for folder in (path, path / "frames"):
+        for leftover in folder.glob(".*.partial"):
+            leftover.unlink(missing_ok=True)
 
 
 def _clear(path: Path, *, overwrite: bool) -> None:
@@ -145,7 +230,7 @@ def _clear(path: Path, *, overwrite: bool) -> None:
         raise RunError(path, "the folder holds something that is not a run: choose another name")
     if not overwrite:
         raise RunError(path, "the run exists already: choose another name or give --overwrite")
-    with _lock(path / "run.json"):
+    with _lock(path):
         for name in _CONTENT:
             target = path / name
             if target.is_dir() and not target.is_symlink():

@@ -10,6 +10,7 @@ import pytest
 
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
+from r3jax.trace.checkpoints import map_tables
 from r3jax.trace.errors import RecordingStopped, RunError
 from r3jax.trace.reader import read_run
 from r3jax.trace.rows import from_json, to_json
@@ -207,7 +208,7 @@ def test_checkpoints_come_back_exactly_and_only_three_are_kept(tmp_path):
     grid = empty_grid(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]))
     with RunWriter(tmp_path / "run", make_header()) as writer:
         for step in (0, 1, 2, 3, 4):
-            writer.checkpoint(step, map_state, grid)
+            writer.checkpoint(step, map_tables(map_state, grid))
     run = read_run(tmp_path / "run")
     step, read_map, read_grid = run.checkpoint()
     assert step == 4

@@ -1,0 +1,127 @@
+"""Recorded frames rebuild the map and the grid of a run, and those of several runs together."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.step import add_to_grid, first_grid
+from r3jax.frame import Frame
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.sighting import look
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run
+
+
+@dataclass(frozen=True)
+class Difference:
+    """An array of a stored state that frames do not rebuild."""
+
+    name: str
+    """Such as `map.visited`."""
+
+    num_different: int
+    """Elements that differ; -1 if the shapes do."""
+
+    largest: float
+    """The largest difference of two elements."""
+
+
+def config_of(run: Run) -> ExplorationConfig:
+    """The settings of the loop that a run was made with.
+
+    Raises:
+        RunError: a setting that this version does not know, or cannot work with.
+    """
+    try:
+        return ExplorationConfig(**run.header.config)
+    except (TypeError, ValueError) as error:
+        raise RunError(run.path / "run.json", f"a setting of the loop: {error}") from None
+
+
+def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, OccupancyGrid]:
+    """The map and the grid that have seen what the runs have seen, one run after the other.
+
+    Args:
+        runs: of one scene: the same box, cells, voxels and range.
+        views: of each run at most so many; None: all.
+
+    Raises:
+        RunError: the runs do not fit together, or a frame is missing or broken.
+    """
+    first, config = runs[0], config_of(runs[0])
+    for run in runs[1:]:
+        _check_alike(first, run)
+    bounds = np.asarray(first.header.bounds, dtype=np.float64)
+    grid = first_grid(bounds, [_start_of(run) for run in runs], config)
+    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
+    for run in runs:
+        for frame in _frames(run, views):
+            map_state = look(
+                map_state,
+                frame,
+                config.max_range,
+                allow_growth=config.allow_growth,
+                drop_edges=config.drop_edges,
+            )
+            grid = add_to_grid(grid, frame, config)
+    return map_state, grid
+
+
+def differences(run: Run) -> tuple[int, list[Difference]]:
+    """Where the newest stored map and grid are not those that the frames rebuild.
+
+    Returns:
+        The views that were compared, and every array that differs.
+
+    Raises:
+        RunError: no checkpoint, or one or a frame that cannot be read.
+    """
+    step, stored_map, stored_grid = run.checkpoint()
+    map_state, grid = rebuild([run], step + 1)
+    found = []
+    for table, stored, rebuilt in (("map", stored_map, map_state), ("grid", stored_grid, grid)):
+        for name, array in vars(stored).items():
+            if isinstance(array, jax.Array):
+                found.append(_compare(f"{table}.{name}", array, getattr(rebuilt, name)))
+    return step + 1, [difference for difference in found if difference is not None]
+
+
+def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | None:
+    a, b = np.asarray(stored), np.asarray(rebuilt)
+    if a.shape != b.shape:
+        return Difference(name, -1, float("inf"))
+    different = a != b
+    if not different.any():
+        return None
+    gap = np.abs(a.astype(np.float64) - b.astype(np.float64))
+    return Difference(name, int(different.sum()), float(gap.max()))
+
+
+def _start_of(run: Run) -> np.ndarray:
+    if not run.rows:
+        raise RunError(run.path, "the run has no view")
+    return np.asarray(run.rows[0].pose, dtype=np.float64)
+
+
+def _frames(run: Run, views: int | None) -> Iterable[Frame]:
+    return (run.frame(row.step) for row in run.rows[:views])
+
+
+def _check_alike(first: Run, other: Run) -> None:
+    """Runs can be merged if they mapped the same scene on the same terms."""
+    a, b = first.header, other.header
+    terms = [
+        ("the scene", a.scene.get("hash"), b.scene.get("hash")),
+        ("the box", a.bounds, b.bounds),
+    ]
+    for name in ("voxel_size", "num_bins", "cell_size", "max_range", "drop_edges"):
+        terms.append((name, a.config.get(name), b.config.get(name)))
+    for name, mine, others in terms:
+        if mine != others:
+            raise RunError(
+                other.path, f"{name} is not that of {first.path}: {others} instead of {mine}"
+            )

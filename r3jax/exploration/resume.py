@@ -1,0 +1,96 @@
+"""A run goes on where it was cut off: from its newest checkpoint, and its frames after that.
+
+Rows and frames alone rebuild the state, from the first view if need be; a checkpoint saves the
+time. So a checkpoint that is missing, damaged or of another version costs time, not the run.
+"""
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from r3jax.exploration.state import LoopState, Mission
+from r3jax.exploration.step import relive
+from r3jax.trace.arrays import fill, named_arrays
+from r3jax.trace.checkpoints import Tables, map_tables
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run
+
+_TREES = {"map_state": "map", "grid": "grid", "policy_state": "policy"}
+"""Fields of the state that have a table of their own; all others are in the table `loop`."""
+
+
+def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
+    """The state as a checkpoint holds it."""
+    tables = map_tables(state.map_state, state.grid)
+    tables["policy"] = named_arrays(state.policy_state)
+    rest = [field.name for field in fields(LoopState) if field.name not in _TREES]
+    return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in rest}}
+
+
+def state_of(tables: Tables, like: LoopState) -> LoopState:
+    """Inverse of `state_tables`.
+
+    Args:
+        tables: of a checkpoint.
+        like: a state of the same run, such as its first: what is not an array is taken from it.
+
+    Raises:
+        ValueError: a table or an array is missing or of another kind.
+    """
+    missing = sorted({"map", "grid", "loop"} - set(tables))
+    if missing:
+        raise ValueError(f"the checkpoint lacks {', '.join(missing)}")
+    arrays = dict(tables["map"])
+    if int(arrays.pop("num_bins", -1)) != like.map_state.num_bins:
+        raise ValueError("the checkpoint's map has other direction bins than the run")
+    rest = {field.name: getattr(like, field.name) for field in fields(LoopState)}
+    for name in _TREES:
+        del rest[name]
+    return LoopState(
+        map_state=fill(like.map_state, arrays),
+        grid=fill(like.grid, tables["grid"]),
+        policy_state=fill(like.policy_state, tables.get("policy", {})),
+        **fill(rest, tables["loop"]),
+    )
+
+
+def continued(run: Run, mission: Mission, start: LoopState) -> LoopState:
+    """The state after the last recorded view.
+
+    Args:
+        run: what was recorded; its trace may have been cut off anywhere.
+        mission: what the run was asked for.
+        start: the state before the first view.
+
+    Raises:
+        RunError: a frame that is needed is missing, broken, or not the one that was recorded.
+    """
+    state = _newest(run, start)
+    for row in run.rows[state.views :]:
+        mission.on_stage("map")
+        state = relive(state, mission, row, run.frame(row.step))
+    return state
+
+
+def _newest(run: Run, start: LoopState) -> LoopState:
+    """The newest usable checkpoint; the start if there is none."""
+    for step in reversed(run.checkpoint_steps()):
+        if step >= len(run.rows):
+            continue
+        try:
+            state = state_of(run.load_checkpoint(step), start)
+        except (RunError, ValueError):
+            continue  # an older one, or the frames, will do
+        if _agrees(state, run.rows[step]):
+            return state
+    return start
+
+
+def _agrees(state: LoopState, row: Any) -> bool:
+    """Whether a checkpoint belongs to a row of the trace."""
+    return (
+        state.views == row.step + 1
+        and np.array_equal(np.asarray(state.T_world_camera, np.float32), row.pose)
+        and (state.seconds, state.metres) == (row.seconds, row.metres)
+    )

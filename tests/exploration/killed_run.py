@@ -1,0 +1,64 @@
+"""One process of a run that is to be killed: begins it, or goes on with it. Not a test itself.
+
+python -m tests.exploration.killed_run FOLDER VIEWS
+"""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import jax
+
+from r3jax.exploration import explore
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.planning.policy import make_policy
+from r3jax.scoring.config import ScoringConfig
+from r3jax.trace.header import camera_fields
+from r3jax.trace.writer import RunWriter
+from tests.exploration.toys import BoxRoom
+from tests.trace.runs import make_header
+
+CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=4)
+SCORING = ScoringConfig(zbuffer_size=32, panorama_size=32)
+
+
+def go_on(path: Path, views: int, policy: str = "ours-pano") -> None:
+    """Begins a run in `path`, or goes on with the one that is there."""
+    simulator = BoxRoom()
+    planner = make_policy(policy, num_candidates=8, num_frontier=3, scoring=SCORING)
+    run = None
+    if (path / "run.json").exists():
+        recorder, run = RunWriter.resume(path)
+    else:
+        camera = camera_fields(simulator.camera)
+        recorder = RunWriter(path, make_header(camera=camera, budget=f"views:{views}"))
+    with recorder:
+        explore(
+            simulator,
+            planner,
+            budget=f"views:{views}",
+            config=CONFIG,
+            recorder=recorder,
+            resume=run,
+        )
+
+
+def _slow_disk() -> None:
+    """Every flush takes 10 ms more, so that many kills fall into a write."""
+    flush = os.fsync
+
+    def slow(descriptor: int) -> None:
+        time.sleep(0.005)
+        flush(descriptor)
+        time.sleep(0.005)
+
+    os.fsync = slow
+
+
+if __name__ == "__main__":
+    # Below the suite's threshold too: a process that lives for seconds must not compile anything.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    _slow_disk()
+    go_on(Path(sys.argv[1]), int(sys.argv[2]))
