@@ -12,7 +12,7 @@ from experiments import suite, sweep
 from experiments.artefacts import Origin
 from experiments.settings import known_settings
 from experiments.sweep import Options
-from experiments.sweep_choice import Trial, choose, leave_one_out
+from experiments.sweep_choice import Trial, choose
 from experiments.sweep_page import Sweep, write_page
 from r3jax.benchmark.conditions import Conditions
 from r3jax.benchmark.engines.local import run_here
@@ -20,6 +20,7 @@ from r3jax.benchmark.plan import Request
 from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
 from tests.benchmark.tiny import CONDITIONS, SETTINGS, write_room
 from tests.evaluation.records import record
+from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 KNOWN = known_settings(Conditions())
 LAMBDA1 = KNOWN["policy.lambda1"]
@@ -45,34 +46,32 @@ def trial(value, level, seeds=(0, 1), scenes=("loft", "kitchen")):
 DEFAULT = {LAMBDA1.name: 16.0}
 
 
-def test_the_best_is_the_arg_max_with_the_interval_of_its_views_and_seeds():
+def law_best(modules: Modules) -> None:
+    """The arg max, with the intervals of its views and seeds, in whatever order records come."""
+    choose = modules["sweep_choice"].choose
     trials = [trial(4.0, (0.0, 1.0)), trial(16.0, (0.0, 0.0)), trial(64.0, (-1.0, 1.5))]
     choice = choose(trials, DEFAULT)
     assert (choice.best, choice.default) == (0, 1)
-    for i, expected in enumerate([20.55, 20.05, 20.3]):
-        hard = np.random.default_rng(5).normal(0.0, 2.0, 12).mean()
-        assert choice.means[i].value == pytest.approx(expected + hard)
+    hard = np.random.default_rng(5).normal(0.0, 2.0, 12).mean()
+    for mean, expected in zip(choice.means, [20.55, 20.05, 20.3], strict=True):
+        assert abs(mean.value - expected - hard) < 1e-9
     scores = [
         {s: np.array([r["views"]["psnr"] for r in t.records if r["scene"] == s]) for s in t.scores}
         for t in trials
     ]
     assert choice.means[0] == mean_over_scenes(scores[0])
     assert choice.gains[0] == paired_difference(scores[0], scores[1])
-    assert choice.gains[0].value == pytest.approx(0.5)
+    assert abs(choice.gains[0].value - 0.5) < 1e-9
     assert choice.is_better  # the difference is the same in every view
     assert choice.gains[1].value == choice.gains[1].high == 0.0
+    turn = modules["sweep_choice"].Trial
+    turned = [turn(t.point, t.records[::-1] if t is trials[0] else t.records) for t in trials]
+    assert choose(turned, DEFAULT) == choice
 
 
-def test_of_equals_the_first_is_taken_and_a_draw_is_not_better():
-    trials = [trial(16.0, (0.0, 0.0)), trial(4.0, (0.0, 0.0))]
-    choice = choose(trials, DEFAULT)
-    assert choice.best == choice.default == 0
-    assert not choice.is_better
-    with pytest.raises(ValueError, match="was not tried"):
-        choose(trials, {LAMBDA1.name: 17.0})
-
-
-def test_a_gain_in_some_views_and_a_loss_in_others_is_within_the_interval():
+def law_doubt(modules: Modules) -> None:
+    """A gain in some views and a loss in others is within the interval; so is no gain at all."""
+    choose = modules["sweep_choice"].choose
     base = trial(16.0, (0.0,), seeds=(0,), scenes=("loft",))
     noise = np.random.default_rng(0).normal(0.0, 3.0, 12)
     noise += 0.1 - noise.mean()
@@ -80,12 +79,17 @@ def test_a_gain_in_some_views_and_a_loss_in_others_is_within_the_interval():
     other = Trial({LAMBDA1.name: 4.0}, [record("ours", "loft", 0, 30, budget=30, psnr=views)])
     choice = choose([base, other], DEFAULT)
     assert choice.best == 1
-    assert choice.gains[1].value == pytest.approx(0.1)
+    assert abs(choice.gains[1].value - 0.1) < 1e-9
     assert choice.gains[1].low < 0.0 < choice.gains[1].high
     assert not choice.is_better
+    same = choose([trial(16.0, (0.0, 0.0)), trial(4.0, (0.0, 0.0))], DEFAULT)
+    assert same.best == same.default == 0  # of equals, the first
+    assert not same.is_better
 
 
-def test_a_scene_left_out_is_judged_by_the_choice_of_the_others():
+def law_left_out(modules: Modules) -> None:
+    """A scene is judged by the choice of the others, worked out by hand."""
+    leave_one_out = modules["sweep_choice"].leave_one_out
     scenes = ("loft", "kitchen", "library")
     trials = [
         trial(4.0, (9.0, 0.0, 0.0), scenes=scenes),  # the loft's own favorite
@@ -93,14 +97,37 @@ def test_a_scene_left_out_is_judged_by_the_choice_of_the_others():
         trial(64.0, (-2.0, 5.0, 1.0), scenes=scenes),
     ]
     found = {row.scene: row for row in leave_one_out(trials, 1)}
-    assert {scene: row.best for scene, row in found.items()} == {
-        "loft": 2,
-        "kitchen": 0,
-        "library": 0,
-    }
-    assert found["loft"].gain.value == pytest.approx(-2.0)
-    assert found["kitchen"].gain.value == pytest.approx(0.0)
+    assert [found[scene].best for scene in scenes] == [2, 0, 0]
+    assert abs(found["loft"].gain.value + 2.0) < 1e-9
+    assert abs(found["kitchen"].gain.value) < 1e-9
     assert leave_one_out([trial(16.0, (0.0,), scenes=("loft",))], 0) == ()
+
+
+CHAIN = ("experiments.sweep_choice",)
+MUTANTS = [
+    Mutant("sweep_choice", "np.argmax([mean", "np.argmin([mean", law_best),
+    Mutant("sweep_choice", "(found, scores[base])", "(scores[base], found)", law_best),
+    Mutant("sweep_choice", 'key=lambda record: record["seed"]', "key=lambda record: 0",
+           law_best),
+    Mutant("sweep_choice", "self.gains[self.best].low >", "self.gains[self.best].value >",
+           law_doubt),
+    Mutant("sweep_choice", "np.delete(table, i, axis=1)", "table", law_left_out),
+]  # fmt: skip
+
+
+def test_the_laws_hold_without_a_fault():
+    for law in (law_best, law_doubt, law_left_out):
+        law(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
+
+
+def test_a_default_that_was_not_tried_is_refused():
+    with pytest.raises(ValueError, match="was not tried"):
+        choose([trial(16.0, (0.0, 0.0))], {LAMBDA1.name: 17.0})
 
 
 # The page ----------------------------------------------------------------------------------------

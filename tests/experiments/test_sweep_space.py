@@ -15,6 +15,7 @@ from experiments.sweep_space import (
     with_default,
 )
 from r3jax.benchmark.conditions import Conditions
+from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 KNOWN = known_settings(Conditions())
 
@@ -47,22 +48,64 @@ def test_random_points_are_in_range_distinct_and_the_same_for_the_same_seed(coun
     assert random_points(axes, count, seed + 1) != points
 
 
-@pytest.mark.parametrize(("scale", "middle"), [(":log", 100.0), ("", 5000.5)])
-def test_half_of_the_draws_lie_below_the_middle_of_their_scale(scale, middle):
-    (axis,) = parse_axes([f"lambda1=1..10000{scale}"], KNOWN)
-    drawn = np.array([p["policy.lambda1"] for p in random_points([axis], 400, 0)])
-    assert abs(np.mean(drawn < middle) - 0.5) < 0.1  # four sigma
+def law_scale(modules: Modules) -> None:
+    """Half of the draws lie below the middle of their scale."""
+    space = modules["sweep_space"]
+    for scale, middle in ((":log", 100.0), ("", 5000.5)):
+        axes = space.parse_axes([f"lambda1=1..10000{scale}"], KNOWN)
+        drawn = [point["policy.lambda1"] for point in space.random_points(axes, 400, 0)]
+        assert abs(np.mean(np.array(drawn) < middle) - 0.5) < 0.1  # four sigma
 
 
-def test_a_range_of_whole_numbers_has_them_all_alike():
-    (axis,) = parse_axes(["num_bins=3..6"], KNOWN)
+def law_whole(modules: Modules) -> None:
+    """Of a range of whole numbers, all are as likely, the ends too."""
+    (axis,) = modules["sweep_space"].parse_axes(["num_bins=3..6"], KNOWN)
     rng = np.random.default_rng(0)
     found, counts = np.unique([axis.draw(rng) for _ in range(800)], return_counts=True)
-    np.testing.assert_array_equal(found, [3, 4, 5, 6])
+    assert found.tolist() == [3, 4, 5, 6]
     assert np.all(np.abs(counts - 200) < 60)
+
+
+def law_points(modules: Modules) -> None:
+    """Every point once, and more points begin with the same ones."""
+    space = modules["sweep_space"]
+    axes = space.parse_axes(["num_bins=3..5", "kappa=box,one"], KNOWN)
+    grid = space.grid_points(space.parse_axes(["num_bins=3,4,5", "kappa=box,one"], KNOWN))
+    points = space.random_points(axes, 6, 1)
+    assert len(grid) == 6
+    assert sorted(map(str, points)) == sorted(map(str, grid))
+    assert space.random_points(axes, 3, 1) == points[:3]
+
+
+LAWS = (law_scale, law_whole, law_points)
+CHAIN = ("experiments.sweep_space",)
+MUTANTS = [
+    Mutant("sweep_space", "math.exp(rng.uniform(math.log(low), math.log(high)))",
+           "float(rng.uniform(low, high))", law_scale),
+    Mutant("sweep_space", "0.5 if is_whole", "0.0 if is_whole", law_whole),
+    Mutant("sweep_space", "found.setdefault(tuple(point.values()), point)",
+           "found[(len(found),)] = point", law_points),
+    Mutant("sweep_space", "default_rng(seed)", "default_rng(seed + count)", law_points),
+    Mutant("sweep_space", "itertools.product(*values)", "zip(*values)", law_points),
+]  # fmt: skip
+
+
+def test_the_laws_hold_without_a_fault():
+    for law in LAWS:
+        law(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
+
+
+def test_more_points_than_there_are_cannot_be_drawn():
+    (axis,) = parse_axes(["num_bins=3..6"], KNOWN)
     assert len(random_points([axis], 4, 0)) == 4
-    with pytest.raises(ValueError, match="1 to 4 points of this space, got 5"):
-        random_points([axis], 5, 0)
+    for count in (0, 5):
+        with pytest.raises(ValueError, match=f"1 to 4 points of this space, got {count}"):
+            random_points([axis], count, 0)
 
 
 def test_the_default_is_always_tried_and_only_once():
