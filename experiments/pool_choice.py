@@ -19,7 +19,6 @@ from r3jax.mapping.occupancy import (
     mark_free_ball,
     world_to_cell,
 )
-from r3jax.mapping.sighting import look
 from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import host_generator, poses_along, random_directions
 from r3jax.planning.config import PlannerConfig
@@ -29,6 +28,7 @@ from r3jax.planning.policies.active_gamer import ActiveGamer, empty_share
 from r3jax.planning.policy import make_policy
 from r3jax.planning.travel import plan_travel
 from r3jax.scoring.pixels import score_pixels
+from r3jax.scoring.sighting import look
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.free_space import GroundTruth
 

@@ -1,7 +1,7 @@
 """Which pixels of a test view show a surface that a training frame has looked at.
 
 Decided by the true depth of the test view and the recorded depth of the frames, not by the map
-whose predictions are judged with it. The rule is that of `mapping.sighting`: a point is seen by a
+whose predictions are judged with it. The rule is that of `scoring.sighting`: a point is seen by a
 frame if it is within range and projects onto a measurement that is no nearer.
 
 Shape symbols: n frames; h w their size; H W size of the test view.

@@ -5,9 +5,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from r3jax.frame import Frame
-from r3jax.mapping.sighting import look
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.scoring.renderability import renderability, renderability_image
+from r3jax.scoring.sighting import look
 
 
 def map_of(

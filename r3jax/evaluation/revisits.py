@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 
 from r3jax.evaluation import style
 from r3jax.formats.recordings import Recording
-from r3jax.mapping.sighting import look
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.scoring.renderability import renderability
+from r3jax.scoring.sighting import look
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.step import add_to_grid, first_grid
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.sighting import look
 from r3jax.mapping.state import MapState, empty_map
+from r3jax.scoring.sighting import look
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 

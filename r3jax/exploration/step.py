@@ -18,9 +18,9 @@ from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
-from r3jax.mapping.sighting import look
 from r3jax.mapping.state import empty_map
 from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.scoring.sighting import look
 from r3jax.trace.images import frame_hash, stored_form
 from r3jax.trace.rows import StepRow, make_choice
 

@@ -16,8 +16,8 @@ from r3jax.exploration.clock import ModelClock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import StopReason
 from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball
-from r3jax.mapping.sighting import look
 from r3jax.mapping.state import empty_map
+from r3jax.scoring.sighting import look
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.exploration.toys import UPPER, BoxRoom, Wander

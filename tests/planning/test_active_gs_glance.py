@@ -7,10 +7,10 @@ import pytest
 
 from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.occupancy import empty_grid
-from r3jax.mapping.sighting import looked_at
 from r3jax.planning.policies.active_gs.confidence import aligned, no_sightings, see
 from r3jax.planning.policies.active_gs.glance import glance
 from r3jax.planning.policy import make_policy
+from r3jax.scoring.sighting import looked_at
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.test_active_gs_confidence import RANGE, frames, maps
 

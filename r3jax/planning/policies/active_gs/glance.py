@@ -1,6 +1,6 @@
 """Sightings of voxels that a frame looked at, but into which none of its pixels fell.
 
-The map counts them as seen for every policy (`mapping.sighting`); without the same rule here the
+The map counts them as seen for every policy (`scoring.sighting`); without the same rule here the
 noise in front of a surface would keep Active-GS looking for ever.
 """
 
@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 from r3jax.frame import Frame
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.voxels import unpack, voxel_center
-from r3jax.mapping.sighting import looked_at
 from r3jax.mapping.state import MapState
 from r3jax.planning.policies.active_gs.confidence import Sightings
+from r3jax.scoring.sighting import looked_at
 
 
 @jax.jit

@@ -1,8 +1,8 @@
 """Voxels that a frame looked at, whether or not one of its pixels fell into them.
 
 A frame's points do not touch all that it sees: of a floor seen at a grazing angle one voxel in
-five, of what lies on a depth edge none. Such a voxel would keep a low renderability however often
-one looks at it, and a planner would look for ever.
+five, of what lies on a depth edge or behind glass none. Such a voxel would keep a low
+renderability however often one looks at it, and a planner would look for ever.
 
 Shape symbols: N capacity of the map; M voxels at a time; H W image size.
 """
@@ -21,13 +21,17 @@ from r3jax.mapping.compact import positions_of_set
 from r3jax.mapping.join import CHUNK, bin_words, grow
 from r3jax.mapping.state import MapState
 from r3jax.mapping.update import integrate
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.views import pinhole_view
+from r3jax.scoring.visibility import candidates_of, depth_buffer, visible_voxels
+from r3jax.scoring.voxels import voxels_of
 
 _MAX_LOAD = 0.7
 """The table grows before more than this share of its rows is in use."""
 
 
 def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]) -> MapState:
-    """Every voxel in view that nothing measured hides has been seen from here.
+    """Every voxel in view that nothing hides has been seen from here.
 
     Its direction bin is set and its best resolution raised; count and colors belong to
     `integrate`, as only pixels know them. Voxels in front of the measured surface count too:
@@ -35,7 +39,7 @@ def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]
 
     Args:
         state: the map, the frame integrated.
-        frame: the frame; where it has no measurement it says nothing.
+        frame: the frame.
         max_range: voxels farther from the camera than this are not seen [m].
     """
     num = state.capacity
@@ -73,7 +77,12 @@ def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]
 
 
 def looked_at(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:
-    """Voxels within range whose center projects onto a measurement that is no nearer."""
+    """Voxels within range that the frame shows.
+
+    Where it has a measurement, those whose center is no farther. Where it has none, those that no
+    other voxel hides: the color image shows what lies behind glass all the same, and whatever
+    the map does not know of is in front of it in every later view from here, too.
+    """
     camera, T = frame.camera, invert_pose(frame.T_world_camera)
     center = voxel_center(jnp.stack(unpack(state.key[0], state.key[1])), state.voxel_size)
     along = lambda i: T[i, 0] * center[0] + T[i, 1] * center[1] + T[i, 2] * center[2] + T[i, 3]
@@ -88,8 +97,28 @@ def looked_at(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Boo
     farthest = jnp.where(frame.depth > 0.0, farthest, 0.0).reshape(-1)
     column = jnp.clip(u, 0.0, camera.width - 1.0).astype(jnp.int32)
     row = jnp.clip(v, 0.0, camera.height - 1.0).astype(jnp.int32)
-    measured = farthest[row * camera.width + column]
-    return is_in & (measured > 0.0) & (z <= measured + state.voxel_size)
+    pixel = row * camera.width + column
+    measured = farthest[pixel]
+    is_shown = (measured > 0.0) & (z <= measured + state.voxel_size)
+    is_hole = is_in & (frame.depth.reshape(-1)[pixel] == 0.0)
+    hidden_by_none = jax.lax.cond(
+        jnp.any(is_hole),
+        lambda: _hidden_by_none(state, frame, jnp.where(is_in, x * x + y * y + z * z, 0.0)),
+        lambda: jnp.zeros(state.capacity, dtype=bool),
+    )
+    return (is_in & is_shown) | (is_hole & hidden_by_none)
+
+
+def _hidden_by_none(
+    state: MapState, frame: Frame, squared_distance: Float[Array, " N"]
+) -> Bool[Array, " N"]:
+    """Voxels that the map itself shows in a frame's view, up to the farthest in it."""
+    farthest = jnp.sqrt(jnp.max(squared_distance)) + state.voxel_size
+    config = ScoringConfig(max_range=farthest)
+    voxels, view = voxels_of(state), pinhole_view(frame.camera, frame.T_world_camera, config)
+    candidates = candidates_of(voxels, view)
+    buffer = depth_buffer(voxels, candidates, view, config)
+    return visible_voxels(voxels, candidates, view, buffer).mask
 
 
 _mark_seen = jax.jit(mark_seen)

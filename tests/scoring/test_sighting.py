@@ -9,10 +9,10 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.geometry.voxels import unpack, voxel_center
-from r3jax.mapping import sighting as real
-from r3jax.mapping.sighting import look
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate, integrate_points
+from r3jax.scoring import sighting as real
+from r3jax.scoring.sighting import look
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 WIDTH, HEIGHT, CAPACITY, VOXEL = 24, 18, 2048, 0.05  # one shape: one compile
@@ -67,8 +67,8 @@ def judged_by_hand(state: MapState, frame: Frame) -> tuple[np.ndarray, np.ndarra
         i, j = int(v), int(u)
         around = depth[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
         limit = around.max() + VOXEL
-        unsure[row] |= abs(z - limit) < 1e-3
-        seen[row] = depth[i, j] > 0 and z <= limit
+        unsure[row] |= abs(z - limit) < 1e-3 or depth[i, j] == 0  # holes: `law_holes`
+        seen[row] = z <= limit
     return seen, unsure
 
 
@@ -116,12 +116,48 @@ def test_marking_twice_changes_nothing():
     jax.tree.map(np.testing.assert_array_equal, once, twice)
 
 
-def test_a_frame_without_measurements_says_nothing():
-    frame = frame_of()
-    blind = Frame(rgb=frame.rgb, depth=np.zeros((HEIGHT, WIDTH), np.float32),
-                  T_world_camera=frame.T_world_camera, camera=CAMERA)  # fmt: skip
-    before = cloud_map()
-    jax.tree.map(np.testing.assert_array_equal, before, mark(before, blind, REACH))
+def law_holes(modules: Modules) -> None:
+    """Without a measurement, a wall is seen where no other wall hides it, and nothing is new."""
+    across, up = np.arange(-0.6, 0.61, 0.04), np.arange(-0.4, 0.41, 0.04)
+    y, z = (a.ravel() for a in np.meshgrid(across, up))
+    far = np.stack([np.full_like(y, 2.525), y, z], axis=1)
+    near = np.stack([np.full_like(y, 1.525), y, z], axis=1)[y > 0.02]
+    points = np.concatenate([far, near])
+    before = integrate_points(
+        empty_map(CAPACITY, VOXEL),
+        jnp.asarray(points, jnp.float32),
+        jnp.full((len(points), 3), 0.5),
+        jnp.array([5.0, -3.0, 1.0]),  # from behind: no bin of the views below
+        jnp.float32(20.0),
+    )
+    centers, occupied = centers_of(before), np.asarray(before.occupied)
+    pose = look_at(jnp.zeros(3), jnp.array([3.0, 0.0, 0.0]))
+    depth = np.zeros((HEIGHT, WIDTH), np.float32)
+    depth[:9] = 2.0  # the upper half has a measurement, between the walls
+    depth[12] = 9.0  # one row of measurements says nothing of the holes beside it
+    frame = Frame(rgb=np.zeros((HEIGHT, WIDTH, 3), np.float32), depth=depth,
+                  T_world_camera=pose, camera=CAMERA)  # fmt: skip
+    after = jax.jit(modules["sighting"].mark_seen)(before, frame, REACH)
+    is_seen = has_bin(after, bins_by_hand(before, frame)) & occupied
+    is_far, is_left = centers[0] > 2.0, centers[1] < 0.0
+    high, low = (centers[2] * s > 0.06 * centers[0] for s in (1.0, -1.0))  # off the border row
+    row = 9.5 - 22.0 * centers[2] / centers[0]
+    inside = occupied & (np.abs(centers[2]) < 0.3) & (np.abs(row - 12.5) > 0.55)
+    # The near wall covers y > 0; what lies up to 0.15 m beside its shadow is left open.
+    clear, covered = is_far & (centers[1] < -0.15), is_far & (centers[1] > 0.2)
+    for wall, where, expected in [
+        (clear, low, True), (covered, low, False), (~is_far, low, True),
+        (clear, high, False), (covered, high, False), (~is_far, high, True),
+    ]:  # fmt: skip
+        rows = inside & wall & where
+        assert rows.sum() > 20
+        assert np.mean(is_seen[rows]) == float(expected), (expected, rows.sum())
+    assert not is_seen[occupied & is_left & ~is_far].any()
+    np.testing.assert_array_equal(after.count, before.count)
+
+
+def test_behind_glass_a_voxel_is_seen_unless_another_hides_it():
+    law_holes({"sighting": real})
 
 
 @pytest.mark.parametrize("allow_growth", [True, False])
@@ -149,10 +185,13 @@ def test_look_lets_edges_in_if_told():
     assert int(filtered.num_occupied) < int(after.num_occupied)
 
 
-CHAIN = ("r3jax.mapping.sighting",)
+CHAIN = ("r3jax.scoring.sighting",)
 MUTANTS = [
     Mutant("sighting", "z <= measured + state.voxel_size", "z <= measured", law_seen),
-    Mutant("sighting", "jnp.where(frame.depth > 0.0, farthest, 0.0)", "farthest", law_seen),
+    Mutant("sighting", "jnp.where(frame.depth > 0.0, farthest, 0.0)", "farthest", law_holes),
+    Mutant("sighting", "(is_hole & hidden_by_none)", "is_hole", law_holes),
+    Mutant("sighting", "(is_in & is_shown) | (is_hole", "(is_in & is_shown) & (is_hole", law_holes),
+    Mutant("sighting", "[pixel] == 0.0", "[pixel] >= 0.0", law_holes),
     Mutant("sighting", "before | words", "words", law_seen),
     Mutant("sighting", "(u < camera.width)", "(u < camera.height)", law_seen),
     Mutant("sighting", "<= max_range * max_range", "< jnp.inf", law_seen),
