@@ -57,6 +57,11 @@ class Choice:
         """Whether the best beats the default by more than views and seeds leave open."""
         return self.best != self.default and self.gains[self.best].low > 0.0
 
+    @property
+    def chosen(self) -> int:
+        """The trial to use from now on: without evidence for another one, the default stays."""
+        return self.best if self.is_better else self.default
+
 
 def choose(trials: Sequence[Trial], default: Point) -> Choice:
     """The arg max of the criterion; of equals, the first.

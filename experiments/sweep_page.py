@@ -75,7 +75,7 @@ def setting_figure(sweep: Sweep, setting: Setting, choice: Choice) -> Figure:
             means = np.concatenate([trial.scores[scene].mean(axis=1) for trial in own])
             by_scene.setdefault(scene, []).append(means.tolist())
     scores = {scene: _padded(rows) for scene, rows in by_scene.items()}
-    chosen = _short(sweep.trials[choice.best].point[setting.name])
+    chosen = _short(sweep.trials[choice.chosen].point[setting.name])
     return sweep_figure(setting.name, values, scores, "mean PSNR of the test views [dB]", chosen)
 
 
@@ -131,9 +131,10 @@ def verdict(sweep: Sweep, choice: Choice) -> str:
         words += [
             f"The default, {sweep.label(default)}, has {_interval(choice.means[choice.default])} "
             f"dB; the difference, view by view, is {gain} dB.",
-            "The interval lies above 0."
+            "The interval lies above 0: the best is chosen."
             if choice.is_better
-            else "The interval holds 0: these views and seeds do not tell them apart.",
+            else "The interval holds 0: these views and seeds do not tell them apart, and the "
+            "default stays.",
         ]
     ends = [s.short for s in sweep.settings if _is_at_an_end(sweep, s, best[s.name])]
     if ends:

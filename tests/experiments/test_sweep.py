@@ -13,7 +13,7 @@ from experiments.artefacts import Origin
 from experiments.settings import known_settings
 from experiments.sweep import Options
 from experiments.sweep_choice import Trial, choose
-from experiments.sweep_page import Sweep, write_page
+from experiments.sweep_page import Sweep, setting_figure, write_page
 from r3jax.benchmark.conditions import Conditions
 from r3jax.benchmark.engines.local import run_here
 from r3jax.benchmark.plan import Request
@@ -63,6 +63,7 @@ def law_best(modules: Modules) -> None:
     assert choice.gains[0] == paired_difference(scores[0], scores[1])
     assert abs(choice.gains[0].value - 0.5) < 1e-9
     assert choice.is_better  # the difference is the same in every view
+    assert choice.chosen == 0
     assert choice.gains[1].value == choice.gains[1].high == 0.0
     turn = modules["sweep_choice"].Trial
     turned = [turn(t.point, t.records[::-1] if t is trials[0] else t.records) for t in trials]
@@ -82,6 +83,7 @@ def law_doubt(modules: Modules) -> None:
     assert abs(choice.gains[1].value - 0.1) < 1e-9
     assert choice.gains[1].low < 0.0 < choice.gains[1].high
     assert not choice.is_better
+    assert choice.chosen == 0
     same = choose([trial(16.0, (0.0, 0.0)), trial(4.0, (0.0, 0.0))], DEFAULT)
     assert same.best == same.default == 0  # of equals, the first
     assert not same.is_better
@@ -144,7 +146,7 @@ def test_the_page_holds_every_value_the_choice_and_where_it_comes_from(tmp_path)
     for value in values:
         assert f"| {value:g} |" in page
     assert "Best is **lambda1 = 256**" in page
-    assert "The interval lies above 0" in page
+    assert "The interval lies above 0: the best is chosen." in page
     assert "lambda1 lies at an end of what was tried" in page
     assert "With 2 of 3 seeds" in page
     assert "report other scenes (flat, house)" in page
@@ -165,6 +167,21 @@ def test_the_page_warns_of_scenes_that_tables_report(tmp_path):
     assert "That is the default." in page
     assert "of 3 seeds" not in page
     assert "no say in it" in page
+
+
+def test_the_page_keeps_the_default_where_nothing_is_told_apart(tmp_path):
+    noise = np.random.default_rng(0).normal(0.0, 3.0, 12)
+    views = 20.0 + noise - noise.mean()
+    base = [record("ours", "loft", 0, 30, budget=30, psnr=np.full(12, 19.9))]
+    other = [record("ours", "loft", 0, 30, budget=30, psnr=views)]
+    trials = [Trial({LAMBDA1.name: 16.0}, base), Trial({LAMBDA1.name: 8.0}, other)]
+    page = page_of(tmp_path, trials)
+    assert "Best is **lambda1 = 8**" in page
+    assert "the difference, view by view, is +0.10 [" in page
+    assert "do not tell them apart, and the default stays." in page
+    sweep_of = Sweep("ours", (LAMBDA1,), tuple(trials))
+    (axes,) = setting_figure(sweep_of, LAMBDA1, choose(trials, DEFAULT)).axes
+    assert axes.get_title(loc="right") == "chosen: policy.lambda1 = 16"
 
 
 def test_several_settings_have_a_figure_each_and_words_are_values_too(tmp_path):
