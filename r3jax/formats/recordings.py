@@ -8,7 +8,9 @@
 Images, depth images and poses belong together in the order of the sorted file names.
 """
 
+import io
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,11 +18,19 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.files import read_bytes
+from r3jax.foreign.images import image_pixels, image_size
 from r3jax.formats.errors import FormatError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, rigid_error
 
 Up = Literal["y", "z"]
+
+_FORMATS = ("PNG", "JPEG")
+
+_MAX_TEXT = 64 << 20
+"""A pose takes some hundred bytes."""
 
 _Z_UP_FROM_Y_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -114,14 +124,11 @@ def _list_images(folder: Path) -> tuple[Path, ...]:
 
 def _read_numbers(path: Path, columns: int) -> np.ndarray:
     """A table of numbers, [n, columns] float64; comments start with #."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise FormatError(path, "the file is missing") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(path, f"the file cannot be read ({error})") from None
+    with _named(path):
+        data = read_bytes(path, _MAX_TEXT)
     rows = []
-    for number, line in enumerate(lines, start=1):
+    for number, raw in enumerate(io.BytesIO(data), start=1):
+        line = raw.decode("utf-8", errors="replace")
         words = line.partition("#")[0].split()
         if not words:
             continue
@@ -130,7 +137,7 @@ def _read_numbers(path: Path, columns: int) -> np.ndarray:
         try:
             rows.append([float(word) for word in words])
         except ValueError as error:
-            raise FormatError(path, f"line {number}: {error}") from None
+            raise FormatError(path, f"line {number}: {error!s:.200}") from None
     if not rows:
         raise FormatError(path, "the file holds no numbers")
     return np.asarray(rows)
@@ -155,7 +162,8 @@ def _read_camera(path: Path, first_image: Path) -> Camera:
     K = _read_numbers(path, columns=3)
     if K.shape != (3, 3) or not np.all(np.isfinite(K)):
         raise FormatError(path, "expected a finite 3x3 matrix")
-    width, height = _image_size(first_image)
+    with _named(first_image):
+        width, height = image_size(first_image, _FORMATS)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if not (fx > 0.0 and fy > 0.0):
         raise FormatError(path, f"focal lengths must be positive, got {fx:g} and {fy:g}")
@@ -168,29 +176,23 @@ def _read_camera(path: Path, first_image: Path) -> Camera:
     return Camera(width, height, float(fx), float(fy), float(cx) + 0.5, float(cy) + 0.5)
 
 
-def _image_size(path: Path) -> tuple[int, int]:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, SyntaxError) as error:
-        raise FormatError(path, f"the image cannot be read ({error})") from None
-
-
 def _read_image(path: Path, camera: Camera, *, is_depth: bool) -> np.ndarray:
     """[H, W, 3] uint8 or [H, W] uint16."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            if image.size != (camera.width, camera.height):
-                raise FormatError(
-                    path, f"the size is {image.size}, others are {(camera.width, camera.height)}"
-                )
-            if is_depth and image.mode not in ("I;16", "I;16B", "I"):
-                raise FormatError(path, f"depth must be 16-bit, the image's mode is {image.mode}")
-            pixels = np.asarray(image if is_depth else image.convert("RGB"))
-    except (OSError, SyntaxError) as error:
-        raise FormatError(path, f"the image cannot be read ({error})") from None
+    size = (camera.width, camera.height)
+    modes = ("I;16", "I;16B", "I") if is_depth else ()
+    with _named(path):
+        pixels = image_pixels(path, _FORMATS, size, modes, "depth must be 16-bit")
     return pixels.astype(np.uint16) if is_depth else pixels
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Adds the name of the file to what is wrong with it."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise FormatError(path, "the file is missing") from None
+    except OSError as error:
+        raise FormatError(path, f"the file cannot be read ({error.strerror})") from None
+    except ForeignFileError as error:
+        raise FormatError(path, str(error)) from None

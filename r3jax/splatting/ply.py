@@ -4,6 +4,7 @@ Shape symbols: n Gaussians, k harmonics per color channel (1, 4, 9 or 16).
 """
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -12,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.files import write_atomic
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.files import check_regular
 from r3jax.splatting.errors import SceneFileError
 from r3jax.splatting.scene import GaussianScene
 
@@ -31,6 +34,12 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 
 _MAX_HEADER_LINES = 10_000
 """A header longer than this is something else."""
+
+_BLOCK = 1 << 22
+"""Of a text that is read at once [bytes]."""
+
+_LONGEST_WORD = 400
+"""A number with more digits is something else."""
 
 _POSITION = ["x", "y", "z"]
 _NORMAL = ["nx", "ny", "nz"]
@@ -91,6 +100,7 @@ def read_scene(path: Path | str) -> GaussianScene:
     """
     path = Path(path)
     try:
+        check_regular(path)
         with open(path, "rb") as file:
             byte_order, elements = _read_header(path, file)
             vertex, before = _find_vertices(path, elements)
@@ -101,6 +111,8 @@ def read_scene(path: Path | str) -> GaussianScene:
         raise SceneFileError(path, "the file is missing") from None
     except OSError as error:
         raise SceneFileError(path, f"the file cannot be read ({error.strerror})") from None
+    except ForeignFileError as error:
+        raise SceneFileError(path, f"the file cannot be read ({error})") from None
     names = [name for name in _scene_fields(num_rest) if name not in _NORMAL]
     values = np.stack([table[name] for name in names], axis=1)
     _check_values(path, names, values)
@@ -214,18 +226,39 @@ def _read_text(
 ) -> dict[str, np.ndarray]:
     """The columns of the vertices as float32: numbers between white space."""
     del byte_order  # text has none
-    words = file.read().split()
     start = sum(element.count * len(element.fields) for element in before)
     width = len(vertex.fields)
-    words = words[start : start + vertex.count * width]
-    if len(words) < vertex.count * width:
-        raise _cut_off(path, vertex.count, len(words) // width)
+    numbers = [np.zeros(0)]
+    needed, skipped = vertex.count * width, 0
     try:
-        table = np.array(words).astype(np.float64).reshape(vertex.count, width)
+        for words in _words(file):
+            begin = min(len(words), start - skipped)
+            skipped += begin
+            taken = words[begin : begin + needed]
+            needed -= len(taken)
+            numbers.append(np.fromiter(map(float, taken), np.float64, len(taken)))
+            if needed == 0:
+                break
     except ValueError as error:
-        raise SceneFileError(path, f"the data is no table of numbers ({error})") from None
+        raise SceneFileError(path, f"the data is no table of numbers ({error!s:.200})") from None
+    if needed:
+        raise _cut_off(path, vertex.count, vertex.count - -(-needed // width))
+    table = np.concatenate(numbers).reshape(vertex.count, width)
     with np.errstate(over="ignore"):
         return {name: table[:, i].astype(np.float32) for i, (name, _) in enumerate(vertex.fields)}
+
+
+def _words(file: BinaryIO) -> Iterator[list[bytes]]:
+    """What stands between white space, block by block: as a whole it takes 20 times the file."""
+    rest = b""
+    while block := file.read(_BLOCK):
+        words = (rest + block).split()
+        # The last word may go on in the next block.
+        rest = words.pop() if words and not block[-1:].isspace() else b""
+        if len(rest) > _LONGEST_WORD:
+            raise ValueError(f"a word has more than {_LONGEST_WORD} characters")
+        yield words
+    yield [rest] if rest else []
 
 
 def _cut_off(path: Path, promised: int, found: int) -> SceneFileError:

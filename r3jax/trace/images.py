@@ -13,6 +13,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.images import image_pixels
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.errors import RunError
@@ -89,20 +91,13 @@ def read_png(path: Path, width: int, height: int, *, is_depth: bool) -> np.ndarr
     Raises:
         RunError: the file is missing, broken, of another size or of another kind.
     """
-    from PIL import Image
-
     kind, modes = ("16-bit depth", ("I;16", "I")) if is_depth else ("8-bit RGB", ("RGB",))
     try:
-        with Image.open(path, formats=["PNG"]) as image:
-            if image.size != (width, height):
-                raise RunError(
-                    path, f"the image is {image.size}, the camera's is {(width, height)}"
-                )
-            if image.mode not in modes:
-                raise RunError(path, f"expected a {kind} PNG, got mode {image.mode}")
-            pixels = np.asarray(image)
+        pixels = image_pixels(path, ["PNG"], (width, height), modes, f"expected {kind}")
     except FileNotFoundError:
         raise RunError(path, "the image is missing") from None
-    except (OSError, SyntaxError) as error:
-        raise RunError(path, f"the image cannot be read ({error})") from None
+    except OSError as error:
+        raise RunError(path, f"the image cannot be read ({error.strerror})") from None
+    except ForeignFileError as error:
+        raise RunError(path, str(error)) from None
     return pixels.astype(np.uint16) if is_depth else pixels

@@ -1,12 +1,15 @@
 """Reads a run folder: settings and rows at once, images when asked for."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import check_type
+from r3jax.foreign.files import read_bytes
+from r3jax.foreign.json_text import parse_json
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -16,6 +19,12 @@ from r3jax.trace.errors import RunError
 from r3jax.trace.header import RunHeader, read_header
 from r3jax.trace.images import content_hash, from_integers, read_png
 from r3jax.trace.rows import EndRow, StepRow, from_json
+
+_MAX_BYTES = 256 << 20
+"""A trace has some kilobytes a view."""
+
+_MAX_LINES = 1 << 20
+"""Views of a run, by far."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +111,7 @@ def read_run(path: Path | str) -> Run:
     for number, line in enumerate(complete_lines(path / "trace.jsonl"), start=1):
         try:
             row = from_json(line)
-        except (ValueError, RecursionError) as error:
+        except ForeignFileError as error:
             raise RunError(path / "trace.jsonl", f"line {number}: {error}") from None
         if isinstance(row, EndRow):
             end = row
@@ -117,14 +126,22 @@ def read_run(path: Path | str) -> Run:
 
 
 def complete_lines(path: Path) -> list[str]:
-    """Lines that end in a newline: a power cut may have torn the last one."""
+    """Lines that end in a newline: a power cut may have torn the last one.
+
+    Raises:
+        RunError: missing, not permitted, or larger than any trace.
+    """
     try:
-        text = path.read_bytes().decode("utf-8", errors="replace")
+        data = read_bytes(path, _MAX_BYTES)
     except FileNotFoundError:
         raise RunError(path, "the file is missing") from None
     except OSError as error:
         raise RunError(path, f"the file cannot be read ({error.strerror})") from None
-    return text.split("\n")[:-1]
+    except ForeignFileError as error:
+        raise RunError(path, str(error)) from None
+    if data.count(b"\n") > _MAX_LINES:
+        raise RunError(path, f"the file has more than {_MAX_LINES} lines: it is no trace")
+    return data.decode("utf-8", errors="replace").split("\n")[:-1]
 
 
 def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
@@ -134,8 +151,9 @@ def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
     timings = []
     for line in complete_lines(path):
         try:
-            plain = json.loads(line)
-            timings.append({str(k): float(v) for k, v in plain.items()})
-        except (ValueError, TypeError, AttributeError):
+            plain = parse_json(line)
+            check_type("timings", plain, dict[str, float])
+        except ForeignFileError:
             continue
+        timings.append({name: float(seconds) for name, seconds in plain.items()})
     return tuple(timings)

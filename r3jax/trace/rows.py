@@ -8,6 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import build
+from r3jax.foreign.json_text import parse_json
+from r3jax.geometry.cameras import rigid_error
 from r3jax.planning.policy import Decision, PlanInfo
 
 TOP_CANDIDATES = 10
@@ -151,38 +155,54 @@ def from_json(line: str) -> StepRow | EndRow:
     """Inverse of `to_json`.
 
     Raises:
-        ValueError: the line is not a row.
+        ForeignFileError: the line is not a row; a field is missing, unknown or of another type; a
+            number is not finite, a pose not rigid.
     """
-    plain = json.loads(line)
+    plain = parse_json(line)
     if not isinstance(plain, dict) or plain.get("kind") not in ("step", "end"):
-        raise ValueError("a row is an object with the kind `step` or `end`")
-    kind = plain.pop("kind")
+        raise ForeignFileError("a row is an object with the kind `step` or `end`")
+    if plain.pop("kind") == "end":
+        return build(EndRow, plain)
+    row = build(
+        StepRow,
+        plain,
+        pose=_pose("pose", plain.get("pose")),
+        choice=None if plain.get("choice") is None else _choice(plain["choice"]),
+        coverage=build(Coverage, plain.get("coverage")),
+    )
+    if row.step < 0:
+        raise ForeignFileError(f"`step` must not be negative, got {row.step}")
+    return row
+
+
+def _choice(plain: Any) -> Choice:
+    known = plain if isinstance(plain, dict) else {}
+    waypoints = _numbers("waypoints", known.get("waypoints"), (-1, 3))
+    return build(Choice, plain, pose=_pose("choice.pose", known.get("pose")), waypoints=waypoints)
+
+
+def _pose(name: str, values: Any) -> np.ndarray:
+    pose = _numbers(name, values, (4, 4))
+    problem = rigid_error(pose)
+    if problem is not None:
+        raise ForeignFileError(f"`{name}`: {problem}")
+    return pose
+
+
+def _numbers(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
+    """A table as float32; -1 stands for any number of rows."""
     try:
-        if kind == "end":
-            return EndRow(**plain)
-        choice = plain.pop("choice")
-        if choice is not None:
-            choice = Choice(
-                **choice
-                | {
-                    "pose": _matrix(choice["pose"], (4, 4)),
-                    "waypoints": _matrix(choice["waypoints"], (-1, 3)),
-                }
-            )
-        return StepRow(
-            **plain
-            | {
-                "choice": choice,
-                "pose": _matrix(plain["pose"], (4, 4)),
-                "coverage": Coverage(**plain["coverage"]),
-            }
-        )
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"the row lacks a field or has an unknown one ({error})") from None
-
-
-def _matrix(values: Any, shape: tuple[int, int]) -> np.ndarray:
-    return np.asarray(values, dtype=np.float32).reshape(shape)
+        with np.errstate(over="ignore"):  # too large for float32: found with the infinities
+            table = np.asarray(values, dtype=np.float32)
+    except (ValueError, TypeError):
+        raise ForeignFileError(f"`{name}` must be a table of numbers") from None
+    if table.size == 0 and shape[0] < 0:
+        table = table.reshape(0, shape[1])
+    if table.ndim != 2 or table.shape[1] != shape[1] or shape[0] not in (-1, len(table)):
+        raise ForeignFileError(f"`{name}` has the shape {table.shape}, expected {shape}")
+    if not np.isfinite(table).all():
+        raise ForeignFileError(f"`{name}` has numbers that are not finite")
+    return table
 
 
 def shortest_floats(array: np.ndarray) -> list:

@@ -1,0 +1,184 @@
+"""The process that reads hostile files: `python -m tests.fuzz.worker FOLDER`.
+
+For every line that it is sent, {"reader": module, "case": number}, it answers two lines of JSON:
+what the case is, once it lies on the disk, and what became of it. Number -1 is the first seed
+itself, -2 the second. What kills this process kills nothing else.
+"""
+
+import importlib
+import json
+import os
+import resource
+import sys
+import traceback
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.fuzz.mutate import mutate
+from tests.fuzz.tree import Files, lay_out
+
+MEMORY = 1 << 30
+"""What one case may add at most [bytes]."""
+
+_LONGEST_MESSAGE = 2000
+"""A message that quotes half the file helps nobody [characters]."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader under test."""
+
+    seeds: Callable[[], list[Files]]
+    """Small valid trees of files."""
+
+    read: Callable[[Path], None]
+    """Reads a tree from a folder; fails an assertion if the values make no sense."""
+
+    errors: tuple[type[BaseException], ...]
+    """The reader's own errors, exactly these types."""
+
+    names_file: bool = True
+    """Whether the message must name a file below the folder."""
+
+    make: Callable[[np.random.Generator, Files], tuple[Files, str]] = mutate
+    """Makes a case from a seed."""
+
+
+class Guard:
+    """Watches what a reader does to the rest of the machine."""
+
+    def __init__(self, scratch: Path):
+        self._scratch = os.fspath(scratch)
+        self.active = False
+        self.problems: list[str] = []
+        sys.addaudithook(self._hook)
+
+    def _hook(self, event: str, args: tuple[Any, ...]) -> None:
+        if not self.active:
+            return
+        if event == "open":
+            path, _, flags = args
+            writes = flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+            if isinstance(path, str | bytes) and writes:
+                self._check(event, path)
+        elif event in ("os.mkdir", "os.remove", "os.rmdir", "os.truncate", "shutil.rmtree"):
+            self._check(event, args[0])
+        elif event in ("os.rename", "os.link", "os.symlink"):
+            self._check(event, args[1])
+        elif event in ("pickle.find_class", "os.system", "subprocess.Popen", "socket.connect"):
+            self.problems.append(f"{event} {args!r:.200}")
+
+    def _check(self, event: str, path: Any) -> None:
+        if not isinstance(path, str | bytes | os.PathLike):
+            return
+        full = os.path.realpath(os.fsdecode(path))
+        # JAX and Numba keep what they compiled; the null device takes what tools print.
+        allowed = (self._scratch, "/dev/null", "/proc/", *_caches())
+        if not full.startswith(allowed):
+            self.problems.append(f"{event} outside the folder: {full}")
+
+
+def _caches() -> tuple[str, ...]:
+    names = ("JAX_COMPILATION_CACHE_DIR", "NUMBA_CACHE_DIR", "MPLCONFIGDIR")
+    found = [os.environ[name] for name in names if os.environ.get(name)]
+    return (*found, str(Path(__file__).resolve().parents[2] / "r3jax"))
+
+
+def make_case(module: str, reader: Reader, seeds: list[Files], number: int) -> tuple[Files, str]:
+    """Case `number` of a reader: always the same."""
+    rng = np.random.default_rng([zlib.crc32(module.encode()), number])
+    return reader.make(rng, seeds[number % len(seeds)])
+
+
+def run_case(reader: Reader, folder: Path, guard: Guard) -> tuple[str, str]:
+    """`read`, `refused` or `failed`, and why."""
+    before, peak = _resident(), _peak()
+    guard.problems.clear()
+    guard.active = True
+    try:
+        reader.read(folder)
+        verdict, why = "read", ""
+    except BaseException as error:  # SystemExit and whatever else a library may raise
+        verdict, why = _judge(reader, folder, error)
+    guard.active = False
+    if guard.problems:
+        return "failed", "; ".join(guard.problems[:3])
+    if _peak() > peak and _peak() - before > MEMORY:
+        return "failed", f"memory rose by {(_peak() - before) >> 20} MiB ({verdict} {why[:200]})"
+    return verdict, why
+
+
+def _judge(reader: Reader, folder: Path, error: BaseException) -> tuple[str, str]:
+    if _ran_out_of_memory(error):
+        return "failed", f"memory: {''.join(traceback.format_exception(error))[-1500:]}"
+    if type(error) not in reader.errors:
+        return "failed", "".join(traceback.format_exception(error))[-1500:]
+    text = str(error)
+    if reader.names_file and os.fspath(folder) not in text:
+        return "failed", f"the message names no file: {text[:500]}"
+    if len(text) > _LONGEST_MESSAGE:
+        return "failed", f"the message has {len(text)} characters: {text[:300]}"
+    return "refused", text
+
+
+def _ran_out_of_memory(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, MemoryError):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def _peak() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def _limit_memory() -> None:
+    """What a reader asks for beyond all measure fails at once and leaves the machine alone."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + 3 * MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def main() -> None:
+    """Answers until there are no more questions."""
+    scratch = Path(sys.argv[1]).resolve()
+    (scratch / "outside").mkdir(parents=True, exist_ok=True)
+    (scratch / "outside" / "secret").write_bytes(b"this is none of your business " * 40)
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # whatever libraries print is no answer
+    guard = Guard(scratch)
+    known: dict[str, tuple[Reader, list[Files]]] = {}
+    folder = scratch / "case"
+    folder.mkdir(exist_ok=True)
+    os.chdir(scratch)
+    for line in sys.stdin:
+        asked = json.loads(line)
+        module, number = asked["reader"], asked["case"]
+        if module not in known:
+            reader: Reader = importlib.import_module(module).READER
+            known[module] = reader, reader.seeds()
+        reader, seeds = known[module]
+        if number < 0:
+            files, what = seeds[-1 - number], "the seed itself"
+        else:
+            files, what = make_case(module, reader, seeds, number)
+        lay_out(folder, files)
+        if number >= 0 and resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
+            _limit_memory()
+        print(json.dumps({"what": what, "seeds": len(seeds)}), file=answers, flush=True)
+        verdict, why = run_case(reader, folder, guard)
+        print(json.dumps({"verdict": verdict, "why": why}), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()
