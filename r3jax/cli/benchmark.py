@@ -18,11 +18,10 @@ from r3jax.benchmark.engines.local import run_here, run_in_processes, visible_gp
 from r3jax.benchmark.engines.slurm import run_on_cluster
 from r3jax.benchmark.plan import Request, cells_left, make_plan
 from r3jax.benchmark.record import collect, read_records
+from r3jax.cli.console import PLAIN
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Benchmark
 from r3jax.cli.results import print_results
-
-_PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
 
 
 def run_benchmark(options: Benchmark) -> int:
@@ -56,7 +55,7 @@ def run_benchmark(options: Benchmark) -> int:
     records = read_records(options.out, cells)
     if records:
         print_results(Console(), records)
-    console.print(f"records  {collected}", **_PLAIN)
+    console.print(f"records  {collected}", **PLAIN)
     return _conclude(console, progress.failures, interrupted)
 
 
@@ -128,24 +127,24 @@ def _run(
 def _announce(
     console: Console, options: Benchmark, cells: Sequence[Cell], left: Sequence[Cell]
 ) -> None:
-    console.print(f"{len(cells)} cells, {len(cells) - len(left)} of them done", **_PLAIN)
+    console.print(f"{len(cells)} cells, {len(cells) - len(left)} of them done", **PLAIN)
     crowded = options.engine == "local" and options.jobs > max(1, len(visible_gpus()))
     if left and crowded and options.clock == "wall":
         console.print(
             f"warning: {options.jobs} cells at a time slow each other down, and the wall clock "
             "charges the policies for it; --jobs 1 or --clock model measure the same for all",
             style="yellow",
-            **_PLAIN,
+            **PLAIN,
         )
 
 
 def _conclude(console: Console, failures: Sequence[Event], interrupted: bool) -> int:
     for event in failures:
-        console.print(f"failed   {event.cell.name}: {event.text}", style="red", **_PLAIN)
+        console.print(f"failed   {event.cell.name}: {event.text}", style="red", **PLAIN)
     if failures:
-        console.print("the error's traceback is in error.txt of the cell's folder", **_PLAIN)
+        console.print("the error's traceback is in error.txt of the cell's folder", **PLAIN)
     if interrupted:
-        console.print("interrupted: the same command goes on from here", **_PLAIN)
+        console.print("interrupted: the same command goes on from here", **PLAIN)
         return 130
     return 1 if failures else 0
 
@@ -202,7 +201,7 @@ class BenchmarkProgress:
         collect(self._root)
         if not self._console.is_terminal:
             what = "done" if event.kind == "done" else f"failed: {event.text}"
-            self._console.print(f"{event.cell.name}: {what}; {self._facts()}", **_PLAIN)
+            self._console.print(f"{event.cell.name}: {what}; {self._facts()}", **PLAIN)
 
     def _facts(self) -> str:
         text = f"{self._done}/{self._total} done"

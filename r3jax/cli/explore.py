@@ -1,166 +1,219 @@
-"""`r3jax explore`: set up a run, let it go, write what comes out of it."""
+"""`r3jax explore`: begin a run, go on with one, or fork one; write what comes out of it."""
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 
+from r3jax.cli.console import PLAIN
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Explore
 from r3jax.cli.progress import RunProgress
+from r3jax.cli.setup import (
+    Plan,
+    default_name,
+    header_of,
+    plan_of_options,
+    plan_of_run,
+    policy_fields,
+    policy_of_options,
+    simulator_of_options,
+    simulator_of_run,
+)
 from r3jax.evaluation.report import write_report
-from r3jax.exploration.budget import Budget, parse_budget
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.loop import Result, explore
 from r3jax.exploration.state import StopReason
 from r3jax.formats.pointcloud import voxel_points, write_points
 from r3jax.formats.transforms import write_transforms
-from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.planning.config import PlannerConfig
-from r3jax.planning.policy import Policy, make_policy
-from r3jax.scenes.registry import open_scene, scene_hash
-from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RunError
-from r3jax.trace.header import RunHeader, camera_fields, package_versions, plain_settings
+from r3jax.trace.header import package_versions
 from r3jax.trace.reader import Run, read_run
 from r3jax.trace.writer import RunWriter
 
-_PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
-"""Text as it is: paths must stay whole for copying."""
-
 _EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
+
+_WITH_RESUME = ("resume", "budget")
+_WITH_FORK = (
+    "fork", "at", "policy", "budget", "name", "out", "overwrite", "candidates", "lambda1",
+    "lambda2",
+)  # fmt: skip
+"""Options that make sense beside these; all others are fixed by the recorded run."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Expedition:
+    """Everything that `explore` is called with."""
+
+    plan: Plan
+    simulator: Simulator
+    recorder: RunWriter
+    seed: int
+    recorded: Run | None = None
+    decided_from: int = 0
 
 
 def run_explore(options: Explore) -> int:
     """Explores a scene and writes the data set and the report.
 
     Raises:
-        UserError: an unknown scene or policy, a setting that cannot work, a run that exists.
+        UserError: an unknown scene or policy, a setting that cannot work, a run that exists, or
+            one that cannot be gone on with.
     """
     console = Console(stderr=True)
     try:
-        # What can be checked quickly comes before the scene is built.
-        budget, config, policy = _plan(options)
-        path = options.out / (options.name or _default_name(options))
-        with console.status(f"opening {options.scene} ..."):
-            simulator = _open(options)
-        header = _header(options, budget, config, policy, simulator)
-        recorder = RunWriter(path, header, overwrite=options.overwrite)
+        expedition = _set_out(options, console)
     except (ValueError, OSError) as error:
         raise UserError(one_line(error)) from error
-    with recorder, RunProgress(console, budget) as progress:
-        result = explore(
-            simulator,
-            policy,
-            budget=budget,
-            seed=options.seed,
-            config=config,
-            recorder=recorder,
-            on_step=progress.on_step,
-            on_stage=progress.on_stage,
-        )
-    _conclude(console, path, result)
+    plan = expedition.plan
+    with expedition.recorder as recorder, RunProgress(console, plan.budget) as progress:
+        try:
+            result = explore(
+                expedition.simulator,
+                plan.policy,
+                budget=plan.budget,
+                seed=expedition.seed,
+                config=plan.config,
+                recorder=recorder,
+                resume=expedition.recorded,
+                decided_from=expedition.decided_from,
+                on_step=progress.on_step,
+                on_stage=progress.on_stage,
+            )
+        except RunError as error:
+            raise UserError(one_line(error)) from error
+    _conclude(console, recorder.path, result)
     return _EXIT_CODES.get(result.reason, 0)
 
 
-def _plan(options: Explore) -> tuple[Budget, ExplorationConfig, Policy]:
-    """Everything but the scene."""
-    if not 16 <= options.resolution <= 4096:
-        raise ValueError(f"--resolution must lie between 16 and 4096, got {options.resolution}")
-    config = ExplorationConfig(
-        voxel_size=options.voxel_size,
-        cell_size=options.cell_size,
-        max_range=options.max_range,
-        capacity=options.capacity,
-        allow_growth=not options.fixed_capacity,
-        clock=options.clock,
-    )
-    scoring = ScoringConfig(max_range=jnp.asarray(options.max_range, jnp.float32))
-    if options.lambda1 is not None:
-        lambda1 = jnp.asarray(options.lambda1, jnp.float32)
-        scoring = eqx.tree_at(lambda config: config.lambda1, scoring, lambda1)
-    settings: dict[str, Any] = {
-        "scoring": scoring,
-        "num_candidates": options.candidates,
-        "lambda2": options.lambda2,
-    }
-    if options.candidates is not None:
-        # Keeps the share that is aimed at the frontier, whatever the number.
-        default = PlannerConfig()
-        share = default.num_frontier / default.num_candidates
-        settings["num_frontier"] = round(share * options.candidates)
-    given = {name: value for name, value in settings.items() if value is not None}
-    return parse_budget(options.budget), config, make_policy(options.policy, **given)
+def _set_out(options: Explore, console: Console) -> Expedition:
+    """What can be checked quickly comes before the scene is built."""
+    if options.resume is not None and options.fork is not None:
+        raise ValueError("--resume goes on with a run, --fork begins another one: give one of them")
+    if (options.at is None) != (options.fork is None):
+        raise ValueError("--fork RUN and --at VIEW belong together")
+    if options.resume is not None:
+        return _resume(options, options.resume, console)
+    if options.fork is not None:
+        return _fork(options, options.fork, console)
+    if options.scene is None:
+        raise ValueError("give a --scene, or --resume RUN; `r3jax info` lists the scenes")
+    plan = plan_of_options(options)
+    name = options.name or default_name(options, options.scene, plan.policy.name)
+    with console.status(f"opening {options.scene} ..."):
+        simulator = simulator_of_options(options)
+    header = header_of(options, plan, simulator)
+    recorder = RunWriter(options.out / name, header, overwrite=options.overwrite)
+    return Expedition(plan, simulator, recorder, options.seed)
 
 
-def _open(options: Explore) -> Simulator:
-    start = None
-    if options.start is not None:
-        start = pose_along(jnp.asarray(options.start), jnp.asarray([1.0, 0.0, 0.0]))
-    return open_scene(
-        options.scene,
-        up=options.up,
-        camera=Camera.from_fov(options.resolution, options.resolution, options.fov),
-        noise=options.noise,
-        seed=options.seed,
-        max_range=options.max_range,
-        start_pose=None if start is None else np.asarray(start, dtype=np.float64),
-    )
+def _resume(options: Explore, path: Path, console: Console) -> Expedition:
+    _refuse_others(options, "--resume", _WITH_RESUME)
+    run = read_run(path)
+    if run.header.parent is not None and "merged" in run.header.parent:
+        raise ValueError(f"{path} was merged from other runs: fork it with --fork and --at")
+    plan = plan_of_run(run)
+    header = None
+    if options.budget is not None:
+        budget = parse_budget(options.budget)
+        plan = dataclasses.replace(plan, budget=budget)
+        header = dataclasses.replace(run.header, budget=str(budget))
+    _warn_of_versions(console, run)
+    with console.status(f"opening {run.header.scene['name']} ..."):
+        simulator = simulator_of_run(run)
+    recorder, run = RunWriter.resume(path, header)
+    console.print(f"goes on behind view {len(run.rows)} of {path}", **PLAIN)
+    return Expedition(plan, simulator, recorder, run.header.seed, run, _decided_from(run))
 
 
-def _default_name(options: Explore) -> str:
-    scene = options.scene.removeprefix("mesh:")
-    stem = Path(scene).stem if scene != options.scene else scene
-    return f"{stem}-{options.policy}-seed{options.seed}"
-
-
-def _header(
-    options: Explore,
-    budget: Budget,
-    config: ExplorationConfig,
-    policy: Policy,
-    simulator: Simulator,
-) -> RunHeader:
-    how = {name: getattr(options, name) for name in ("up", "noise", "max_range", "start")}
-    return RunHeader(
-        scene={"name": options.scene, "hash": scene_hash(simulator), **how},
-        policy={"name": policy.name, "settings": plain_settings(getattr(policy, "config", {}))},
-        budget=str(budget),
-        seed=options.seed,
-        config=dataclasses.asdict(config),
-        camera=camera_fields(simulator.camera),
-        bounds=np.asarray(simulator.bounds).tolist(),
+def _fork(options: Explore, path: Path, console: Console) -> Expedition:
+    _refuse_others(options, "--fork", _WITH_FORK)
+    run, at = read_run(path), options.at
+    assert at is not None
+    if not 1 <= at <= len(run.rows):
+        raise ValueError(f"--at must lie between 1 and the run's {len(run.rows)} views, got {at}")
+    plan = plan_of_run(run)
+    given = (options.policy, options.candidates, options.lambda1, options.lambda2)
+    if any(value is not None for value in given):
+        policy = policy_of_options(options, run.header.scene["max_range"])
+        plan = dataclasses.replace(plan, policy=policy)
+    if options.budget is not None:
+        plan = dataclasses.replace(plan, budget=parse_budget(options.budget))
+    with console.status(f"opening {run.header.scene['name']} ..."):
+        simulator = simulator_of_run(run)
+    fields = policy_fields(plan.policy)
+    is_same = fields == run.header.policy
+    decided_from = _decided_from(run) if is_same else at
+    header = dataclasses.replace(
+        run.header,
+        policy=fields,
+        budget=str(plan.budget),
         packages=package_versions(),
+        parent={"forked": str(path), "views": at, "decided_from": decided_from},
     )
+    name = options.name or f"{path.name}-{plan.policy.name}-from{at}"
+    recorder = RunWriter(options.out / name, header, overwrite=options.overwrite)
+    try:
+        for row in run.rows[:at]:
+            run.frame(row.step)  # says what is wrong with it
+            recorder.adopt(row, run, row.step)
+        recorded = read_run(recorder.path)
+        return Expedition(plan, simulator, recorder, run.header.seed, recorded, decided_from)
+    except BaseException:
+        recorder.close()
+        raise
+
+
+def _decided_from(run: Run) -> int:
+    """The first view that the run's own policy chose: a fork took the earlier ones over."""
+    return int((run.header.parent or {}).get("decided_from", 0))
+
+
+def _refuse_others(options: Explore, flag: str, allowed: tuple[str, ...]) -> None:
+    """A setting that would be ignored is a mistake."""
+    fields = [field for field in dataclasses.fields(options) if field.name not in allowed]
+    given = [field.name for field in fields if getattr(options, field.name) != field.default]
+    if given:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise ValueError(f"{flag} takes these from the recorded run, leave them out: {names}")
+
+
+def _warn_of_versions(console: Console, run: Run) -> None:
+    now, then = package_versions(), run.header.packages
+    changed = [f"{k} {then.get(k)} -> {v}" for k, v in now.items() if then.get(k) != v]
+    if changed:
+        console.print(
+            f"the run was begun with other versions ({', '.join(changed)}): what follows may "
+            "differ in the last digits from what would have followed then",
+            **PLAIN,
+        )
 
 
 def _conclude(console: Console, path: Path, result: Result) -> None:
     """Data set, report, and a few words; a full disk must not hide how the run ended."""
-    console.print(f"{result.reason.value}: {result.message}", **_PLAIN)
+    console.print(f"{result.reason.value}: {result.message}", **PLAIN)
     if result.state.views == 0:
         return
+    if result.reason in _EXIT_CODES:
+        console.print(f"go on     r3jax explore --resume {path}", **PLAIN)
     try:
         with console.status("writing the data set and the report ..."):
             run = read_run(path)
             write_data_set(run, result)
             page = write_report(run, result.state.map_state, result.state.grid)
     except (RunError, OSError) as error:
-        console.print(f"the report could not be written: {one_line(error)}", **_PLAIN)
+        console.print(f"the report could not be written: {one_line(error)}", **PLAIN)
         return
     last = result.rows[-1]
     console.print(
         f"{len(result.rows)} views, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
         f"{100 * last.coverage.known_share:.0f} % of the box explored, mean renderability "
         f"{last.coverage.mean_renderability:.2f}",
-        **_PLAIN,
+        **PLAIN,
     )
-    console.print(f"data set  {path / 'transforms.json'}", **_PLAIN)
-    console.print(f"report    {page}", **_PLAIN)
+    console.print(f"data set  {path / 'transforms.json'}", **PLAIN)
+    console.print(f"report    {page}", **PLAIN)
 
 
 def write_data_set(run: Run, result: Result) -> None:

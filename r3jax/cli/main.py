@@ -8,7 +8,17 @@ from pathlib import Path
 import tyro
 
 from r3jax.cli.errors import UserError
-from r3jax.cli.options import Benchmark, Demo, Evaluate, Explore, Info, Policies, Train
+from r3jax.cli.options import (
+    Benchmark,
+    Demo,
+    Evaluate,
+    Explore,
+    Info,
+    Merge,
+    Policies,
+    Replay,
+    Train,
+)
 
 _COMMANDS = {
     "demo": Demo,
@@ -16,6 +26,8 @@ _COMMANDS = {
     "train": Train,
     "evaluate": Evaluate,
     "benchmark": Benchmark,
+    "replay": Replay,
+    "merge": Merge,
     "policies": Policies,
     "info": Info,
 }
@@ -31,8 +43,8 @@ def main(args: Sequence[str] | None = None) -> int:
         args: the words after `r3jax`; None: those of this process.
 
     Returns:
-        The exit code: 0 done, 1 stopped by the disk or a cell failed, 2 wrong input, 130
-        interrupted.
+        The exit code: 0 done, 1 stopped by the disk, a cell failed or a replay differed, 2 wrong
+        input, 130 interrupted.
     """
     command = tyro.extras.subcommand_cli_from_dict(
         _COMMANDS,
@@ -50,7 +62,9 @@ def main(args: Sequence[str] | None = None) -> int:
         return USER_ERROR
 
 
-def _run(command: Demo | Explore | Train | Evaluate | Benchmark | Policies | Info) -> int:
+def _run(
+    command: Demo | Explore | Train | Evaluate | Benchmark | Replay | Merge | Policies | Info,
+) -> int:
     """Imports what the command needs and nothing else, so that --help does not wait for JAX."""
     if isinstance(command, Demo):
         from r3jax.cli.demo import run_demo
@@ -72,6 +86,14 @@ def _run(command: Demo | Explore | Train | Evaluate | Benchmark | Policies | Inf
         from r3jax.cli.benchmark import run_benchmark
 
         return run_benchmark(command)
+    if isinstance(command, Replay):
+        from r3jax.cli.replay import run_replay
+
+        return run_replay(command)
+    if isinstance(command, Merge):
+        from r3jax.cli.merge import run_merge
+
+        return run_merge(command)
     if isinstance(command, Policies):
         from r3jax.cli.policies import run_policies
 

@@ -31,14 +31,23 @@ class Demo:
 class Explore:
     """Explore a scene: choose every view, record images, depth, poses, and write a report."""
 
-    scene: Annotated[str, tyro.conf.arg(metavar="SCENE")]
+    scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE")] = None
     """Embedded scene by name, or `mesh:<file>` (GLB, PLY, OBJ); `r3jax info` lists them."""
 
-    policy: Annotated[str, tyro.conf.arg(metavar="POLICY")] = "ours-pano"
-    """Who chooses the next view; `r3jax info` lists them."""
+    policy: Annotated[str | None, tyro.conf.arg(metavar="POLICY")] = None
+    """Who chooses the next view: `ours-pano` by default; `r3jax policies` lists them."""
 
-    budget: Annotated[str, tyro.conf.arg(metavar="BUDGET")] = "views:100"
-    """When to stop: `views:N`, `seconds:S` of the mission clock, or `metres:M`."""
+    budget: Annotated[str | None, tyro.conf.arg(metavar="BUDGET")] = None
+    """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `metres:M`."""
+
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """Go on with a run that was cut off; all settings are its own. Another --budget extends it."""
+
+    fork: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """Try another --policy from a view of a run on; the scene and the sensor are the run's."""
+
+    at: Annotated[int | None, tyro.conf.arg(metavar="VIEW")] = None
+    """Number of the view that the fork takes anew; those before it are kept."""
 
     name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Name of the run; by default made of scene, policy and seed."""
@@ -110,6 +119,31 @@ class Info:
 
     voxel_size: float = 0.05
     """Edge of a voxel when a recording is mapped [m]."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Rebuild the map of a run from its recorded frames, and compare it with the stored one."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Merge two runs of one scene: their frames in one data set, and the map that saw both."""
+
+    first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+    second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Another one: the same scene, sensor, voxels and cells."""
+
+    out: Path | None = None
+    """Folder of the merged run; by default both names joined by `+`, beside the first."""
+
+    overwrite: bool = False
+    """Replace the run that is there."""
 
 
 @dataclass(frozen=True)

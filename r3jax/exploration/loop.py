@@ -44,6 +44,7 @@ def explore(
     config: ExplorationConfig | None = None,
     recorder: RunWriter | None = None,
     resume: Run | None = None,
+    decided_from: int = 0,
     on_step: Callable[[StepRow], None] | None = None,
     on_stage: Callable[[str], None] | None = None,
 ) -> Result:
@@ -58,6 +59,8 @@ def explore(
         recorder: where the run is written; None keeps nothing.
         resume: what was recorded of this run before it was cut off; None for a new run. Under
             the model clock the result is the one of a run that was never cut off, bit for bit.
+        decided_from: the first of the recorded views that this policy chose. Of those before it
+            is shown the frames, but not asked what it would have decided.
         on_step: called with the row of every view.
         on_stage: called with the name of what happens next.
 
@@ -85,7 +88,8 @@ def explore(
     state = start_state(mission, init_key)
     rows: list[StepRow] = []
     if resume is not None:
-        state, rows = continued(resume, mission, state), list(resume.rows)
+        state = continued(resume, mission, state, decided_from=decided_from)
+        rows = list(resume.rows)
     try:
         stop: Stop | None = None
         while stop is None:

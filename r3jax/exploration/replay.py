@@ -1,5 +1,6 @@
 """Recorded frames rebuild the map and the grid of a run, and those of several runs together."""
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -54,9 +55,9 @@ def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, Oc
     """
     first, config = runs[0], config_of(runs[0])
     for run in runs[1:]:
-        _check_alike(first, run)
+        check_alike(first, run)
     bounds = np.asarray(first.header.bounds, dtype=np.float64)
-    grid = first_grid(bounds, [_start_of(run) for run in runs], config)
+    grid = first_grid(bounds, [pose for run in runs for pose in _starts_of(run)], config)
     map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
     for run in runs:
         for frame in _frames(run, views):
@@ -101,17 +102,20 @@ def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | N
     return Difference(name, int(different.sum()), float(gap.max()))
 
 
-def _start_of(run: Run) -> np.ndarray:
+def _starts_of(run: Run) -> list[np.ndarray]:
+    """Where a run began; a merged one began several times."""
     if not run.rows:
         raise RunError(run.path, "the run has no view")
-    return np.asarray(run.rows[0].pose, dtype=np.float64)
+    views = (run.header.parent or {}).get("merged_views", [len(run.rows)])
+    begins = itertools.accumulate(views[:-1], initial=0)
+    return [np.asarray(run.rows[step].pose, dtype=np.float64) for step in begins]
 
 
 def _frames(run: Run, views: int | None) -> Iterable[Frame]:
     return (run.frame(row.step) for row in run.rows[:views])
 
 
-def _check_alike(first: Run, other: Run) -> None:
+def check_alike(first: Run, other: Run) -> None:
     """Runs can be merged if they mapped the same scene on the same terms."""
     a, b = first.header, other.header
     terms = [

@@ -55,13 +55,14 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
     )
 
 
-def continued(run: Run, mission: Mission, start: LoopState) -> LoopState:
+def continued(run: Run, mission: Mission, start: LoopState, *, decided_from: int = 0) -> LoopState:
     """The state after the last recorded view.
 
     Args:
         run: what was recorded; its trace may have been cut off anywhere.
         mission: what the run was asked for.
         start: the state before the first view.
+        decided_from: the first view that the mission's policy chose.
 
     Raises:
         RunError: a frame that is needed is missing, broken, or not the one that was recorded.
@@ -69,7 +70,8 @@ def continued(run: Run, mission: Mission, start: LoopState) -> LoopState:
     state = _newest(run, start)
     for row in run.rows[state.views :]:
         mission.on_stage("map")
-        state = relive(state, mission, row, run.frame(row.step))
+        decide = row.step >= decided_from
+        state = relive(state, mission, row, run.frame(row.step), decide=decide)
     return state
 
 

@@ -11,14 +11,24 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import build, check_type
+from r3jax.foreign.files import read_bytes
+from r3jax.foreign.images import MAX_PIXELS
+from r3jax.foreign.json_text import parse_json
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.errors import RunError
 
 FORMAT = "r3jax-run"
 """What run.json says it is."""
 
-VERSION = 1
-"""Format version that this package writes and reads."""
+VERSION = 2
+"""Format version that this package writes. Version 1 knew no `parent`; it is read too."""
+
+_MAX_BYTES = 16 << 20
+"""Settings take some kilobytes."""
+
+_LENS = ("fx", "fy", "cx", "cy")
 
 _PACKAGES = ("r3jax", "jax", "jaxlib", "numpy", "equinox", "scikit-image", "orbax-checkpoint")
 
@@ -51,16 +61,20 @@ class RunHeader:
     packages: dict[str, str] = field(default_factory=dict)
     """Versions of the packages that shape the result, of Python, and the device."""
 
+    parent: dict[str, Any] | None = None
+    """Where the first views come from if not from this run: `forked` from a run, `views` of it,
+    the run's own policy from view `decided_from` on; or `merged` runs with `merged_views` each."""
+
     @property
     def intrinsics(self) -> Camera:
         """The camera of every frame."""
         size = {name: int(self.camera[name]) for name in ("width", "height")}
-        return Camera(**size, **{name: self.camera[name] for name in ("fx", "fy", "cx", "cy")})  # pyright: ignore[reportArgumentType]
+        return Camera(**size, **{name: self.camera[name] for name in _LENS})  # pyright: ignore[reportArgumentType]
 
 
 def camera_fields(camera: Camera) -> dict[str, int | float]:
     """A camera as plain numbers."""
-    traced = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    traced = {name: float(getattr(camera, name)) for name in _LENS}
     return {"width": camera.width, "height": camera.height, **traced}
 
 
@@ -101,24 +115,44 @@ def read_header(path: Path) -> RunHeader:
         RunError: missing, not JSON, of another format or version, or with fields missing.
     """
     try:
-        plain = json.loads(path.read_text(encoding="utf-8"))
+        plain = parse_json(read_bytes(path, _MAX_BYTES))
     except FileNotFoundError:
         raise RunError(path, "the file is missing: this folder is not a run") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ForeignFileError) as error:
         raise RunError(path, f"the file cannot be read ({error})") from None
     if not isinstance(plain, dict) or plain.pop("format", None) != FORMAT:
         raise RunError(path, f"the file does not describe a run (no format {FORMAT!r})")
     version = plain.pop("version", None)
-    if version != VERSION:
+    if version not in (1, VERSION):
         age = "newer" if isinstance(version, int) and version > VERSION else "other"
         raise RunError(
             path,
-            f"the run has format version {version}, this package reads version {VERSION}: "
+            f"the run has format version {version}, this package reads versions 1 and {VERSION}: "
             f"use the {age} r3jax that wrote it",
         )
     try:
-        header = RunHeader(**plain)
-        _ = header.intrinsics
-    except (KeyError, TypeError, ValueError) as error:
+        header = build(RunHeader, plain)
+        _check(header)
+    except ValueError as error:
         raise RunError(path, f"a setting is missing or malformed ({error})") from None
     return header
+
+
+def _check(header: RunHeader) -> None:
+    """Refuses what types alone do not tell.
+
+    Raises:
+        ValueError: says which setting makes no sense.
+    """
+    for name, kind in (("width", int), ("height", int), *dict.fromkeys(_LENS, float).items()):
+        check_type(f"camera.{name}", header.camera.get(name), kind)
+    check_type("scene.name", header.scene.get("name"), str)
+    check_type("policy.name", header.policy.get("name"), str)
+    camera = header.intrinsics
+    if camera.width * camera.height > MAX_PIXELS:
+        raise ForeignFileError(f"images of {camera.width} x {camera.height} pixels are not read")
+    if [len(corner) for corner in header.bounds] != [3, 3]:
+        raise ForeignFileError("`bounds` must be two corners of three numbers")
+    lower, upper = header.bounds
+    if any(low > high for low, high in zip(lower, upper, strict=True)):
+        raise ForeignFileError(f"`bounds` are upside down: {lower} to {upper}")

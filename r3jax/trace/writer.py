@@ -131,6 +131,30 @@ class RunWriter:
             append_line(self.path / "trace.jsonl", to_json(row))
             self.views += 1
 
+    def adopt(self, row: StepRow, run: Run, step: int) -> None:
+        """Stores a view of another run as the next one of this run; its pixels stay as they are.
+
+        Args:
+            row: what the trace says of it here.
+            run: where its images lie.
+            step: its number there.
+
+        Raises:
+            RunError: an image cannot be read.
+            RecordingStopped: the disk refused.
+        """
+        stem = self.path / "frames" / f"{row.step:06d}"
+        try:
+            images = [run.image_path(step).read_bytes(), run.depth_path(step).read_bytes()]
+        except OSError as error:
+            raise RunError(run.path, f"view {step} cannot be read ({error.strerror})") from None
+        with self._guarded():
+            for suffix, data in zip((".png", ".depth.png"), images, strict=True):
+                write_atomic(stem.with_suffix(suffix), data)
+            sync_folder(stem.parent)
+            append_line(self.path / "trace.jsonl", to_json(row))
+            self.views += 1
+
     def add_timings(self, step: int, stages: dict[str, float]) -> None:
         """Stores what the stages of one view really took [s], outside the mission clock too."""
         line = json.dumps({"step": step, **{k: round(v, 6) for k, v in stages.items()}})

@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 import trimesh
 
@@ -13,31 +12,13 @@ from r3jax.exploration.budget import parse_budget
 from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
+from tests.cli.rooms import explore, write_room
 from tests.trace.runs import make_header, make_view
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """A box room with a pillar, as `mesh:<file>`."""
-    walls = trimesh.creation.box(extents=(4.0, 3.0, 2.4))
-    walls.invert()
-    pillar = trimesh.creation.box(extents=(0.3, 0.3, 2.4))
-    pillar.apply_translation((1.2, 0.6, 0.0))
-    mesh = trimesh.util.concatenate([walls.subdivide().subdivide(), pillar.subdivide()])
-    rng = np.random.default_rng(0)
-    mesh.visual.vertex_colors = rng.integers(0, 256, (len(mesh.vertices), 3), dtype=np.uint8)
-    path = tmp_path_factory.mktemp("mesh") / "room.ply"
-    mesh.export(path)
-    return f"mesh:{path}"
-
-
-def explore(room, out, *words):
-    """A small run; the same shapes as all others here, so that each part compiles once."""
-    options = {"scene": room, "policy": "random", "budget": "views:3", "clock": "model"}
-    options |= {"resolution": 48, "fov": 90, "capacity": 16384, "voxel-size": 0.1}
-    options |= {"out": out, "name": "box", "candidates": 20}
-    given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-    return main(["explore", *given, *words])
+    return write_room(tmp_path_factory.mktemp("mesh"))
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +123,9 @@ def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monke
 
     monkeypatch.setattr(RaycastSimulator, "render", render)
     assert explore(room, tmp_path) == 130
-    assert "interrupted" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "interrupted" in errors
+    assert f"r3jax explore --resume {tmp_path / 'box'}" in errors
     run = read_run(tmp_path / "box")
     assert run.end is not None
     assert (run.end.outcome, len(run.rows)) == ("interrupted", 2)

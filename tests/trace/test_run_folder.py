@@ -101,7 +101,7 @@ def test_an_image_that_was_swapped_is_found(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, "newer r3jax"),
+        ({"version": 3}, "newer r3jax"),
         ({"version": 0}, "format version 0"),
         ({"format": "other"}, "does not describe a run"),
         ({"camera": {"width": 8}}, "missing or malformed"),

@@ -1,0 +1,101 @@
+"""`r3jax merge`: two runs of one scene as one data set, with the map that saw both."""
+
+import dataclasses
+from pathlib import Path
+
+from rich.console import Console
+
+from r3jax.cli.console import PLAIN
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import Merge
+from r3jax.exploration.replay import check_alike, rebuild
+from r3jax.formats.pointcloud import voxel_points, write_points
+from r3jax.formats.transforms import write_transforms
+from r3jax.mapping.state import MapState
+from r3jax.trace.checkpoints import map_tables
+from r3jax.trace.errors import RunError
+from r3jax.trace.header import RunHeader, package_versions
+from r3jax.trace.reader import Run, read_run
+from r3jax.trace.rows import StepRow
+from r3jax.trace.writer import RunWriter
+
+
+def run_merge(options: Merge) -> int:
+    """Writes the merged run: the views of both, the map, transforms.json and points.
+
+    Raises:
+        UserError: not runs, of different scenes or settings, or the folder cannot be written.
+    """
+    console = Console(stderr=True)
+    out = options.out or options.first.parent / f"{options.first.name}+{options.second.name}"
+    try:
+        runs = [read_run(path) for path in (options.first, options.second)]
+        with console.status("integrating the frames of both ..."):
+            map_state = merge_runs(runs, out, overwrite=options.overwrite)
+    except (RunError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    views = " + ".join(str(len(run.rows)) for run in runs)
+    console.print(f"{views} views, {int(map_state.num_occupied)} voxels", **PLAIN)
+    console.print(f"merged    {out}", **PLAIN)
+    return 0
+
+
+def merge_runs(runs: list[Run], out: Path, *, overwrite: bool = False) -> MapState:
+    """Writes a run that holds the views of several, one run after the other.
+
+    The rows of a later run are numbered on, and its totals (clock, path, angle) added to those
+    before; what a row says of the map is of that run's own map. The stored map and grid have
+    seen all.
+
+    Args:
+        runs: of one scene, mapped on the same terms, with the same camera.
+        out: folder of the merged run.
+        overwrite: replace the run that is there.
+
+    Returns:
+        The map.
+
+    Raises:
+        RunError: the runs do not fit together, cannot be read, or `out` cannot be written.
+    """
+    for run in runs[1:]:
+        check_alike(runs[0], run)
+    map_state, grid = rebuild(runs)
+    with RunWriter(out, _header(runs), overwrite=overwrite) as writer:
+        last: StepRow | None = None
+        for run in runs:
+            before = last
+            for row in run.rows:
+                last = _behind(row, before)
+                writer.adopt(last, run, row.step)
+        writer.checkpoint(writer.views - 1, map_tables(map_state, grid))
+        writer.finish("merged", f"the views of {' and '.join(str(run.path) for run in runs)}")
+    merged = read_run(out)
+    points = out / "exports" / "points.ply"
+    points.parent.mkdir(exist_ok=True)
+    write_points(points, *voxel_points(map_state))
+    write_transforms(merged, points.relative_to(out).as_posix())
+    return map_state
+
+
+def _header(runs: list[Run]) -> RunHeader:
+    views = [len(run.rows) for run in runs]
+    return dataclasses.replace(
+        runs[0].header,
+        budget=f"views:{sum(views)}",
+        packages=package_versions(),
+        parent={"merged": [str(run.path) for run in runs], "merged_views": views},
+    )
+
+
+def _behind(row: StepRow, before: StepRow | None) -> StepRow:
+    """A row of a later run, numbered on behind the last row of the runs before."""
+    if before is None:
+        return row
+    return dataclasses.replace(
+        row,
+        step=before.step + 1 + row.step,
+        seconds=before.seconds + row.seconds,
+        metres=before.metres + row.metres,
+        radians=before.radians + row.radians,
+    )

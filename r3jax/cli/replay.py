@@ -1,0 +1,38 @@
+"""`r3jax replay`: do the recorded frames rebuild the stored map?"""
+
+from rich.console import Console
+
+from r3jax.cli.console import PLAIN
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import Replay
+from r3jax.exploration.replay import differences
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import read_run
+
+_DIFFERS = 1
+"""Exit code where the maps are not equal."""
+
+
+def run_replay(options: Replay) -> int:
+    """Rebuilds map and grid from the frames and compares them, array by array, bit by bit.
+
+    Raises:
+        UserError: not a run, no stored map, a frame that is missing or not the recorded one.
+    """
+    console = Console(stderr=True)
+    try:
+        run = read_run(options.path)
+        with console.status("integrating the recorded frames ..."):
+            views, found = differences(run)
+    except (RunError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    if not found:
+        console.print(f"{views} frames rebuild the stored map and grid, bit for bit", **PLAIN)
+        return 0
+    console.print(f"{views} frames do not rebuild what is stored:", **PLAIN)
+    for difference in found:
+        what = f"{difference.num_different} elements, by at most {difference.largest:g}"
+        text = "another shape" if difference.num_different < 0 else what
+        console.print(f"  {difference.name}: {text}", **PLAIN)
+    console.print("made by another version of this package, or on another kind of device?", **PLAIN)
+    return _DIFFERS

@@ -1,0 +1,180 @@
+"""What an exploration needs, from the options of a new run or from the header of a recorded one."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.cli.options import Explore
+from r3jax.exploration.budget import Budget, parse_budget
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.replay import config_of
+from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.policy import Policy, make_policy
+from r3jax.scenes.registry import open_scene, scene_hash
+from r3jax.scoring.config import ScoringConfig
+from r3jax.simulators.base import Simulator
+from r3jax.trace.errors import RunError
+from r3jax.trace.header import RunHeader, camera_fields, package_versions, plain_settings
+from r3jax.trace.reader import Run
+
+DEFAULT_POLICY = "ours-pano"
+DEFAULT_BUDGET = "views:100"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked of an exploration, before its scene is opened."""
+
+    budget: Budget
+    config: ExplorationConfig
+    policy: Policy
+
+
+def plan_of_options(options: Explore) -> Plan:
+    """A new run: everything but the scene.
+
+    Raises:
+        ValueError: a setting that cannot work.
+    """
+    if not 16 <= options.resolution <= 4096:
+        raise ValueError(f"--resolution must lie between 16 and 4096, got {options.resolution}")
+    config = ExplorationConfig(
+        voxel_size=options.voxel_size,
+        cell_size=options.cell_size,
+        max_range=options.max_range,
+        capacity=options.capacity,
+        allow_growth=not options.fixed_capacity,
+        clock=options.clock,
+    )
+    budget = parse_budget(options.budget or DEFAULT_BUDGET)
+    return Plan(budget, config, policy_of_options(options, options.max_range))
+
+
+def policy_of_options(options: Explore, max_range: float) -> Policy:
+    """The policy that the options name, with the settings that they give.
+
+    Raises:
+        ValueError: an unknown policy, a setting that cannot work.
+    """
+    scoring = ScoringConfig(max_range=jnp.asarray(max_range, jnp.float32))
+    if options.lambda1 is not None:
+        lambda1 = jnp.asarray(options.lambda1, jnp.float32)
+        scoring = eqx.tree_at(lambda config: config.lambda1, scoring, lambda1)
+    settings: dict[str, Any] = {
+        "scoring": scoring,
+        "num_candidates": options.candidates,
+        "lambda2": options.lambda2,
+    }
+    if options.candidates is not None:
+        # Keeps the share that is aimed at the frontier, whatever the number.
+        default = PlannerConfig()
+        share = default.num_frontier / default.num_candidates
+        settings["num_frontier"] = round(share * options.candidates)
+    given = {name: value for name, value in settings.items() if value is not None}
+    return make_policy(options.policy or DEFAULT_POLICY, **given)
+
+
+def plan_of_run(run: Run) -> Plan:
+    """A recorded run: what it was asked for.
+
+    Raises:
+        RunError: a policy or a setting that this version does not know.
+    """
+    header = run.header
+    try:
+        settings = dict(header.policy["settings"])
+        scoring = ScoringConfig(**settings.pop("scoring", {}))
+        policy = make_policy(header.policy["name"], scoring=scoring, **settings)
+        return Plan(parse_budget(header.budget), config_of(run), policy)
+    except RunError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(run.path / "run.json", f"the run cannot be set up again: {error}") from None
+
+
+def simulator_of_options(options: Explore) -> Simulator:
+    """The scene of a new run.
+
+    Raises:
+        ValueError: the scene is unknown, or its file is refused.
+    """
+    assert options.scene is not None
+    return open_scene(
+        options.scene,
+        up=options.up,
+        camera=Camera.from_fov(options.resolution, options.resolution, options.fov),
+        noise=options.noise,
+        seed=options.seed,
+        max_range=options.max_range,
+        start_pose=_start_pose(options.start),
+    )
+
+
+def simulator_of_run(run: Run) -> Simulator:
+    """The scene of a recorded run.
+
+    Raises:
+        RunError: the scene is not the one that the run was recorded in.
+        ValueError: the scene is unknown, or its file is refused.
+    """
+    scene = run.header.scene
+    try:
+        simulator = open_scene(
+            scene["name"],
+            up=scene["up"],
+            camera=run.camera,
+            noise=scene["noise"],
+            seed=run.header.seed,
+            max_range=scene["max_range"],
+            start_pose=_start_pose(scene["start"]),
+        )
+    except KeyError as error:
+        raise RunError(run.path / "run.json", f"the scene lacks {error}") from None
+    if scene_hash(simulator) != scene.get("hash"):
+        raise RunError(
+            run.path / "run.json",
+            f"the scene {scene['name']} is not the one that the run was recorded in: its content "
+            "has changed",
+        )
+    return simulator
+
+
+def header_of(options: Explore, plan: Plan, simulator: Simulator) -> RunHeader:
+    """What fixes a new run."""
+    how = {name: getattr(options, name) for name in ("up", "noise", "max_range", "start")}
+    return RunHeader(
+        scene={"name": options.scene, "hash": scene_hash(simulator), **how},
+        policy=policy_fields(plan.policy),
+        budget=str(plan.budget),
+        seed=options.seed,
+        config=dataclasses.asdict(plan.config),
+        camera=camera_fields(simulator.camera),
+        bounds=np.asarray(simulator.bounds).tolist(),
+        packages=package_versions(),
+    )
+
+
+def policy_fields(policy: Policy) -> dict[str, Any]:
+    """A policy as a header names it."""
+    return {"name": policy.name, "settings": plain_settings(getattr(policy, "config", {}))}
+
+
+def default_name(options: Explore, scene: str, policy: str) -> str:
+    """A run's name where none is given."""
+    file = scene.removeprefix("mesh:")
+    stem = Path(file).stem if file != scene else scene
+    return f"{stem}-{policy}-seed{options.seed}"
+
+
+def _start_pose(start: Any) -> np.ndarray | None:
+    """Looks along x from a start position [m]."""
+    if start is None:
+        return None
+    pose = pose_along(jnp.asarray(start, jnp.float32), jnp.asarray([1.0, 0.0, 0.0]))
+    return np.asarray(pose, dtype=np.float64)

@@ -1,0 +1,178 @@
+"""Resume, fork, replay and merge, as a user meets them."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from r3jax.cli.main import main
+from r3jax.exploration.replay import rebuild
+from r3jax.mapping.join import grow, merge
+from r3jax.trace.reader import read_run
+from tests.cli.rooms import explore, write_room
+
+VIEWS = 5
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return write_room(tmp_path_factory.mktemp("mesh"))
+
+
+@pytest.fixture(scope="module")
+def runs(room, tmp_path_factory):
+    """`whole` has five views, `part` the first three of them, `other` another seed."""
+    out = tmp_path_factory.mktemp("runs")
+    budget = ("--budget", f"views:{VIEWS}")
+    assert explore(room, out, "--name", "whole", *budget) == 0
+    assert explore(room, out, "--name", "part") == 0
+    assert explore(room, out, "--name", "other", "--seed", "1") == 0
+    return out
+
+
+@pytest.fixture
+def part(runs, tmp_path):
+    return shutil.copytree(runs / "part", tmp_path / "part")
+
+
+def poses_of(path):
+    return np.stack([row.pose for row in read_run(path).rows])
+
+
+def test_a_resumed_run_is_the_whole_run(runs, part, capsys):
+    assert main(["explore", "--resume", str(part), "--budget", f"views:{VIEWS}"]) == 0
+    assert "goes on behind view 3 of" in capsys.readouterr().err
+    for name in ("trace.jsonl", "transforms.json", "frames/000004.depth.png", "run.json"):
+        assert (part / name).read_bytes() == (runs / "whole" / name).read_bytes(), name
+    assert (part / "report" / "report.html").exists()
+
+
+def test_without_another_budget_a_finished_run_stays_as_it_is(part):
+    before = (part / "trace.jsonl").read_bytes()
+    assert main(["explore", "--resume", str(part)]) == 0
+    assert (part / "trace.jsonl").read_bytes() == before
+
+
+def test_a_fork_keeps_the_first_views_and_goes_its_own_way(runs, tmp_path):
+    words = ["--at", "2", "--out", str(tmp_path), "--budget", f"views:{VIEWS}"]
+    fork = ["explore", "--fork", str(runs / "whole"), *words]
+    assert main([*fork, "--policy", "uniform", "--candidates", "20"]) == 0
+    run = read_run(tmp_path / "whole-uniform-from2")
+    assert len(run.rows) == VIEWS
+    before, after = poses_of(runs / "whole"), poses_of(run.path)
+    np.testing.assert_array_equal(after[:2], before[:2])
+    assert np.abs(after[2:] - before[2:]).max() > 0.1
+    assert run.header.policy["name"] == "uniform"
+    assert run.header.parent == {"forked": str(runs / "whole"), "views": 2, "decided_from": 2}
+    assert len(list(run.frames())) == VIEWS
+
+
+def test_a_fork_by_the_same_policy_repeats_the_run(runs, tmp_path):
+    words = ["--at", "3", "--out", str(tmp_path), "--name", "same"]
+    assert main(["explore", "--fork", str(runs / "whole"), *words]) == 0
+    trace = (tmp_path / "same" / "trace.jsonl").read_bytes()
+    assert trace == (runs / "whole" / "trace.jsonl").read_bytes()
+
+
+def test_a_fork_that_is_cut_off_goes_on(runs, tmp_path):
+    words = ["--at", "2", "--out", str(tmp_path), "--policy", "uniform", "--candidates", "20"]
+    fork = ["explore", "--fork", str(runs / "whole"), *words]
+    assert main([*fork, "--name", "long", "--budget", f"views:{VIEWS}"]) == 0
+    assert main([*fork, "--name", "short", "--budget", "views:3"]) == 0
+    shutil.rmtree(tmp_path / "short" / "checkpoints")
+    assert main(["explore", "--resume", str(tmp_path / "short"), "--budget", f"views:{VIEWS}"]) == 0
+    trace = (tmp_path / "short" / "trace.jsonl").read_bytes()
+    assert trace == (tmp_path / "long" / "trace.jsonl").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--resume", "{part}", "--resolution", "32"], "leave them out: --resolution"),
+        (["--resume", "{part}", "--policy", "frontier"], "leave them out: --policy"),
+        (["--resume", "{part}", "--fork", "{part}", "--at", "1"], "give one of them"),
+        (["--resume", "{part}", "--budget", "views:0"], "budget"),
+        (["--resume", "{part}/frames"], "not a run"),
+        (["--fork", "{part}"], "--fork RUN and --at VIEW belong together"),
+        (["--fork", "{part}", "--at", "4"], "between 1 and the run's 3 views, got 4"),
+        (["--fork", "{part}", "--at", "1", "--scene", "flat"], "leave them out: --scene"),
+        ([], "give a --scene"),
+    ],
+)
+def test_a_mistake_is_named_and_changes_nothing(part, capsys, words, message):
+    before = {p: p.read_bytes() for p in part.rglob("*") if p.is_file() and p.name != "lock"}
+    assert main(["explore", *(word.format(part=part) for word in words)]) == 2
+    assert message in capsys.readouterr().err
+    after = {p: p.read_bytes() for p in part.rglob("*") if p.is_file() and p.name != "lock"}
+    assert after == before
+
+
+def test_another_scene_under_the_same_name_is_noticed(room, part, capsys):
+    header = json.loads((part / "run.json").read_text())
+    header["scene"]["hash"] = "0" * 64
+    (part / "run.json").write_text(json.dumps(header))
+    assert main(["explore", "--resume", str(part)]) == 2
+    assert "is not the one that the run was recorded in" in capsys.readouterr().err
+
+
+def test_other_versions_are_told(part, capsys):
+    header = json.loads((part / "run.json").read_text())
+    header["packages"]["jax"] = "0.1"
+    (part / "run.json").write_text(json.dumps(header))
+    assert main(["explore", "--resume", str(part)]) == 0
+    assert "begun with other versions (jax 0.1 -> " in capsys.readouterr().err
+
+
+def test_a_replay_finds_the_stored_map(runs, capsys):
+    assert main(["replay", str(runs / "whole")]) == 0
+    assert "5 frames rebuild the stored map and grid, bit for bit" in capsys.readouterr().err
+
+
+def test_a_replay_notices_a_map_that_the_frames_do_not_give(runs, part, capsys):
+    """The checkpoint of the whole run, put into the run of three views as its last."""
+    shutil.rmtree(part / "checkpoints" / "000002")
+    shutil.copytree(runs / "whole" / "checkpoints" / "000004", part / "checkpoints" / "000002")
+    assert main(["replay", str(part)]) == 1
+    errors = capsys.readouterr().err
+    assert "3 frames do not rebuild what is stored" in errors
+    assert "map.count: " in errors
+    assert "grid.log_odds: " in errors
+
+
+def test_a_merged_run_has_seen_what_both_have_seen(runs, tmp_path):
+    out = tmp_path / "both"
+    first, second = read_run(runs / "whole"), read_run(runs / "other")
+    assert main(["merge", str(first.path), str(second.path), "--out", str(out)]) == 0
+    run = read_run(out)
+    assert [row.step for row in run.rows] == list(range(VIEWS + 3))
+    np.testing.assert_array_equal(
+        poses_of(out), np.concatenate([poses_of(first.path), poses_of(second.path)])
+    )
+    assert len(list(run.frames())) == VIEWS + 3
+    assert run.rows[-1].metres == first.rows[-1].metres + second.rows[-1].metres
+    assert len(json.loads((out / "transforms.json").read_text())["frames"]) == VIEWS + 3
+    assert main(["replay", str(out)]) == 0
+    _, merged, grid = run.checkpoint()
+    maps = [rebuild([r])[0] for r in (first, second)]
+    joined = merge(grow(maps[0], merged.capacity), maps[1])
+    assert int(merged.num_occupied) == int(joined.num_occupied)
+    assert float(merged.count.sum()) == float(joined.count.sum())
+    known = lambda grid: int((grid.free | grid.occupied).sum())
+    assert known(grid) >= max(known(rebuild([r])[1]) for r in (first, second))
+
+
+def test_a_merged_run_is_forked_not_resumed(runs, tmp_path, capsys):
+    out = tmp_path / "both"
+    assert main(["merge", str(runs / "part"), str(runs / "other"), "--out", str(out)]) == 0
+    assert main(["explore", "--resume", str(out)]) == 2
+    assert "fork it with --fork and --at" in capsys.readouterr().err
+    words = ["--at", "6", "--budget", "views:7", "--policy", "random", "--candidates", "20"]
+    assert main(["explore", "--fork", str(out), *words, "--out", str(tmp_path)]) == 0
+    assert len(read_run(tmp_path / "both-random-from6").rows) == 7
+
+
+def test_runs_of_different_terms_do_not_merge(room, runs, tmp_path, capsys):
+    assert explore(room, tmp_path, "--max-range", "3") == 0
+    assert main(["merge", str(runs / "part"), str(tmp_path / "box")]) == 2
+    assert "max_range is not that of" in capsys.readouterr().err
