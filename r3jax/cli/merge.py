@@ -68,7 +68,7 @@ def merge_runs(runs: list[Run], out: Path, *, overwrite: bool = False) -> MapSta
             for row in run.rows:
                 last = _behind(row, before)
                 writer.adopt(last, run, row.step)
-        writer.checkpoint(writer.views - 1, map_tables(map_state, grid))
+        writer.checkpoint(writer.views - 1, map_tables(map_state, grid), wait=True)
         writer.finish("merged", f"the views of {' and '.join(str(run.path) for run in runs)}")
     merged = read_run(out)
     points = out / "exports" / "points.ply"

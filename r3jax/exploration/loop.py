@@ -131,7 +131,7 @@ def _finish(recorder: RunWriter, state: LoopState, stop: Stop) -> Stop:
     """Writes the last map and how the run ended; a full disk may refuse even that."""
     try:
         if state.views > 0:
-            recorder.checkpoint(state.views - 1, state_tables(state))
+            recorder.checkpoint(state.views - 1, state_tables(state), wait=True)
         recorder.finish(stop.reason.value, stop.message)
     except RecordingStopped as error:
         unsaid = f"{stop.message}; the end could not be recorded ({error.reason})"

@@ -9,6 +9,7 @@ import contextlib
 import json
 import shutil
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ _DISCARDED = ".discarded-"
 
 
 class CheckpointWriter:
-    """Saves checkpoints one after the other; each is whole or absent."""
+    """Saves checkpoints one after the other in a thread of its own; each is whole or absent."""
 
     def __init__(self, folder: Path):
         """Makes the folder and clears away what a killed process left behind.
@@ -37,54 +38,71 @@ class CheckpointWriter:
         Raises:
             OSError: the folder cannot be made.
         """
-        import orbax.checkpoint as ocp
-
         self._folder = folder.resolve()
         self._folder.mkdir(parents=True, exist_ok=True)
         for entry in self._folder.iterdir():
             if not entry.name.isdigit():
                 shutil.rmtree(entry, ignore_errors=True)
-        self._checkpointer = ocp.AsyncCheckpointer(ocp.PyTreeCheckpointHandler())
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._under_way: Future[None] | None = None
 
-    def save(self, step: int, tables: Tables) -> None:
-        """Starts to save the state after view `step`; waits for the one before to be whole.
+    def save(self, step: int, tables: Tables, *, wait: bool = False) -> bool:
+        """Begins to save the state after view `step`, unless the one before is still being saved.
+
+        A map of gigabytes takes longer to write than a step takes: then there is a checkpoint
+        every few views, and the mission is not held up.
+
+        Args:
+            step: number of the view.
+            tables: the state; nobody may write into its arrays.
+            wait: True waits for the one before, and for this one.
+
+        Returns:
+            Whether it is being saved.
 
         Raises:
-            OSError: this one or the one before could not be written.
+            OSError: the one before, or with `wait` this one, could not be written.
         """
-        import orbax.checkpoint as ocp
-
+        if self._under_way is not None and not wait and not self._under_way.done():
+            return False
         self.wait()
         tree = {name: _storable(table) for name, table in tables.items() if table}
-        try:
-            # Orbax writes under a temporary name and renames.
-            self._checkpointer.save(
-                self._folder / f"{step:06d}", args=ocp.args.PyTreeSave(tree), force=True
-            )
-        except (ValueError, RuntimeError) as error:
-            raise OSError(f"the checkpoint of view {step} failed: {error}") from error
+        self._under_way = self._thread.submit(self._write, step, tree)
+        if wait:
+            self.wait()
+        return True
 
     def wait(self) -> None:
-        """Returns when what was begun is whole, and nothing but the newest three is kept.
+        """Returns when what was begun is whole.
 
         Raises:
             OSError: it could not be written.
         """
+        under_way, self._under_way = self._under_way, None
+        if under_way is not None:
+            under_way.result()
+
+    def _write(self, step: int, tree: dict[str, dict[str, np.ndarray]]) -> None:
+        """In the thread: writes one and discards all but the newest three."""
+        import orbax.checkpoint as ocp
+
         try:
-            self._checkpointer.wait_until_finished()
+            with ocp.PyTreeCheckpointer() as checkpointer:
+                # Orbax writes under a temporary name and renames.
+                checkpointer.save(self._folder / f"{step:06d}", tree, force=True)
         except (ValueError, RuntimeError) as error:  # how Orbax's storage reports a full disk
-            raise OSError(f"a checkpoint failed: {error}") from error
-        for step in checkpoint_steps(self._folder)[:-KEPT]:
+            raise OSError(f"the checkpoint of view {step} failed: {error}") from error
+        for old in checkpoint_steps(self._folder)[:-KEPT]:
             # Out of sight first: a checkpoint that is half deleted must not look like one.
-            discarded = self._folder / f"{_DISCARDED}{step:06d}"
-            (self._folder / f"{step:06d}").rename(discarded)
+            discarded = self._folder / f"{_DISCARDED}{old:06d}"
+            (self._folder / f"{old:06d}").rename(discarded)
             shutil.rmtree(discarded, ignore_errors=True)
 
     def close(self) -> None:
-        """Waits and frees the threads. What `wait` would say of the last one is lost."""
+        """Waits and ends the thread. What `wait` would say of the last one is lost."""
         with contextlib.suppress(OSError):
             self.wait()
-        self._checkpointer.close()
+        self._thread.shutdown()
 
 
 def checkpoint_steps(folder: Path) -> list[int]:

@@ -161,14 +161,16 @@ class RunWriter:
         with self._guarded(), open(self.path / "timings.jsonl", "a", encoding="utf-8") as file:
             file.write(line + "\n")
 
-    def checkpoint(self, step: int, tables: Tables) -> None:
-        """Begins to store the state after view `step`: `exploration.resume.state_tables`.
+    def checkpoint(self, step: int, tables: Tables, *, wait: bool = False) -> None:
+        """Stores the state after view `step` (`exploration.resume.state_tables`) in the background.
+
+        Left out if the state before is still being stored, unless `wait` is True.
 
         Raises:
-            RecordingStopped: the disk refused this checkpoint or the one before.
+            RecordingStopped: the disk refused the checkpoint before, or with `wait` this one.
         """
         with self._guarded():
-            self._checkpoints.save(step, tables)
+            self._checkpoints.save(step, tables, wait=wait)
 
     def finish(self, outcome: str, message: str) -> None:
         """Stores how the run ended.

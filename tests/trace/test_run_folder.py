@@ -208,7 +208,7 @@ def test_checkpoints_come_back_exactly_and_only_three_are_kept(tmp_path):
     grid = empty_grid(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]))
     with RunWriter(tmp_path / "run", make_header()) as writer:
         for step in (0, 1, 2, 3, 4):
-            writer.checkpoint(step, map_tables(map_state, grid))
+            writer.checkpoint(step, map_tables(map_state, grid), wait=True)
     run = read_run(tmp_path / "run")
     step, read_map, read_grid = run.checkpoint()
     assert step == 4

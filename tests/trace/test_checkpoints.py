@@ -1,0 +1,141 @@
+"""Checkpoints: what goes in comes out, one at a time, and what a kill or a full disk leaves."""
+
+import shutil
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+
+from r3jax.trace.arrays import fill, named_arrays
+from r3jax.trace.checkpoints import CheckpointWriter, checkpoint_steps, load_checkpoint
+from r3jax.trace.errors import RunError
+
+TABLES = {
+    "loop": {"seconds": np.asarray(1 / 3), "views": np.asarray(7), "is_lost": np.asarray(True)},
+    "map": {"key": np.arange(6, dtype=np.uint32).reshape(2, 3)},
+    "policy": {"memory.taken": np.zeros((0, 3), np.float32), "memory.0": np.ones(4, np.float32)},
+    "nothing": {},
+}
+
+
+def test_arrays_come_back_with_type_and_shape(tmp_path):
+    writer = CheckpointWriter(tmp_path / "c")
+    writer.save(3, TABLES, wait=True)
+    writer.close()
+    tables = load_checkpoint(tmp_path / "c", 3)
+    assert set(tables) == {"loop", "map", "policy"}
+    for table, arrays in tables.items():
+        assert arrays.keys() == TABLES[table].keys()
+        for name, array in arrays.items():
+            expected = np.asarray(TABLES[table][name])
+            assert (array.dtype, array.shape) == (expected.dtype, expected.shape), name
+            np.testing.assert_array_equal(array, expected)
+
+
+def test_the_newest_three_are_kept(tmp_path):
+    writer = CheckpointWriter(tmp_path / "c")
+    for step in range(5):
+        assert writer.save(step, TABLES, wait=True)
+    writer.close()
+    assert sorted(p.name for p in (tmp_path / "c").iterdir()) == ["000002", "000003", "000004"]
+
+
+def test_a_slow_disk_leaves_checkpoints_out_but_not_the_last(tmp_path, monkeypatch):
+    go_on, save = threading.Event(), ocp.PyTreeCheckpointer.save
+
+    def slow(self, *args, **kwargs):
+        assert go_on.wait(30.0)
+        return save(self, *args, **kwargs)
+
+    monkeypatch.setattr(ocp.PyTreeCheckpointer, "save", slow)
+    writer = CheckpointWriter(tmp_path / "c")
+    assert writer.save(0, TABLES)
+    assert not writer.save(1, TABLES)  # view 0 is still under way: the mission is not held up
+    go_on.set()
+    assert writer.save(2, TABLES, wait=True)
+    writer.close()
+    assert checkpoint_steps(tmp_path / "c") == [0, 2]
+
+
+def test_what_a_killed_process_left_is_cleared_away(tmp_path):
+    folder = tmp_path / "c"
+    for name in ("000004", "000005.orbax-checkpoint-tmp-3", ".discarded-000001"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "part").write_bytes(b"x")
+    CheckpointWriter(folder).close()
+    assert [p.name for p in folder.iterdir()] == ["000004"]
+
+
+def test_a_refused_write_is_told_at_the_next_call(tmp_path, monkeypatch):
+    def full(self, *args, **kwargs):
+        raise ValueError("RESOURCE_EXHAUSTED: No space left on device")
+
+    monkeypatch.setattr(ocp.PyTreeCheckpointer, "save", full)
+    writer = CheckpointWriter(tmp_path / "c")
+    writer.save(0, TABLES)
+    with pytest.raises(OSError, match=r"checkpoint of view 0 failed.*No space left"):
+        writer.wait()
+    writer.close()
+
+
+@pytest.mark.parametrize("how", ["missing", "empty", "no tables"])
+def test_a_damaged_checkpoint_is_named(tmp_path, how):
+    writer = CheckpointWriter(tmp_path)
+    writer.save(0, TABLES, wait=True)
+    writer.close()
+    if how == "missing":
+        shutil.rmtree(tmp_path / "000000")
+    elif how == "empty":
+        for file in (p for p in (tmp_path / "000000").rglob("*") if p.is_file()):
+            file.write_bytes(b"")
+    else:
+        with ocp.PyTreeCheckpointer() as checkpointer:
+            checkpointer.save(tmp_path / "000000", {"a": np.ones(3)}, force=True)
+    with pytest.raises(RunError, match="000000: the checkpoint"):
+        load_checkpoint(tmp_path, 0)
+
+
+def test_a_tree_is_filled_with_what_it_is_made_of():
+    tree = {"a": 3, "b": (np.zeros(2), True, 2.5), "c": None, "d": []}
+    arrays = named_arrays(tree)
+    assert sorted(arrays) == ["a", "b.0", "b.1", "b.2"]
+    back = fill(tree, arrays)
+    assert back["a"] == 3
+    assert type(back["a"]) is int
+    assert type(back["b"][1]) is bool
+    assert back["c"] is None
+    grown = fill(tree, arrays | {"b.0": np.arange(5.0)})
+    np.testing.assert_array_equal(grown["b"][0], np.arange(5.0))
+    with pytest.raises(ValueError, match=r"b\.0 is float64 with 2 axes, expected float64 with 1"):
+        fill(tree, arrays | {"b.0": np.zeros((2, 2))})
+    with pytest.raises(ValueError, match=r"of no use: a, e$"):
+        fill(tree, {k: v for k, v in arrays.items() if k != "a"} | {"e": np.zeros(1)})
+
+
+def test_a_really_full_disk_is_reported(tmp_path):
+    """On a file system of 1 MB, where a user may mount one."""
+    program = (
+        "import sys, numpy as np\nfrom pathlib import Path\n"
+        "from r3jax.trace.checkpoints import CheckpointWriter\n"
+        "noise = np.random.default_rng(0).integers(0, 256, 4_000_000, np.uint8)\n"
+        "writer = CheckpointWriter(Path(sys.argv[1]))\n"
+        "try:\n    writer.save(0, {'map': {'noise': noise}}, wait=True)\n"
+        "except OSError as error:\n    print('refused:', error)\n"
+        "writer.close()\n"
+    )
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(tmp_path)], capture_output=True
+    )
+    if mounted.returncode != 0:
+        pytest.skip("needs the right to mount a file system")
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(tmp_path / "c")], capture_output=True, text=True
+        )
+        assert done.stdout.startswith("refused: the checkpoint of view 0 failed"), done.stderr
+        assert checkpoint_steps(tmp_path / "c") == []
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=True)
