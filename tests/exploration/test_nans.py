@@ -1,0 +1,27 @@
+"""No operation of the whole loop makes a NaN, not even one that is thrown away later."""
+
+import jax
+import pytest
+
+from r3jax.exploration import explore
+from r3jax.planning.policy import make_policy, policy_names
+from tests.exploration.killed_run import CONFIG, SCORING
+from tests.exploration.toys import BoxRoom
+
+
+class HoleyRoom(BoxRoom):
+    """A quarter of the picture without depth, a quarter out of range."""
+
+    def render(self, T_world_camera):
+        frame = super().render(T_world_camera)
+        half = frame.depth.shape[0] // 2
+        depth = frame.depth.at[:half, :half].set(0.0).at[half:, half:].set(float("inf"))
+        return type(frame)(frame.rgb, depth, frame.T_world_camera, frame.camera)
+
+
+@pytest.mark.parametrize("name", policy_names())
+def test_the_loop_makes_no_nan(name):
+    policy = make_policy(name, num_candidates=8, num_frontier=3, scoring=SCORING)
+    with jax.debug_nans(True):
+        result = explore(HoleyRoom(), policy, budget="views:3", config=CONFIG)
+    assert len(result.rows) == 3
