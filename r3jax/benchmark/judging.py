@@ -18,11 +18,17 @@ import numpy as np
 from r3jax.benchmark.cells import Cell
 from r3jax.benchmark.conditions import Conditions
 from r3jax.files import write_atomic
-from r3jax.geometry.cameras import Camera
+from r3jax.foreign.arrays import read_npz
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.splatting.views import Views
 
 FOLDER = "test_views"
 """Of a benchmark: poses and images."""
+
+_KINDS = {"hash": "U", "rgb": "u"} | dict.fromkeys(
+    ("poses", "depth", "T_world_camera", "cameras"), "f"
+)
 
 
 @dataclass(frozen=True)
@@ -73,11 +79,17 @@ def read_judging_views(path: Path) -> JudgingViews:
 
     Raises:
         FileNotFoundError: the images are not there.
+        ValueError: the file is damaged; the message names it.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: the test views are gone; start the benchmark again")
-    with np.load(path) as data:
-        stored = {name: data[name] for name in data.files}
+    try:
+        stored = read_npz(path, _KINDS)
+        _check(stored)
+    except ForeignFileError as error:
+        raise ValueError(
+            f"{path} does not hold test views ({error}): delete it and start the benchmark again"
+        ) from None
     height, width = stored["rgb"].shape[1:3]
     # The leaves of a camera are its four numbers, in the order of its fields.
     like = jax.tree.structure(Camera(width, height, 1.0, 1.0, 0.0, 0.0))
@@ -88,6 +100,38 @@ def read_judging_views(path: Path) -> JudgingViews:
         cameras=jax.tree.unflatten(like, [jnp.asarray(x) for x in stored["cameras"]]),
     )
     return JudgingViews(str(stored["hash"]), stored["poses"], views)
+
+
+def _check(stored: dict[str, np.ndarray]) -> None:
+    """Refuses arrays that do not belong together, and numbers that render to nothing.
+
+    Raises:
+        ForeignFileError: says which.
+    """
+    rgb = stored["rgb"]
+    v = len(rgb) if rgb.ndim == 4 else 0
+    expected = {
+        "hash": (),
+        "poses": (v, 4, 4),
+        "rgb": (v, *rgb.shape[1:3], 3),
+        "depth": (v, *rgb.shape[1:3]),
+        "T_world_camera": (v, 4, 4),
+        "cameras": (4, v),
+    }
+    for name, shape in expected.items():
+        if stored[name].shape != shape or not stored[name].size:
+            raise ForeignFileError(f"{name} has the shape {stored[name].shape}, expected {shape}")
+    if rgb.dtype != np.uint8:
+        raise ForeignFileError(f"rgb is {rgb.dtype}, expected uint8")
+    if not (stored["depth"] >= 0.0).all():  # infinite where there is nothing
+        raise ForeignFileError("depth is negative or NaN")
+    if not (np.isfinite(stored["cameras"]).all() and (stored["cameras"][:2] > 0.0).all()):
+        raise ForeignFileError("a camera has no focal length, or numbers that are not finite")
+    for name in ("poses", "T_world_camera"):
+        problems = [(i, rigid_error(pose)) for i, pose in enumerate(stored[name])]
+        wrong = next(((i, problem) for i, problem in problems if problem), None)
+        if wrong is not None:
+            raise ForeignFileError(f"{name}, view {wrong[0]}: {wrong[1]}")
 
 
 def load_judging_views(root: Path, cell: Cell) -> JudgingViews:

@@ -8,18 +8,43 @@ import os
 import platform
 import subprocess
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from r3jax.benchmark.cells import Cell, paths_of
 from r3jax.benchmark.conditions import snapshot_order
 from r3jax.evaluation.scores import METRICS, ViewRow, summarize
 from r3jax.files import write_atomic
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import check_fields
+from r3jax.foreign.files import read_bytes
+from r3jax.foreign.json_text import parse_json
 from r3jax.trace.header import package_versions, plain_settings
 from r3jax.trace.rows import StepRow
 
 FORMAT = 1
 """Format version of a record."""
+
+_MAX_BYTES = 64 << 20
+
+_KINDS = {
+    **dict.fromkeys(("format", "seed", "resolution"), int),
+    **dict.fromkeys(
+        ("scene", "scene_hash", "policy", "budget", "snapshot", "clock", "run", "machine"), str
+    ),
+    **dict.fromkeys(("settings", "sensing", "training", "test_views", "packages"), dict[str, Any]),
+    **dict.fromkeys(("commit", "lpips_network"), str | None),
+    "exploration": dict[str, float | str],
+    "metrics": dict[str, dict[str, float | list[float] | None] | None],
+    "views": dict[str, list[float | None] | None],
+}
+
+_PARTS = {
+    "training": {"iterations": int, "resolution": int},
+    "test_views": {"hash": str, "resolution": int},
+    "views": {"view": list[int]},
+}
+"""What tables and figures take for granted."""
 
 CELLS = "cells.jsonl"
 """All records of a benchmark, one a line."""
@@ -132,6 +157,10 @@ def read_records(root: Path, cells: Iterable[Cell] | None = None) -> list[dict[s
     Args:
         root: folder of the benchmark.
         cells: whose records; None: all that were ever made there.
+
+    Raises:
+        ValueError: a record is damaged; the message names it.
+        OSError: a record cannot be read.
     """
     if cells is None:
         folders = [path for path in (Path(root) / "cells").glob("*") if path.is_dir()]
@@ -139,9 +168,37 @@ def read_records(root: Path, cells: Iterable[Cell] | None = None) -> list[dict[s
         folders = [paths_of(root, cell).folder for cell in cells]
     records = []
     for folder in sorted(folders):
-        found = [json.loads(path.read_text()) for path in folder.glob("snapshot-*.json")]
+        found = [_read_record(path) for path in folder.glob("snapshot-*.json")]
         records += sorted(found, key=lambda record: snapshot_order(record["snapshot"]))
     return records
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """One record.
+
+    Raises:
+        ValueError: it is damaged, or a newer version of this package wrote it.
+    """
+    try:
+        record = parse_json(read_bytes(path, _MAX_BYTES))
+        check_fields("record", record, _KINDS)
+        for name, kinds in _PARTS.items():
+            check_fields(name, record[name], kinds)
+        if record["format"] != FORMAT:
+            raise ForeignFileError(f"its format is {record['format']}, this reads {FORMAT}")
+        snapshot_order(record["snapshot"])
+        run = PurePosixPath(record["run"])
+        if run.is_absolute() or ".." in run.parts or "\0" in record["run"]:
+            raise ForeignFileError(f"its run {record['run'][:80]!r} lies outside of the benchmark")
+        lengths = {len(column) for column in record["views"].values() if column is not None}
+        if len(lengths) != 1:
+            raise ForeignFileError(f"the columns of `views` differ in length: {sorted(lengths)}")
+    except ValueError as error:
+        raise ValueError(
+            f"{path} is no record of a benchmark ({error!s:.300}): delete it and start the "
+            "benchmark again, it makes what is missing"
+        ) from None
+    return record
 
 
 def collect(root: Path) -> Path:

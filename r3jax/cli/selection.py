@@ -1,6 +1,5 @@
 """Which model `r3jax evaluate` judges, and by which views."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,22 @@ import numpy as np
 from r3jax.cli.captures import Capture, open_capture
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Evaluate
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import check_type
+from r3jax.foreign.files import read_bytes
+from r3jax.foreign.json_text import parse_json
 from r3jax.frame import Frame
+
+_MAX_BYTES = 64 << 20
+
+_KINDS = {
+    "data": str,
+    "resolution": int,
+    "train_views": list[int],
+    "test_views": list[int],
+    "config": dict[str, Any],
+}
+"""What is used of train.json."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +85,32 @@ def find_training(options: Evaluate, capture: Capture) -> Training:
         )
     path = model.parent / "train.json"
     try:
-        record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    except ValueError as error:
+        record = _read_record(path) if path.exists() else {}
+    except (ForeignFileError, OSError) as error:
         raise UserError(f"{path}: the file cannot be read ({one_line(error)})") from error
     is_inside = capture.models.resolve() in model.resolve().parents
     is_same = "data" in record and Path(record["data"]).resolve() == capture.path.resolve()
     return Training(model, record, bool(record) and (is_inside or is_same))
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """train.json, with what is used of it checked.
+
+    Raises:
+        ForeignFileError: it is damaged.
+        OSError: it cannot be read.
+    """
+    record = parse_json(read_bytes(path, _MAX_BYTES))
+    check_type("train.json", record, dict[str, Any])
+    for name, kind in _KINDS.items():
+        if name in record:
+            check_type(name, record[name], kind)
+    for name in ("train_views", "test_views"):
+        if min(record.get(name, ()), default=0) < 0:
+            raise ForeignFileError(f"`{name}` holds a negative number")
+    if record.get("resolution", 1) < 1 or "\0" in record.get("data", ""):
+        raise ForeignFileError("`resolution` or `data` makes no sense")
+    return record
 
 
 def choose_views(options: Evaluate, capture: Capture, training: Training) -> TestSet:
@@ -112,7 +146,7 @@ def _held_out(capture: Capture, training: Training) -> list[int]:
             f"{training.model}: which views of {capture.path} were held out is not known ({why}); "
             "use --views all, every:N or another run"
         )
-    numbers = [int(number) for number in training.record.get("test_views", [])]
+    numbers = list(training.record.get("test_views", []))
     if not numbers:
         raise UserError(
             f"{training.model} was trained on all views; train with --hold-out 8, or use --views "

@@ -2,7 +2,7 @@
 
 import csv
 import html
-import json
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r3jax.evaluation import style
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import check_fields
+from r3jax.foreign.files import read_bytes
+from r3jax.foreign.json_text import parse_json
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
@@ -20,6 +24,31 @@ _TITLES = {
     "ssim": ("SSIM", 3),
     "lpips": ("LPIPS", 3),
 }
+_MAX_BYTES = 64 << 20
+
+_KINDS = {
+    "model": str,
+    "metrics": dict[str, dict[str, Any]],
+    "numbers": list[int],
+    "trained_on": int | None,
+    **dict.fromkeys(("gaussians", "width", "height"), int),
+}
+"""What is used of evaluation.json."""
+
+_PARTS = {
+    **dict.fromkeys(("mean", "median", "percentile_5", "worst"), float),
+    "interval": list[float],
+    "worst_view": int,
+    "poor_share": float | None,
+}
+"""What is used of one metric."""
+
+_COLUMNS = ("step", "loss", "psnr", "gaussians")
+"""Of history.csv."""
+
+_LARGEST = 1e12
+"""No axis of a figure goes further."""
+
 _SMOOTHING = 50
 """Steps over which the curves are averaged: single views differ by many dB."""
 
@@ -48,20 +77,48 @@ def read_judged_model(run: Run) -> JudgedModel | None:
     if not path.exists():
         return None
     try:
-        evaluation = json.loads(path.read_text(encoding="utf-8"))
+        evaluation = parse_json(read_bytes(path, _MAX_BYTES))
+        _check(evaluation)
         curve = Path(evaluation["model"]).parent / "history.csv"
         history = _read_columns(curve) if curve.exists() else {}
         sheet = path.with_suffix(".png")
-        return JudgedModel(evaluation, history, sheet.read_bytes() if sheet.exists() else None)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunError(path, f"the evaluation cannot be read ({error}): evaluate again") from None
+        image = read_bytes(sheet, _MAX_BYTES) if sheet.exists() else None
+    except (OSError, ValueError, csv.Error) as error:
+        raise RunError(
+            path, f"the evaluation cannot be read ({error!s:.300}): evaluate again"
+        ) from None
+    return JudgedModel(evaluation, history, image)
+
+
+def _check(evaluation: Any) -> None:
+    """Refuses what the table and the note could not show.
+
+    Raises:
+        ForeignFileError: says what is missing or of another type.
+    """
+    check_fields("evaluation", evaluation, _KINDS)
+    for name, metric in evaluation["metrics"].items():
+        check_fields(name, metric, _PARTS)
+        if len(metric["interval"]) != 2:
+            raise ForeignFileError(f"`{name}.interval` must be two numbers")
 
 
 def _read_columns(path: Path) -> dict[str, np.ndarray]:
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    names = rows[0].keys() if rows else []
-    return {name: np.array([float(row[name]) for row in rows]) for name in names}
+    """history.csv by column; empty if it has no rows.
+
+    Raises:
+        ValueError, csv.Error: not a table, or not with these columns.
+        OSError: it cannot be read.
+    """
+    text = read_bytes(path, _MAX_BYTES).decode("utf-8")
+    rows = list(csv.DictReader(io.StringIO(text)))
+    try:
+        columns = {name: np.array([float(row[name]) for row in rows]) for name in _COLUMNS}
+    except (KeyError, TypeError):
+        raise ForeignFileError(f"{path} lacks one of {', '.join(_COLUMNS)}") from None
+    if not all((np.abs(column) <= _LARGEST).all() for column in columns.values()):
+        raise ForeignFileError(f"{path} holds a value that is no number, or beyond all measure")
+    return columns if rows else {}
 
 
 def training_figure(history: dict[str, np.ndarray]) -> Figure:

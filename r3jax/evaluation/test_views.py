@@ -23,6 +23,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from r3jax.files import write_atomic
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import check_fields
+from r3jax.foreign.files import read_bytes
+from r3jax.foreign.json_text import parse_json
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
 
@@ -33,6 +37,18 @@ MARGIN = 0.3
 """The robot's radius [m]."""
 
 _FORMAT = 1
+_KINDS = {
+    "scene": str,
+    "scene_hash": str,
+    "spacing": list[float],
+    "margin": float,
+    "max_views": int | None,
+    "views": list[dict[str, Any]],
+}
+_MAX_BYTES = 64 << 20
+_FARTHEST = 1e6
+"""From the origin [m]; beyond that tenths of millimetres are no whole 64-bit numbers."""
+
 _LOOKS = ("+x", "-x", "+y", "-y", "+z", "-z")
 _LEAST_SEEN = 0.5
 """A view with less surface than this share of the picture is left out."""
@@ -223,13 +239,13 @@ def read_view_set(path: str | Path) -> ViewSet:
     """
     path = Path(path)
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = parse_json(read_bytes(path, _MAX_BYTES))
         if record["format"] != _FORMAT:
             raise ValueError(f"its format is {record['format']}, not {_FORMAT}")
         view_set = _from_record(record)
         matches = view_set.hash == record["hash"]
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is not a set of test views ({error!r}): {_AGAIN}") from error
+        raise ValueError(f"{path} is not a set of test views ({error!r:.300}): {_AGAIN}") from error
     if not matches:
         raise ValueError(f"{path} was changed: its content does not give its hash; {_AGAIN}")
     return view_set
@@ -306,9 +322,16 @@ def _write(path: Path, view_set: ViewSet) -> None:
 
 def _from_record(record: dict[str, Any]) -> ViewSet:
     """The set that a stored record describes."""
+    check_fields("set", record, _KINDS)
     x, y, z = (float(side) for side in record["spacing"])
     views = record["views"]
     positions = np.array([view["position"] for view in views], dtype=np.float64).reshape(-1, 3)
+    odd = sorted({str(view["look"]) for view in views} - set(_LOOKS))
+    if odd or not views or not np.abs(positions).max() <= _FARTHEST:
+        raise ForeignFileError(
+            f"expected views along {', '.join(_LOOKS)}, within {_FARTHEST:g} m, got "
+            f"{len(views)}, some along {odd[:1] or 'them, but farther away'}"
+        )
     return ViewSet(
         str(record["scene"]),
         str(record["scene_hash"]),

@@ -47,6 +47,20 @@ def build(kind: type[T], plain: Any, /, **ready: Any) -> T:
     return kind(**{**plain, **ready})
 
 
+def check_fields(name: str, record: Any, kinds: Mapping[str, Any]) -> None:
+    """Refuses a JSON object that lacks fields, or has them of other types; others may be there.
+
+    Raises:
+        ForeignFileError: says which field of `name`.
+    """
+    check_type(name, record, dict[str, Any])
+    missing = sorted(kinds.keys() - record.keys())
+    if missing:
+        raise ForeignFileError(f"`{name[:80]}` lacks {', '.join(missing)}")
+    for field, kind in kinds.items():
+        check_type(f"{name}.{field}", record[field], kind)
+
+
 def check_type(name: str, value: Any, hint: Any) -> None:
     """Refuses a value from JSON that is not of a type.
 

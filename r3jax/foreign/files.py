@@ -45,3 +45,20 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
         )
     with open(path, "rb") as file:
         return file.read(limit)
+
+
+def check_tree(folder: Path) -> None:
+    """Refuses a folder with pipes or devices below it: a library would wait for them for ever.
+
+    Raises:
+        ForeignFileError: says which.
+        OSError: not a folder, or not permitted.
+    """
+    for path in folder.rglob("*"):
+        if not path.is_dir():
+            try:
+                check_regular(path)
+            except FileNotFoundError:
+                raise ForeignFileError(f"{path.name} is a link that leads nowhere") from None
+            except ForeignFileError as error:
+                raise ForeignFileError(f"{path.name}: {error}") from None

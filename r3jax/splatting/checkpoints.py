@@ -10,6 +10,9 @@ import jax
 import numpy as np
 
 from r3jax.files import write_atomic
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.files import check_tree, read_bytes
+from r3jax.foreign.json_text import parse_json
 from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.train_step import TrainState
 from r3jax.splatting.training_config import TrainConfig
@@ -22,6 +25,7 @@ FORMAT_VERSION = 1
 """Raised whenever older checkpoints can no longer be read."""
 
 _SETTINGS = "training.json"
+_MAX_BYTES = 16 << 20
 
 
 def settings_record(config: TrainConfig, views: Views, extent: float) -> dict[str, Any]:
@@ -111,20 +115,35 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) ->
     sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     to_shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)
     try:
+        check_tree(newest)
         with ocp.StandardCheckpointer() as checkpointer:
-            return checkpointer.restore(newest.resolve(), jax.tree.map(to_shape, like))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+            state = checkpointer.restore(newest.resolve(), jax.tree.map(to_shape, like))
+        _check_state(state, like)
+    except Exception as error:  # whatever a damaged file makes Orbax's storage raise
         raise CheckpointError(
-            newest, f"cannot be read ({error}); delete it to fall back on the one before"
+            newest, f"cannot be read ({error!s:.500}); delete it to fall back on the one before"
         ) from None
+    return state
+
+
+def _check_state(state: TrainState, like: TrainState) -> None:
+    """Refuses a state of other shapes, and numbers that no training would have gone on with."""
+    for (path, leaf), wanted in zip(
+        jax.tree_util.tree_leaves_with_path(state), jax.tree.leaves(like), strict=True
+    ):
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        if leaf.shape != wanted.shape or leaf.dtype != wanted.dtype:
+            raise ForeignFileError(f"{name} is {leaf.dtype}{leaf.shape}, not {wanted.shape}")
+        if not np.isfinite(leaf).all():
+            raise ForeignFileError(f"{name} has numbers that are not finite")
 
 
 def _check_settings(folder: Path, settings: dict[str, Any]) -> None:
     path = folder / _SETTINGS
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = parse_json(read_bytes(path, _MAX_BYTES))
         if not isinstance(stored, dict):
-            raise ValueError("not a table of settings")
+            raise ForeignFileError("not a table of settings")
     except (OSError, ValueError) as error:
         raise CheckpointError(path, f"cannot be read ({error})") from None
     names = sorted(stored.keys() | settings.keys())
@@ -135,5 +154,5 @@ def _check_settings(folder: Path, settings: dict[str, Any]) -> None:
     ]
     if changed:
         raise CheckpointError(
-            folder, f"the checkpoint is of another training: {', '.join(changed)} differ"
+            folder, f"the checkpoint is of another training: {', '.join(changed):.1000} differ"
         )

@@ -20,12 +20,12 @@ _HEADER_BYTES = 2000
 def mutate(rng: Rng, files: Files) -> tuple[dict[str, Entry], str]:
     """A damaged copy of the files, and what was done to it."""
     changed = dict(files)
-    names = sorted(changed)
+    names, described = sorted(changed), "nothing"
     for _ in range(int(rng.choice([1, 1, 1, 2]))):
         name = names[rng.integers(len(names))]
         data = changed.get(name)
         if not isinstance(data, bytes):
-            continue
+            continue  # done with by the first damage
         kinds = _kinds_for(name, data)
         kind = kinds[rng.integers(len(kinds))]
         damaged = kind(rng, data)
@@ -33,8 +33,7 @@ def mutate(rng: Rng, files: Files) -> tuple[dict[str, Entry], str]:
             del changed[name]
         else:
             changed[name] = damaged
-        what = f"{kind.__name__.strip('_')} of {name}"
-        names, described = sorted(changed), what
+        described = f"{kind.__name__.strip('_')} of {name}"
     return changed, described
 
 

@@ -1,0 +1,54 @@
+"""Damaged records of a benchmark.
+
+All 2,000 cases: `pytest -m slow tests/fuzz/test_records.py`.
+"""
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from r3jax.benchmark.record import read_records
+from r3jax.cli.results import print_results
+from tests.evaluation.records import record
+from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.tree import Files
+from tests.fuzz.worker import Reader
+
+CASES = 700
+"""In the normal suite."""
+
+
+def seeds() -> list[Files]:
+    files = {}
+    for policy, snapshot in (("ours", 30), ("ours", 60), ("random", 60)):
+        plain = record(policy, snapshot=snapshot)
+        path = f"cells/flat-{policy}-seed0/snapshot-views-{snapshot}.json"
+        files[path] = json.dumps(plain, separators=(",", ":")).encode() + b"\n"
+    return [files]
+
+
+def read(folder: Path) -> None:
+    records = read_records(folder)
+    if not records:
+        return
+    try:  # What is accepted can be shown, or is said not to be comparable: nothing breaks later.
+        print_results(Console(file=io.StringIO(), width=200), records)
+    except ValueError as error:
+        if "records cannot be compared" not in str(error):
+            raise
+
+
+READER = Reader(seeds, read, (ValueError, FileNotFoundError))
+
+
+def test_damaged_records_are_refused_or_read(referee):
+    referee.check(__name__, CASES)
+
+
+@pytest.mark.slow
+def test_many_damaged_records(referee):
+    """`pytest -m slow tests/fuzz/test_records.py`."""
+    referee.check(__name__, CASES_SLOW)
