@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -122,6 +123,26 @@ def test_other_versions_are_told(part, capsys):
     (part / "run.json").write_text(json.dumps(header))
     assert main(["explore", "--resume", str(part)]) == 0
     assert "begun with other versions (jax 0.1 -> " in capsys.readouterr().err
+
+
+@pytest.fixture
+def read_only(part):
+    """The run on a file system that nobody can write."""
+    mount = ["mount", "--bind", str(part), str(part)]
+    remount = ["mount", "-o", "remount,ro,bind", str(part)]
+    if any(subprocess.run(words, capture_output=True).returncode for words in (mount, remount)):
+        subprocess.run(["umount", str(part)], capture_output=True)
+        pytest.skip("needs the right to mount a file system")
+    yield part
+    subprocess.run(["umount", str(part)], check=True)
+
+
+def test_a_read_only_run_can_be_read_and_replayed_but_not_gone_on_with(read_only, capsys):
+    assert main(["info", str(read_only)]) == 0
+    assert main(["replay", str(read_only)]) == 0
+    capsys.readouterr()
+    assert main(["explore", "--resume", str(read_only), "--budget", "views:4"]) == 2
+    assert "cannot go on with the run (Read-only file system)" in capsys.readouterr().err
 
 
 def test_a_replay_finds_the_stored_map(runs, capsys):

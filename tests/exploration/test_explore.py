@@ -145,6 +145,15 @@ def test_only_planning_mapping_and_flight_are_on_the_wall_clock(monkeypatch):
     assert result.state.seconds == pytest.approx(expected)
 
 
+def test_a_clock_that_jumps_back_does_not_touch_the_mission(monkeypatch, tmp_path):
+    ticks = itertools.count(start=2e9, step=-3600.0)
+    monkeypatch.setattr(clock.time, "time", lambda: next(ticks))
+    result = run_in(tmp_path / "run", budget="views:4", config=replace(CONFIG, clock="wall"))
+    assert all(row.charged[part] >= 0.0 for row in result.rows for part in row.charged)
+    assert np.all(np.diff([row.seconds for row in result.rows]) > 0.0)
+    assert len(read_run(tmp_path / "run").rows) == 4
+
+
 def test_no_reachable_candidate_ends_the_run_with_the_reason(tmp_path):
     result = run_in(tmp_path / "run", policy=Wander(last_step=1), budget="views:50")
     assert result.reason is StopReason.NO_REACHABLE_CANDIDATE
