@@ -1,4 +1,4 @@
-"""Mesh files as worlds: GLB, glTF, PLY, OBJ and whatever else trimesh reads.
+"""Mesh files as worlds: GLB, glTF, PLY, OBJ, STL and OFF.
 
 glTF is y-up by its standard and is turned to z-up, (x, y, z) -> (x, -z, y); other formats are
 taken as z-up unless told otherwise. Colours are used as stored, as Habitat does without lights.
@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.foreign.errors import ForeignFileError
 from r3jax.simulators.gltf import texture_transforms
+from r3jax.simulators.mesh_files import MeshFile
 from r3jax.simulators.world import Material, World
 
 _GLTF_SUFFIXES = (".glb", ".gltf")
@@ -23,6 +25,9 @@ _PLAIN = Material(color=(0.7, 0.7, 0.7))
 
 _MAX_EXTENT = 1e5
 """Worlds larger than this are not in metres [m]."""
+
+_MAX_UV = 1e6
+"""Texture coordinates beyond this have no fraction left that could choose a texel."""
 
 
 @dataclass(frozen=True)
@@ -59,35 +64,24 @@ def load_world(path: str | Path, up: str | None = None) -> World:
         raise ValueError(f"up must be 'y' or 'z', got {up!r}")
     if not path.is_file():
         raise ValueError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
-    scene = _read(path)
     is_gltf = path.suffix.lower() in _GLTF_SUFFIXES
-    moves = texture_transforms(path) if is_gltf else {}
-    parts = []
-    for node in scene.graph.nodes_geometry:
-        part = _part_of(path, scene, node, moves)
-        if part is not None:
-            parts.append(part)
+    try:
+        file = MeshFile(path)
+        moves = texture_transforms(path) if is_gltf else {}
+        nodes = [_part_of(file, T, name, moves) for T, name in file.placed]
+    except (ForeignFileError, OSError) as error:
+        raise ValueError(
+            f"cannot read the mesh file {path}: {error} (is it damaged, or a format other than "
+            "GLB, glTF, PLY, OBJ?)"
+        ) from error
+    parts = [part for part in nodes if part is not None]
     if not parts:
-        _refuse_empty(path, scene)
+        _refuse_empty(path, file.scene)
     is_y_up = up == "y" or (up is None and is_gltf)
     turn = _Z_UP_FROM_Y_UP if is_y_up else np.eye(3)
     world = _assemble(path, parts, turn)
     _check(path, world)
     return world
-
-
-def _read(path: Path) -> Any:
-    """The file as a trimesh scene."""
-    import trimesh
-
-    try:
-        # `process=False`: merging vertices would tear texture seams.
-        return trimesh.load_scene(path, process=False)
-    except Exception as error:  # every reader fails in its own way
-        raise ValueError(
-            f"cannot read the mesh file {path}: {error or type(error).__name__} (is it damaged, "
-            "or a format other than GLB, glTF, PLY, OBJ?)"
-        ) from error
 
 
 def _refuse_empty(path: Path, scene: Any) -> None:
@@ -101,21 +95,25 @@ def _refuse_empty(path: Path, scene: Any) -> None:
     raise ValueError(f"{path} holds an empty mesh: no vertices, no faces; export it again")
 
 
-def _part_of(path: Path, scene: Any, node: str, moves: dict[str, np.ndarray]) -> _Part | None:
-    """The mesh at a node of the scene graph; None for points, lines and empty meshes."""
-    T_world_node, name = scene.graph[node]
-    mesh = scene.geometry[name]
+def _part_of(
+    file: MeshFile, T: np.ndarray, name: str, moves: dict[str, np.ndarray]
+) -> _Part | None:
+    """A mesh in its place, `T_world_node`; None for points, lines and empty meshes.
+
+    Raises:
+        ForeignFileError: faces that name no vertex, or a texture that cannot be read.
+    """
+    mesh = file.scene.geometry[name]
     faces = np.asarray(getattr(mesh, "faces", ()), dtype=np.int64).reshape(-1, 3)
     if len(faces) == 0:
         return None
     if faces.min() < 0 or faces.max() >= len(mesh.vertices):
-        raise ValueError(
-            f"{path}: a face of {name!r} names vertex {faces.max()}, but there are only "
-            f"{len(mesh.vertices)}; the file is damaged, export it again"
+        raise ForeignFileError(
+            f"a face of {name!r} names vertex {faces.max()}, but there are only "
+            f"{len(mesh.vertices)}"
         )
-    T = np.asarray(T_world_node, dtype=np.float64)
     vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
-    uv, colors, material = _appearance(mesh, faces)
+    uv, colors, material = _appearance(file, mesh, faces)
     move = moves.get(str(getattr(getattr(mesh.visual, "material", None), "name", "")))
     if move is not None:
         uv = uv @ move[:2, :2].T + move[:2, 2]
@@ -125,7 +123,9 @@ def _part_of(path: Path, scene: Any, node: str, moves: dict[str, np.ndarray]) ->
     return _Part(vertices, faces, uv, colors, material)
 
 
-def _appearance(mesh: Any, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, Material]:
+def _appearance(
+    file: MeshFile, mesh: Any, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None, Material]:
     """Texture coordinates and colours per corner, and the material."""
     visual = mesh.visual
     no_uv = np.zeros((len(faces), 3, 2), np.float32)
@@ -139,7 +139,7 @@ def _appearance(mesh: Any, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray | 
         return no_uv, None, _PLAIN
     uv = getattr(visual, "uv", None)
     has_uv = uv is not None and len(uv) == len(mesh.vertices)
-    material = _material(visual.material, has_uv=has_uv)
+    material = _material(file, visual.material, has_uv=has_uv)
     colors = getattr(visual, "vertex_attributes", {}).get("color")
     if colors is not None and len(colors) == len(mesh.vertices):
         colors = _as_unit(colors)[faces]
@@ -149,7 +149,7 @@ def _appearance(mesh: Any, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray | 
     return corner_uv, colors, material
 
 
-def _material(source: Any, *, has_uv: bool) -> Material:
+def _material(file: MeshFile, source: Any, *, has_uv: bool) -> Material:
     """A trimesh material as ours. The texture keeps its size."""
     if hasattr(source, "baseColorFactor"):
         image, factor = source.baseColorTexture, source.baseColorFactor
@@ -160,7 +160,7 @@ def _material(source: Any, *, has_uv: bool) -> Material:
             factor = None
     texture = None
     if image is not None and has_uv:
-        texture = np.array(image.convert("RGB"), dtype=np.uint8)
+        texture = file.texture(image)
     if factor is None:
         return Material(texture=texture)
     red, green, blue = (float(x) for x in _as_unit(np.asarray(factor).reshape(1, -1))[0])
@@ -212,8 +212,11 @@ def _check(path: Path, world: World) -> None:
             f"{path}: {len(bad)} of {len(world.vertices)} vertices are not finite, the first is "
             f"number {bad[0]}: {world.vertices[bad[0]].tolist()}; repair the mesh first"
         )
-    if not np.isfinite(world.face_uv).all():
-        raise ValueError(f"{path}: texture coordinates are not finite; repair the mesh first")
+    if not np.abs(world.face_uv).max() <= _MAX_UV:
+        raise ValueError(
+            f"{path}: texture coordinates are not finite, or beyond {_MAX_UV:g}; repair the mesh "
+            "first"
+        )
     extent = world.bounds[1] - world.bounds[0]
     corners = world.vertices[world.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

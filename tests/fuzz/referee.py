@@ -55,6 +55,20 @@ class Referee:
         assert verdicts["read"], f"no case of {module} was harmless: is the seed read at all?"
         assert verdicts["refused"], f"no case of {module} was refused"
 
+    def check_crafted(self, reader: str) -> None:
+        """Runs the seeds of a reader as the cases: ones that were made by hand.
+
+        Raises:
+            AssertionError: as for `check`.
+        """
+        number, seeds, failures = 0, 1, []
+        while number < seeds:
+            answer = self._ask(reader, -1 - number, _HANG)
+            if answer["verdict"] == "failed":
+                failures.append(f"case {number}: {answer['why']}")
+            number, seeds = number + 1, answer.get("seeds", seeds)
+        assert not failures, "\n\n".join(failures)
+
     def _warm_up(self, module: str) -> None:
         """The seeds must read; it also imports and compiles what the reader needs."""
         number, seeds = 0, 1

@@ -1,8 +1,8 @@
 """The process that reads hostile files: `python -m tests.fuzz.worker FOLDER`.
 
-For every line that it is sent, {"reader": module, "case": number}, it answers two lines of JSON:
-what the case is, once it lies on the disk, and what became of it. Number -1 is the first seed
-itself, -2 the second. What kills this process kills nothing else.
+For every line that it is sent, {"reader": "module:attribute", "case": number}, it answers two
+lines of JSON: what the case is, once it lies on the disk, and what became of it. Number -1 is the
+first seed itself, -2 the second. What kills this process kills nothing else.
 """
 
 import importlib
@@ -165,7 +165,8 @@ def main() -> None:
         asked = json.loads(line)
         module, number = asked["reader"], asked["case"]
         if module not in known:
-            reader: Reader = importlib.import_module(module).READER
+            name, _, attribute = module.partition(":")
+            reader: Reader = getattr(importlib.import_module(name), attribute or "READER")
             known[module] = reader, reader.seeds()
         reader, seeds = known[module]
         if number < 0:
