@@ -52,8 +52,8 @@ class Reader:
 class Guard:
     """Watches what a reader does to the rest of the machine."""
 
-    def __init__(self, scratch: Path):
-        self._scratch = os.fspath(scratch)
+    def __init__(self, folder: Path):
+        self._folder = os.fspath(folder)
         self.active = False
         self.problems: list[str] = []
         sys.addaudithook(self._hook)
@@ -78,7 +78,7 @@ class Guard:
             return
         full = os.path.realpath(os.fsdecode(path))
         # JAX and Numba keep what they compiled; the null device takes what tools print.
-        allowed = (self._scratch, "/dev/null", "/proc/", *_caches())
+        allowed = (self._folder, "/dev/null", "/proc/", *_caches())
         if not full.startswith(allowed):
             self.problems.append(f"{event} outside the folder: {full}")
 
@@ -156,7 +156,7 @@ def main() -> None:
     (scratch / "outside" / "secret").write_bytes(b"this is none of your business " * 40)
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print is no answer
-    guard = Guard(scratch)
+    guard = Guard(scratch / "case")
     known: dict[str, tuple[Reader, list[Files]]] = {}
     folder = scratch / "case"
     folder.mkdir(exist_ok=True)

@@ -1,0 +1,243 @@
+"""The command line with odd words, on whole and on damaged folders.
+
+The work itself (exploring, training, judging, planning a benchmark) is left out: a case ends where
+it would begin. What was asked must be refused with one line and exit code 2, or be sensible.
+
+All 2,000 cases: `pytest -m slow tests/fuzz/test_cli.py`.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import io
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from r3jax.cli import benchmark, evaluate, explore, merge, options, replay, train
+from r3jax.cli.main import main
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.scenes import procedural
+from r3jax.simulators.meshes import load_world
+from r3jax.trace.header import header_to_json
+from tests.fuzz import test_models, test_recordings, test_runs, test_splats
+from tests.fuzz.mutate import mutate
+from tests.fuzz.numbers import NUMBER_TEXTS
+from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.tree import Entry, Files
+from tests.fuzz.worker import Reader
+from tests.trace.runs import make_header
+
+CASES = 500
+"""In the normal suite."""
+
+COMMANDS = (
+    ("info",),
+    ("info", "run"),
+    ("info", "recording", "--up", "z"),
+    ("policies",),
+    ("explore", "--scene", "flat", "--policy", "random", "--budget", "views:2", "--out", "out"),
+    ("explore", "--scene", "mesh:room.obj", "--budget", "seconds:5", "--resolution", "64"),
+    ("explore", "--resume", "run"),
+    ("explore", "--fork", "run", "--at", "1", "--name", "fork"),
+    ("train", "recording", "--iterations", "10", "--hold-out", "2", "--name", "m"),
+    ("train", "run", "--resolution", "16", "--name", "other"),
+    ("evaluate", "run", "--lpips", "none", "--views", "all"),
+    (
+        "evaluate",
+        "recording",
+        "--views",
+        "every:2",
+        "--lpips",
+        "none",
+        "--model",
+        "run/models/last",
+    ),
+    ("benchmark", "--scenes", "flat", "--policies", "random", "--budget", "views:3", "--jobs", "0"),
+    ("replay", "run"),
+    ("merge", "run", "run", "--out", "out"),
+)
+
+OPTIONS = {
+    name: [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(kind)]
+    for name, kind in {
+        "info": options.Info, "policies": options.Policies, "explore": options.Explore,
+        "train": options.Train, "evaluate": options.Evaluate, "benchmark": options.Benchmark,
+        "replay": options.Replay, "merge": options.Merge,
+    }.items()
+}  # fmt: skip
+"""The options of each command."""
+
+WORDS = (
+    *(number.decode() for number in NUMBER_TEXTS),
+    "views:nan", "views:1e308", "views:-1", "views:", ":", "seconds:inf", "metres:0", "views:1.5",
+    "every:0", "every:-3", "every:1e9", "mesh:", "mesh:../outside/secret", "mesh:/dev/zero",
+    "mesh:.", "mesh:run/run.json", "mesh:x\0.glb", "../../x", "/proc/nope", "/dev/null/x", ".",
+    "run", "recording", "run/run.json", "a,b,,c", "lambda2=nan", "lambda2=[[1]]", "=", "x=",
+    "scoring.lambda1={}", "num_candidates=1e308", "\udcff", "x" * 5000, "x\0y", "~", "-", "--",
+    "[bold]", "{}", "%s", "\n", " ",
+)  # fmt: skip
+
+
+CONFIG = ExplorationConfig()
+
+
+class Refused(Exception):
+    """Exit code 2, and one line that says why."""
+
+
+class Begun(Exception):
+    """The words make sense: the work would begin."""
+
+
+def seeds() -> list[Files]:
+    files: dict[str, Entry] = {}
+    for name, data in (test_runs.seeds()[0] | test_models.seeds()[0]).items():
+        files[f"run/{name}"] = data
+    files["run/models/last/scene.ply"] = test_splats.seeds()[0]["scene.ply"]
+    scene = {"name": "mesh:room.obj", "up": None, "noise": 0.0, "max_range": 5.0, "start": None}
+    policy = {"name": "random", "settings": {}}
+    for name, data in test_recordings.seeds()[0].items():
+        files[f"recording/{name}"] = data
+    corners = "".join(f"v {x} {y} {z}\n" for z in (0, 3) for y in (0, 4) for x in (0, 4))
+    quads = ((1, 3, 4, 2), (5, 6, 8, 7), (1, 2, 6, 5), (3, 7, 8, 4), (1, 5, 7, 3), (2, 4, 8, 6))
+    faces = "".join("f {} {} {} {}\n".format(*quad) for quad in quads)
+    files["room.obj"] = (corners + faces).encode()
+    with tempfile.TemporaryDirectory() as name:
+        (Path(name) / "room.obj").write_bytes(files["room.obj"])
+        scene["hash"] = load_world(Path(name) / "room.obj").content_hash
+    header = header_to_json(make_header(scene=scene, policy=policy, config=vars(CONFIG)))
+    files["run/run.json"] = header.encode()
+    return [files | {"words.json": json.dumps(words).encode()} for words in COMMANDS]
+
+
+def make(rng: np.random.Generator, files: Files) -> tuple[Files, str]:
+    """Odd words, or a damaged folder, or both."""
+    words = json.loads(bytes_of(files["words.json"]))
+    known = [*OPTIONS[words[0]], "--nonsense"]
+    changed, what = dict(files), "whole files"
+    if rng.random() < 0.4:
+        folder = ("run/", "recording/")[rng.integers(2)]
+        part, what = mutate(rng, {k: v for k, v in files.items() if k.startswith(folder)})
+        changed = {k: v for k, v in files.items() if not k.startswith(folder)} | dict(part)
+    for _ in range(int(rng.integers(0 if what != "whole files" else 1, 3))):
+        word = WORDS[rng.integers(len(WORDS))]
+        how = rng.integers(8)
+        if how == 0:
+            words.insert(int(rng.integers(len(words) + 1)), word)
+        elif how <= 2:
+            words[int(rng.integers(len(words)))] = word
+        else:
+            words += [known[rng.integers(len(known))], word]
+    for i in range(1, len(words)):
+        if words[i - 1] in ("--out", "--plot") and words[i] == "../../x":
+            words[i] = "deep/x"  # who asks for a folder gets it
+    changed["words.json"] = json.dumps(words).encode()
+    return changed, f"{what}, {words!r:.300}"
+
+
+def bytes_of(entry: Entry) -> bytes:
+    assert isinstance(entry, bytes)
+    return entry
+
+
+def read(folder: Path) -> None:
+    words = json.loads((folder / "words.json").read_bytes())
+    said, before = io.StringIO(), Path.cwd()
+    os.chdir(folder)
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            with_work_left_out()
+            code = main(words)
+    except Begun:
+        return
+    except SystemExit as stop:  # how tyro refuses words
+        code = stop.code
+    finally:
+        os.chdir(before)
+    assert code in (0, 2), f"exit code {code}: {said.getvalue()[-500:]}"
+    text = said.getvalue()
+    assert "Traceback" not in text
+    if code == 2:
+        assert text.strip(), "it says nothing"
+        raise Refused(text[-300:])
+
+
+@functools.cache
+def with_work_left_out() -> None:
+    """Replaces, in this process, what takes minutes."""
+
+    def begin(*_: Any, **__: Any) -> Any:
+        raise Begun
+
+    explore.explore = begin
+    train.train.fit = begin
+    evaluate.judge = begin
+    benchmark.make_plan = begin
+    merge.rebuild = begin
+    replay.differences = begin
+    procedural.build = functools.cache(procedural.build)
+
+
+READER = Reader(seeds, read, (Refused,), names_file=False, make=make)
+
+
+def test_odd_words_are_refused_or_make_sense(referee):
+    referee.check(__name__, CASES)
+
+
+@pytest.mark.slow
+def test_many_odd_words(referee):
+    """`pytest -m slow tests/fuzz/test_cli.py`."""
+    referee.check(__name__, CASES_SLOW)
+
+
+VALUES = {
+    "--seed": ("-1", "9223372036854775808", "4294967296"),
+    "--noise": ("nan", "-1", "inf", "1e308"),
+    "--max-range": ("nan", "-1", "0", "inf", "1e308", "1e-300"),
+    "--fov": ("nan", "0", "180", "1e-300"),
+    "--start": ("nan 0 0", "1e308 0 0", "inf 0 0"),
+    "--resolution": ("-1", "0", "1000000000"),
+    "--voxel-size": ("nan", "0", "-1", "1e-300", "1e308"),
+    "--cell-size": ("nan", "0", "-1", "1e-300", "1e308"),
+    "--capacity": ("0", "-1", "3", "1099511627776", "9223372036854775807"),
+    "--candidates": ("0", "-1", "1000000000000"),
+    "--lambda1": ("nan", "-1", "inf", "1e308"),
+    "--lambda2": ("nan", "-1", "inf", "1e308"),
+    "--name": ("../../x", "/etc/x", "a/../../../x", "", ".", "..", "x\0y", "x" * 300),
+    "--budget": ("views:1e30", "views:nan", "seconds:1e308", "views:9223372036854775808"),
+    "--iterations": ("0", "-1", "1000000000000"),
+    "--gaussians": ("0", "-1", "1000000000000"),
+    "--hold-out": ("1", "-1", "1000000000000"),
+    "--views-per-step": ("0", "-1", "1000000000000"),
+    "--worst": ("-1", "1000000000000"),
+    "--test-views": ("-1", "1", "1000000000000"),
+    "--jobs": ("-1",),
+}
+"""Values of options that chance seldom pairs with them."""
+
+BEGINNINGS = (COMMANDS[4], COMMANDS[8], COMMANDS[10], COMMANDS[12])
+
+
+def crafted() -> list[Files]:
+    (whole, *_) = seeds()
+    cases = []
+    for words in BEGINNINGS:
+        for option in sorted(VALUES.keys() & set(OPTIONS[words[0]])):
+            for value in VALUES[option]:
+                asked = [*words, option, *(value.split() if option == "--start" else [value])]
+                cases.append(dict(whole) | {"words.json": json.dumps(asked).encode()})
+    return cases
+
+
+CRAFTED = Reader(crafted, read, (Refused,), names_file=False)
+
+
+def test_values_without_sense_are_refused(referee):
+    referee.check_crafted(f"{__name__}:CRAFTED")
