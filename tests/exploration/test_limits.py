@@ -1,0 +1,118 @@
+"""A very large hall, a very large table, a very long run: nothing slows down, nothing leaks.
+
+    pytest -m slow tests/exploration/test_limits.py -s
+
+takes most of an hour and prints what a step costs along the run.
+"""
+
+import gc
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r3jax.exploration import explore
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.planning.policy import Policy, make_policy
+from r3jax.scoring.config import ScoringConfig
+from r3jax.trace.header import camera_fields
+from r3jax.trace.reader import read_run
+from r3jax.trace.writer import RunWriter
+from tests.exploration.hall import Hall
+from tests.exploration.killed_run import CONFIG, SCORING
+from tests.trace.runs import make_header
+
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+@dataclass
+class Watch:
+    """Follows a run."""
+
+    memory: list[int] = field(default_factory=list)
+    """Of the process after every view [bytes]."""
+
+    def on_step(self, row) -> None:
+        del row
+        gc.collect()
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        self.memory.append(pages * _PAGE)
+
+
+def long_run(
+    path: Path, hall: Hall, policy: Policy, config: ExplorationConfig, views: int
+) -> Watch:
+    """Explores and records, and watches the memory."""
+    watch = Watch()
+    with RunWriter(path, make_header(camera=camera_fields(hall.camera))) as recorder:
+        explore(
+            hall,
+            policy,
+            budget=f"views:{views}",
+            config=config,
+            recorder=recorder,
+            on_step=watch.on_step,
+        )
+    return watch
+
+
+def memory_rise(memory: list[int]) -> float:
+    """Rise over the second half, as a share: the median of its last fifth over its first."""
+    half = np.asarray(memory[len(memory) // 2 :], dtype=np.float64)
+    fifth = max(1, len(half) // 5)
+    return float(np.median(half[-fifth:]) / np.median(half[:fifth]) - 1.0)
+
+
+def test_a_rise_is_noticed():
+    flat = [1000] * 100
+    assert memory_rise(flat) == 0.0
+    leaking = [1000 + 2 * k for k in range(100)]
+    assert memory_rise(leaking) > 0.03
+
+
+def test_the_hall_has_walls_and_pillars():
+    """From (1.5, 3, 1.5) along x: the pillar at (3, 3) begins at 2.7 m; beside it the next row."""
+    hall = Hall()
+    pose = np.asarray(pose_along(jnp.asarray([1.5, 3.0, 1.5]), jnp.asarray([1.0, 0.0, 0.0])))
+    depth = np.asarray(hall.render(np.float64(pose)).depth)
+    np.testing.assert_allclose(depth[48, 46:50], 1.2, rtol=1e-5)
+    assert depth[48, 0] > 1.2
+    assert depth[95, 47] < 1.6  # the floor, 1.5 m below, at 45 degrees
+
+
+def test_a_short_run_in_a_small_hall(tmp_path):
+    """The same code at a size for every day; memory still settles, so it is not asked."""
+    policy = make_policy("ours-pano", num_candidates=8, num_frontier=3, scoring=SCORING)
+    hall = Hall((4.0, 3.0, 2.4), Camera.from_fov(48, 48, 90.0))
+    watch = long_run(tmp_path / "run", hall, policy, CONFIG, 6)
+    assert len(watch.memory) == 6
+    rows = read_run(tmp_path / "run").rows
+    assert rows[-1].coverage.voxels > rows[0].coverage.voxels > 500
+    assert rows[-1].coverage.dropped == 0
+
+
+@pytest.mark.slow
+def test_a_thousand_views_of_a_hall_of_sixty_meters(tmp_path, capsys):
+    scoring = ScoringConfig(zbuffer_size=64, panorama_size=64)
+    policy = make_policy("ours-pano", num_candidates=40, num_frontier=20, scoring=scoring)
+    config = ExplorationConfig(capacity=1 << 22, max_still_views=1000)
+    watch = long_run(tmp_path / "run", Hall(), policy, config, 1000)
+    run = read_run(tmp_path / "run")
+    assert len(run.rows) == 1000
+    assert run.rows[-1].coverage.dropped == 0
+    with capsys.disabled():
+        print()
+        for first in range(0, 1000, 100):
+            timings = run.timings[first : first + 100]
+            stages = {k: np.median([t.get(k, 0.0) for t in timings]) for k in timings[-1]}
+            del stages["step"]
+            text = ", ".join(f"{k} {1e3 * v:.0f}" for k, v in stages.items() if "plan." not in k)
+            row = run.rows[first + 99]
+            print(f"{first + 100} views, {row.coverage.voxels} voxels, ms: {text}")
+        rise = 100 * memory_rise(watch.memory)
+        print(f"memory {watch.memory[-1] / 1e9:.2f} GB, rise {rise:.1f} % over the last 500 views")
+    assert memory_rise(watch.memory) < 0.03
