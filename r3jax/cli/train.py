@@ -83,6 +83,8 @@ def _config(options: Train) -> TrainConfig:
 
 def _folder(options: Train, capture: Capture) -> Path:
     """The model's folder; one that is there is kept, unless the user says otherwise."""
+    if Path(options.name).name != options.name or options.name == "..":
+        raise UserError(f"--name is the name of one folder, without a path, got {options.name!r}")
     folder = (options.out or capture.models) / options.name
     in_use = folder.is_dir() and any(folder.iterdir())
     if in_use and not (options.overwrite or options.resume):
