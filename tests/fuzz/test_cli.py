@@ -1,7 +1,7 @@
 """The command line with odd words, on whole and on damaged folders.
 
-The work itself (exploring, training, judging, planning a benchmark) is left out: a case ends where
-it would begin. What was asked must be refused with one line and exit code 2, or be sensible.
+The work itself (exploring, mapping, training, judging, planning a benchmark) is left out: a case
+ends where it would begin. What was asked is refused with one line and exit code 2, or makes sense.
 
 All 2,000 cases: `pytest -m slow tests/fuzz/test_cli.py`.
 """
@@ -21,8 +21,8 @@ import pytest
 
 from r3jax.cli import benchmark, evaluate, explore, merge, options, replay, train
 from r3jax.cli.main import main
+from r3jax.evaluation import revisits
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.scenes import procedural
 from r3jax.simulators.meshes import load_world
 from r3jax.trace.header import header_to_json
 from tests.fuzz import test_models, test_recordings, test_runs, test_splats
@@ -41,7 +41,7 @@ COMMANDS = (
     ("info", "run"),
     ("info", "recording", "--up", "z"),
     ("policies",),
-    ("explore", "--scene", "flat", "--policy", "random", "--budget", "views:2", "--out", "out"),
+    ("explore", "--scene", "mesh:room.obj", "--policy", "random", "--resolution", "32"),
     ("explore", "--scene", "mesh:room.obj", "--budget", "seconds:5", "--resolution", "64"),
     ("explore", "--resume", "run"),
     ("explore", "--fork", "run", "--at", "1", "--name", "fork"),
@@ -181,7 +181,8 @@ def with_work_left_out() -> None:
     benchmark.make_plan = begin
     merge.rebuild = begin
     replay.differences = begin
-    procedural.build = functools.cache(procedural.build)
+    evaluate.map_of = begin
+    revisits.follow_recording = begin
 
 
 READER = Reader(seeds, read, (Refused,), names_file=False, make=make)
