@@ -4,6 +4,7 @@ A mesh may name buffers, materials and images. Only regular files below its own 
 no image is unpacked before its size is known, and archives are not opened at all.
 """
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,8 @@ class MeshFile:
                 "OBJ, STL or OFF file"
             )
         self._bytes = check_regular(path)
+        if path.suffix.lower() == ".glb":
+            _check_chunks(path, self._bytes)
         self._texels = 0
         self.scene = self._load(path)
         try:
@@ -121,6 +124,18 @@ class MeshFile:
             raise ForeignFileError(
                 f"its {stored} faces are repeated until they are {repeated}: it is not unpacked"
             )
+
+
+def _check_chunks(path: Path, size: int) -> None:
+    """Refuses a GLB whose chunks claim to be longer than it: room is made for what is claimed."""
+    with open(path, "rb") as file:
+        at = 12  # behind the header
+        while at + 8 <= size:
+            file.seek(at)
+            (length,) = struct.unpack("<I", file.read(4))
+            at += 8 + length
+    if at > size:
+        raise ForeignFileError("it is cut off: a chunk is longer than what is left of the file")
 
 
 def _num_faces(mesh: Any) -> int:

@@ -107,6 +107,8 @@ def _part_of(
     faces = np.asarray(getattr(mesh, "faces", ()), dtype=np.int64).reshape(-1, 3)
     if len(faces) == 0:
         return None
+    if np.shape(mesh.vertices)[1:] != (3,):
+        raise ForeignFileError(f"the vertices of {name!r} have the shape {mesh.vertices.shape}")
     if faces.min() < 0 or faces.max() >= len(mesh.vertices):
         raise ForeignFileError(
             f"a face of {name!r} names vertex {faces.max()}, but there are only "
@@ -138,7 +140,7 @@ def _appearance(
     if kind != "texture" and not hasattr(visual, "material"):
         return no_uv, None, _PLAIN
     uv = getattr(visual, "uv", None)
-    has_uv = uv is not None and len(uv) == len(mesh.vertices)
+    has_uv = uv is not None and np.shape(uv) == (len(mesh.vertices), 2)
     material = _material(file, visual.material, has_uv=has_uv)
     colors = getattr(visual, "vertex_attributes", {}).get("color")
     if colors is not None and len(colors) == len(mesh.vertices):
@@ -170,6 +172,8 @@ def _material(file: MeshFile, source: Any, *, has_uv: bool) -> Material:
 def _as_unit(colors: np.ndarray) -> np.ndarray:
     """Colours [n, 3 or 4] of any type as float32 [n, 3] in [0, 1]."""
     colors = np.asarray(colors)[:, :3]
+    if colors.shape[1] != 3:
+        raise ForeignFileError(f"colors of {colors.shape[1]} channels: expected 3 or 4")
     if np.issubdtype(colors.dtype, np.integer):
         return (colors / np.iinfo(colors.dtype).max).astype(np.float32)
     return np.clip(colors, 0.0, 1.0).astype(np.float32)

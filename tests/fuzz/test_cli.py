@@ -33,7 +33,7 @@ from tests.fuzz.tree import Entry, Files
 from tests.fuzz.worker import Reader
 from tests.trace.runs import make_header
 
-CASES = 500
+CASES = 300
 """In the normal suite."""
 
 COMMANDS = (
