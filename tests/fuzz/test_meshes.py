@@ -134,13 +134,13 @@ def doubling(tree: dict[str, Any]) -> None:
 
 
 def deep(tree: dict[str, Any]) -> None:
-    tree["nodes"] = [{"children": [i + 1]} for i in range(20_000)] + [{"mesh": 0}]
+    tree["nodes"] = [{"children": [i + 1]} for i in range(2_000)] + [{"mesh": 0}]
     tree["scenes"] = [{"nodes": [0]}]
 
 
 def repeating(tree: dict[str, Any]) -> None:
-    tree["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(30_000)]
-    tree["scenes"] = [{"nodes": list(range(30_000))}]
+    tree["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(3_000)]
+    tree["scenes"] = [{"nodes": list(range(3_000))}]
 
 
 def unfinished(tree: dict[str, Any]) -> None:
