@@ -89,6 +89,10 @@ def run_explore(options: Explore) -> int:
 
 def _set_out(options: Explore, console: Console) -> Expedition:
     """What can be checked quickly comes before the scene is built."""
+    if options.name is not None and (
+        Path(options.name).name != options.name or options.name == ".."
+    ):
+        raise ValueError(f"--name is the name of one folder, without a path, got {options.name!r}")
     if options.resume is not None and options.fork is not None:
         raise ValueError("--resume goes on with a run, --fork begins another one: give one of them")
     if (options.at is None) != (options.fork is None):

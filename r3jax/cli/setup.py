@@ -44,6 +44,8 @@ def plan_of_options(options: Explore) -> Plan:
     """
     if not 16 <= options.resolution <= 4096:
         raise ValueError(f"--resolution must lie between 16 and 4096, got {options.resolution}")
+    if not 0 <= options.seed < 1 << 32:
+        raise ValueError(f"--seed must lie between 0 and 2^32 - 1, got {options.seed}")
     config = ExplorationConfig(
         voxel_size=options.voxel_size,
         cell_size=options.cell_size,

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 
 from r3jax.exploration.clock import ClockName
 
+MAX_CAPACITY = 1 << 27
+"""Rows of a map: 5 GB."""
+
 
 @dataclass(frozen=True)
 class ExplorationConfig:
@@ -57,10 +60,17 @@ class ExplorationConfig:
         for name in ("voxel_size", "cell_size", "max_range", "speed"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("voxel_size", "cell_size"):
+            if not 1e-3 <= getattr(self, name) <= 1e3:
+                raise ValueError(
+                    f"{name} must lie between 0.001 and 1000 m, got {getattr(self, name)}"
+                )
         for name in ("num_bins", "num_probes", "checkpoint_every", "max_still_views"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.capacity < 2 or self.capacity & (self.capacity - 1):
             raise ValueError(f"capacity must be a power of two >= 2, got {self.capacity}")
+        if self.capacity > MAX_CAPACITY:
+            raise ValueError(f"capacity must be at most {MAX_CAPACITY}, got {self.capacity}")
         if self.clock not in ("wall", "model"):
             raise ValueError(f"clock must be `wall` or `model`, got {self.clock!r}")

@@ -95,6 +95,10 @@ def test_info_follows_a_recording(shared, tmp_path, capsys):
         (["--scene", "mesh:/nowhere/house.glb"], ["/nowhere/house.glb"]),
         (["--scene", "mesh:"], ["mesh:"]),
         (["--start", "50", "0", "0"], ["50"]),
+        (["--name", "../x"], ["--name is the name of one folder"]),
+        (["--seed", "9223372036854775808"], ["--seed must lie between"]),
+        (["--capacity", "1099511627776"], ["capacity must be at most"]),
+        (["--cell-size", "1e-300"], ["cell_size must lie between"]),
     ],
 )
 def test_a_mistake_gets_one_line_and_no_traceback(room, tmp_path, capsys, words, message):

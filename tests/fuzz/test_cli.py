@@ -223,9 +223,6 @@ VALUES = {
 }
 """Values of options that chance seldom pairs with them."""
 
-UNCHECKED = {"explore": {"--name"}}
-"""`explore --name ../../x` leads out of --out."""
-
 BEGINNINGS = (COMMANDS[5], COMMANDS[8], COMMANDS[10], COMMANDS[12])
 
 
@@ -233,7 +230,7 @@ def crafted() -> list[Files]:
     (whole, *_) = seeds()
     cases = []
     for words in BEGINNINGS:
-        known = set(OPTIONS[words[0]]) - UNCHECKED.get(words[0], set())
+        known = set(OPTIONS[words[0]])
         for option in sorted(VALUES.keys() & known):
             for value in VALUES[option]:
                 asked = [*words, option, *(value.split() if option == "--start" else [value])]
