@@ -90,6 +90,18 @@ def explore(
     if resume is not None:
         state = continued(resume, mission, state, decided_from=decided_from)
         rows = list(resume.rows)
+    state, stop = _go(state, mission, rows, recorder, on_step or (lambda row: None))
+    return Result(state, tuple(rows), stop.reason, stop.message)
+
+
+def _go(
+    state: LoopState,
+    mission: Mission,
+    rows: list[StepRow],
+    recorder: RunWriter | None,
+    on_step: Callable[[StepRow], None],
+) -> tuple[LoopState, Stop]:
+    """Steps until something ends the run; adds to `rows`, and records the end."""
     try:
         stop: Stop | None = None
         while stop is None:
@@ -99,11 +111,10 @@ def explore(
                 continue
             if recorder is not None:
                 mission.on_stage("record")
-                _record(recorder, output, after, config)
+                _record(recorder, output, after, mission.config)
             state = after
             rows.append(output.row)
-            if on_step is not None:
-                on_step(output.row)
+            on_step(output.row)
     except KeyboardInterrupt:
         stop = Stop(StopReason.INTERRUPTED, f"interrupted by the user after {len(rows)} views")
     except RecordingStopped as error:
@@ -112,9 +123,7 @@ def explore(
         if recorder is not None:
             _finish(recorder, state, Stop(StopReason.FAILED, f"{type(error).__name__}: {error}"))
         raise
-    if recorder is not None:
-        stop = _finish(recorder, state, stop)
-    return Result(state, tuple(rows), stop.reason, stop.message)
+    return state, stop if recorder is None else _finish(recorder, state, stop)
 
 
 def _record(recorder: RunWriter, view: View, state: LoopState, config: ExplorationConfig) -> None:
