@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from r3jax.cli.console import PLAIN
-from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.errors import UserError, check_folder_name, one_line
 from r3jax.cli.options import Explore
 from r3jax.cli.progress import RunProgress
 from r3jax.cli.setup import (
@@ -89,10 +89,8 @@ def run_explore(options: Explore) -> int:
 
 def _set_out(options: Explore, console: Console) -> Expedition:
     """What can be checked quickly comes before the scene is built."""
-    if options.name is not None and (
-        Path(options.name).name != options.name or options.name == ".."
-    ):
-        raise ValueError(f"--name is the name of one folder, without a path, got {options.name!r}")
+    if options.name is not None:
+        check_folder_name(options.name)
     if options.resume is not None and options.fork is not None:
         raise ValueError("--resume goes on with a run, --fork begins another one: give one of them")
     if (options.at is None) != (options.fork is None):

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 from r3jax.cli.captures import Capture, open_capture
-from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.errors import UserError, check_folder_name, one_line
 from r3jax.cli.options import Train
 from r3jax.files import write_atomic
 from r3jax.formats.errors import FormatError
@@ -83,8 +83,7 @@ def _config(options: Train) -> TrainConfig:
 
 def _folder(options: Train, capture: Capture) -> Path:
     """The model's folder; one that is there is kept, unless the user says otherwise."""
-    if Path(options.name).name != options.name or options.name == "..":
-        raise UserError(f"--name is the name of one folder, without a path, got {options.name!r}")
+    check_folder_name(options.name)
     folder = (options.out or capture.models) / options.name
     in_use = folder.is_dir() and any(folder.iterdir())
     if in_use and not (options.overwrite or options.resume):

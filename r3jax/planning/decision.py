@@ -63,14 +63,6 @@ def initial_state(camera: Camera, grid: OccupancyGrid, memory: Any = None) -> Pl
     return PlannerState(camera=camera, trail=nowhere, looks=looks, memory=memory)
 
 
-def ways_from(
-    state: PlannerState, grid: OccupancyGrid, T_world_camera: np.ndarray, config: PlannerConfig
-) -> Travel:
-    """Where the robot can go from here."""
-    position = np.asarray(T_world_camera, dtype=np.float64)[:3, 3]
-    return plan_travel(grid, position, config.safety_margin, np.asarray(state.trail))
-
-
 def look_round(
     state: PlannerState,
     map_state: MapState,
@@ -92,7 +84,8 @@ def look_round(
         that no robot can look at, and those that several views left unexplored, are marked as
         occupied in it (`mask_unexplorable`).
     """
-    travel = ways_from(state, grid, T_world_camera, config)
+    position = np.asarray(T_world_camera, dtype=np.float64)[:3, 3]
+    travel = plan_travel(grid, position, config.safety_margin, np.asarray(state.trail))
     pose = jnp.asarray(T_world_camera, dtype=jnp.float32)
     visible = visible_unexplored(map_state, grid, state.camera, pose, config.scoring)
     state = eqx.tree_at(lambda s: s.looks, state, state.looks + visible.astype(jnp.int32))

@@ -123,13 +123,7 @@ class RunWriter:
             RecordingStopped: the disk refused; the views before stay readable.
         """
         rgb, depth = to_integers(frame)
-        stem = self.path / "frames" / f"{row.step:06d}"
-        with self._guarded():
-            write_atomic(stem.with_suffix(".png"), encode_png(rgb))
-            write_atomic(stem.with_suffix(".depth.png"), encode_png(depth))
-            sync_folder(stem.parent)
-            append_line(self.path / "trace.jsonl", to_json(row))
-            self.views += 1
+        self._store(row, encode_png(rgb), encode_png(depth))
 
     def adopt(self, row: StepRow, run: Run, step: int) -> None:
         """Stores a view of another run as the next one of this run; its pixels stay as they are.
@@ -143,14 +137,17 @@ class RunWriter:
             RunError: an image cannot be read.
             RecordingStopped: the disk refused.
         """
-        stem = self.path / "frames" / f"{row.step:06d}"
         try:
-            images = [run.image_path(step).read_bytes(), run.depth_path(step).read_bytes()]
+            rgb, depth = run.image_path(step).read_bytes(), run.depth_path(step).read_bytes()
         except OSError as error:
             raise RunError(run.path, f"view {step} cannot be read ({error.strerror})") from None
+        self._store(row, rgb, depth)
+
+    def _store(self, row: StepRow, rgb_png: bytes, depth_png: bytes) -> None:
+        stem = self.path / "frames" / f"{row.step:06d}"
         with self._guarded():
-            for suffix, data in zip((".png", ".depth.png"), images, strict=True):
-                write_atomic(stem.with_suffix(suffix), data)
+            write_atomic(stem.with_suffix(".png"), rgb_png)
+            write_atomic(stem.with_suffix(".depth.png"), depth_png)
             sync_folder(stem.parent)
             append_line(self.path / "trace.jsonl", to_json(row))
             self.views += 1
@@ -229,10 +226,11 @@ def _lock(folder: Path):
 def _mend(path: Path) -> None:
     """Leaves the whole rows of views in the trace, and nothing half written anywhere."""
     trace = path / "trace.jsonl"
-    lines = complete_lines(trace)
-    views = [line for line in lines if isinstance(from_json(line), StepRow)]
-    for line in lines:
-        if line not in views:
+    views = []
+    for line in complete_lines(trace):
+        if isinstance(from_json(line), StepRow):
+            views.append(line)
+        else:
             append_line(path / "history.jsonl", line)
     whole = "".join(f"{line}\n" for line in views).encode()
     if trace.read_bytes() != whole:

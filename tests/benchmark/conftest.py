@@ -3,7 +3,8 @@
 import pytest
 
 from r3jax.benchmark.run_cell import run_cell
-from tests.benchmark.tiny import make_cells, write_room
+from tests.benchmark.tiny import make_cells
+from tests.box_room import write_room
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import pytest
 from r3jax.benchmark import run_cell as running
 from r3jax.benchmark.record import CELLS
 from r3jax.cli.main import main
-from tests.benchmark.tiny import write_room
+from tests.box_room import write_room
 
 SMALL = {"policies": "random,frontier", "budget": "views:3", "clock": "model", "resolution": 32}
 SMALL |= {"train-resolution": 32, "iterations": 30, "gaussians": 200, "capacity": 400}

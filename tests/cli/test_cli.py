@@ -12,13 +12,14 @@ from r3jax.exploration.budget import parse_budget
 from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
-from tests.cli.rooms import explore, write_room
+from tests.box_room import write_room
+from tests.cli.small_runs import explore
 from tests.trace.runs import make_header, make_view
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    return write_room(tmp_path_factory.mktemp("mesh"))
+    return write_room(tmp_path_factory.mktemp("mesh") / "room.ply")
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,15 @@ from r3jax.cli.main import main
 from r3jax.exploration.replay import rebuild
 from r3jax.mapping.join import grow, merge
 from r3jax.trace.reader import read_run
-from tests.cli.rooms import explore, write_room
+from tests.box_room import write_room
+from tests.cli.small_runs import explore
 
 VIEWS = 5
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    return write_room(tmp_path_factory.mktemp("mesh"))
+    return write_room(tmp_path_factory.mktemp("mesh") / "room.ply")
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,8 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.views import pinhole_view
 from r3jax.scoring.visibility import candidates_of, depth_buffer
 from r3jax.scoring.voxels import voxels_of
-from tests.benchmark.tiny import CONDITIONS, make_cells, write_room
+from tests.benchmark.tiny import CONDITIONS, make_cells
+from tests.box_room import write_room
 
 CONFIG = ScoringConfig(max_range=5.0)
 LOOKS = [

@@ -14,7 +14,8 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
 from r3jax.trace.reader import read_run
-from tests.benchmark.tiny import CONDITIONS, SETTINGS, make_cells, write_room
+from tests.benchmark.tiny import CONDITIONS, SETTINGS, make_cells
+from tests.box_room import write_room
 from tests.planning.rooms import center, grid_of, pose_at
 
 KNOWN = known_settings(Conditions())

@@ -18,7 +18,8 @@ from r3jax.benchmark.conditions import Conditions
 from r3jax.benchmark.engines.local import run_here
 from r3jax.benchmark.plan import Request
 from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
-from tests.benchmark.tiny import CONDITIONS, SETTINGS, write_room
+from tests.benchmark.tiny import CONDITIONS, SETTINGS
+from tests.box_room import write_room
 from tests.evaluation.records import record
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 

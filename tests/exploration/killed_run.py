@@ -12,7 +12,7 @@ import jax
 
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.planning.policy import make_policy
+from r3jax.planning.policy import Policy, make_policy
 from r3jax.scoring.config import ScoringConfig
 from r3jax.trace.header import camera_fields
 from r3jax.trace.writer import RunWriter
@@ -23,10 +23,15 @@ CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_
 SCORING = ScoringConfig(zbuffer_size=32, panorama_size=32)
 
 
+def small_policy(name: str) -> Policy:
+    """A policy whose decisions are quick; the same shapes for all tests of the loop."""
+    return make_policy(name, num_candidates=8, num_frontier=3, scoring=SCORING)
+
+
 def go_on(path: Path, views: int, policy: str = "ours-pano") -> None:
     """Begins a run in `path`, or goes on with the one that is there."""
     simulator = BoxRoom()
-    planner = make_policy(policy, num_candidates=8, num_frontier=3, scoring=SCORING)
+    planner = small_policy(policy)
     run = None
     if (path / "run.json").exists():
         recorder, run = RunWriter.resume(path)

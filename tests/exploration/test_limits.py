@@ -23,7 +23,7 @@ from r3jax.trace.header import camera_fields
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.exploration.hall import Hall
-from tests.exploration.killed_run import CONFIG, SCORING
+from tests.exploration.killed_run import CONFIG, small_policy
 from tests.trace.runs import make_header
 
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -86,7 +86,7 @@ def test_the_hall_has_walls_and_pillars():
 
 def test_a_short_run_in_a_small_hall(tmp_path):
     """The same code at a size for every day; memory still settles, so it is not asked."""
-    policy = make_policy("ours-pano", num_candidates=8, num_frontier=3, scoring=SCORING)
+    policy = small_policy("ours-pano")
     hall = Hall((4.0, 3.0, 2.4), Camera.from_fov(48, 48, 90.0))
     watch = long_run(tmp_path / "run", hall, policy, CONFIG, 6)
     assert len(watch.memory) == 6

@@ -4,8 +4,8 @@ import jax
 import pytest
 
 from r3jax.exploration import explore
-from r3jax.planning.policy import make_policy, policy_names
-from tests.exploration.killed_run import CONFIG, SCORING
+from r3jax.planning.policy import policy_names
+from tests.exploration.killed_run import CONFIG, small_policy
 from tests.exploration.toys import BoxRoom
 
 
@@ -31,7 +31,7 @@ SCORERS = ("ours", "ours-pano", "active-gs", "cover")
     ],
 )
 def test_the_loop_makes_no_nan(name):
-    policy = make_policy(name, num_candidates=8, num_frontier=3, scoring=SCORING)
+    policy = small_policy(name)
     with jax.debug_nans(True):
         result = explore(HoleyRoom(), policy, budget="views:3", config=CONFIG)
     assert len(result.rows) == 3

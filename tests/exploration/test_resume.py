@@ -15,12 +15,12 @@ import pytest
 from r3jax.exploration import explore
 from r3jax.exploration.resume import state_of, state_tables
 from r3jax.exploration.state import StopReason
-from r3jax.planning.policy import make_policy
 from r3jax.trace.checkpoints import CheckpointWriter, load_checkpoint
 from r3jax.trace.errors import RunError
+from r3jax.trace.header import camera_fields
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
-from tests.exploration.killed_run import CONFIG, SCORING
+from tests.exploration.killed_run import CONFIG, small_policy
 from tests.exploration.toys import BoxRoom, Wander
 from tests.trace.runs import make_header
 
@@ -28,20 +28,15 @@ VIEWS, CUT = 6, 3
 
 
 def policy_of(name):
-    if name == "wander":
-        return Wander()
-    return make_policy(name, num_candidates=8, num_frontier=3, scoring=SCORING)
+    return Wander() if name == "wander" else small_policy(name)
 
 
 def run_in(path, name, views, resume=False, config=CONFIG, simulator=None):
     simulator = simulator or BoxRoom()
-    camera = simulator.camera
-    numbers = {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
-    size = {"width": camera.width, "height": camera.height}
     if resume:
         recorder, run = RunWriter.resume(path)
     else:
-        recorder, run = RunWriter(path, make_header(camera=size | numbers)), None
+        recorder, run = RunWriter(path, make_header(camera=camera_fields(simulator.camera))), None
     with recorder:
         return explore(
             simulator,
