@@ -101,7 +101,7 @@ _AMOUNTS = {
     ("small", "views"): (30, 60),
     ("paper", "views"): (60, 120, 180, 240, 300),
     ("smoke", "seconds"): (8, 16),
-    ("small", "seconds"): (60, 120),
+    ("small", "seconds"): (30, 60),
     ("paper", "seconds"): (60, 120, 180, 240, 300),
 }
 """Snapshots by size and unit; the last one is the budget."""
