@@ -19,6 +19,7 @@ from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.fields import check_fields
 from r3jax.foreign.files import read_bytes
 from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.versions import VersionError, check_version
 from r3jax.trace.header import package_versions, plain_settings
 from r3jax.trace.rows import StepRow
 
@@ -181,11 +182,11 @@ def _read_record(path: Path) -> dict[str, Any]:
     """
     try:
         record = parse_json(read_bytes(path, _MAX_BYTES))
+        if isinstance(record, dict):
+            check_version(record.get("format"), FORMAT)
         check_fields("record", record, _KINDS)
         for name, kinds in _PARTS.items():
             check_fields(name, record[name], kinds)
-        if record["format"] != FORMAT:
-            raise ForeignFileError(f"its format is {record['format']}, this reads {FORMAT}")
         snapshot_order(record["snapshot"])
         run = PurePosixPath(record["run"])
         if run.is_absolute() or ".." in run.parts or "\0" in record["run"]:
@@ -193,6 +194,8 @@ def _read_record(path: Path) -> dict[str, Any]:
         lengths = {len(column) for column in record["views"].values() if column is not None}
         if len(lengths) != 1:
             raise ForeignFileError(f"the columns of `views` differ in length: {sorted(lengths)}")
+    except VersionError as error:
+        raise ValueError(f"{path} has {error}") from None
     except ValueError as error:
         raise ValueError(
             f"{path} is no record of a benchmark ({error!s:.300}): delete it and start the "

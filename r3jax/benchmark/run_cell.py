@@ -185,12 +185,14 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
 
 def _begin_or_resume(path: Path, header: RunHeader) -> tuple[RunWriter, Run | None]:
     """A new run, or what was recorded of the one that lies there."""
-    try:
-        return RunWriter.resume(path)
-    except RunError:  # none, or its header was never written: nothing was recorded
-        if path.exists():
-            shutil.rmtree(path)
-        return RunWriter(path, header), None
+    if (path / "run.json").exists():
+        try:
+            return RunWriter.resume(path)
+        except RunError as error:  # of another version, damaged, not ours to write
+            raise CellError(f"{error}; move it away to explore anew") from None
+    if path.exists():
+        shutil.rmtree(path)  # killed before the header was whole: nothing was recorded
+    return RunWriter(path, header), None
 
 
 def steps_within(run: Run, snapshot: str) -> tuple[StepRow, ...]:

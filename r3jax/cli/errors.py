@@ -17,6 +17,16 @@ def check_folder_name(name: str) -> None:
         raise UserError(f"--name is the name of one folder, without a path, got {name!r}")
 
 
+def check_resolution(pixels: int | None) -> None:
+    """Refuses a --resolution that leaves nothing to compare; None is the default.
+
+    Raises:
+        UserError: fewer than 16 pixels.
+    """
+    if pixels is not None and pixels < 16:
+        raise UserError(f"--resolution must be at least 16, got {pixels}")
+
+
 def one_line(error: BaseException) -> str:
     """An error's text without line breaks."""
     return " ".join(str(error).split())

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from r3jax.cli.captures import Capture, open_capture
-from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.errors import UserError, check_resolution, one_line
 from r3jax.cli.options import Evaluate
 from r3jax.cli.selection import (
     TestSet,
@@ -84,6 +84,7 @@ def _evaluate(options: Evaluate, capture: Capture) -> Outcome:
     # What can be checked quickly comes first.
     if options.worst < 0:
         raise ValueError(f"--worst must not be negative, got {options.worst}")
+    check_resolution(options.resolution)
     training = find_training(options, capture)
     test = choose_views(options, capture, training)
     lpips = None if options.lpips == "none" else load_lpips(options.lpips)
@@ -157,6 +158,7 @@ def _record(options: Evaluate, outcome: Outcome) -> dict[str, Any]:
         plain = dataclasses.asdict(summary)
         summaries[plain.pop("metric")["name"]] = plain
     return {
+        "format": 1,
         "model": str(outcome.training.model),
         "gaussians": outcome.num_gaussians,
         "data": str(outcome.test.capture.path),

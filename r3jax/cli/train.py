@@ -11,8 +11,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 from r3jax.cli.captures import Capture, open_capture
-from r3jax.cli.errors import UserError, check_folder_name, one_line
+from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
 from r3jax.cli.options import Train
+from r3jax.cli.selection import RECORD_FORMAT
 from r3jax.files import write_atomic
 from r3jax.formats.errors import FormatError
 from r3jax.formats.pointcloud import write_points
@@ -67,8 +68,7 @@ def run_train(options: Train) -> int:
 
 
 def _config(options: Train) -> TrainConfig:
-    if options.resolution is not None and options.resolution < 16:
-        raise ValueError(f"--resolution must be at least 16, got {options.resolution}")
+    check_resolution(options.resolution)
     return TrainConfig(
         iterations=options.iterations,
         strategy=options.strategy,
@@ -104,6 +104,7 @@ def _write_record(
 ) -> None:
     """train.json: what the model was trained on, for `r3jax evaluate` and for the reader."""
     record = {
+        "format": RECORD_FORMAT,
         "data": str(options.path),
         "resolution": max(views.width, views.height),
         "train_views": training.tolist(),

@@ -27,6 +27,7 @@ from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.fields import check_fields
 from r3jax.foreign.files import read_bytes
 from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.versions import VersionError, check_version
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
 
@@ -240,10 +241,11 @@ def read_view_set(path: str | Path) -> ViewSet:
     path = Path(path)
     try:
         record = parse_json(read_bytes(path, _MAX_BYTES))
-        if record["format"] != _FORMAT:
-            raise ValueError(f"its format is {record['format']}, not {_FORMAT}")
+        check_version(record["format"], _FORMAT)
         view_set = _from_record(record)
         matches = view_set.hash == record["hash"]
+    except VersionError as error:
+        raise ValueError(f"{path} has {error}, or {_AGAIN}") from None
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not a set of test views ({error!r:.300}): {_AGAIN}") from error
     if not matches:

@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 
 from r3jax.scoring.config import ScoringConfig
 
+MAX_CANDIDATES = 1_000_000
+"""More are no longer a choice within seconds, and their scores no longer fit into memory."""
+
 
 @dataclass(frozen=True)
 class PlannerConfig:
@@ -39,8 +42,10 @@ class PlannerConfig:
 
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""
-        if self.num_candidates < 1:
-            raise ValueError(f"num_candidates must be at least 1, got {self.num_candidates}")
+        if not 1 <= self.num_candidates <= MAX_CANDIDATES:
+            raise ValueError(
+                f"num_candidates must lie between 1 and {MAX_CANDIDATES}, got {self.num_candidates}"
+            )
         if not 0 <= self.num_frontier <= self.num_candidates:
             raise ValueError(
                 f"num_frontier must lie between 0 and num_candidates ({self.num_candidates}), "

@@ -13,6 +13,7 @@ from r3jax.files import write_atomic
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.files import check_tree, read_bytes
 from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.versions import check_version
 from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.train_step import TrainState
 from r3jax.splatting.training_config import TrainConfig
@@ -144,6 +145,7 @@ def _check_settings(folder: Path, settings: dict[str, Any]) -> None:
         stored = parse_json(read_bytes(path, _MAX_BYTES))
         if not isinstance(stored, dict):
             raise ForeignFileError("not a table of settings")
+        check_version(stored.get("format"), FORMAT_VERSION)
     except (OSError, ValueError) as error:
         raise CheckpointError(path, f"cannot be read ({error})") from None
     names = sorted(stored.keys() | settings.keys())

@@ -144,6 +144,11 @@ class TrainConfig(eqx.Module):
         for name in ("iterations", "num_gaussians", "views_per_step", "refine_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.iterations * self.views_per_step >= 1 << 31:
+            raise ValueError(
+                f"{self.iterations} iterations of {self.views_per_step} views each are more than "
+                "2^31 renderings: lower iterations or views_per_step"
+            )
         for name in ("sh_every", "reset_every"):
             value = getattr(self, name)
             if value is not None and value < 1:

@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.foreign.files import check_tree
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
@@ -122,6 +123,7 @@ def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]
 
     path = (folder / f"{step:06d}").resolve()
     try:
+        check_tree(path)
         with ocp.PyTreeCheckpointer() as checkpointer:
             tree = checkpointer.metadata(path).item_metadata.tree
             # NumPy: device arrays would cut 64-bit numbers short.

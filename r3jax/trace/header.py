@@ -16,6 +16,7 @@ from r3jax.foreign.fields import build, check_type
 from r3jax.foreign.files import read_bytes
 from r3jax.foreign.images import MAX_PIXELS
 from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.versions import VersionError, check_version
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.errors import RunError
 
@@ -122,14 +123,10 @@ def read_header(path: Path) -> RunHeader:
         raise RunError(path, f"the file cannot be read ({error})") from None
     if not isinstance(plain, dict) or plain.pop("format", None) != FORMAT:
         raise RunError(path, f"the file does not describe a run (no format {FORMAT!r})")
-    version = plain.pop("version", None)
-    if version not in (1, VERSION):
-        age = "newer" if isinstance(version, int) and version > VERSION else "other"
-        raise RunError(
-            path,
-            f"the run has format version {version}, this package reads versions 1 and {VERSION}: "
-            f"use the {age} r3jax that wrote it",
-        )
+    try:
+        check_version(plain.pop("version", None), VERSION)
+    except VersionError as error:
+        raise RunError(path, f"the run has {error}") from None
     try:
         header = build(RunHeader, plain)
         _check(header)

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 
 from r3jax.files import append_line, sync_folder, write_atomic
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.files import read_bytes
 from r3jax.frame import Frame
 from r3jax.trace.checkpoints import CheckpointWriter, Tables
 from r3jax.trace.errors import RecordingStopped, RunError
@@ -17,6 +19,9 @@ from r3jax.trace.header import RunHeader, header_to_json, package_versions, read
 from r3jax.trace.images import encode_png, to_integers
 from r3jax.trace.reader import Run, complete_lines, read_run
 from r3jax.trace.rows import EndRow, StepRow, from_json, to_json
+
+_MAX_IMAGE_BYTES = 256 << 20
+"""No encoded image of a run comes near it."""
 
 _CONTENT = (
     "run.json",
@@ -138,9 +143,12 @@ class RunWriter:
             RecordingStopped: the disk refused.
         """
         try:
-            rgb, depth = run.image_path(step).read_bytes(), run.depth_path(step).read_bytes()
-        except OSError as error:
-            raise RunError(run.path, f"view {step} cannot be read ({error.strerror})") from None
+            rgb, depth = (
+                read_bytes(path, _MAX_IMAGE_BYTES)
+                for path in (run.image_path(step), run.depth_path(step))
+            )
+        except (OSError, ForeignFileError) as error:
+            raise RunError(run.path, f"view {step} cannot be read ({error})") from None
         self._store(row, rgb, depth)
 
     def _store(self, row: StepRow, rgb_png: bytes, depth_png: bytes) -> None:

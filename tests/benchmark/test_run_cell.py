@@ -13,6 +13,7 @@ from r3jax.benchmark import run_cell as module
 from r3jax.benchmark.cells import paths_of, snapshots_left
 from r3jax.benchmark.record import collect, read_records
 from r3jax.benchmark.run_cell import CellError, run_cell, steps_within
+from r3jax.trace.errors import RunError
 from r3jax.trace.reader import read_run
 from tests.benchmark.tiny import SETTINGS, make_cells
 
@@ -172,6 +173,25 @@ def test_a_snapshot_that_fails_leaves_the_others_and_a_reason(room, tmp_path, ca
         run_cell(cell, tmp_path)
     assert snapshots_left(tmp_path, cell) == ("views:1",)
     assert "ViewsError" in paths_of(tmp_path, cell).error.read_text()
+
+
+@pytest.mark.parametrize("damage", ["a later version", "an image that is missing"])
+def test_a_recorded_exploration_is_never_deleted(finished, room, tmp_path, damage):
+    (cell,) = make_cells(room, tmp_path)
+    run = paths_of(tmp_path, cell).run
+    shutil.copytree(paths_of(finished[0], finished[1][0]).run, run)
+    trace = run / "trace.jsonl"
+    trace.write_bytes(b"".join(trace.read_bytes().splitlines(keepends=True)[:2]))  # cut off
+    if damage == "a later version":
+        header = json.loads((run / "run.json").read_text())
+        (run / "run.json").write_text(json.dumps(header | {"version": 1000}))
+    else:
+        shutil.rmtree(run / "checkpoints")
+        (run / "frames" / "000001.png").unlink()
+    before = sorted(path for path in run.rglob("*") if path.is_file() and path.name != "lock")
+    with pytest.raises((CellError, RunError), match="1000" if "later" in damage else "000001.png"):
+        run_cell(cell, tmp_path)
+    assert set(before) <= set(run.rglob("*"))
 
 
 def test_a_scene_that_changed_meanwhile_is_refused(room, tmp_path):

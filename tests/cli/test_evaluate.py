@@ -144,6 +144,13 @@ def test_the_background_of_the_training_is_used(place):
     assert float(results(place, "white")[0][0]["psnr"]) < 25.0
 
 
+def test_a_training_of_a_later_version_is_told_as_such(place, capsys):
+    path = place / "runs" / "lounge" / "models" / "last" / "train.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 2}))
+    assert evaluate() == 2
+    assert "use the newer r3jax" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -152,7 +159,8 @@ def test_the_background_of_the_training_is_used(place):
         (["--views", "every:0"], ["at least 1, got 'every:0'"]),
         (["--views", "every:x"], ["at least 1, got 'every:x'"]),
         (["--worst", "-1"], ["--worst"]),
-        (["--resolution", "8"], ["at least 11 x 11 px"]),
+        (["--resolution", "8"], ["--resolution must be at least 16, got 8"]),
+        (["--resolution", "0"], ["--resolution must be at least 16, got 0"]),
         (["--views", "elsewhere"], ["different", "size"]),
     ],
 )

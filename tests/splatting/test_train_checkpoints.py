@@ -1,16 +1,21 @@
 """A training that was interrupted goes on as if it had not been."""
 
 import json
+import random
 import shutil
 import signal
+import subprocess
+import sys
+import time
 
 import jax
 import numpy as np
 import pytest
 
 from r3jax.splatting.errors import CheckpointError
+from r3jax.splatting.ply import write_scene
 from r3jax.splatting.train import fit
-from tests.splatting.test_train import ROOMY, config, views  # noqa: F401
+from tests.splatting.ball import ROOMY, ball_views, config
 
 
 def interrupt_at(step: int):
@@ -22,7 +27,12 @@ def interrupt_at(step: int):
 
 
 @pytest.fixture(scope="module")
-def interrupted(views, tmp_path_factory):  # noqa: F811
+def views():
+    return ball_views()
+
+
+@pytest.fixture(scope="module")
+def interrupted(views, tmp_path_factory):
     """A folder with a training that Ctrl-C ended after 20 of 40 steps."""
     folder = tmp_path_factory.mktemp("interrupted")
     result = fit(views, config(), folder=folder, checkpoint_every=12, on_progress=interrupt_at(20))
@@ -37,7 +47,7 @@ def folder(interrupted, tmp_path):
 
 
 @pytest.mark.parametrize("strategy", ["vanilla", "mcmc"])
-def test_resumed_equals_uninterrupted_bit_for_bit(views, tmp_path, strategy):  # noqa: F811
+def test_resumed_equals_uninterrupted_bit_for_bit(views, tmp_path, strategy):
     settings = config(strategy=strategy, background="random")
     whole = fit(views, settings)
     first = fit(views, settings, folder=tmp_path, on_progress=interrupt_at(17))
@@ -49,7 +59,7 @@ def test_resumed_equals_uninterrupted_bit_for_bit(views, tmp_path, strategy):  #
     assert second.dropped == whole.dropped
 
 
-def test_the_newest_two_are_kept_and_an_end_is_always_saved(views, interrupted, folder):  # noqa: F811
+def test_the_newest_two_are_kept_and_an_end_is_always_saved(views, interrupted, folder):
     names = lambda: sorted(p.name for p in folder.iterdir() if p.is_dir())
     assert names() == ["0000012", "0000020"]
     result = fit(views, config(), folder=folder, resume=True, checkpoint_every=12)
@@ -60,7 +70,7 @@ def test_the_newest_two_are_kept_and_an_end_is_always_saved(views, interrupted, 
     jax.tree.map(np.testing.assert_array_equal, again.scene, result.scene)
 
 
-def test_another_budget_may_resume_but_other_settings_are_named(views, folder):  # noqa: F811
+def test_another_budget_may_resume_but_other_settings_are_named(views, folder):
     changed = config(rate_sh=1e-3, iterations=50)
     with pytest.raises(CheckpointError, match=r"iterations \(stored 40, now 50\), rate_sh"):
         fit(views, changed, folder=folder, resume=True)
@@ -70,17 +80,17 @@ def test_another_budget_may_resume_but_other_settings_are_named(views, folder): 
     fit(views, config(raster=type(ROOMY)(backend="numba")), folder=folder, resume=True)
 
 
-def test_a_new_training_does_not_bury_an_old_one(views, folder):  # noqa: F811
+def test_a_new_training_does_not_bury_an_old_one(views, folder):
     with pytest.raises(CheckpointError, match="resume it, overwrite it, or choose another folder"):
         fit(views, config(), folder=folder)
 
 
-def test_nothing_to_resume_from(views, tmp_path):  # noqa: F811
+def test_nothing_to_resume_from(views, tmp_path):
     with pytest.raises(CheckpointError, match="no checkpoint to resume from"):
         fit(views, config(), folder=tmp_path, resume=True)
 
 
-def test_what_cannot_be_read_is_named(views, folder):  # noqa: F811
+def test_what_cannot_be_read_is_named(views, folder):
     newest = folder / "0000020"
     for path in newest.rglob("*"):
         if path.is_file():
@@ -92,7 +102,7 @@ def test_what_cannot_be_read_is_named(views, folder):  # noqa: F811
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"format":'])
-def test_settings_that_cannot_be_read_are_named(views, folder, text):  # noqa: F811
+def test_settings_that_cannot_be_read_are_named(views, folder, text):
     (folder / "training.json").write_text(text)
     with pytest.raises(CheckpointError, match=r"training\.json: cannot be read"):
         fit(views, config(), folder=folder, resume=True)
@@ -103,3 +113,40 @@ def test_settings_are_stored_as_plain_numbers(folder):
     assert stored["iterations"] == 40
     assert stored["raster.backend"] == "numba"
     assert "raster.max_intersections" not in stored
+
+
+def test_a_training_of_a_later_version_is_told_as_such(views, folder):
+    path = folder / "training.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 2}))
+    with pytest.raises(CheckpointError, match="use the newer r3jax"):
+        fit(views, config(), folder=folder, resume=True)
+
+
+def _start(folder):
+    command = [sys.executable, "-m", "tests.splatting.killed_training", str(folder)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def _saved(folder):
+    return {path.name for path in folder.glob("checkpoints/[0-9]*") if path.name.isdigit()}
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(30, marks=pytest.mark.slow)])
+def test_a_training_survives_kills_at_random_moments(views, tmp_path, kills):
+    rng, steps = random.Random(kills), []
+    for _ in range(kills):
+        process = _start(tmp_path)
+        before = _saved(tmp_path)
+        while process.poll() is None and _saved(tmp_path) <= before:
+            time.sleep(0.002)
+        time.sleep(rng.uniform(0.0, 1.0))
+        process.send_signal(signal.SIGKILL)
+        process.communicate(timeout=60)
+        steps.append(max(map(int, _saved(tmp_path))))
+    assert steps == sorted(steps)  # what was reached is never lost
+    process = _start(tmp_path)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors.decode()
+    whole = fit(views, config(background="random"))
+    write_scene(tmp_path / "whole.ply", whole.scene)
+    assert (tmp_path / "scene.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
