@@ -115,6 +115,7 @@ def _resume(options: Explore, path: Path, console: Console) -> Expedition:
     run = read_run(path)
     if run.header.parent is not None and "merged" in run.header.parent:
         raise ValueError(f"{path} was merged from other runs: fork it with --fork and --at")
+    _refuse_half_a_fork(run)
     plan = plan_of_run(run)
     header = None
     if options.budget is not None:
@@ -165,6 +166,17 @@ def _fork(options: Explore, path: Path, console: Console) -> Expedition:
     except BaseException:
         recorder.close()
         raise
+
+
+def _refuse_half_a_fork(run: Run) -> None:
+    """A fork that was cut off while it took views over would go its own way too early."""
+    parent = run.header.parent or {}
+    wanted = parent.get("views", 0) if "forked" in parent else 0
+    if len(run.rows) < wanted:
+        raise ValueError(
+            f"{run.path} was cut off when it had {len(run.rows)} of the {wanted} views that it "
+            f"takes over from {parent['forked']}: fork again, with --overwrite"
+        )
 
 
 def _decided_from(run: Run) -> int:

@@ -32,6 +32,7 @@ _COMMANDS = {
     "info": Info,
 }
 
+INTERRUPTED = 130
 USER_ERROR = 2
 """Exit code where the user can mend it: an unknown name, a folder that exists, a broken file."""
 
@@ -60,6 +61,9 @@ def main(args: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"r3jax: {error}", file=sys.stderr)
         return USER_ERROR
+    except KeyboardInterrupt:  # what a command has not caught itself
+        print("r3jax: interrupted; what was recorded before is complete", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _run(

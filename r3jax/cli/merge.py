@@ -8,7 +8,7 @@ from rich.console import Console
 from r3jax.cli.console import PLAIN
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Merge
-from r3jax.exploration.replay import check_alike, rebuild
+from r3jax.exploration.replay import check_alike, parts_of, rebuild
 from r3jax.formats.pointcloud import voxel_points, write_points
 from r3jax.formats.transforms import write_transforms
 from r3jax.mapping.state import MapState
@@ -79,7 +79,7 @@ def merge_runs(runs: list[Run], out: Path, *, overwrite: bool = False) -> MapSta
 
 
 def _header(runs: list[Run]) -> RunHeader:
-    views = [len(run.rows) for run in runs]
+    views = [views for run in runs for views in parts_of(run)]
     return dataclasses.replace(
         runs[0].header,
         budget=f"views:{sum(views)}",

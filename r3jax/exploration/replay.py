@@ -102,12 +102,16 @@ def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | N
     return Difference(name, int(different.sum()), float(gap.max()))
 
 
+def parts_of(run: Run) -> list[int]:
+    """Views of each run that a merged one is made of; all views of any other."""
+    return (run.header.parent or {}).get("merged_views", [len(run.rows)])
+
+
 def _starts_of(run: Run) -> list[np.ndarray]:
     """Where a run began; a merged one began several times."""
     if not run.rows:
         raise RunError(run.path, "the run has no view")
-    views = (run.header.parent or {}).get("merged_views", [len(run.rows)])
-    begins = itertools.accumulate(views[:-1], initial=0)
+    begins = itertools.accumulate(parts_of(run)[:-1], initial=0)
     return [np.asarray(run.rows[step].pose, dtype=np.float64) for step in begins]
 
 

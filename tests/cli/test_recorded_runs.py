@@ -194,6 +194,35 @@ def test_a_merged_run_is_forked_not_resumed(runs, tmp_path, capsys):
     assert len(read_run(tmp_path / "both-random-from6").rows) == 7
 
 
+def test_a_merged_run_merges_again(runs, tmp_path):
+    paths = [str(runs / name) for name in ("part", "other", "whole")]
+    assert main(["merge", *paths[:2], "--out", str(tmp_path / "two")]) == 0
+    assert main(["merge", str(tmp_path / "two"), paths[2], "--out", str(tmp_path / "three")]) == 0
+    assert main(["replay", str(tmp_path / "three")]) == 0
+    run = read_run(tmp_path / "three")
+    assert run.header.parent["merged_views"] == [3, 3, VIEWS]
+    cells = rebuild([read_run(path) for path in paths])[1]
+    np.testing.assert_array_equal(run.checkpoint()[2].log_odds, cells.log_odds)
+
+
+def test_a_fork_that_was_cut_off_while_it_took_views_over_is_refused(runs, tmp_path, capsys):
+    words = ["--at", "3", "--out", str(tmp_path), "--name", "fork", "--budget", "views:3"]
+    assert main(["explore", "--fork", str(runs / "part"), *words]) == 0
+    trace = tmp_path / "fork" / "trace.jsonl"
+    trace.write_bytes(b"".join(trace.read_bytes().splitlines(keepends=True)[:2]))
+    assert main(["explore", "--resume", str(tmp_path / "fork")]) == 2
+    assert "it had 2 of the 3 views that it takes over from" in capsys.readouterr().err
+
+
+def test_an_interrupt_that_nobody_catches_is_no_traceback(part, monkeypatch, capsys):
+    def interrupted(run):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("r3jax.cli.replay.differences", interrupted)
+    assert main(["replay", str(part)]) == 130
+    assert "r3jax: interrupted" in capsys.readouterr().err
+
+
 def test_runs_of_different_terms_do_not_merge(room, runs, tmp_path, capsys):
     assert explore(room, tmp_path, "--max-range", "3") == 0
     assert main(["merge", str(runs / "part"), str(tmp_path / "box")]) == 2
