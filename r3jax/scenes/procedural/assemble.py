@@ -73,7 +73,7 @@ def assemble(
 
 
 def _rounded(lamps: list[Lamp]) -> tuple[Lamp, ...]:
-    out = []
+    out: list[Lamp] = []
     for lamp in lamps:
         x, y, z = (round(c, 6) for c in lamp.position)
         out.append(Lamp((x, y, z), lamp.color, lamp.reach))

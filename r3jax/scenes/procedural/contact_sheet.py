@@ -61,7 +61,7 @@ def _shoot(world: World, eyes_and_targets: list[np.ndarray], fov_deg: float) -> 
 
     edge = _TILE * _SHARPER
     simulator = RaycastSimulator(world, Camera.from_fov(edge, edge, fov_deg))
-    pictures = []
+    pictures: list[Image.Image] = []
     for eye, target in eyes_and_targets:
         pose = look_at(jnp.asarray(eye, jnp.float32), jnp.asarray(target, jnp.float32))
         rgb = np.array(simulator.render(np.asarray(pose, dtype=np.float64)).rgb)

@@ -9,6 +9,7 @@ from r3jax.scenes.procedural import finishes as f
 from r3jax.scenes.procedural.model import Finish, Model
 from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import box, combine, curtain, cylinder, disc, panel, quad, tube
+from r3jax.scenes.procedural.textures import Color
 
 
 def picture(
@@ -62,7 +63,7 @@ def radiator(width: Real = 1.0, height: Real = 0.55) -> Model:
     return model.add(pipe, f.metal((0.72, 0.5, 0.36), 2))
 
 
-def rug(width: Real, depth: Real, palette, seed: int) -> Model:
+def rug(width: Real, depth: Real, palette: tuple[Color, ...], seed: int) -> Model:
     """A rug, origin in its middle."""
     sheet = quad((-width / 2, -depth / 2, 0.012), (width, 0, 0), (0, depth, 0), 0.3)
     rim = box((-width / 2, -depth / 2, 0.001), (width / 2, depth / 2, 0.0115))

@@ -5,6 +5,8 @@ Tiles are sized for about 320 texels per metre on walls and floors, more on smal
 
 import functools
 
+import numpy as np
+
 from r3jax.scenes.procedural import patterns, pictures, screens, textures
 from r3jax.scenes.procedural.model import Finish
 from r3jax.scenes.procedural.noise import Real
@@ -222,7 +224,7 @@ def frosted(seed: int = 6) -> Finish:
     return Finish(Material(texture, specular=0.4, shininess=60.0, mirror=0.08), (0.9, 0.9))
 
 
-def _flat(texture, gloss: Real = 0.15, emission: Real = 0.0) -> Finish:
+def _flat(texture: np.ndarray, gloss: Real = 0.15, emission: Real = 0.0) -> Finish:
     return Finish(Material(texture, specular=gloss, shininess=40.0, emission=emission))
 
 

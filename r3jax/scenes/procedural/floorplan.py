@@ -7,6 +7,7 @@ faces they touch and get reveals, frames and sills. So a camera inside sees surf
 
 import itertools
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,10 @@ DOOR_HEIGHT = 2.15
 _CELL = 0.36  # largest cell of a wall, floor or ceiling [m]: how finely corners are shaded
 
 
+_Hole = tuple[Real, Real, Real, Real]
+"""An opening in a wall: from, to, bottom, top along it [m]."""
+
+
 @dataclass
 class Room:
     """A rectangle of free space and what its surfaces are made of."""
@@ -36,7 +41,7 @@ class Room:
     floor: Finish
     ceiling: Finish
     height: Real = 2.6
-    sides: dict[str, Finish] = field(default_factory=dict)
+    sides: dict[str, Finish] = field(default_factory=dict[str, Finish])
     """Other finishes for single walls: "n", "e", "s", "w"."""
     wainscot: tuple[Real, Finish] | None = None
     """Height [m] and finish of the lower part of all walls."""
@@ -60,11 +65,11 @@ class Opening:
 class Plan:
     """A floor plan under construction."""
 
-    rooms: dict[str, Room] = field(default_factory=dict)
-    openings: list[Opening] = field(default_factory=list)
+    rooms: dict[str, Room] = field(default_factory=dict[str, Room])
+    openings: list[Opening] = field(default_factory=list[Opening])
     model: Model = field(default_factory=Model)
 
-    def room(self, name: str, rect: tuple[Real, Real, Real, Real], **surfaces) -> Room:
+    def room(self, name: str, rect: tuple[Real, Real, Real, Real], **surfaces: Any) -> Room:
         """Adds a room (x0, y0, x1, y1); `surfaces` are the fields of `Room`."""
         self.rooms[name] = Room(*rect, **surfaces)
         return self.rooms[name]
@@ -184,9 +189,7 @@ class Plan:
             if r.skirting is not None:
                 self._strip(r, side, (0.0, 0.09), 0.015, holes, r.skirting)
 
-    def _rail(
-        self, r: Room, side: str, z: Real, holes: list[tuple[Real, Real, Real, Real]]
-    ) -> None:
+    def _rail(self, r: Room, side: str, z: Real, holes: list[_Hole]) -> None:
         finish = r.skirting or f.enamel(f.WHITE, 3, 0.2)
         blocking = [
             (a, b, 0.0 if c < z + 0.02 and d > z - 0.02 else 9.0, d) for a, b, c, d in holes
@@ -194,7 +197,13 @@ class Plan:
         self._strip(r, side, (z - 0.02, z + 0.02), 0.018, blocking, finish)
 
     def _strip(
-        self, r: Room, side: str, z: tuple[Real, Real], depth: Real, holes, finish: Finish
+        self,
+        r: Room,
+        side: str,
+        z: tuple[Real, Real],
+        depth: Real,
+        holes: list[_Hole],
+        finish: Finish,
     ) -> None:
         """A bar along a wall, interrupted by the openings that reach down to it."""
         lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
@@ -204,20 +213,21 @@ class Plan:
         for a, b in zip(starts, ends, strict=True):
             if b - a < 0.02:
                 continue
-            low, high = {
+            corners: dict[str, tuple[tuple[Real, Real], tuple[Real, Real]]] = {
                 "n": ((a, r.y1 - depth), (b, r.y1)),
                 "s": ((a, r.y0), (b, r.y0 + depth)),
                 "e": ((r.x1 - depth, a), (r.x1, b)),
                 "w": ((r.x0, a), (r.x0 + depth, b)),
-            }[side]
+            }
+            low, high = corners[side]
             self.model.add(box((*low, z[0]), (*high, z[1])), finish)
 
-    def _holes(self, r: Room, side: str) -> list[tuple[Real, Real, Real, Real]]:
-        """Openings in one wall: (from, to, bottom, top) along it [m]."""
+    def _holes(self, r: Room, side: str) -> list[_Hole]:
+        """Openings in one wall."""
         face = {"n": r.y1, "s": r.y0, "e": r.x1, "w": r.x0}[side]
         across, along = (1, 0) if side in "ns" else (0, 1)
         lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
-        holes = []
+        holes: list[_Hole] = []
         for o in self.openings:
             touches = min(abs(o.low[across] - face), abs(o.high[across] - face)) < 1e-6
             if touches and o.low[along] > lo - 1e-6 and o.high[along] < hi + 1e-6:
@@ -225,7 +235,7 @@ class Plan:
         return holes
 
 
-def _wall(r: Room, side: str, z0: Real, z1: Real, holes) -> Shape:
+def _wall(r: Room, side: str, z0: Real, z1: Real, holes: list[_Hole]) -> Shape:
     """One wall between two heights, seen from inside, without its openings."""
     lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
     s = _ticks(lo, hi, [v for a, b, _, _ in holes for v in (a, b)])
@@ -264,7 +274,9 @@ def _ticks(lo: Real, hi: Real, cuts: list[Real]) -> np.ndarray:
     return np.concatenate([*parts, [hi]])
 
 
-def _tunnel(axis: str, gap, span, z) -> list[Shape]:
+def _tunnel(
+    axis: str, gap: tuple[Real, Real], span: tuple[Real, Real], z: tuple[Real, Real]
+) -> list[Shape]:
     """The four inner faces of an opening: floor, head and both jambs."""
     (g0, g1), (s0, s1), (z0, z1) = gap, span, z
     faces = [

@@ -11,6 +11,7 @@ import numpy as np
 
 from r3jax.scenes.procedural.noise import Real
 from r3jax.scenes.procedural.shapes import Shape, rotation
+from r3jax.scenes.procedural.textures import Color
 from r3jax.simulators.world import Lamp, Material
 
 HEADINGS = {"n": 0.0, "w": 90.0, "s": 180.0, "e": 270.0}
@@ -41,8 +42,8 @@ class Piece:
 class Model:
     """A collection of pieces and lamps that is placed as one."""
 
-    pieces: list[Piece] = field(default_factory=list)
-    lamps: list[Lamp] = field(default_factory=list)
+    pieces: list[Piece] = field(default_factory=list[Piece])
+    lamps: list[Lamp] = field(default_factory=list[Lamp])
 
     def add(
         self,
@@ -74,7 +75,9 @@ class Model:
         self.pieces.append(Piece(shape.corners, uv, finish, tint))
         return self
 
-    def light(self, at: tuple[Real, Real, Real], reach: Real = 2.5, color=None) -> "Model":
+    def light(
+        self, at: tuple[Real, Real, Real], reach: Real = 2.5, color: Color | None = None
+    ) -> "Model":
         """Adds a lamp at a place in the model's frame; returns the model."""
         self.lamps.append(Lamp(at, color or (1.0, 0.9, 0.75), reach))
         return self

@@ -40,7 +40,8 @@ def book_row(length: Real, height: Real, depth: Real, seed: int, thickness: Real
     thick, times `thickness`.
     """
     rng = np.random.default_rng(seed)
-    covers, pages = [], []
+    covers: list[Shape] = []
+    pages: list[Shape] = []
     x = 0.0
     while x < length - 0.02:
         thick = min(thickness * (0.018 + 0.038 * rng.random()), length - x)
@@ -132,7 +133,7 @@ def leafy_plant(height: Real, seed: int, leaves: int = 34, broad: Real = 0.3) ->
         lathe([(0.92 * pot, 1.45 * pot), (0.0, 1.46 * pot)], 12),
         f.carpet((0.25, 0.18, 0.13), (0.4, 0.32, 0.25), 2),
     )
-    blades = {0: [], 1: []}
+    blades: dict[int, list[Shape]] = {0: [], 1: []}
     for k in range(leaves):
         angle = 2.39996 * k + 0.3 * rng.random()
         lift = 1.35 - 1.1 * (k / leaves) * (0.8 + 0.4 * rng.random())

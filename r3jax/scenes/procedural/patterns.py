@@ -9,14 +9,14 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from r3jax.scenes.procedural.noise import Real, blend, cloud, smoothstep, texels
-from r3jax.scenes.procedural.textures import Color
+from r3jax.scenes.procedural.textures import Color, Ink
 
 
 def _rgb(color: Color) -> np.ndarray:
     return np.asarray(color, dtype=np.float32)
 
 
-def _bytes(color: Color, shade: Real = 1.0) -> tuple[int, int, int]:
+def _bytes(color: Color, shade: Real = 1.0) -> Ink:
     r, g, b = (int(255 * min(1.0, max(0.0, c * shade))) for c in color)
     return r, g, b
 
@@ -102,7 +102,7 @@ def rug(palette: tuple[Color, ...], seed: int, height: int = 512, width: int = 7
     return texels(image * shade[..., None])
 
 
-def _leaf(draw: ImageDraw.ImageDraw, at: np.ndarray, angle: Real, length: Real, fill) -> None:
+def _leaf(draw: ImageDraw.ImageDraw, at: np.ndarray, angle: Real, length: Real, fill: Ink) -> None:
     along = np.linspace(0.0, 1.0, 9)
     half = 0.22 * np.sin(np.pi * along**0.8)
     direction = np.array([np.cos(angle), np.sin(angle)])
@@ -112,7 +112,9 @@ def _leaf(draw: ImageDraw.ImageDraw, at: np.ndarray, angle: Real, length: Real, 
     draw.polygon([tuple(p) for p in np.concatenate([spine + edge, (spine - edge)[::-1]])], fill)
 
 
-def _sprig(draw: ImageDraw.ImageDraw, at: np.ndarray, size: Real, rng, inks) -> None:
+def _sprig(
+    draw: ImageDraw.ImageDraw, at: np.ndarray, size: Real, rng: np.random.Generator, inks: list[Ink]
+) -> None:
     """A branch with leaves on both sides and a flower on top."""
     lean = rng.normal(0.0, 0.35) - np.pi / 2
     tip = at + size * np.array([np.cos(lean), np.sin(lean)])
@@ -151,7 +153,9 @@ def wallpaper(
     return texels(printed * (1.0 + emboss + fibres)[..., None])
 
 
-def _botanical(draw: ImageDraw.ImageDraw, size: int, rng, inks) -> None:
+def _botanical(
+    draw: ImageDraw.ImageDraw, size: int, rng: np.random.Generator, inks: tuple[Color, ...]
+) -> None:
     cells = 4
     pitch = size / cells
     for i in range(cells):
@@ -165,7 +169,9 @@ def _botanical(draw: ImageDraw.ImageDraw, size: int, rng, inks) -> None:
                 _sprig(draw, at + wrap, pitch * 0.95, rng, fills)
 
 
-def _damask(draw: ImageDraw.ImageDraw, size: int, rng, inks) -> None:
+def _damask(
+    draw: ImageDraw.ImageDraw, size: int, rng: np.random.Generator, inks: tuple[Color, ...]
+) -> None:
     pitch = size / 4
     for i in range(-1, 6):
         for j in range(-1, 6):
@@ -179,7 +185,9 @@ def _damask(draw: ImageDraw.ImageDraw, size: int, rng, inks) -> None:
                 draw.ellipse([at[0] - r, at[1] - r, at[0] + r, at[1] + r], fill=_bytes(ink, 0.8))
 
 
-def _trellis(draw: ImageDraw.ImageDraw, size: int, rng, inks) -> None:
+def _trellis(
+    draw: ImageDraw.ImageDraw, size: int, rng: np.random.Generator, inks: tuple[Color, ...]
+) -> None:
     pitch = size // 8
     width = max(3, size // 130)
     for k in range(-size, 2 * size, pitch):
@@ -192,7 +200,9 @@ def _trellis(draw: ImageDraw.ImageDraw, size: int, rng, inks) -> None:
                 draw.ellipse([x - r, y - r, x + r, y + r], fill=_bytes(inks[-1]))
 
 
-def _lines(draw: ImageDraw.ImageDraw, size: int, rng, inks) -> None:
+def _lines(
+    draw: ImageDraw.ImageDraw, size: int, rng: np.random.Generator, inks: tuple[Color, ...]
+) -> None:
     pitch = size // 8
     for k in range(8):
         x = k * pitch

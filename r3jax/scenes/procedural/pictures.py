@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from r3jax.scenes.procedural.noise import Real, blend, cloud, ridge, smoothstep, texels
+from r3jax.scenes.procedural.textures import Color, Ink
 
 PALETTES = (
     (
@@ -31,7 +32,7 @@ PALETTES = (
 """Colours that go together, five each."""
 
 
-def ink(color, shade: Real = 1.0) -> tuple[int, int, int]:
+def ink(color: Color | np.ndarray, shade: Real = 1.0) -> Ink:
     """A colour in [0, 1] as the bytes that Pillow draws with."""
     r, g, b = (int(255 * min(1.0, max(0.0, c * shade))) for c in color)
     return r, g, b
@@ -42,7 +43,14 @@ def to_float(image: Image.Image) -> np.ndarray:
     return np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
 
 
-def write_lines(draw: ImageDraw.ImageDraw, box, height: Real, rng, fill, ragged=0.35) -> None:
+def write_lines(
+    draw: ImageDraw.ImageDraw,
+    box: tuple[Real, Real, Real, Real],
+    height: Real,
+    rng: np.random.Generator,
+    fill: Ink,
+    ragged: Real = 0.35,
+) -> None:
     """Fills a box (left, top, right, bottom) with marks that look like lines of print."""
     left, top, right, bottom = box
     y = top
@@ -160,7 +168,7 @@ def window_view(seed: int, height: int = 512, width: int = 512) -> np.ndarray:
     return texels(np.clip(canvas * 1.12 + 0.04, 0, 1) * grain[..., None])
 
 
-def _hedge(canvas: Image.Image, rng) -> Image.Image:
+def _hedge(canvas: Image.Image, rng: np.random.Generator) -> Image.Image:
     width, height = canvas.size
     draw = ImageDraw.Draw(canvas)
     for _ in range(700):

@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw
 
 from r3jax.scenes.procedural.noise import cloud, smoothstep, texels
 from r3jax.scenes.procedural.pictures import PALETTES, ink, landscape, to_float, write_lines
+from r3jax.scenes.procedural.textures import Color
 
 SPINES = 32
 """Books in the atlas that `book_spines` draws, side by side."""
@@ -72,7 +73,9 @@ def blackboard(seed: int, height: int = 512, width: int = 1024) -> np.ndarray:
     )
 
 
-def _board(seed: int, height: int, width: int, ground, pens) -> np.ndarray:
+def _board(
+    seed: int, height: int, width: int, ground: Color, pens: tuple[Color, ...]
+) -> np.ndarray:
     rng = np.random.default_rng(seed)
     canvas = Image.new("RGB", (width, height), ink(ground))
     draw = ImageDraw.Draw(canvas)
@@ -105,7 +108,7 @@ def _board(seed: int, height: int, width: int, ground, pens) -> np.ndarray:
     return texels(to_float(canvas) * (1.0 + grain)[..., None] + smear[..., None])
 
 
-def ridge_line(rng, num: int) -> np.ndarray:
+def ridge_line(rng: np.random.Generator, num: int) -> np.ndarray:
     """A short random curve with mean 0, [num]."""
     line = np.cumsum(rng.normal(size=num))
     return (line - line.mean()) / max(float(np.abs(line).max()), 1e-6)

@@ -8,6 +8,7 @@ Shape symbols: F triangles; n points.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -176,7 +177,7 @@ def ball(radii: Point, segments: int = 12, rings: int = 7, power: Real = 1.0) ->
     """
     theta = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
     phi = np.linspace(0.0, 2.0 * np.pi, segments + 1)
-    soften = lambda c: np.sign(c) * np.abs(c) ** power
+    soften: Callable[[np.ndarray], np.ndarray] = lambda c: np.sign(c) * np.abs(c) ** power
     cos_t, sin_t = soften(np.cos(theta)), soften(np.sin(theta))
     cos_t[[0, -1]], sin_t[[0, -1]] = 0.0, (-1.0, 1.0)
     cos_p, sin_p = soften(np.cos(phi)), soften(np.sin(phi))

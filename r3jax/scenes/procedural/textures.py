@@ -14,6 +14,10 @@ from PIL import Image, ImageDraw
 from r3jax.scenes.procedural.noise import Real, blend, cloud, smoothstep, texels
 
 Color = tuple[Real, Real, Real]
+"""Red, green and blue in [0, 1]."""
+
+Ink = tuple[int, int, int]
+"""The same as Pillow wants it: in 0 .. 255."""
 
 
 def _rgb(color: Color) -> np.ndarray:
