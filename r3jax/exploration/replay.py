@@ -83,7 +83,7 @@ def differences(run: Run) -> tuple[int, list[Difference]]:
     """
     step, stored_map, stored_grid = run.checkpoint()
     map_state, grid = rebuild([run], step + 1)
-    found = []
+    found: list[Difference | None] = []
     for table, stored, rebuilt in (("map", stored_map, map_state), ("grid", stored_grid, grid)):
         for name, array in vars(stored).items():
             if isinstance(array, jax.Array):

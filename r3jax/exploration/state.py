@@ -81,7 +81,7 @@ class View:
     frame: Frame
     """In stored form."""
 
-    stages: dict[str, float] = field(default_factory=dict)
+    stages: dict[str, float] = field(default_factory=dict[str, float])
     """Seconds that the stages really took, those off the mission clock included."""
 
 

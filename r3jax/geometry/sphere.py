@@ -5,6 +5,7 @@ Shape symbols: B directions of a lattice; n query directions; S cells along an o
 
 import functools
 import math
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,10 +57,13 @@ def octahedral_cell(directions: Float[Array, "3 n"], size: int) -> Int[Array, " 
     x, y, z = directions
     inverse = 1.0 / jnp.maximum(jnp.abs(x) + jnp.abs(y) + jnp.abs(z), 1e-20)
     u, v = x * inverse, y * inverse
-    sign = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
+    sign: Callable[[Array], Array] = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
     u_folded = jnp.where(z < 0.0, (1.0 - jnp.abs(v)) * sign(u), u)
     v_folded = jnp.where(z < 0.0, (1.0 - jnp.abs(u)) * sign(v), v)
-    place = lambda value: jnp.clip(((value * 0.5 + 0.5) * size).astype(jnp.int32), 0, size - 1)
+
+    def place(value: Array) -> Array:
+        return jnp.clip(((value * 0.5 + 0.5) * size).astype(jnp.int32), 0, size - 1)
+
     return place(v_folded) * size + place(u_folded)
 
 

@@ -4,6 +4,8 @@ A voxel index is three signed integers of 21 bits each, packed into two 32-bit w
 that is a world of 100 km.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
@@ -48,5 +50,5 @@ def unpack(
     ux = low & mask21
     uy = (low >> 21) | ((high & jnp.uint32((1 << 10) - 1)) << 11)
     uz = (high >> 10) & mask21
-    signed = lambda u: u.astype(jnp.int32) - INDEX_LIMIT
+    signed: Callable[[Array], Array] = lambda u: u.astype(jnp.int32) - INDEX_LIMIT
     return signed(ux), signed(uy), signed(uz)

@@ -7,6 +7,8 @@ for its voxel.
 Shape symbols: P points of the frame; S scratch slots; H W image size.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,10 @@ from r3jax.mapping.table import hash_key
 _SCRATCH_BITS = (7, 7, 6)
 """Scratch slots along x, y and z as powers of two: 6.4 x 6.4 x 3.2 m at 5 cm. Inside such a box
 no two voxels share a slot; larger frames need further rounds with a hash."""
+
+
+_Election = tuple[UInt32[Array, ""], Int[Array, " P"], Bool[Array, " P"]]
+"""Number of the round, leader of each point so far, points still waiting for one."""
 
 
 class Groups(eqx.Module):
@@ -71,13 +77,13 @@ def points_of_pixels(frame: Frame, depth: Float[Array, "H W"]) -> Float[Array, "
     u = (jnp.arange(camera.width, dtype=jnp.float32) + 0.5 - camera.cx) / camera.fx
     v = (jnp.arange(camera.height, dtype=jnp.float32) + 0.5 - camera.cy) / camera.fy
     x, y = u[None, :] * depth, v[:, None] * depth
-    along = lambda i: T[i, 0] * x + T[i, 1] * y + T[i, 2] * depth + T[i, 3]
+    along: Callable[[int], Array] = lambda i: T[i, 0] * x + T[i, 1] * y + T[i, 2] * depth + T[i, 3]
     return jnp.stack([along(i).reshape(-1) for i in range(3)])
 
 
 def _torus_slot(x: Int[Array, " P"], y: Int[Array, " P"], z: Int[Array, " P"]) -> Int[Array, " P"]:
     bx, by, bz = _SCRATCH_BITS
-    low_bits = lambda value, bits: value & ((1 << bits) - 1)
+    low_bits: Callable[[Array, int], Array] = lambda value, bits: value & ((1 << bits) - 1)
     return low_bits(x, bx) | (low_bits(y, by) << bx) | (low_bits(z, bz) << (bx + by))
 
 
@@ -92,14 +98,16 @@ def _leaders(
     point = jnp.arange(num, dtype=jnp.int32)
     num_slots = 1 << sum(_SCRATCH_BITS)
 
-    def elect(slot, leader, waiting):
+    def elect(
+        slot: Int[Array, " P"], leader: Int[Array, " P"], waiting: Bool[Array, " P"]
+    ) -> tuple[Int[Array, " P"], Bool[Array, " P"]]:
         scratch = jnp.full(num_slots, -1, dtype=jnp.int32)
         scratch = scratch.at[jnp.where(waiting, slot, num_slots)].max(point, mode="drop")
         elected = jnp.maximum(scratch[slot], 0)
         agrees = waiting & (low[elected] == low) & (high[elected] == high)
         return jnp.where(agrees, elected, leader), waiting & ~agrees
 
-    def elect_by_hash(carry):
+    def elect_by_hash(carry: _Election) -> _Election:
         round_number, leader, waiting = carry
         seeded = hash_key(low + round_number * jnp.uint32(0x9E3779B9), high)
         slot = (seeded & jnp.uint32(num_slots - 1)).astype(jnp.int32)
@@ -147,7 +155,7 @@ def _breaks(
     depth: Float[Array, "H W"], around: list[Float[Array, "H W"]], limit: Float[Array, "..."]
 ) -> Bool[Array, "H W"]:
     """Where the surface breaks by more than a limit [m], along its row or its column."""
-    inverse = lambda value: 1.0 / jnp.maximum(value, 1e-4)
+    inverse: Callable[[Array], Array] = lambda value: 1.0 / jnp.maximum(value, 1e-4)
     is_break = jnp.zeros(depth.shape, dtype=bool)
     for before, after in ((around[3], around[5]), (around[1], around[7])):
         # A missing neighbor agrees with the pixel itself.

@@ -5,6 +5,8 @@ A frame, another map, a smaller table: all are statistics per voxel, and one rul
 Shape symbols: N capacity; M rows of new statistics; W words of bins.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -57,8 +59,11 @@ def join(state: MapState, new: Statistics) -> MapState:
     Algorithm 2. The result does not depend on the order of joins beyond rounding.
     """
     key, row = find_or_insert(state.key, new.key, new.valid)
-    at = lambda x: x.at[..., row].get(mode="fill", fill_value=0)
-    put = lambda x, value: x.at[..., row].set(value, mode="drop")  # rows are distinct
+    at: Callable[[Array], Array] = lambda x: x.at[..., row].get(mode="fill", fill_value=0)
+
+    def put(x: Array, value: Array) -> Array:
+        return x.at[..., row].set(value, mode="drop")  # rows are distinct
+
     n_a, mean_a = at(state.count), at(state.mean)
     n = n_a + new.count
     weight = new.count / jnp.maximum(n, 1.0)
@@ -90,8 +95,10 @@ def _join_map(state: MapState, other: MapState) -> MapState:
     """Joins every row of `other`, in chunks: scratch memory does not grow with the map."""
     size = min(CHUNK, other.capacity)
 
-    def join_chunk(i, state):
-        rows = lambda x: jax.lax.dynamic_slice_in_dim(x, i * size, size, axis=-1)
+    def join_chunk(i: Int[Array, ""], state: MapState) -> MapState:
+        def rows(x: Array) -> Array:
+            return jax.lax.dynamic_slice_in_dim(x, i * size, size, axis=-1)
+
         return join(
             state,
             Statistics(

@@ -19,6 +19,13 @@ MAX_PROBES = 192
 expected longest search is about 30."""
 
 
+_Search = tuple[Int[Array, ""], Int[Array, " n"], Bool[Array, " n"]]
+"""Number of the probe, row of each key so far, keys still searching."""
+
+_Bidding = tuple[Int[Array, ""], Int[Array, " N"], Int[Array, " n"], Bool[Array, " n"]]
+"""Number of the probe, owner of each slot, slot that each item has won, items still wanting one."""
+
+
 def hash_key(low: UInt32[Array, " n"], high: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
     """Mixes a packed key to 32 well-spread bits (the finalizer of MurmurHash3, twice)."""
     h = _mix(low ^ jnp.uint32(0x9E3779B9))
@@ -43,11 +50,11 @@ def find(
     capacity = table.shape[1]
     hashed = hash_key(keys[0], keys[1])
 
-    def is_unfinished(carry):
+    def is_unfinished(carry: _Search) -> Bool[Array, ""]:
         probe, _, searching = carry
         return jnp.any(searching) & (probe < MAX_PROBES)
 
-    def look(carry):
+    def look(carry: _Search) -> _Search:
         probe, row, searching = carry
         slot = _slot(hashed, probe, capacity)
         low, high = table[0, slot], table[1, slot]
@@ -89,11 +96,11 @@ def _claim(
     capacity, num_items = is_empty.shape[0], hashed.shape[0]
     item = jnp.arange(num_items, dtype=jnp.int32)
 
-    def is_unfinished(carry):
+    def is_unfinished(carry: _Bidding) -> Bool[Array, ""]:
         probe, _, _, wanting = carry
         return jnp.any(wanting) & (probe < MAX_PROBES)
 
-    def bid(carry):
+    def bid(carry: _Bidding) -> _Bidding:
         probe, owner, won, wanting = carry
         slot = _slot(hashed, probe, capacity)
         bids = wanting & (owner[slot] == -1)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import is_traced
@@ -57,7 +57,7 @@ def integrate_groups(
     num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
 
     # Chunks are counted one by one, as in `scoring.chunks`: XLA miscounts other steps.
-    def join_chunk(chunk, state):
+    def join_chunk(chunk: Int[Array, ""], state: MapState) -> MapState:
         index = jax.lax.dynamic_slice_in_dim(leaders, chunk * size, size)
         valid = index < num
         index = jnp.minimum(index, num - 1)
@@ -121,7 +121,13 @@ def integrate(
 
 
 @jax.jit
-def _integrate_points(state, points_world, rgb, camera_position, focal):
+def _integrate_points(
+    state: MapState,
+    points_world: Float[Array, "P 3"],
+    rgb: Float[Array, "P 3"],
+    camera_position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+) -> MapState:
     valid = jnp.all(jnp.isfinite(points_world), axis=1)
     points = jnp.where(valid[:, None], points_world, 0.0)
     groups = group_by_voxel(points.T, rgb, valid, state.voxel_size)

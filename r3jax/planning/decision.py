@@ -1,7 +1,7 @@
 """The frame that every policy's decision is built in: look round, score, choose, remember."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -45,11 +45,11 @@ class PlannerState(eqx.Module):
 class Stopwatch:
     """Wall time of the parts of one decision."""
 
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict[str, float])
     """Per part [s]."""
 
     @contextmanager
-    def part(self, name: str) -> Iterator[None]:
+    def part(self, name: str) -> Generator[None]:
         """Adds the time spent in a `with` block to a part."""
         begin = time.perf_counter()
         yield
@@ -148,7 +148,7 @@ def net_utility(utility: np.ndarray, path: np.ndarray, lambda2: float) -> np.nda
     candidates (as in Active-GS); a sum of 0 leaves its term out. Unreachable: -inf.
     """
     is_reachable = np.isfinite(path)
-    shares = []
+    shares: list[np.ndarray] = []
     for values in (utility, path):
         values = np.where(is_reachable, np.asarray(values, dtype=np.float64), 0.0)
         shares.append(values / (values.sum() or 1.0))

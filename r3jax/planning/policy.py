@@ -47,7 +47,7 @@ class Decision:
     candidates: np.ndarray
     """Every pose that was scored, [C, 4, 4]."""
 
-    utilities: dict[str, np.ndarray] = field(default_factory=dict)
+    utilities: dict[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
     """Per candidate, [C] each: always `path` [m] and `total`; `utility` where views were scored,
     and its parts `exploration` and `rendering` where they were told apart."""
 
@@ -59,7 +59,7 @@ class PlanInfo:
     outcome: Outcome
     num_candidates: int = 0
     num_reachable: int = 0
-    stage_seconds: dict[str, float] = field(default_factory=dict)
+    stage_seconds: dict[str, float] = field(default_factory=dict[str, float])
     """Wall time per part of the decision (`candidates`, `travel`, `scoring`) [s]."""
 
 

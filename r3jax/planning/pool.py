@@ -54,7 +54,7 @@ class Stage:
 
         The lattice lies half a spacing inside the box's lower corner.
         """
-        axes = []
+        axes: list[np.ndarray] = []
         for length in grid_shape[:2]:
             points = np.arange(0.5 * self.spacing, length * cell_size, self.spacing)
             # The nudge puts points that lie on a border of cells on the same side of it.
@@ -73,7 +73,8 @@ class Stage:
         layer_of_floor = floor_layer(travel.free)
         height = (np.arange(stops.shape[1]) + 0.5 - layer_of_floor) * travel.cell_size
         borders = [-np.inf, *(0.5 * (a + b) for a, b in pairwise(self.heights)), np.inf]
-        layers, is_there = [], []
+        layers: list[np.ndarray] = []
+        is_there: list[np.ndarray] = []
         for level, (low, high) in zip(self.heights, pairwise(borders), strict=True):
             gap = np.abs(height - level)
             may_stand = stops & (height >= low) & (height < high) & (gap <= _SLACK + 1e-6)
@@ -143,7 +144,7 @@ class Draw:
 
 def empty_pools(grid_shape: Sequence[int], cell_size: float) -> Pools:
     """Pools for a grid in which nothing is known yet."""
-    pools = []
+    pools: list[Pool] = []
     for stage in STAGES:
         num_places = len(stage.columns(grid_shape, cell_size)) * len(stage.heights)
         shape = (num_places, stage.num_directions)

@@ -269,7 +269,8 @@ def _shortest_ways(
     flat = np.flatnonzero(usable)
     node = np.full(usable.shape, -1, dtype=np.int32)
     node[usable] = np.arange(flat.size, dtype=np.int32)
-    ends, lengths = [], []
+    ends: list[np.ndarray] = []
+    lengths: list[np.ndarray] = []
     for step in _STEPS:
         tails = node[_overlap(usable.shape, step, (0, 0, 0))]
         heads = node[_overlap(usable.shape, step, step)]
@@ -290,7 +291,9 @@ def _shortest_ways(
     return cost, previous
 
 
-def _overlap(shape: tuple[int, ...], step: tuple[int, ...], shift: tuple[int, ...]) -> tuple:
+def _overlap(
+    shape: tuple[int, ...], step: tuple[int, ...], shift: tuple[int, ...]
+) -> tuple[slice, ...]:
     """The cells from which `step` stays in the grid, as a slice moved by `shift`."""
     return tuple(
         slice(max(0, -d) + s, n - max(0, d) + s) for n, d, s in zip(shape, step, shift, strict=True)

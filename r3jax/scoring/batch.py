@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera, is_traced
 from r3jax.mapping.compact import positions_of_set
@@ -27,6 +27,7 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.panorama import Panorama, panorama_of
 from r3jax.scoring.sharding import padded_to, score_on_devices
 from r3jax.scoring.utility import ViewUtility, utility_of_view
+from r3jax.scoring.views import Coordinates
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 SMALLEST = 1 << 14
@@ -63,13 +64,25 @@ def score_positions(
 
 
 @jax.jit
-def _score_views(voxels, cells, camera, config, poses):
+def _score_views(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    config: ScoringConfig,
+    poses: Float[Array, "C 4 4"],
+) -> ViewUtility:
     score = functools.partial(utility_of_view, voxels, cells, camera, config=config)
     return jax.lax.map(score, poses)
 
 
 @jax.jit
-def _score_positions(voxels, cells, camera, config, positions):
+def _score_positions(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    config: ScoringConfig,
+    positions: Float[Array, "C 3"],
+) -> Panorama:
     score = functools.partial(panorama_of, voxels, cells, camera, config=config)
     return jax.lax.map(score, positions)
 
@@ -97,10 +110,16 @@ def _padded(count: int, most: int) -> int:
     return min(max(SMALLEST, 1 << max(count - 1, 0).bit_length()), most)
 
 
-def _masks(voxels, cells, low, high, config):
+def _masks(
+    voxels: Voxels,
+    cells: Cells,
+    low: Float[Array, " 3"],
+    high: Float[Array, " 3"],
+    config: ScoringConfig,
+) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:
     """Voxels and unexplored cells within range of a box."""
 
-    def is_near(points, margin):
+    def is_near(points: Coordinates, margin: Float[Array, ""] | float) -> Bool[Array, " k"]:
         gap = [
             jnp.maximum(jnp.maximum(low[i] - points[i], points[i] - high[i]), 0.0) for i in range(3)
         ]
@@ -113,13 +132,26 @@ def _masks(voxels, cells, low, high, config):
 
 
 @jax.jit
-def _count_near(state, grid, low, high, config):
+def _count_near(
+    state: MapState,
+    grid: OccupancyGrid,
+    low: Float[Array, " 3"],
+    high: Float[Array, " 3"],
+    config: ScoringConfig,
+) -> Int[Array, " 2"]:
     masks = _masks(voxels_of(state, config.delta), cells_of(grid), low, high, config)
     return jnp.stack([jnp.sum(mask, dtype=jnp.int32) for mask in masks])
 
 
 @functools.partial(jax.jit, static_argnames="sizes")
-def _gather_near(state, grid, low, high, config, sizes):
+def _gather_near(
+    state: MapState,
+    grid: OccupancyGrid,
+    low: Float[Array, " 3"],
+    high: Float[Array, " 3"],
+    config: ScoringConfig,
+    sizes: tuple[int, int],
+) -> tuple[Voxels, Cells, Int[Array, " n"]]:
     voxels, cells = voxels_of(state, config.delta), cells_of(grid)
     gathered, indices = [], []
     masks = _masks(voxels, cells, low, high, config)

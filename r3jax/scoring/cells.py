@@ -4,16 +4,15 @@ Shape symbols: X Y Z cells of the grid; c cells at hand; B bins of the panorama.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.scoring.chunks import for_selected, select
+from r3jax.scoring.chunks import Carry, for_selected, select
 from r3jax.scoring.lack import sum_by_direction
-from r3jax.scoring.views import View
+from r3jax.scoring.views import Placement, View
 from r3jax.scoring.visibility import DepthBuffer, is_visible
 
 
@@ -45,7 +44,7 @@ def cells_of(grid: OccupancyGrid) -> Cells:
         grid.origin[i] + (jnp.arange(n, dtype=jnp.float32) + 0.5) * grid.cell_size
         for i, n in enumerate(shape)
     )
-    fill = lambda axis: jnp.broadcast_to(axis, shape).reshape(-1)
+    fill: Callable[[Array], Array] = lambda axis: jnp.broadcast_to(axis, shape).reshape(-1)
     return Cells(
         fill(x[:, None, None]),
         fill(y[None, :, None]),
@@ -71,7 +70,12 @@ def unexplored_by_direction(
         num_bins: bins of the Fibonacci lattice; 1 counts over all directions.
     """
 
-    def count(points, place, is_seen, total):
+    def count(
+        points: Float[Array, "3 n"],
+        place: Placement,
+        is_seen: Bool[Array, " n"],
+        total: Float[Array, " B"],
+    ) -> Float[Array, " B"]:
         del place
         weight = is_seen.astype(jnp.float32)
         return total + sum_by_direction(points, weight, position, num_bins)
@@ -80,8 +84,12 @@ def unexplored_by_direction(
 
 
 def over_visible(
-    cells: Cells, view: View, buffer: DepthBuffer, add: Callable[..., Any], start: Any
-) -> Any:
+    cells: Cells,
+    view: View,
+    buffer: DepthBuffer,
+    add: Callable[[Float[Array, "3 n"], Placement, Bool[Array, " n"], Carry], Carry],
+    start: Carry,
+) -> Carry:
     """Adds something up over the unexplored cells whose center the view sees.
 
     Args:
@@ -93,7 +101,7 @@ def over_visible(
         start: the total of nothing.
     """
 
-    def of_chunk(index, valid, total):
+    def of_chunk(index: Int[Array, " n"], valid: Bool[Array, " n"], total: Carry) -> Carry:
         points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
         place = view.place(points)
         return add(points, place, valid & is_visible(view, place, buffer.distance), total)

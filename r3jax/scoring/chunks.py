@@ -21,6 +21,9 @@ CHUNK = 1 << 12
 
 Carry = TypeVar("Carry")
 
+_Kept = tuple[Int[Array, " n_padded"], Int[Array, ""]]
+"""`order` and `count` of a selection."""
+
 
 class Selection(eqx.Module):
     """Places of the selected items."""
@@ -63,7 +66,7 @@ def for_selected(
 
     # Chunks are counted one by one: for a limit that XLA knows and that is no multiple of the
     # step, it gets the number of turns wrong (one chunk: none).
-    def next_chunk(chunk, carry):
+    def next_chunk(chunk: Int[Array, ""], carry: Carry) -> Carry:
         index = jax.lax.dynamic_slice_in_dim(selection.order, chunk * size, size)
         return body(jnp.minimum(index, num - 1), index < num, carry)
 
@@ -78,7 +81,7 @@ def narrow(
     size = min(CHUNK, selection.num)
     room = selection.order.shape[0]
 
-    def keep(index, valid, kept):
+    def keep(index: Int[Array, " K"], valid: Bool[Array, " K"], kept: _Kept) -> _Kept:
         order, count = kept
         passes = valid & test(index)
         place = running_count(passes)

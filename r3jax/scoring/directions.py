@@ -4,6 +4,7 @@ Shape symbols: n voxels; W words of bins; B bins.
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +58,11 @@ def _pack(cosine: Float[Array, " n"], inside: Float[Array, " n"]) -> Float[Array
 
 
 @seen_directions.defjvp
-def _seen_directions_jvp(num_bins, primals, tangents):
+def _seen_directions_jvp(
+    num_bins: int,
+    primals: tuple[UInt32[Array, "W n"], Float[Array, "3 n"]],
+    tangents: tuple[Any, Float[Array, "3 n"]],
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     visited, direction = primals
     cosine, inside, nearest = _scan(visited, direction, num_bins, keep_nearest=True)
     moved = sum(nearest[axis] * tangents[1][axis] for axis in range(3))

@@ -7,6 +7,8 @@ neighbors meet.
 Shape symbols: n voxels.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -61,7 +63,7 @@ def footprint(
     level = jnp.clip(jnp.ceil(jnp.log2(0.5 * widest)), 0.0, len(shapes) - 1.0)
     scale = jnp.exp2(-level)
     level = level.astype(jnp.int32)
-    table = lambda values: jnp.asarray(values, dtype=jnp.int32)[level]
+    table: Callable[[list[int]], Array] = lambda values: jnp.asarray(values, dtype=jnp.int32)[level]
     height, width = table([s[0] for s in shapes]), table([s[1] for s in shapes])
     offset = table(offsets[:-1])
     begins_level = (level > 0) & (0.5 * widest * scale < _SEAM)
@@ -69,7 +71,7 @@ def footprint(
     columns = _covered(place.column * scale, 0.5 * widths[0] * scale + spread)
     rows = _covered(place.row * scale, 0.5 * widths[1] * scale + spread)
     slanted = [half * w * scale + 2.0 * spread for w in (place.sum_scale, place.difference_scale)]
-    indices = []
+    indices: list[Int[Array, " n"]] = []
     for r, covers_row, down in rows:
         for c, covers_column, right in columns:
             is_own = (jnp.abs(right) <= 0.5) & (jnp.abs(down) <= 0.5)

@@ -7,10 +7,11 @@ Shape symbols: n voxels; B bins of the panorama.
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
@@ -41,7 +42,9 @@ def lack_by_direction(
         num_bins: bins of the Fibonacci lattice; 1 sums over all directions.
     """
 
-    def add(index, valid, total):
+    def add(
+        index: Int[Array, " K"], valid: Bool[Array, " K"], total: Float[Array, " B"]
+    ) -> Float[Array, " B"]:
         seen = voxels.take(index, valid)
         return total + _lack(seen, valid, position, focal, kappa, num_bins)
 
@@ -49,9 +52,16 @@ def lack_by_direction(
 
 
 @lack_by_direction.defjvp
-def _lack_by_direction_jvp(kappa, num_bins, primals, tangents):
+def _lack_by_direction_jvp(
+    kappa: str,
+    num_bins: int,
+    primals: tuple[Voxels, Selection, Float[Array, " 3"], Float[Array, ""]],
+    tangents: tuple[Any, ...],
+) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
     # A loop of unknown length has no reverse mode; the dense form has, and gives the same sums.
-    def dense(voxels, visible, position, focal):
+    def dense(
+        voxels: Voxels, visible: Selection, position: Float[Array, " 3"], focal: Float[Array, ""]
+    ) -> Float[Array, " B"]:
         return _lack(voxels, visible.mask, position, focal, kappa, num_bins)
 
     return jax.jvp(dense, primals, tangents)

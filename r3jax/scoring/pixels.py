@@ -22,7 +22,7 @@ from r3jax.mapping.state import MapState
 from r3jax.scoring.batch import deal, near
 from r3jax.scoring.cells import Cells, over_visible
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.views import PinholeView, pinhole_view
+from r3jax.scoring.views import PinholeView, Placement, pinhole_view
 from r3jax.scoring.visibility import DepthBuffer, candidates_of, depth_buffer
 from r3jax.scoring.voxels import Voxels
 
@@ -90,8 +90,19 @@ def score_pixels(
 
 
 @functools.partial(jax.jit, static_argnames="value")
-def _score(value, voxels, cells, camera, config, rows, reach, poses):
-    look = lambda pose: value(pixel_view(voxels, cells, camera, pose, config, rows, reach))
+def _score(
+    value: Value,
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    config: ScoringConfig,
+    rows: Any,
+    reach: Float[Array, ""],
+    poses: Float[Array, "C 4 4"],
+) -> Any:
+    def look(pose: Array) -> Any:
+        return value(pixel_view(voxels, cells, camera, pose, config, rows, reach))
+
     return jax.lax.map(look, poses)
 
 
@@ -131,7 +142,12 @@ def _unexplored(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Number of unexplored cells whose center the view sees, and the sum of their distances."""
 
-    def add(points, place, is_seen, totals):
+    def add(
+        points: Float[Array, "3 n"],
+        place: Placement,
+        is_seen: Bool[Array, " n"],
+        totals: tuple[Float[Array, ""], Float[Array, ""]],
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         del points
         count = jnp.sum(is_seen, dtype=jnp.float32)
         return totals[0] + count, totals[1] + jnp.sum(jnp.where(is_seen, place.distance, 0.0))

@@ -6,12 +6,14 @@ Shape symbols: n voxels; N capacity of the map; h w size of the depth buffer.
 """
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.numerics import safe_norm, safe_power
@@ -70,7 +72,7 @@ def score_voxels(
     noise = safe_power(voxels.delta, kappa_value * (1.0 - bias))
     ratio = jnp.minimum(voxels.resolution * distance / focal, 1.0)
     resolution = safe_power(ratio, 1.0 - voxels.delta * bias)
-    blank = lambda term: jnp.where(voxels.present, term, 0.0)
+    blank: Callable[[Array], Array] = lambda term: jnp.where(voxels.present, term, 0.0)
     return Renderability(
         kappa=kappa_value,
         bias=blank(bias),
@@ -88,7 +90,9 @@ def _score_present(
     """`score_voxels`, at a cost that follows the voxels present and not the capacity."""
     num = voxels.present.shape[0]
 
-    def score(index, valid, terms):
+    def score(
+        index: Int[Array, " K"], valid: Bool[Array, " K"], terms: Renderability
+    ) -> Renderability:
         part = score_voxels(voxels.take(index, valid), camera_position, focal, kappa)
         target = jnp.where(valid, index, num)
         return jax.tree.map(lambda all, new: all.at[target].set(new, mode="drop"), terms, part)
@@ -100,13 +104,19 @@ def _score_present(
 
 
 @_score_present.defjvp
-def _score_present_jvp(kappa, primals, tangents):
+def _score_present_jvp(
+    kappa: str,
+    primals: tuple[Voxels, Float[Array, " 3"], Float[Array, ""]],
+    tangents: tuple[Any, ...],
+) -> tuple[Renderability, Renderability]:
     # A loop of unknown length has no reverse mode; the dense form has.
     return jax.jvp(functools.partial(score_voxels, kappa=kappa), primals, tangents)
 
 
 @functools.partial(jax.jit, static_argnames="kappa")
-def _voxel_renderability(state, camera_position, focal, kappa):
+def _voxel_renderability(
+    state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], kappa: str
+) -> Renderability:
     return _score_present(voxels_of(state), camera_position, focal, kappa)
 
 

@@ -58,9 +58,17 @@ def score_on_devices(
 
 
 @eqx.filter_jit
-def _score(score, mesh, known, candidates):
+def _score(
+    score: Callable[..., Any],
+    mesh: Mesh,
+    known: tuple[Any, ...],
+    candidates: Float[Array, "P ..."],
+) -> Any:
     arrays, others = eqx.partition(known, eqx.is_array)
-    own = lambda arrays, share: score(*eqx.combine(arrays, others), share)
+
+    def own(arrays: Any, share: Array) -> Any:
+        return score(*eqx.combine(arrays, others), share)
+
     split = PartitionSpec(_AXIS)
     # The loops inside start from constants, which are the same everywhere, and end in what is not.
     spread = jax.shard_map(

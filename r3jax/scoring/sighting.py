@@ -4,13 +4,13 @@ A frame's points do not touch all that it sees: of a floor seen at a grazing ang
 five, of what lies on a depth edge or behind glass none. Such a voxel would keep a low
 renderability however often one looks at it, and a planner would look for ever.
 
-Shape symbols: N capacity of the map; M voxels at a time; H W image size.
+Shape symbols: N capacity of the map; M voxels at a time; W words of bins; H W image size.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import invert_pose
@@ -28,6 +28,10 @@ from r3jax.scoring.voxels import voxels_of
 
 _MAX_LOAD = 0.7
 """The table grows before more than this share of its rows is in use."""
+
+
+_Tables = tuple[UInt32[Array, "W N"], Float[Array, " N"]]
+"""A map's direction bins and best resolutions."""
 
 
 def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]) -> MapState:
@@ -48,7 +52,7 @@ def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]
     rows = positions_of_set(seen, -(-num // size) * size)
     count = jnp.sum(seen, dtype=jnp.int32)
 
-    def mark(chunk, tables):
+    def mark(chunk: Int[Array, ""], tables: _Tables) -> _Tables:
         visited, resolution = tables
         row = jax.lax.dynamic_slice_in_dim(rows, chunk * size, size)
         key = state.key.at[:, row].get(mode="fill", fill_value=0)
@@ -85,7 +89,10 @@ def looked_at(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Boo
     """
     camera, T = frame.camera, invert_pose(frame.T_world_camera)
     center = voxel_center(jnp.stack(unpack(state.key[0], state.key[1])), state.voxel_size)
-    along = lambda i: T[i, 0] * center[0] + T[i, 1] * center[1] + T[i, 2] * center[2] + T[i, 3]
+
+    def along(i: int) -> Array:
+        return T[i, 0] * center[0] + T[i, 1] * center[1] + T[i, 2] * center[2] + T[i, 3]
+
     x, y, z = along(0), along(1), along(2)
     per_z = 1.0 / jnp.maximum(z, 1e-3)
     u, v = camera.fx * x * per_z + camera.cx, camera.fy * y * per_z + camera.cy

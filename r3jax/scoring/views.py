@@ -11,6 +11,7 @@ Shape symbols: n points; h w size of the view.
 """
 
 import math
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -81,7 +82,10 @@ class PinholeView(eqx.Module):
         """Coordinates in the camera's frame [m]."""
         R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         offset = [points[i] - t[i] for i in range(3)]
-        along = lambda j: R[0, j] * offset[0] + R[1, j] * offset[1] + R[2, j] * offset[2]
+
+        def along(j: int) -> Array:
+            return R[0, j] * offset[0] + R[1, j] * offset[1] + R[2, j] * offset[2]
+
         return along(0), along(1), along(2)
 
     def may_see(self, points: Coordinates, margin: Float[Array, ""]) -> Bool[Array, " n"]:
@@ -92,7 +96,7 @@ class PinholeView(eqx.Module):
         low_x, high_x = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
         low_y, high_y = -camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
         # Distance to a side plane x = k z is |x - k z| / sqrt(1 + k^2).
-        slack = lambda k: margin * jnp.sqrt(1.0 + k * k)
+        slack: Callable[[Array], Array] = lambda k: margin * jnp.sqrt(1.0 + k * k)
         is_in = (x >= low_x * z - slack(low_x)) & (x <= high_x * z + slack(high_x))
         is_in &= (y >= low_y * z - slack(low_y)) & (y <= high_y * z + slack(high_y))
         return is_in & (z > -margin) & (x * x + y * y + z * z <= reach * reach)
@@ -103,10 +107,16 @@ class PinholeView(eqx.Module):
         is_ahead = z > 1e-3
         inverse = 1.0 / jnp.where(is_ahead, z, 1.0)
         R = self.T_world_camera[:3, :3]
-        gradient = lambda f, j, slope: [f * inverse * (R[i, j] - slope * R[i, 2]) for i in range(3)]
+
+        def gradient(f: Array, j: int, slope: Array) -> list[Array]:
+            return [f * inverse * (R[i, j] - slope * R[i, 2]) for i in range(3)]
+
         along_column = gradient(self.camera.fx, 0, x * inverse)
         along_row = gradient(self.camera.fy, 1, y * inverse)
-        total = lambda parts: jnp.abs(parts[0]) + jnp.abs(parts[1]) + jnp.abs(parts[2])
+
+        def total(parts: list[Array]) -> Array:
+            return jnp.abs(parts[0]) + jnp.abs(parts[1]) + jnp.abs(parts[2])
+
         both = list(zip(along_column, along_row, strict=True))
         return Placement(
             column=self.camera.fx * x * inverse + self.camera.cx,
@@ -161,11 +171,14 @@ class PanoramaView(eqx.Module):
         inverse = 1.0 / jnp.maximum(jnp.abs(x) + jnp.abs(y) + jnp.abs(z), 1e-6)
         u, v = x * inverse, y * inverse
         a, b = jnp.abs(u), jnp.abs(v)
-        sign = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
+        sign: Callable[[Array], Array] = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
         half = 0.5 * self.size
         is_lower = z < 0.0
         p, q = jnp.where(is_lower, b, a), jnp.where(is_lower, a, b)
-        diagonal = lambda w, k: jnp.abs(1.0 - w * sign(x)) + jnp.abs(k - w * sign(y)) + jnp.abs(w)
+
+        def diagonal(w: Array, k: float) -> Array:
+            return jnp.abs(1.0 - w * sign(x)) + jnp.abs(k - w * sign(y)) + jnp.abs(w)
+
         return Placement(
             column=jnp.where(is_lower, (1.0 - b) * sign(u), u) * half + half,
             row=jnp.where(is_lower, (1.0 - a) * sign(v), v) * half + half,

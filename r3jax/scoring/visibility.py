@@ -6,6 +6,8 @@ down. This is the idea of ODGS, omnidirectional splatting, on voxels.
 Shape symbols: n voxels or points; h w size of the finest level.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
@@ -52,7 +54,9 @@ def depth_buffer(
     num = candidates.num
     item_bits = max(1, (num - 1).bit_length())
 
-    def splat(index, valid, pixels):
+    def splat(
+        index: Int[Array, " K"], valid: Bool[Array, " K"], pixels: UInt32[Array, " p"]
+    ) -> UInt32[Array, " p"]:
         place = view.place(voxels.center_of(index))
         valid = valid & place.ahead & (place.distance <= view.max_range)
         packed = _pack(place.distance / view.max_range, index, item_bits)
@@ -75,7 +79,7 @@ def visible_voxels(
 ) -> Selection:
     """The voxels that the view sees: in the image, within range, and not hidden as a whole."""
 
-    def test(index):
+    def test(index: Int[Array, " K"]) -> Bool[Array, " K"]:
         place = view.place(voxels.center_of(index))
         return _shows_a_corner(view, place, voxels.size, buffer.limit)
 
@@ -131,7 +135,10 @@ def _at_pixel(
 ) -> Float[Array, " n"]:
     """Values at continuous coordinates; outside, where the map wraps, or at the border."""
     height, width = image.shape
-    whole = lambda value, size: jnp.floor(jnp.clip(value, -1.0, float(size))).astype(jnp.int32)
+
+    def whole(value: Array, size: int) -> Array:
+        return jnp.floor(jnp.clip(value, -1.0, float(size))).astype(jnp.int32)
+
     r, c = whole(row, height), whole(column, width)
     if wraps:
         r, c = wrap(r, c, jnp.full_like(r, height))
@@ -156,7 +163,7 @@ def _push_down(
     pixels: UInt32[Array, " p"], shapes: list[tuple[int, int]], offsets: list[int]
 ) -> UInt32[Array, "h w"]:
     """The minimum over all levels, at the finest."""
-    level = lambda i: pixels[offsets[i] : offsets[i + 1]].reshape(shapes[i])
+    level: Callable[[int], Array] = lambda i: pixels[offsets[i] : offsets[i + 1]].reshape(shapes[i])
     combined = level(len(shapes) - 1)
     for i in range(len(shapes) - 2, -1, -1):
         height, width = shapes[i]

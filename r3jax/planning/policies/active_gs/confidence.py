@@ -9,10 +9,12 @@ frame's pixels in it. (The original's primitives are Gaussians; here they are th
 Shape symbols: N capacity of the map; H W image size.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.frame import Frame
 from r3jax.geometry.numerics import safe_norm
@@ -86,7 +88,10 @@ def _is_aligned(key: Array, map_key: Array) -> Bool[Array, ""]:
 @jax.jit
 def _realigned(seen: Sightings, state: MapState) -> Sightings:
     row = find(state.key, seen.key, seen.key[1] != jnp.uint32(EMPTY_WORD))
-    move = lambda blank, x: blank.at[..., row].set(x, mode="drop")  # rows are distinct
+
+    def move(blank: Array, x: Array) -> Array:
+        return blank.at[..., row].set(x, mode="drop")  # rows are distinct
+
     moved = jax.tree.map(move, no_sightings(state.capacity), seen)
     return eqx.tree_at(lambda s: s.key, moved, state.key)
 
@@ -108,7 +113,7 @@ def see(seen: Sightings, state: MapState, frame: Frame, max_range: Float[Array, 
 
 
 @jax.jit
-def _see(seen, state, frame, max_range):
+def _see(seen: Sightings, state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Sightings:
     seen = eqx.tree_at(lambda s: s.key, seen, state.key)
     depth = frame.depth
     valid = (depth > 0.0) & (depth <= max_range)
@@ -121,7 +126,7 @@ def _see(seen, state, frame, max_range):
     num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
 
     # Chunks are counted one by one, as in `scoring.chunks`: XLA miscounts other steps.
-    def see_chunk(chunk, seen):
+    def see_chunk(chunk: Int[Array, ""], seen: Sightings) -> Sightings:
         index = jax.lax.dynamic_slice_in_dim(leaders, chunk * size, size)
         return _sight(seen, state, groups, index, frame, max_range)
 
@@ -141,8 +146,11 @@ def _sight(
     index = jnp.minimum(leader, num - 1)
     key = groups.key[:, index]
     row = find(state.key, key, leader < num)
-    at = lambda x: x.at[..., row].get(mode="fill", fill_value=0)
-    put = lambda x, value: x.at[..., row].set(value, mode="drop")  # rows are distinct
+    at: Callable[[Array], Array] = lambda x: x.at[..., row].get(mode="fill", fill_value=0)
+
+    def put(x: Array, value: Array) -> Array:
+        return x.at[..., row].set(value, mode="drop")  # rows are distinct
+
     center = voxel_center(jnp.stack(unpack(key[0], key[1])), state.voxel_size)
     offset = frame.position[:, None] - center
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)

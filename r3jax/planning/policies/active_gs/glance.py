@@ -4,6 +4,8 @@ The map counts them as seen for every policy (`scoring.sighting`); without the s
 noise in front of a surface would keep Active-GS looking for ever.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -42,7 +44,7 @@ def glance(
     direction = offset / distance[None, :]
     cosine = jnp.maximum(0.0, jnp.sum(touched.normal * direction, axis=0))
     weight = jnp.maximum(0.0, 1.0 - distance / max_range)
-    add = lambda x, more: x + jnp.where(is_new, more, 0.0)
+    add: Callable[[Array, Array | float], Array] = lambda x, more: x + jnp.where(is_new, more, 0.0)
     return Sightings(
         key=touched.key,
         views=add(touched.views, 1.0),

@@ -165,7 +165,10 @@ def _draw(
 
 def _draw_directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Random unit vectors within 60 degrees of normals [R, 3], or anywhere: [R, _DRAWS, 3]."""
-    unit = lambda x: x / np.maximum(np.linalg.norm(x, axis=2, keepdims=True), 1e-12)
+
+    def unit(x: np.ndarray) -> np.ndarray:
+        return x / np.maximum(np.linalg.norm(x, axis=2, keepdims=True), 1e-12)
+
     anywhere = rng.normal(size=(len(normals), _DRAWS, 3))
     cosine = rng.uniform(MIN_COSINE, 1.0, size=(len(normals), _DRAWS, 1))
     axis = normals[:, None, :]
