@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,9 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) ->
     _check_settings(folder, settings)
     newest = found[-1]
     sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    to_shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)
+    to_shape: Callable[[jax.Array], jax.ShapeDtypeStruct] = lambda x: jax.ShapeDtypeStruct(
+        x.shape, x.dtype, sharding=sharding
+    )
     try:
         check_tree(newest)
         with ocp.StandardCheckpointer() as checkpointer:

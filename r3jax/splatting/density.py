@@ -4,6 +4,7 @@ Every decision is a mask over all rows. What is born goes into unused rows; wher
 the Gaussians with the largest gradients are served first and the rest is counted.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -196,5 +197,8 @@ def reset_opacities(
     limit = jnp.log(config.reset_opacity / (1.0 - jnp.asarray(config.reset_opacity)))
     logits = jnp.minimum(scene.opacity_logits, limit)
     scene = eqx.tree_at(lambda s: s.opacity_logits, scene, logits)
-    logits_of = lambda m: (m.mean.opacity_logits, m.square.opacity_logits)
+    logits_of: Callable[[Moments], tuple[Array, Array]] = lambda m: (
+        m.mean.opacity_logits,
+        m.square.opacity_logits,
+    )
     return scene, eqx.tree_at(logits_of, moments, (jnp.zeros_like(logits),) * 2)

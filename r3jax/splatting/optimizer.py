@@ -1,5 +1,6 @@
 """Adam with a learning rate for each kind of parameter (Kerbl et al. 2023)."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -64,7 +65,8 @@ def adam_update(
 
     Unused rows have no gradient and stay as they are. If not `is_applied`, everything does.
     """
-    tree, keep = _optax.tree, lambda new, old: jnp.where(is_applied, new, old)
+    tree = _optax.tree
+    keep: Callable[[Array, Array], Array] = lambda new, old: jnp.where(is_applied, new, old)
     count = moments.count + 1
     mean = tree.update_moment(gradient, moments.mean, _BETA1, 1)
     square = tree.update_moment_per_elem_norm(gradient, moments.square, _BETA2, 2)
@@ -91,7 +93,10 @@ def adam_update(
 
 def forget(moments: Moments, rows: Bool[Array, " n"]) -> Moments:
     """Zeroes the moments of some rows: what now stands there has no past."""
-    zeroed = lambda m: jnp.where(rows.reshape((-1,) + (1,) * (m.ndim - 1)), 0.0, m)
+
+    def zeroed(m: Array) -> Array:
+        return jnp.where(rows.reshape((-1,) + (1,) * (m.ndim - 1)), 0.0, m)
+
     return Moments(
         mean=jax.tree.map(zeroed, moments.mean),
         square=jax.tree.map(zeroed, moments.square),

@@ -139,7 +139,8 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:
     """Byte order and elements; leaves the file at the first byte of the data."""
     if file.readline(16).strip() != b"ply":
         raise SceneFileError(path, "not a PLY file (it does not begin with 'ply')")
-    byte_order, elements = "", []
+    elements: list[_Element] = []
+    byte_order = ""
     for _ in range(_MAX_HEADER_LINES):
         line = file.readline(1 << 16)
         words = line.decode("ascii", errors="replace").split()

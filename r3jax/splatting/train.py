@@ -4,7 +4,7 @@ import dataclasses
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -252,7 +252,8 @@ class _Loop:
 
     def _advance(self, stop: int) -> None:
         """Steps up to `stop`; fewer if one does not fit the budget, which is then raised."""
-        run, infos = self.run, []
+        run = self.run
+        infos: list[StepInfo] = []
         begin = time.perf_counter()
         for _ in range(stop - self.step):
             self.state, info = train_step(
@@ -320,12 +321,14 @@ class _Loop:
         )
 
     def _history(self) -> History:
-        column = lambda name: np.array([getattr(info, name) for info in self.infos])
+        def column(name: str) -> np.ndarray:
+            return np.array([getattr(info, name) for info in self.infos])
+
         return History(self.first_step, column("loss"), column("psnr"), column("num_gaussians"))
 
 
 @contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+def _deferred_interrupt() -> Generator[Callable[[], bool]]:
     """Lets Ctrl-C wait until the loop looks, so that no step is torn; a second one does not wait.
 
     A step gives its state's buffers away: an exception between the call and the assignment would

@@ -4,11 +4,12 @@ Shape symbols: n rows of the scene, v views, b views per step.
 """
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from r3jax.geometry.cameras import invert_pose, project, transform
 from r3jax.splatting import density, mcmc
@@ -73,6 +74,10 @@ class _ViewReport(eqx.Module):
     mse: Float[Array, ""]
     num_intersections: Int[Array, ""]
     overflow: Int[Array, ""]
+
+
+_Sums = tuple[Float[Array, ""], GaussianScene, DensityStatistics, _ViewReport]
+"""Loss, gradient, statistics and report of the views so far."""
 
 
 def start_state(scene: GaussianScene) -> TrainState:
@@ -141,7 +146,7 @@ def train_step(
         num_gaussians=jnp.sum(state.scene.is_alive, dtype=jnp.int32),
         num_intersections=report.num_intersections,
     )
-    keep = lambda new, old: jnp.where(outcome == DONE, new, old)
+    keep: Callable[[Array, Array], Array] = lambda new, old: jnp.where(outcome == DONE, new, old)
     return jax.tree.map(keep, after, state), info
 
 
@@ -157,7 +162,7 @@ def _gradients(
     num = config.views_per_step
     background = _background(config, state.step)
 
-    def add_view(carry, slot: Int[Array, ""]):
+    def add_view(carry: _Sums, slot: Int[Array, ""]) -> tuple[_Sums, None]:
         total, gradient, statistics, report = carry
         view = views.view(view_index(config, state.step * num + slot, len(views)))
         (loss, found), (slope, pull) = jax.value_and_grad(_view_loss, argnums=(0, 1), has_aux=True)(
@@ -213,7 +218,7 @@ def _up_to_degree(gradient: GaussianScene, degree: Int[Array, ""]) -> GaussianSc
     return eqx.tree_at(lambda s: s.sh, gradient, sh)
 
 
-def _in_view(scene: GaussianScene, view: View):
+def _in_view(scene: GaussianScene, view: View) -> Bool[Array, " n"]:
     """True where the center lies in the image."""
     pixels, z = project(view.camera, transform(invert_pose(view.T_world_camera), scene.means))
     size = jnp.array([view.camera.width, view.camera.height], dtype=jnp.float32)

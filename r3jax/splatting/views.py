@@ -101,7 +101,10 @@ def load_views(frames: Iterable[Frame], resolution: int | None = None) -> Views:
     """
     if resolution is not None and resolution < 1:
         raise ValueError(f"resolution is the longer side in pixels, at least 1, got {resolution}")
-    rgb, depth, poses, cameras = [], [], [], []
+    rgb: list[np.ndarray] = []
+    depth: list[np.ndarray] = []
+    poses: list[np.ndarray] = []
+    cameras: list[Camera] = []
     size = (0, 0)
     for number, frame in enumerate(frames):
         found = (frame.camera.width, frame.camera.height)

@@ -20,6 +20,10 @@ from r3jax.splatting.config import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 PIXELS = TILE * TILE
 
 
+Operation = Callable[[Array, Array], Array]
+"""Elementwise, such as a product or a sum."""
+
+
 class Chunk(eqx.Module):
     """The next Gaussians of every tile of a batch, as its pixels see them."""
 
@@ -37,7 +41,7 @@ class Chunk(eqx.Module):
     """Transmittance behind the last of them."""
 
 
-def stage(go: Bool[Array, ""], compute: Callable, *args: Array) -> Array:
+def stage(go: Bool[Array, ""], compute: Callable[..., Array], *args: Array) -> Array:
     """compute(*args), into memory. A branch is what XLA does not merge with its surroundings.
 
     Args:
@@ -150,7 +154,7 @@ def _shape_gradient(
     return jnp.stack([*by_center, -0.5 * dxx, -dxy, -0.5 * dyy, by_opacity])
 
 
-def _chain(x: Float[Array, "B G P"], op: Callable) -> Float[Array, "B O I P"]:
+def _chain(x: Float[Array, "B G P"], op: Operation) -> Float[Array, "B O I P"]:
     """Running products or sums within blocks of up to 8 elements of G."""
     tiles, size, pixels = x.shape
     inner = max(d for d in range(1, 9) if size % d == 0)
@@ -162,7 +166,7 @@ def _chain(x: Float[Array, "B G P"], op: Callable) -> Float[Array, "B O I P"]:
 
 
 def _link(
-    start: Float[Array, "B P"], chains: Float[Array, "B O I P"], op: Callable
+    start: Float[Array, "B P"], chains: Float[Array, "B O I P"], op: Operation
 ) -> tuple[Float[Array, "B O P"], Float[Array, "B P"]]:
     """What comes before each block of `_chain`, from `start` on, and after the last."""
     firsts = [start]

@@ -1,5 +1,7 @@
 """Rasteriser for CPUs: projection, binning, sort, compositing and all gradients in Numba."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,18 @@ from r3jax.splatting.backends.numba import records
 from r3jax.splatting.backends.numba.bridge import BACKWARD, FORWARD, num_workers, register
 from r3jax.splatting.config import TILE, RasterConfig
 from r3jax.splatting.scene import GaussianScene
+
+_Size = tuple[int, int, int]
+"""Width and height of the image [px], and the budget of intersections."""
+
+_Cloud = tuple[Array, ...]
+"""The scene's arrays and the center offsets, as `forward_pass` takes them."""
+
+_Images = tuple[Array, Array, Array, Array]
+"""RGB, depth, alpha, and the two totals."""
+
+_Residuals = tuple[_Cloud, Array, tuple[Array, ...], tuple[Array, ...]]
+"""Cloud, view, images, and what the kernels keep for the backward pass."""
 
 
 def rasterise(
@@ -54,11 +68,13 @@ def rasterise(
     )
 
 
-def _images_and_totals(size, cloud, view):
+def _images_and_totals(size: _Size, cloud: _Cloud, view: Float[Array, " 19"]) -> _Images:
     return _composite_forward(size, cloud, view)[0]
 
 
-def _composite_forward(size, cloud, view):
+def _composite_forward(
+    size: _Size, cloud: _Cloud, view: Float[Array, " 19"]
+) -> tuple[_Images, _Residuals]:
     width, height, budget = size
     tiles = -(-width // TILE) * -(-height // TILE)
     result = jax.ShapeDtypeStruct
@@ -81,7 +97,9 @@ def _composite_forward(size, cloud, view):
     return (rgb, depth, alpha, totals), (cloud, view, results[:3], results[4:])
 
 
-def _composite_backward(size, residuals, gradients):
+def _composite_backward(
+    size: _Size, residuals: _Residuals, gradients: tuple[Any, ...]
+) -> tuple[_Cloud, Float[Array, " 19"]]:
     cloud, view, images, kept = residuals
     shapes = [jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in (*cloud, view)]
     workers = np.array([num_workers()], dtype=np.int32)

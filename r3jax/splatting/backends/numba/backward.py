@@ -9,6 +9,9 @@ where the sum is the pixel's total minus what has been passed. Every decision (s
 forward pass's own.
 """
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import numpy as np
 from numba import prange
 

@@ -1,5 +1,8 @@
 """Lists of Gaussians by tile, near ones first: projection, counting, one sort by (tile, depth)."""
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import numpy as np
 from numba import prange
 

@@ -6,10 +6,15 @@ shapes of the arrays. Compared with `jax.pure_callback` nothing is copied, no Py
 a computation, and nothing can wait for a thread of XLA's pool while it occupies the only one.
 """
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# Code generators get what llvmlite makes, which has no types.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import functools
 import inspect
 import os
 import threading
+from typing import Any
 
 import jax
 import numpy as np
@@ -222,7 +227,7 @@ def register() -> None:
 
 
 @functools.cache
-def _register() -> tuple:
+def _register() -> tuple[Any, Any]:
     require_threads()
     handler = cfunc(types.int64(types.int64), cache=True)
     handlers = handler(inspect.unwrap(_forward)), handler(inspect.unwrap(_backward))

@@ -9,6 +9,8 @@ from typing import Any
 from llvmlite import ir
 from numba import extending, njit, types
 
+_Function = Callable[..., Any]
+
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 
@@ -28,12 +30,12 @@ def _forget_outdated_code() -> None:
 _forget_outdated_code()
 
 
-def intrinsic(function: Callable) -> Callable[..., Any]:
+def intrinsic(function: _Function) -> _Function:
     """Makes a function that kernels can call of one that emits LLVM instructions."""
     return extending.intrinsic(inspect.unwrap(function))
 
 
-def kernel(function: Callable) -> Callable:
+def kernel(function: _Function) -> _Function:
     """Compiles a kernel to machine code; the disk keeps it for the next process.
 
     Floating-point operations stay as written: two passes that must take the same decisions
@@ -43,12 +45,12 @@ def kernel(function: Callable) -> Callable:
     return njit(cache=True, error_model="numpy")(inspect.unwrap(function))
 
 
-def inlined(function: Callable) -> Callable:
+def inlined(function: _Function) -> _Function:
     """Compiles a small function into its callers."""
     return njit(cache=True, error_model="numpy", forceinline=True)(inspect.unwrap(function))
 
 
-def inlined_fast(function: Callable) -> Callable:
+def inlined_fast(function: _Function) -> _Function:
     """The same for formulas that nothing has to repeat: LLVM may fuse and reorder them.
 
     NaN and infinity keep their meaning.
@@ -57,17 +59,17 @@ def inlined_fast(function: Callable) -> Callable:
     return compiler(inspect.unwrap(function))
 
 
-def parallel_kernel(function: Callable) -> Callable:
+def parallel_kernel(function: _Function) -> _Function:
     """Compiles a kernel whose `prange` loops share the cores that the process may use."""
     return njit(cache=True, error_model="numpy", parallel=True)(inspect.unwrap(function))
 
 
 @intrinsic
-def claim(typingctx, counter):
+def claim(typingctx: Any, counter: Any) -> Any:
     """Next number of a counter (an int64 array of length 1) that all threads share."""
     signature = types.int64(counter)
 
-    def codegen(context, builder, sig, args):
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         array = context.make_array(sig.args[0])(context, builder, args[0])
         one = ir.Constant(ir.IntType(64), 1)
         return builder.atomic_rmw("add", array.data, one, "monotonic")

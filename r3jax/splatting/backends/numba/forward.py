@@ -1,5 +1,8 @@
 """Compositing of tiles, front to back: one vector of 16 pixels for each row of a tile."""
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import numpy as np
 from numba import prange
 

@@ -3,6 +3,9 @@
 Names: `g_x` is dL/dx. The order is that of `project.py`, backwards.
 """
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import numpy as np
 from numba import prange
 

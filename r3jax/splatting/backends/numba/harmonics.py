@@ -3,6 +3,9 @@
 The same functions in the same order as `r3jax.splatting.harmonics`.
 """
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import numpy as np
 
 from r3jax.splatting import harmonics as shared

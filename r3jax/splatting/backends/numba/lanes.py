@@ -5,6 +5,10 @@ what a vector is. LLVM splits 16 lanes into what the machine has (AVX-512, AVX2,
 Operators work lane by lane and take scalars as well; nothing is reassociated.
 """
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# Code generators get what llvmlite makes, which has no types.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import operator
 
 from llvmlite import ir

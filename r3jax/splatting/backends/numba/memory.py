@@ -1,5 +1,8 @@
 """Large fresh arrays in large pages: else the first write to 38 MB costs 10 000 page faults."""
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import sys
 
 from numba import types

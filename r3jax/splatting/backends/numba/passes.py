@@ -1,5 +1,8 @@
 """The forward and the backward pass of a view: from the scene's arrays to images and gradients."""
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import numpy as np
 
 from r3jax.splatting.backends.numba import records as at

@@ -1,5 +1,8 @@
 """Projection and color of one Gaussian: `r3jax.splatting.projection`, scalar by scalar."""
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import numpy as np
 
 from r3jax.splatting import config

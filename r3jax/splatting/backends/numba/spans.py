@@ -1,5 +1,8 @@
 """Which tiles a Gaussian touches: the exact rows of its ellipse in each column of tiles."""
 
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
 import numpy as np
 
 from r3jax.splatting.backends.numba.compiled import inlined
