@@ -45,7 +45,7 @@ class Cell:
     num_test_views: int
     """Views in it."""
 
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict[str, Any])
     """Settings of the policy that differ from their defaults; see `Conditions.policy`."""
 
     up: str | None = None

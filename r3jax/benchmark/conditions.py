@@ -81,10 +81,10 @@ class Conditions:
     lpips: Literal["alex", "vgg", "none"] = "alex"
     """Network of LPIPS; `none` leaves it out."""
 
-    loop: dict[str, Any] = field(default_factory=dict)
+    loop: dict[str, Any] = field(default_factory=dict[str, Any])
     """Further settings of `ExplorationConfig` by name; those at their defaults are left out."""
 
-    trainer: dict[str, Any] = field(default_factory=dict)
+    trainer: dict[str, Any] = field(default_factory=dict[str, Any])
     """Further settings of `TrainConfig` by name; those at their defaults are left out."""
 
     def __post_init__(self) -> None:

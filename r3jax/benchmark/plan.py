@@ -36,7 +36,7 @@ class Request:
     max_test_views: int | None = 120
     """Test views of a scene at most; None: all of the lattice."""
 
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict[str, Any])
     """Settings of all policies that differ from their defaults."""
 
     up: str | None = None

@@ -131,7 +131,7 @@ def _metrics(rows: Sequence[ViewRow]) -> dict[str, Any]:
 
 def _columns(rows: Sequence[ViewRow]) -> dict[str, Any]:
     """Rows as columns; None instead of a column that has no value at all."""
-    columns = {}
+    columns: dict[str, Any] = {}
     for field in dataclasses.fields(ViewRow):
         values = [_finite(getattr(row, field.name)) for row in rows]
         columns[field.name] = None if all(value is None for value in values) else values
@@ -167,7 +167,7 @@ def read_records(root: Path, cells: Iterable[Cell] | None = None) -> list[dict[s
         folders = [path for path in (Path(root) / "cells").glob("*") if path.is_dir()]
     else:
         folders = [paths_of(root, cell).folder for cell in cells]
-    records = []
+    records: list[dict[str, Any]] = []
     for folder in sorted(folders):
         found = [_read_record(path) for path in folder.glob("snapshot-*.json")]
         records += sorted(found, key=lambda record: snapshot_order(record["snapshot"]))

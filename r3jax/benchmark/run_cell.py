@@ -12,7 +12,7 @@ import json
 import shutil
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -89,9 +89,9 @@ def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> 
     write_atomic(paths.identity, json.dumps(identity(cell), indent=1).encode())
     run = _finished_run(paths.run) or _explore(cell, paths, on_stage)
     judging = load_judging_views(root, cell)
-    failures = []
+    failures: list[str] = []
     for snapshot in left:
-        stage = lambda what, snapshot=snapshot: on_stage(f"{snapshot}: {what}")
+        stage: OnStage = lambda what, snapshot=snapshot: on_stage(f"{snapshot}: {what}")
         try:
             _do_snapshot(cell, root, run, judging, snapshot, stage)
         except Exception as error:  # the other snapshots may work
@@ -102,7 +102,7 @@ def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> 
 
 
 @contextlib.contextmanager
-def _lock(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> Generator[None]:
     """One process at a time; the lock dies with its process, so that none is ever stale."""
     end = time.monotonic() + _LOCK_PATIENCE
     with open(folder / "lock", "w") as file:

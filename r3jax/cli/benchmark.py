@@ -60,7 +60,9 @@ def run_benchmark(options: Benchmark) -> int:
 
 
 def _request(options: Benchmark) -> Request:
-    words = lambda text: tuple(word.strip() for word in text.split(",") if word.strip())
+    def words(text: str) -> tuple[str, ...]:
+        return tuple(word.strip() for word in text.split(",") if word.strip())
+
     try:
         seeds = tuple(int(seed) for seed in words(options.seeds))
     except ValueError:

@@ -153,7 +153,7 @@ def _write(options: Evaluate, outcome: Outcome, folder: Path) -> dict[str, Path]
 
 def _record(options: Evaluate, outcome: Outcome) -> dict[str, Any]:
     """Everything that the numbers depend on, and the numbers."""
-    summaries = {}
+    summaries: dict[str, Any] = {}
     for summary in outcome.summaries:
         plain = dataclasses.asdict(summary)
         summaries[plain.pop("metric")["name"]] = plain
@@ -180,7 +180,7 @@ def _sheet(options: Evaluate, outcome: Outcome):
     """The contact sheet of the worst views."""
     rows, renders = outcome.judgment.rows, outcome.judgment.renders
     place = {row.view: i for i, row in enumerate(rows)}
-    lines = []
+    lines: list[SheetView] = []
     for row in worst_rows(rows, options.worst):
         i, expected = place[row.view], None
         if outcome.state is not None:
@@ -236,7 +236,10 @@ def _table(summaries: tuple[Summary, ...]) -> Table:
         column.no_wrap = True
         column.justify = "left" if column is table.columns[0] else "right"
     for summary in summaries:
-        show = lambda value, digits=summary.metric.decimals: f"{value:.{digits}f}"
+
+        def show(value: float, digits: int = summary.metric.decimals) -> str:
+            return f"{value:.{digits}f}"
+
         low, high = summary.interval
         poor = "" if summary.poor_share is None else f"{100 * summary.poor_share:.1f} %"
         table.add_row(
@@ -254,7 +257,7 @@ def _table(summaries: tuple[Summary, ...]) -> Table:
 def _warnings(outcome: Outcome) -> list[str]:
     """What makes the numbers mean less than they seem to."""
     test, training = outcome.test, outcome.training
-    warnings = []
+    warnings: list[str] = []
     if test.num_trained:
         warnings.append(
             f"the model was trained on {test.num_trained} of these {len(test.numbers)} views; "

@@ -85,7 +85,7 @@ def _show_run(console: Console, path: Path) -> None:
 
 
 def _show_recording(console: Console, options: Info, path: Path) -> None:
-    from r3jax.evaluation.revisits import follow_recording, revisit_figure
+    from r3jax.evaluation.revisits import FrameReport, follow_recording, revisit_figure
     from r3jax.evaluation.style import to_png
 
     recording = read_recording(path, options.up)
@@ -96,7 +96,7 @@ def _show_recording(console: Console, options: Info, path: Path) -> None:
         highlight=False,
     )
     console.print("frame  renderability  new voxels  voxels  path [m]", style="bold", markup=False)
-    reports = []
+    reports: list[FrameReport] = []
     for report, _ in follow_recording(recording, voxel_size=options.voxel_size):
         reports.append(report)
         bar = "█" * round(20 * report.renderability)

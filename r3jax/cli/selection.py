@@ -185,7 +185,7 @@ def mapped_views(training: Training, test: TestSet, capture: Capture) -> list[in
         return [number for number in training.train_views if number < len(capture)]
     if training.record:
         return []
-    tested = set(test.numbers) if test.capture is capture else set()
+    tested: set[int] = set(test.numbers) if test.capture is capture else set()
     return [number for number in range(len(capture)) if number not in tested]
 
 

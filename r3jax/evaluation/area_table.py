@@ -55,7 +55,8 @@ def area_table(
     if x not in EXPLORATION:
         raise ValueError(f"no budget {x!r}; there are {', '.join(EXPLORATION)}")
     scenes, methods, seeds = scenes_of(cells), methods_of(cells), seed_texts(cells)
-    columns, ranges = [], []
+    columns: list[list[float | None]] = []
+    ranges: list[str] = []
     for scene in scenes:
         here = [cell for cell in cells if cell["scene"] == scene]
         curves = {method: _curves(here, method, x, metric) for method in methods}
@@ -89,7 +90,7 @@ def area_table(
 def _curves(cells: Sequence[Cell], method: str, x: str, metric: str) -> list[Curve]:
     """The curve of every seed; none at all if one of them has fewer than two points."""
     chosen = [cell for cell in cells if method_name(cell) == method]
-    curves = []
+    curves: list[Curve] = []
     for budget, quality in zip(
         values_by_seed(chosen, x), values_by_seed(chosen, metric), strict=True
     ):

@@ -21,7 +21,7 @@ def in_batches(
     """
     count = len(arrays[0])
     batch = min(batch, count)
-    results = []
+    results: list[np.ndarray] = []
     for start in range(0, count, batch):
         first = min(start, count - batch)
         part = call(*(array[first : first + batch] for array in arrays))

@@ -49,7 +49,8 @@ def ridge_figure(cells: Sequence[Cell], metric: str = "psnr") -> Figure:
     check_equal_terms(cells, one_snapshot=False)
     cells = with_short_names(cells)
     methods, snapshots = methods_of(cells), snapshots_of(cells)
-    looks, pooled = looks_of(methods), {}
+    looks = looks_of(methods)
+    pooled: dict[tuple[str, str], np.ndarray] = {}
     for snapshot in snapshots:
         scores = scores_by_method([c for c in cells if c["snapshot"] == snapshot], metric)
         for method, scenes in scores.items():
@@ -59,7 +60,7 @@ def ridge_figure(cells: Sequence[Cell], metric: str = "psnr") -> Figure:
         raise ValueError(f"no record has a value of {metric}")
     everything = np.concatenate(list(pooled.values()))
     margin = 0.08 * np.ptp(everything) + 1e-3
-    grid = np.linspace(everything.min() - margin, everything.max() + margin, 300)
+    grid: np.ndarray = np.linspace(everything.min() - margin, everything.max() + margin, 300)
     heights = {key: density(views, grid) for key, views in pooled.items()}
     scale = _RIDGE_HEIGHT / max(height.max() for height in heights.values())
     figure = style.new_figure(max(5.0, 3.4 * len(snapshots)), 0.62 * len(methods) + 1.6)
@@ -135,7 +136,7 @@ def scatter_figure(
     main, top, side = (axes[name] for name in ("main", "top", "side"))
     style.dress(main, x=x_label, y=y_label)
     order = list(dict.fromkeys(groups))
-    grids = [
+    grids: list[np.ndarray] = [
         np.linspace(v.min() - 0.05 * np.ptp(v), v.max() + 0.05 * np.ptp(v), 200) for v in (x, y)
     ]
     for i, group in enumerate(name for name in order if name in names):

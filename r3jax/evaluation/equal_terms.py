@@ -203,7 +203,9 @@ def scores_by_method(cells: Sequence[Cell], metric: str) -> dict[str, dict[str, 
 def seeds_by_method(cells: Sequence[Cell]) -> dict[str, dict[str, list[int]]]:
     """Per method and scene the seeds there are, ascending; an empty list where there are none."""
     scenes = scenes_of(cells)
-    seeds = {method: {scene: [] for scene in scenes} for method in methods_of(cells)}
+    seeds: dict[str, dict[str, list[int]]] = {
+        method: {scene: [] for scene in scenes} for method in methods_of(cells)
+    }
     for cell in sorted(cells, key=lambda cell: cell["seed"]):
         known = seeds[method_name(cell)][cell["scene"]]
         if cell["seed"] not in known:  # it has other snapshots too

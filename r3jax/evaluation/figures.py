@@ -57,7 +57,8 @@ def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
     axes.grid(visible=False)
     axes.imshow(picture, origin="lower", extent=extent, interpolation="nearest")
     order = np.arange(len(run.rows))
-    segments, colors = [], []
+    segments: list[np.ndarray] = []
+    colors: list[int] = []
     for row in run.rows[1:]:
         if row.choice is not None and len(row.choice.waypoints) > 1:
             segments.append(row.choice.waypoints[:, :2])

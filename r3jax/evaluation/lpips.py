@@ -8,6 +8,7 @@ Shape symbols: n images; H, W image size.
 
 import functools
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -89,7 +90,7 @@ def _distances(
 ) -> Float[Array, " n"]:
     """One batch, [0, 1] in."""
     apply = _network(metric.network).apply
-    to_range = lambda x: 2.0 * x - 1.0
+    to_range: Callable[[Array], Array] = lambda x: 2.0 * x - 1.0
     # The package leans on promotion of ranks, which callers may have forbidden.
     with jax.numpy_rank_promotion("allow"):
         return apply({"params": metric.weights}, to_range(images), to_range(truth))[:, 0, 0, 0]

@@ -143,7 +143,7 @@ def quality_table(evaluation: dict[str, Any]) -> str:
         f'<th class="n">{title}</th>'
         for title in ("mean", "95 % interval", "median", "5th percentile", "worst", "&lt; 20 dB")
     )
-    rows = []
+    rows: list[str] = []
     for name, metric in evaluation["metrics"].items():
         title, digits = _TITLES.get(name, (name, 3))
         low, high = metric["interval"]

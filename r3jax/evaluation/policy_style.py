@@ -66,7 +66,7 @@ def looks_of(methods: Sequence[str]) -> dict[str, Look]:
     The first settings of a policy look the same in every figure; others have other dashes.
     """
     seen: dict[str, int] = {}
-    looks = {}
+    looks: dict[str, Look] = {}
     for method in methods:
         policy = method.partition(" (")[0]
         color, marker, dashes = _POLICIES.get(policy, _UNKNOWN)
@@ -85,7 +85,7 @@ def legend_below(figure: Figure, labels: Sequence[str]) -> None:
         figure: whose axes have artists with these labels.
         labels: in the order of the legend; those that no panel has are left out.
     """
-    found = {}
+    found: dict[str, Any] = {}
     for axes in figure.axes:
         found = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True)) | found
     named = [label for label in labels if label in found]

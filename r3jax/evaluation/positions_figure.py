@@ -7,6 +7,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D
 
 from r3jax.evaluation import style
 
@@ -41,7 +42,7 @@ def positions_figure(
     columns = min(len(positions), _PANELS_PER_LINE)
     lines = -(-len(positions) // columns)
     figure = style.new_figure(max(4.6, 3.2 * columns + 0.8), 2.7 * lines + 0.4)
-    panels = []
+    panels: list[Axes3D] = []
     for i, (method, found) in enumerate(positions.items()):
         axes = figure.add_subplot(lines, columns, i + 1, projection="3d")
         panels.append(axes)

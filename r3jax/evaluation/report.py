@@ -112,7 +112,7 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     }
     folder = run.path / "report"
     folder.mkdir(exist_ok=True)
-    sections = []
+    sections: list[str] = []
     for name, figure in drawn.items():
         png = style.to_png(figure)
         write_atomic(folder / f"{name}.png", png)

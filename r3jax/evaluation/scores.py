@@ -118,7 +118,7 @@ def summarize(rows: Sequence[ViewRow], *, seed: int = 0) -> tuple[Summary, ...]:
     """
     if not rows:
         raise ValueError("there is no view to summarize")
-    summaries = []
+    summaries: list[Summary] = []
     for metric in METRICS:
         known = [(row.view, value) for row in rows if _has(value := getattr(row, metric.name))]
         if known:

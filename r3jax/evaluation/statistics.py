@@ -207,7 +207,8 @@ def mean_over_scenes(scores: Scores, *, seed: int = 0, resamples: int = RESAMPLE
     if not scores:
         raise ValueError("there is no scene to average over")
     rng = np.random.default_rng(seed)
-    means, drawn, count = [], np.zeros(resamples), 0
+    means: list[float] = []
+    drawn, count = np.zeros(resamples), 0
     for scene in sorted(scores):  # so that the order of the mapping does not matter
         values = _known_views(scene, scores[scene])
         num_seeds, num_views = values.shape

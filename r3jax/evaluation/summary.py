@@ -42,7 +42,7 @@ class StageTime:
 
 def stage_times(run: Run) -> list[StageTime]:
     """Step times by stage, as measured; stages that never ran are left out."""
-    table = []
+    table: list[StageTime] = []
     known = [*STAGES, *sorted({k for t in run.timings for k in t} - {"step", *STAGES})]
     for key in known:
         seconds = np.array([t[key] for t in run.timings if key in t])

@@ -116,7 +116,8 @@ def to_csv(table: Table) -> str:
 
 def _without_repeats(table: Table) -> list[tuple[str, ...]]:
     """Labels with the method named once, on its first line."""
-    labels, last = [], None
+    labels: list[tuple[str, ...]] = []
+    last = None
     for row in table.rows:
         labels.append(row.labels if row.labels[0] != last else ("", *row.labels[1:]))
         last = row.labels[0]

@@ -30,7 +30,7 @@ class Entry:
     rank: int = 0
     """1 for the best of its column, 2 for the second best, 0 for others."""
 
-    extra: Mapping[str, float | str] = field(default_factory=dict)
+    extra: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
     """What else the text tells (interval, name of a scene), by name, for machines."""
 
 

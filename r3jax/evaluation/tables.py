@@ -55,7 +55,7 @@ def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
     rows: dict[tuple[str, str], Row] = {}
     for name in PAPER_METRICS:
         metric, scores = metric_named(name), scores_by_method(cells, name)
-        columns = []
+        columns: list[list[Entry]] = []
         for scene in [*scenes, None]:
             means = [_mean(scores.get(method, {}), scene, scenes) for method in methods]
             columns.append(ranked(means, metric))
@@ -216,7 +216,7 @@ def difference_table(
         text = f"{estimate.value:+.{shown.decimals}f}"
         return with_bounds(Entry(estimate.value, text), estimate, shown, "+")
 
-    rows = []
+    rows: list[Row] = []
     for method in methods:
         if method == reference:
             continue

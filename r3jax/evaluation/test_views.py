@@ -258,7 +258,7 @@ _AGAIN = "delete the file and it is computed again"
 
 def poses_at(positions: np.ndarray, looks: Sequence[str] | np.ndarray) -> np.ndarray:
     """Poses without roll, [V, 4, 4] float64, at positions [V, 3] [m] along "+x", "-x", ..."""
-    axes = {}
+    axes: dict[str, np.ndarray] = {}
     for look in _LOOKS:
         direction = np.zeros(3, np.float32)
         direction["xyz".index(look[1])] = 1.0 if look[0] == "+" else -1.0

@@ -4,7 +4,7 @@ Shape symbols: H, W image size.
 """
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ def image_pixels(
 
 
 @contextmanager
-def _opened(path: Path, formats: Sequence[str]) -> Iterator[Any]:
+def _opened(path: Path, formats: Sequence[str]) -> Generator[Any]:
     """An open image; whatever Pillow says of a broken one becomes one kind of error."""
     from PIL import Image
 

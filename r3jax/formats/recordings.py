@@ -9,7 +9,7 @@ Images, depth images and poses belong together in the order of the sorted file n
 """
 
 import io
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,7 +126,7 @@ def _read_numbers(path: Path, columns: int) -> np.ndarray:
     """A table of numbers, [n, columns] float64; comments start with #."""
     with _named(path):
         data = read_bytes(path, _MAX_TEXT)
-    rows = []
+    rows: list[list[float]] = []
     for number, raw in enumerate(io.BytesIO(data), start=1):
         line = raw.decode("utf-8", errors="replace")
         words = line.partition("#")[0].split()
@@ -186,7 +186,7 @@ def _read_image(path: Path, camera: Camera, *, is_depth: bool) -> np.ndarray:
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
+def _named(path: Path) -> Generator[None]:
     """Adds the name of the file to what is wrong with it."""
     try:
         yield

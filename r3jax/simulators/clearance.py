@@ -48,7 +48,7 @@ class SurfaceDistance:
 
 def cut_triangles(corners: np.ndarray, longest: float) -> np.ndarray:
     """Halves triangles [n, 3, 3] at their longest edge until no edge is over `longest` [m]."""
-    done = []
+    done: list[np.ndarray] = []
     while len(corners):
         edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)  # edge k: k, k+1
         is_small = edges.max(axis=1) <= longest

@@ -33,7 +33,7 @@ def texture_transforms(path: Path) -> dict[str, np.ndarray]:
     Raises:
         ForeignFileError: the JSON of the file is damaged, or a transform has no numbers.
     """
-    moves = {}
+    moves: dict[str, np.ndarray] = {}
     tree = _read_tree(path)
     check_type("glTF", tree, dict[str, Any])
     for material in _part(tree, "materials", list[dict[str, Any]], []):

@@ -185,7 +185,7 @@ def _assemble(path: Path, parts: list[_Part], turn: np.ndarray) -> World:
     starts = np.concatenate([[0], np.cumsum(sizes)])
     materials: list[Material] = []
     index: dict[int, int] = {}
-    face_material = []
+    face_material: list[np.ndarray] = []
     for part in parts:
         k = index.setdefault(id(part.material), len(materials))
         if k == len(materials):
@@ -193,7 +193,10 @@ def _assemble(path: Path, parts: list[_Part], turn: np.ndarray) -> World:
         face_material.append(np.full(len(part.faces), k, dtype=np.int32))
     colors = None
     if any(part.colors is not None for part in parts):
-        white = lambda part: np.ones((len(part.faces), 3, 3), np.float32)
+
+        def white(part: _Part) -> np.ndarray:
+            return np.ones((len(part.faces), 3, 3), np.float32)
+
         colors = np.concatenate([white(p) if p.colors is None else p.colors for p in parts])
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
     return World(

@@ -205,7 +205,7 @@ class RaycastSimulator:
         """Colours [n, 3] and hits of rays `directions` [n, 3] from the camera."""
         steps = self._pixel_steps(T)
         origin = T[None, :3, 3].astype(np.float32)
-        parts = []
+        parts: list[tuple[Hits, jax.Array]] = []
         # While embree works on one chunk, the kernel colours the one before it.
         for begin in range(0, len(directions), shading.CHUNK):
             chunk = directions[begin : begin + shading.CHUNK]

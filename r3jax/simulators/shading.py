@@ -16,6 +16,8 @@ footprint: isotropic mip maps would blur floors and walls seen at a low angle.
 Shape symbols: n rays of a chunk; L lamps.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -117,7 +119,8 @@ def _texture_color(
     # Probes spread only as far as the footprint is longer than wide.
     spread = 1.0 - jnp.minimum(shorter / jnp.maximum(longer, 1e-6), 1.0)
 
-    indices, weights = [], []
+    indices: list[Array] = []
+    weights: list[Array] = []
     for coarser in range(2):
         k = jnp.minimum(fine.astype(jnp.int32) + coarser, MAX_LEVELS - 1)
         size_k = jnp.maximum(size >> k[None, :], 1)
@@ -137,10 +140,11 @@ def _texture_color(
     # One gather of whole texels, kept apart from what follows: fused, XLA would fetch every
     # texel once per channel.
     packed = jax.lax.optimization_barrier(_rows(surface.texels, index))
-    channels = []
+    channels: list[Array] = []
     for shift in (0, 8, 16):
         values = [((texels >> shift) & jnp.uint32(255)).astype(jnp.float32) for texels in packed]
-        channels.append(sum(w * value for w, value in zip(weights, values, strict=True)))
+        total = sum(w * value for w, value in zip(weights, values, strict=True))
+        channels.append(jnp.asarray(total))
     return jnp.stack(channels) / 255.0
 
 
@@ -171,13 +175,16 @@ def _lit(
     distance: Float[Array, " n"],
 ) -> Float[Array, "3 n"]:
     """The module's formula for a world with lamps."""
-    unit = lambda x: x / jnp.maximum(jnp.sqrt(_dot(x, x)), 1e-6)[None, :]
+    unit: Callable[[Array], Array] = lambda x: x / jnp.maximum(jnp.sqrt(_dot(x, x)), 1e-6)[None, :]
     view = unit(-rays.direction.T)
     facing = jnp.where((_dot(normal, view) < 0.0)[None, :], -normal, normal)
     position = rays.origin.T + distance[None, :] * rays.direction.T
     # All that is per ray is worked out once, not once per lamp.
     view, facing, position = jax.lax.optimization_barrier((view, facing, position))
-    per_lamp = lambda x: [row[None, :] for row in x]  # [1, n] each, against [L, 1]
+
+    def per_lamp(x: Array) -> list[Array]:
+        return [row[None, :] for row in x]  # [1, n] each, against [L, 1]
+
     view_of, facing_of = per_lamp(view), per_lamp(facing)
     offset = [surface.lamps[:, k, None] - position[None, k] for k in range(3)]
     squared = _dot(offset, offset)

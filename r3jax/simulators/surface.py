@@ -6,6 +6,7 @@ Shape symbols: F faces; K materials; T textures; L lamps; S texels.
 """
 
 import hashlib
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -67,7 +68,9 @@ def build_surface(world: World, *, lighting: bool) -> Surface:
     lamps = [(*lamp.position, *lamp.color, lamp.reach) for lamp in world.lamps if lighting]
     # Dark lamps fill up the table, so that worlds share compiled kernels.
     lamps += [(0.0,) * 6 + (1.0,)] * (-len(lamps) % 8)
-    as_float = lambda x: jnp.asarray(np.asarray(x, dtype=np.float32))
+    as_float: Callable[[np.ndarray | float], Array] = lambda x: jnp.asarray(
+        np.asarray(x, dtype=np.float32)
+    )
     return Surface(
         faces=as_float(_padded(faces)),
         corner_colors=as_float(corner_colors),

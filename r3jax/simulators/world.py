@@ -87,7 +87,7 @@ class World:
     start_yaw: float = 0.0
     """Heading at the start: angle of the viewing direction from the world's x axis [rad]."""
 
-    notes: dict[str, str] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict[str, str])
     """Where it came from."""
 
     @property

@@ -138,13 +138,16 @@ def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]
 
 def _storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Orbax refuses arrays without elements: their names say what they are."""
-    named = lambda name, x: name if x.size else f"{name} empty {x.dtype.str} {list(x.shape)}"
+
+    def named(name: str, x: np.ndarray) -> str:
+        return name if x.size else f"{name} empty {x.dtype.str} {list(x.shape)}"
+
     return {named(name, x): x if x.size else np.zeros(1, np.uint8) for name, x in table.items()}
 
 
 def _stored(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Inverse of `_storable`."""
-    arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     for full_name, array in table.items():
         name, is_empty, rest = full_name.partition(" empty ")
         if is_empty:

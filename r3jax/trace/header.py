@@ -59,7 +59,7 @@ class RunHeader:
     bounds: list[list[float]]
     """Lower and upper corner of the scene's box [m], world."""
 
-    packages: dict[str, str] = field(default_factory=dict)
+    packages: dict[str, str] = field(default_factory=dict[str, str])
     """Versions of the packages that shape the result, of Python, and the device."""
 
     parent: dict[str, Any] | None = None
@@ -94,7 +94,10 @@ def package_versions() -> dict[str, str]:
     """Versions of what shapes the result on this machine."""
     import jax
 
-    versions = {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
+    versions: dict[str, str] = {
+        "python": platform.python_version(),
+        "device": jax.devices()[0].device_kind,
+    }
     for name in _PACKAGES:
         try:
             versions[name] = importlib.metadata.version(name)

@@ -148,7 +148,7 @@ def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
     """Timings are a by-product: what cannot be read of them is left out."""
     if not path.exists():
         return ()
-    timings = []
+    timings: list[dict[str, float]] = []
     for line in complete_lines(path):
         try:
             plain = parse_json(line)

@@ -40,7 +40,7 @@ class Choice:
     num_reachable: int
     """Poses that a safe path leads to."""
 
-    top: dict[str, list[float | None]] = field(default_factory=dict)
+    top: dict[str, list[float | None]] = field(default_factory=dict[str, list[float | None]])
     """Utilities of the best candidates, best first; None where one has no finite value."""
 
 
@@ -176,7 +176,7 @@ def from_json(line: str) -> StepRow | EndRow:
 
 
 def _choice(plain: Any) -> Choice:
-    known = plain if isinstance(plain, dict) else {}
+    known: dict[str, Any] = plain if isinstance(plain, dict) else {}
     waypoints = _numbers("waypoints", known.get("waypoints"), (-1, 3))
     return build(Choice, plain, pose=_pose("choice.pose", known.get("pose")), waypoints=waypoints)
 
@@ -205,7 +205,7 @@ def _numbers(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     return table
 
 
-def shortest_floats(array: np.ndarray) -> list:
+def shortest_floats(array: np.ndarray) -> list[Any]:
     """Nested lists of the shortest decimals that read back as the same float32 numbers."""
     if array.ndim > 1:
         return [shortest_floats(part) for part in array]

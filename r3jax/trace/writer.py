@@ -234,7 +234,7 @@ def _lock(folder: Path):
 def _mend(path: Path) -> None:
     """Leaves the whole rows of views in the trace, and nothing half written anywhere."""
     trace = path / "trace.jsonl"
-    views = []
+    views: list[str] = []
     for line in complete_lines(trace):
         if isinstance(from_json(line), StepRow):
             views.append(line)

@@ -129,7 +129,7 @@ def _end_without_result(cell: Cell, root: Path, job: Any, state: str) -> Event:
         return Event(cell, "done")
     text = f"job {job.job_id} ended without a result: {state}"
     log = job.paths.stderr
-    lines = log.read_text(errors="replace").splitlines() if log.exists() else []
+    lines: list[str] = log.read_text(errors="replace").splitlines() if log.exists() else []
     said = [line.strip() for line in lines if line.strip()]
     said = [line for line in said if "error" in line.lower()] or said
     return Event(cell, "failed", f"{text}; {log} says: {said[-1]}" if said else text)
@@ -144,7 +144,6 @@ def _ended_by_submitit(jobs: Sequence[Any], job_ids: Iterable[str]) -> dict[str,
 def _submitit() -> Any:
     try:
         import submitit
-        import submitit.helpers
     except ImportError as error:
         raise ImportError(
             "--engine slurm needs the package submitit: pip install 'r3jax[slurm]'"

@@ -59,11 +59,11 @@ def read_queue(job_ids: Iterable[str], listing: str) -> dict[str, str]:
 
     A job that is not listed ended so long ago that Slurm forgot it (its MinJobAge).
     """
-    listed = {}
+    listed: dict[str, tuple[str, str]] = {}
     for line in listing.splitlines():
         job_id, state, reason = line.strip().split("|", 2)
         listed[job_id] = (state, reason)
-    ended = {}
+    ended: dict[str, str] = {}
     for job_id in job_ids:
         state, reason = listed.get(job_id, ("no longer in the queue", "None"))
         if state in _ENDED or job_id not in listed:
