@@ -139,7 +139,7 @@ def _caption(row: ViewRow) -> str:
 def _color_bar(figure: Figure, image: AxesImage, axes: Axes, label: str) -> None:
     """A bar below a column of pictures."""
     bar = figure.colorbar(image, cax=axes, orientation="horizontal")
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.outline.set_visible(False)
     bar.set_ticks(list(np.linspace(*image.get_clim(), 3)))
     bar.set_label(label, fontsize=7, color=style.MUTED)
     axes.tick_params(labelsize=7, colors=style.MUTED, length=2)

@@ -108,7 +108,7 @@ def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
         )
     bar = figure.colorbar(dots, ax=axes, shrink=0.6, pad=0.01)
     bar.set_label("order of acquisition", fontsize=9, color=style.MUTED)
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, colors=style.MUTED)
     return figure
 
@@ -129,7 +129,7 @@ def panorama_figure(picture: PanoramaPicture) -> Figure:
     lower.set_facecolor("#e5e7eb")
     image = lower.imshow(picture.value, extent=extent, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
     bar = figure.colorbar(image, ax=[upper, lower], shrink=0.4, pad=0.01, anchor=(0.0, 0.0))
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.outline.set_visible(False)
     bar.set_label("R (grey: nothing mapped within range)", fontsize=9, color=style.MUTED)
     bar.ax.tick_params(labelsize=8, colors=style.MUTED)
     for axes in (upper, lower):

@@ -69,7 +69,7 @@ def positions_figure(
         ScalarMappable(scale, style.PATH_MAP), ax=panels, shrink=0.6, pad=0.04, aspect=30
     )
     bar.set_label("order of acquisition", fontsize=9, color=style.MUTED)
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, colors=style.MUTED)
     figure.suptitle(title, fontsize=11, color=style.INK, fontweight="bold")
     return figure

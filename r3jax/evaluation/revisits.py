@@ -97,7 +97,7 @@ def revisit_figure(recording: Recording, reports: list[FrameReport]) -> Figure:
     )
     right.annotate("start", path[0, :2], xytext=(6, 6), textcoords="offset points", fontsize=9)
     bar = figure.colorbar(dots, ax=right, shrink=0.8, pad=0.01)
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.outline.set_visible(False)
     bar.set_label("renderability", fontsize=9, color=style.MUTED)
     bar.ax.tick_params(labelsize=8, colors=style.MUTED)
     return figure
