@@ -1,7 +1,9 @@
-"""Writes that are either complete or not there."""
+"""Writes that are either complete or not there, and one writer at a time."""
 
+import fcntl
 import os
 import secrets
+from io import FileIO
 from pathlib import Path
 
 
@@ -51,3 +53,23 @@ def sync_folder(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def lock_folder(folder: Path) -> FileIO:
+    """Takes the lock of a folder: an open file `lock` in it; closing it frees the lock.
+
+    The lock dies with its process, so that none is ever stale.
+
+    Raises:
+        BlockingIOError: another process, or another part of this one, holds it.
+        OSError: the folder cannot be written.
+    """
+    # For reading too: a pipe of that name would wait for a reader.
+    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    file = FileIO(descriptor, "w")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BaseException:
+        file.close()
+        raise
+    return file

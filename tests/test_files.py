@@ -1,11 +1,13 @@
 """Writes are whole or not there, whoever else writes, and whatever fails."""
 
 import os
+import subprocess
+import sys
 import threading
 
 import pytest
 
-from r3jax.files import append_line, write_atomic
+from r3jax.files import append_line, lock_folder, write_atomic
 
 
 def names(folder):
@@ -80,3 +82,29 @@ def test_a_failed_append_is_taken_back(tmp_path, monkeypatch):
             append_line(path, "two")
     append_line(path, "three")
     assert path.read_text() == "one\nthree\n"
+
+
+def test_a_lock_is_held_once_and_free_again_when_closed(tmp_path):
+    with lock_folder(tmp_path), pytest.raises(BlockingIOError):
+        lock_folder(tmp_path)
+    lock_folder(tmp_path).close()
+
+
+def test_a_pipe_in_the_place_of_the_lock_does_not_wait_for_ever(tmp_path):
+    os.mkfifo(tmp_path / "lock")
+    lock_folder(tmp_path).close()
+
+
+def test_a_lock_dies_with_its_process(tmp_path):
+    code = (
+        "import sys, time, pathlib; from r3jax.files import lock_folder; "
+        "lock = lock_folder(pathlib.Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    with pytest.raises(BlockingIOError):
+        lock_folder(tmp_path)
+    process.kill()
+    process.communicate()
+    lock_folder(tmp_path).close()

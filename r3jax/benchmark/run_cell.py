@@ -6,7 +6,6 @@ goes on behind the last complete stage (a training behind its last checkpoint).
 
 import contextlib
 import dataclasses
-import fcntl
 import itertools
 import json
 import shutil
@@ -27,7 +26,7 @@ from r3jax.evaluation.maps import map_of
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.loop import explore
 from r3jax.exploration.state import StopReason
-from r3jax.files import write_atomic
+from r3jax.files import lock_folder, write_atomic
 from r3jax.scenes.registry import open_scene, scene_hash
 from r3jax.scoring.renderability import renderability
 from r3jax.splatting import train
@@ -103,17 +102,17 @@ def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> 
 
 @contextlib.contextmanager
 def _lock(folder: Path) -> Generator[None]:
-    """One process at a time; the lock dies with its process, so that none is ever stale."""
+    """One process at a time."""
     end = time.monotonic() + _LOCK_PATIENCE
-    with open(folder / "lock", "w") as file:
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > end:
-                    raise CellError(f"{folder}: another process is at this cell") from None
-                time.sleep(0.2)
+    while True:
+        try:
+            lock = lock_folder(folder)
+            break
+        except BlockingIOError:
+            if time.monotonic() > end:
+                raise CellError(f"{folder}: another process is at this cell") from None
+            time.sleep(0.2)
+    with lock:
         yield
 
 

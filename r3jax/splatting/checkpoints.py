@@ -3,14 +3,15 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from r3jax.files import write_atomic
+from r3jax.files import lock_folder, write_atomic
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.files import check_tree, read_bytes
 from r3jax.foreign.json_text import parse_json
@@ -54,6 +55,30 @@ def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[prefix + name] = value
     return flat
+
+
+@contextmanager
+def only_training(folder: Path, *, is_new: bool) -> Generator[None]:
+    """Within it no other process trains in the folder.
+
+    Args:
+        folder: of the checkpoints.
+        is_new: make the folder.
+
+    Raises:
+        CheckpointError: another process does.
+        OSError: the folder cannot be written.
+    """
+    if is_new:
+        folder.mkdir(parents=True, exist_ok=True)
+    elif not _checkpoints(folder):
+        raise CheckpointError(folder, "there is no checkpoint to resume from")
+    try:
+        lock = lock_folder(folder)
+    except BlockingIOError:
+        raise CheckpointError(folder, "another process is training here") from None
+    with lock:
+        yield
 
 
 def begin_checkpoints(folder: Path, settings: dict[str, Any], *, overwrite: bool = False) -> None:

@@ -5,7 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from r3jax.splatting.checkpoints import (
     begin_checkpoints,
+    only_training,
     read_checkpoint,
     save_checkpoint,
     settings_record,
@@ -147,7 +148,8 @@ def fit(
     Raises:
         ViewsError: nothing, or too little, to train on.
         TooLargeError: it would not fit in memory.
-        CheckpointError: nothing to resume from, or a training with other settings.
+        CheckpointError: nothing to resume from, a training with other settings, or another
+            process that trains in `folder`.
         TrainingDiverged: the loss or a gradient is no longer finite. The last good checkpoint
             stays.
         ValueError: settings that do not fit together.
@@ -162,15 +164,16 @@ def fit(
         raise ValueError("resume goes on with the checkpoints, overwrite deletes them: choose one")
     extent = scene_extent(views)
     settings = settings_record(config, views, extent)
-    if resume and folder is not None:
-        like = jax.eval_shape(lambda: start_state(empty_scene(config.rows, config.sh_degree)))
-        state = read_checkpoint(folder, settings, like)
-    else:
-        state = start_state(_first_scene(views, config, scene))
-        if folder is not None:
-            begin_checkpoints(folder, settings, overwrite=overwrite)
     run = _Run(views, jnp.asarray(extent, dtype=jnp.float32), config, config.schedule())
-    return _Loop(run, state, folder, checkpoint_every, on_progress).result()
+    with nullcontext() if folder is None else only_training(folder, is_new=not resume):
+        if resume and folder is not None:
+            like = jax.eval_shape(lambda: start_state(empty_scene(config.rows, config.sh_degree)))
+            state = read_checkpoint(folder, settings, like)
+        else:
+            state = start_state(_first_scene(views, config, scene))
+            if folder is not None:
+                begin_checkpoints(folder, settings, overwrite=overwrite)
+        return _Loop(run, state, folder, checkpoint_every, on_progress).result()
 
 
 def scene_extent(views: Views) -> float:

@@ -2,14 +2,14 @@
 
 import contextlib
 import datetime
-import fcntl
 import json
 import shutil
 from dataclasses import replace
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 
-from r3jax.files import append_line, sync_folder, write_atomic
+from r3jax.files import append_line, lock_folder, sync_folder, write_atomic
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.files import read_bytes
 from r3jax.frame import Frame
@@ -219,16 +219,11 @@ class RunWriter:
         self.close()
 
 
-def _lock(folder: Path):
-    """An exclusive lock that dies with the process, so that none is ever stale."""
-    path = folder / "lock"
-    file = open(path, "ab")  # noqa: SIM115 (held open on purpose: closing it frees the lock)
+def _lock(folder: Path) -> FileIO:
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return lock_folder(folder)
     except BlockingIOError:
-        file.close()
         raise RunError(folder, "another process is writing this run") from None
-    return file
 
 
 def _mend(path: Path) -> None:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from r3jax.files import lock_folder
 from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.train import fit
@@ -83,6 +84,14 @@ def test_another_budget_may_resume_but_other_settings_are_named(views, folder):
 def test_a_new_training_does_not_bury_an_old_one(views, folder):
     with pytest.raises(CheckpointError, match="resume it, overwrite it, or choose another folder"):
         fit(views, config(), folder=folder)
+
+
+@pytest.mark.parametrize("how", [{"resume": True}, {"overwrite": True}])
+def test_two_processes_cannot_train_in_one_folder(views, folder, how):
+    before = sorted(folder.rglob("*"))
+    with lock_folder(folder), pytest.raises(CheckpointError, match="another process is training"):
+        fit(views, config(), folder=folder, **how)
+    assert sorted(folder.rglob("*")) == before
 
 
 def test_nothing_to_resume_from(views, tmp_path):
