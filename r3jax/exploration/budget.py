@@ -26,7 +26,8 @@ class Budget:
 
     def __str__(self) -> str:
         """As `parse_budget` reads it."""
-        return f"{self.unit}:{self.amount:g}"
+        short = f"{self.amount:g}"
+        return f"{self.unit}:{short if float(short) == self.amount else repr(self.amount)}"
 
 
 def parse_budget(text: str) -> Budget:

@@ -10,6 +10,7 @@ from r3jax.exploration.budget import Budget, parse_budget
 @given(st.sampled_from(["seconds", "metres"]), st.floats(0.01, 1e6))
 def test_the_text_of_a_budget_reads_back(unit, amount):
     assert parse_budget(f"{unit}:{amount}") == Budget(unit, amount)
+    assert parse_budget(str(Budget(unit, amount))) == Budget(unit, amount)
 
 
 NONSENSE = """
