@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 from pathlib import Path
 
 import jax
@@ -16,6 +17,10 @@ _cache = os.environ.get("JAX_COMPILATION_CACHE_DIR")
 if _cache:
     jax.config.update("jax_compilation_cache_dir", _cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+# A shell's background job begins with Ctrl-C ignored; the tests of interrupts need it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("jax", deadline=None, max_examples=30, derandomize=True)
 settings.load_profile("jax")
