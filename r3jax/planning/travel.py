@@ -1,4 +1,4 @@
-"""Path lengths and waypoints over known free space. On the host: NumPy and SciPy.
+"""Path lengths and waypoints over known free space. On the host: NumPy and Numba.
 
 A cell is *safe* if the ball of the safety margin round its centre touches known free cells only;
 unknown space is an obstacle. With 0.2 m cells and 0.3 m margin these are the cells whose 26
@@ -6,9 +6,9 @@ neighbours are free, so that every point of a path keeps at least one cell's wid
 anything that is not known to be free. The cell in which the robot stands is always usable.
 
 Paths run over the 26-connected graph of usable cells. A diagonal step needs every cell of the
-block it crosses, so that it cannot squeeze between two corners. For that rule the graph is
-spelled out for SciPy's Dijkstra: `skimage.graph.MCP_Geometric` takes as long and cannot express
-it (tests compare the two).
+block it crosses, so that it cannot squeeze between two corners. `skimage.graph.MCP_Geometric`
+cannot express that rule (tests compare the two), and SciPy's Dijkstra, for which the graph would
+have to be spelled out, takes five to nine times as long.
 
 Shape symbols: X Y Z cells along the axes; n cells or points; K waypoints.
 """
@@ -18,18 +18,14 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning.shortest_ways import shortest_ways
 
 _BORDER = 1e-3
 """A segment that passes a corner closer than this counts as touching it [cells]."""
 
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * _BORDER
-
-_STEPS = [d for d in itertools.product((-1, 0, 1), repeat=3) if d > (0, 0, 0)]
-"""One of each pair of opposite steps to the 26 neighbours."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +190,7 @@ def plan_travel(
         if trail is not None:
             usable |= trail & ~np.asarray(grid.occupied)
         usable[cell] = True
-    cost, previous = _shortest_ways(usable, cell if is_inside else None)
+    cost, previous = shortest_ways(usable, (cell[0], cell[1], cell[2]) if is_inside else None)
     return Travel(
         start=start,
         start_cell=(cell[0], cell[1], cell[2]),
@@ -256,45 +252,3 @@ def segment_cells(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             # On both sides of the plane, and of any other plane that is as good as touched.
             points.append((crossing[:, None, :] + _CORNERS).reshape(-1, 3))
     return np.floor(np.concatenate(points)).astype(np.int64)
-
-
-def _shortest_ways(
-    usable: np.ndarray, start: tuple[int, ...] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Length of the shortest way from `start` [cells] to each cell, and the cell before it."""
-    cost = np.full(usable.shape, np.inf)
-    previous = np.full(usable.shape, -1, dtype=np.int64)
-    if start is None:
-        return cost, previous
-    flat = np.flatnonzero(usable)
-    node = np.full(usable.shape, -1, dtype=np.int32)
-    node[usable] = np.arange(flat.size, dtype=np.int32)
-    ends: list[np.ndarray] = []
-    lengths: list[np.ndarray] = []
-    for step in _STEPS:
-        tails = node[_overlap(usable.shape, step, (0, 0, 0))]
-        heads = node[_overlap(usable.shape, step, step)]
-        is_open = np.ones(tails.shape, dtype=bool)
-        for corner in itertools.product(*({0, d} for d in step)):
-            is_open &= usable[_overlap(usable.shape, step, corner)]
-        ends.append(np.stack([tails[is_open], heads[is_open]]))
-        lengths.append(np.full(ends[-1].shape[1], np.linalg.norm(step)))
-    graph = csr_matrix(
-        (np.concatenate(lengths), tuple(np.concatenate(ends, axis=1))),
-        shape=(flat.size, flat.size),
-    )
-    length, before = dijkstra(
-        graph, directed=False, indices=int(node[start]), return_predecessors=True
-    )
-    cost[usable] = length
-    previous[usable] = np.where(before >= 0, flat[np.maximum(before, 0)], -1)
-    return cost, previous
-
-
-def _overlap(
-    shape: tuple[int, ...], step: tuple[int, ...], shift: tuple[int, ...]
-) -> tuple[slice, ...]:
-    """The cells from which `step` stays in the grid, as a slice moved by `shift`."""
-    return tuple(
-        slice(max(0, -d) + s, n - max(0, d) + s) for n, d, s in zip(shape, step, shift, strict=True)
-    )
