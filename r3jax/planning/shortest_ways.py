@@ -41,14 +41,13 @@ def shortest_ways(
     cost = np.full(padded.size, np.inf)
     previous = np.full(padded.size, -1, dtype=np.int64)
     if start is not None:
+        number = np.pad(np.arange(usable.size).reshape(usable.shape), 1).reshape(-1)
         first = int(np.ravel_multi_index([i + 1 for i in start], padded.shape))
         room = int(np.count_nonzero(usable))
-        _compiled()(padded.reshape(-1), *_steps(padded.shape), first, room, cost, previous)
-    inner = (slice(1, -1),) * 3
-    before = previous.reshape(padded.shape)[inner]
-    way = np.unravel_index(np.maximum(before, 0), padded.shape)
-    flat = np.ravel_multi_index([np.maximum(i - 1, 0) for i in way], usable.shape)
-    return cost.reshape(padded.shape)[inner].copy(), np.where(before >= 0, flat, -1)
+        steps = _steps(padded.shape)
+        _compiled()(padded.reshape(-1), number, *steps, first, room, cost, previous)
+    inner = lambda x: np.ascontiguousarray(x.reshape(padded.shape)[1:-1, 1:-1, 1:-1])
+    return inner(cost), inner(previous)
 
 
 def _steps(
@@ -84,6 +83,7 @@ def _compiled() -> _Kernel:
 
 def _settle(
     usable: Any,
+    number: Any,
     steps: Any,
     lengths: Any,
     between: Any,
@@ -93,7 +93,10 @@ def _settle(
     cost: Any,
     previous: Any,
 ) -> None:
-    """Fills `cost` and `previous` of a flattened grid with a border. For Numba."""
+    """Fills `cost` and `previous` of a flattened grid with a border, for Numba.
+
+    `number` holds the cells' flat index in the grid without the border.
+    """
     queues = np.empty((3, room), dtype=np.int32)  # a step ends at most two buckets further on
     filled = np.zeros(3, dtype=np.int64)
     queued = np.full(usable.size, -1, dtype=np.int32)  # the bucket that holds a cell
@@ -122,7 +125,7 @@ def _settle(
                 if not is_open:
                     continue
                 cost[there] = length
-                previous[there] = here
+                previous[there] = number[here]
                 new = int(length)
                 if queued[there] != new:
                     queued[there] = new

@@ -31,7 +31,16 @@ _MAX_BYTES = 16 << 20
 
 _LENS = ("fx", "fy", "cx", "cy")
 
-_PACKAGES = ("r3jax", "jax", "jaxlib", "numpy", "equinox", "scikit-image", "orbax-checkpoint")
+_PACKAGES = (
+    "r3jax",
+    "jax",
+    "jaxlib",
+    "numpy",
+    "scipy",
+    "numba",
+    "equinox",
+    "orbax-checkpoint",
+)
 
 
 @dataclass(frozen=True)
