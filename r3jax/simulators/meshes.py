@@ -60,8 +60,7 @@ def load_world(path: str | Path, up: str | None = None) -> World:
             vertices that are not finite, or has no extent.
     """
     path = Path(path)
-    if up not in (None, "y", "z"):
-        raise ValueError(f"up must be 'y' or 'z', got {up!r}")
+    turn = world_from_file(path, up)
     if not path.is_file():
         raise ValueError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
     is_gltf = path.suffix.lower() in _GLTF_SUFFIXES
@@ -77,11 +76,25 @@ def load_world(path: str | Path, up: str | None = None) -> World:
     parts = [part for part in nodes if part is not None]
     if not parts:
         _refuse_empty(path, file.scene)
-    is_y_up = up == "y" or (up is None and is_gltf)
-    turn = _Z_UP_FROM_Y_UP if is_y_up else np.eye(3)
     world = _assemble(path, parts, turn)
     _check(path, world)
     return world
+
+
+def world_from_file(path: Path, up: str | None = None) -> np.ndarray:
+    """The rotation [3, 3] from a mesh file's axes to the z-up world.
+
+    Args:
+        path: the file; it is not read.
+        up: its vertical axis, "y" or "z"; None: y for glTF, z for everything else.
+
+    Raises:
+        ValueError: `up` is neither.
+    """
+    if up not in (None, "y", "z"):
+        raise ValueError(f"up must be 'y' or 'z', got {up!r}")
+    is_gltf = path.suffix.lower() in _GLTF_SUFFIXES
+    return _Z_UP_FROM_Y_UP if up == "y" or (up is None and is_gltf) else np.eye(3)
 
 
 def _refuse_empty(path: Path, scene: Any) -> None:
