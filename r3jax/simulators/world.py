@@ -93,7 +93,9 @@ class World:
     @property
     def bounds(self) -> np.ndarray:
         """Axis-aligned box, [2, 3] [m]."""
-        used = self.vertices[np.unique(self.faces)]
+        is_used = np.zeros(len(self.vertices), dtype=bool)
+        is_used[self.faces] = True
+        used = self.vertices[is_used]
         return np.stack([used.min(axis=0), used.max(axis=0)])
 
     @property
