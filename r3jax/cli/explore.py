@@ -64,7 +64,7 @@ def run_explore(options: Explore) -> int:
     console = Console(stderr=True)
     try:
         expedition = _set_out(options, console)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         raise UserError(one_line(error)) from error
     plan = expedition.plan
     with expedition.recorder as recorder, RunProgress(console, plan.budget) as progress:

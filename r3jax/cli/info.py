@@ -47,7 +47,7 @@ def _show_inventory(console: Console) -> None:
     from r3jax.trace.header import package_versions
 
     scenes = {name: registry.describe(name) for name in registry.scene_names()}
-    scenes["mesh:<file>"] = "any GLB, glTF, PLY or OBJ file"
+    scenes |= registry.outside_scenes()
     policies = {name: policy.describe(name) for name in policy.policy_names()}
     for title, entries in (
         ("Scenes", scenes),

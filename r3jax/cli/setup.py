@@ -169,8 +169,10 @@ def policy_fields(policy: Policy) -> dict[str, Any]:
 
 def default_name(options: Explore, scene: str, policy: str) -> str:
     """A run's name where none is given."""
-    file = scene.removeprefix("mesh:")
-    stem = Path(file).stem if file != scene else scene
+    kind, colon, rest = scene.partition(":")
+    stem = Path(rest).stem if colon else scene
+    if kind == "habitat" and colon:
+        stem = f"habitat-{stem.removesuffix('.stage_config')}"
     return f"{stem}-{policy}-seed{options.seed}"
 
 

@@ -1,1 +1,1 @@
-"""Where worlds come from: procedural rooms and mesh files."""
+"""Where worlds come from: procedural rooms, mesh files, the Replica dataset."""

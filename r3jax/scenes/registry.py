@@ -1,21 +1,42 @@
-"""Scenes by name: the embedded rooms, and any mesh file as `mesh:<file>`."""
+"""Scenes by name: the embedded rooms, any mesh file, Replica's scenes, and Habitat-Sim."""
+
+import dataclasses
+from pathlib import Path
 
 import numpy as np
 
 from r3jax.geometry.cameras import Camera
-from r3jax.scenes import procedural
+from r3jax.scenes import procedural, replica
 from r3jax.simulators.base import Simulator
+from r3jax.simulators.habitat import HabitatSimulator
+from r3jax.simulators.habitat_stage import read_stage
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.noise import NoisySimulator
 from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.simulators.world import World
 
-_MESH_PREFIX = "mesh:"
+_OUTSIDE = {
+    "mesh": ("the mesh file", "a file, as in mesh:house.glb"),
+    "replica": ("the Replica scene", "a scene, as in replica:office0"),
+    "habitat": ("Habitat-Sim on", "a scene of Replica, or a file, as in habitat:house.glb"),
+}
+"""What comes before a colon: how a description begins, and what must follow the colon."""
 
 
 def scene_names() -> list[str]:
-    """Names of the embedded scenes. `mesh:<file>` opens any mesh besides."""
+    """Names of the embedded scenes; `outside_scenes` says what else can be opened."""
     return list(procedural.names())
+
+
+def outside_scenes() -> dict[str, str]:
+    """How to name scenes that are not embedded, each with a line about them."""
+    return {
+        "mesh:<file>": "any GLB, glTF, PLY or OBJ file",
+        "replica:<name>": "hotel0, office0 to office4, room0 to room2 of the Replica dataset; "
+        f"{replica.ROOT} names its folder",
+        "habitat:<scene>": "Habitat-Sim (conda) on a scene of Replica, or on a .glb, .ply or "
+        ".stage_config.json file",
+    }
 
 
 def describe(name: str) -> str:
@@ -24,31 +45,31 @@ def describe(name: str) -> str:
     Raises:
         ValueError: the scene is unknown; the message lists the known ones.
     """
-    if name.startswith(_MESH_PREFIX):
-        return f"the mesh file {name.removeprefix(_MESH_PREFIX)}"
-    _check_known(name)
-    return procedural.describe(name)
+    kind, rest = _split(name)
+    return f"{_OUTSIDE[kind][0]} {rest}" if kind in _OUTSIDE else procedural.describe(name)
 
 
 def open_world(spec: str, up: str | None = None) -> World:
     """The triangles and materials behind a scene's name.
 
     Args:
-        spec: the name of an embedded scene, or `mesh:<file>`.
+        spec: the name of an embedded scene, or one of `outside_scenes`. Of a Habitat scene this is
+            the mesh that it shows.
         up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
 
     Raises:
         ValueError: the scene is unknown, `up` is given for an embedded scene, or the mesh file is
-            refused (see `load_world`).
+            refused (see `load_world`) or missing.
     """
-    if spec.startswith(_MESH_PREFIX):
-        file = spec.removeprefix(_MESH_PREFIX)
-        if not file:
-            raise ValueError("mesh: needs a file after the colon, for example mesh:house.glb")
-        return load_world(file, up)
-    _check_known(spec)
+    kind, rest = _split(spec)
+    if kind == "mesh":
+        return load_world(rest, up)
+    if kind == "habitat":
+        return load_world(read_stage(_habitat_file(rest)).mesh, up)
     if up not in (None, "z"):
-        raise ValueError(f"up={up!r} is for mesh files; the embedded scene {spec!r} is z-up")
+        raise ValueError(f"up={up!r} is for mesh files; the scene {spec!r} is z-up")
+    if kind == "replica":
+        return dataclasses.replace(load_world(replica.mesh_file(rest)), name=spec)
     return procedural.build(spec)
 
 
@@ -65,7 +86,7 @@ def open_scene(
     """Opens a scene for exploration.
 
     Args:
-        spec: the name of an embedded scene, or `mesh:<file>`.
+        spec: the name of an embedded scene, or one of `outside_scenes`.
         up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
         camera: intrinsics; None: 512x512 pixels, 60 degrees.
         noise: standard deviation of the depth as a share of the depth; 0: exact depth.
@@ -74,29 +95,56 @@ def open_scene(
         start_pose: `T_world_camera` at the start; None: the scene's own, or a search.
 
     Raises:
-        ValueError: see `open_world` and `RaycastSimulator`.
+        ValueError: see `open_world`, `RaycastSimulator` and `HabitatSimulator`.
+        ImportError: a Habitat scene, and Habitat-Sim is not installed; says how to get it.
     """
-    simulator = RaycastSimulator(
-        open_world(spec, up), camera, max_range=max_range, start_pose=start_pose, seed=seed
-    )
+    kind, rest = _split(spec)
+    simulator: Simulator
+    if kind == "habitat":
+        simulator = HabitatSimulator(
+            _habitat_file(rest),
+            camera,
+            up=up,
+            max_range=max_range,
+            start_pose=start_pose,
+            seed=seed,
+        )
+    else:
+        simulator = RaycastSimulator(
+            open_world(spec, up), camera, max_range=max_range, start_pose=start_pose, seed=seed
+        )
     return NoisySimulator(simulator, noise, seed) if noise != 0.0 else simulator
 
 
 def scene_hash(simulator: Simulator) -> str:
-    """SHA-256 of what a simulator from `open_scene` shows: geometry, colours, lamps.
+    """SHA-256 of what a simulator from `open_scene` shows: geometry, colours, lamps, by whom.
 
     Raises:
         ValueError: the simulator does not come from `open_scene`.
     """
     inner = simulator.simulator if isinstance(simulator, NoisySimulator) else simulator
+    if isinstance(inner, HabitatSimulator):
+        return inner.content_hash
     if not isinstance(inner, RaycastSimulator):
         raise ValueError(f"a {type(inner).__name__} has no world that could be hashed")
     return inner.world.content_hash
 
 
-def _check_known(name: str) -> None:
-    if name not in procedural.names():
+def _habitat_file(rest: str) -> Path:
+    """The file that Habitat loads for what follows `habitat:`."""
+    return replica.stage_file(rest) if rest in replica.names() else Path(rest)
+
+
+def _split(spec: str) -> tuple[str, str]:
+    """What opens a scene (a key of `_OUTSIDE`, or "embedded"), and its name or file there."""
+    kind, colon, rest = spec.partition(":")
+    if colon and kind in _OUTSIDE:
+        if not rest:
+            raise ValueError(f"{spec} needs {_OUTSIDE[kind][1]}")
+        return kind, rest
+    if spec not in procedural.names():
         raise ValueError(
-            f"unknown scene {name!r}; known are {', '.join(procedural.names())}, and "
-            "mesh:<file> for any GLB, glTF, PLY or OBJ file"
+            f"unknown scene {spec!r}; known are {', '.join(procedural.names())}, and "
+            f"{', '.join(outside_scenes())}"
         )
+    return "embedded", spec

@@ -1,1 +1,1 @@
-"""Worlds that answer with RGB-D frames: the only place that imports trimesh, embreex, habitat_sim."""
+"""Worlds that answer with RGB-D frames. Only here are trimesh, embreex and habitat_sim imported."""

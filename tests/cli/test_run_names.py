@@ -1,0 +1,20 @@
+"""A run without a name is named after what it explored; never a path."""
+
+import pytest
+
+from r3jax.cli.options import Explore
+from r3jax.cli.setup import default_name
+
+
+@pytest.mark.parametrize(
+    ("scene", "expected"),
+    [
+        ("flat", "flat"),
+        ("mesh:/data/house.glb", "house"),
+        ("replica:office0", "office0"),
+        ("habitat:office0", "habitat-office0"),
+        ("habitat:/data/office_0/a.stage_config.json", "habitat-a"),
+    ],
+)
+def test_default_names(scene, expected):
+    assert default_name(Explore(seed=3), scene, "ours") == f"{expected}-ours-seed3"
