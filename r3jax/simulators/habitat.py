@@ -4,9 +4,12 @@ Habitat-Sim is not on the Python package index, so there is no extra for it; it 
 
     conda install habitat-sim headless -c conda-forge -c aihabitat
 
-No display is needed, and no GPU. It shows surfaces in their stored colours, without lights. Two
-of its ways matter here: faces are seen from their front only, and a mesh without a material (any
-PLY, so also Replica's) is tinted by a default material; its depth is right all the same.
+or, where these packages do not fit (r3jax needs Python 3.11 and NumPy 2), from source:
+https://github.com/facebookresearch/habitat-sim. No display is needed, and no GPU.
+
+Surfaces are shown in their stored colours, without lights. Two of Habitat's ways matter here:
+faces are seen from their front only, and a mesh without a material (any PLY, so also Replica's)
+is tinted by a default material; its depth is right all the same.
 
 Range and noise are ours, as those of the ray caster: depth beyond `max_range` is inf, and
 `NoisySimulator` adds the noise. Where Habitat finds no surface its depth is 0, which is our

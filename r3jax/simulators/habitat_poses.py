@@ -35,9 +35,11 @@ def habitat_from_axes(up: Sequence[float | int], front: Sequence[float | int]) -
     """
     y, z = np.asarray(up, np.float64), -np.asarray(front, np.float64)
     if y.shape != (3,) or z.shape != (3,):
-        raise ValueError(f"up and front are 3 numbers each, got {up} and {front}")
-    rotation = np.stack([np.cross(y, z), y, z])
-    if not np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-6:
+        raise ValueError(f"up and front are 3 numbers each, got {y.size} and {z.size}")
+    with np.errstate(all="ignore"):  # numbers of any size may stand in a file
+        rotation = np.stack([np.cross(y, z), y, z])
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not error <= 1e-6:
         raise ValueError(
             f"up {list(up)} and front {list(front)} must have unit length and be at right angles"
         )

@@ -59,7 +59,7 @@ def read_stage(path: str | Path) -> Stage:
     except FileNotFoundError:
         raise ValueError(f"no such file for Habitat: {path}") from None
     except (ForeignFileError, OSError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {error!s:.500}") from error
     return Stage(path, path, turn)
 
 
@@ -73,7 +73,7 @@ def _read_config(path: Path) -> Stage:
     for name, value in _UNMOVED.items():
         if config.get(name, value) != value:
             raise ForeignFileError(
-                f"{name} {config[name]} is not supported, only {value}: apply it to the mesh"
+                f"{name} {config[name]!s:.60} is not supported, only {value}: apply it to the mesh"
             )
     lacking = [name for name in ("up", "front") if name not in config]
     if lacking:

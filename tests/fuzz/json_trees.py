@@ -37,12 +37,12 @@ def damage_lines(rng: np.random.Generator, data: bytes) -> bytes:
     """Damages one value of a JSON text, or of one line of JSON lines."""
     try:
         return damage(rng, data)
-    except ValueError:
+    except (ValueError, RecursionError):  # no JSON, or nested by earlier damage
         lines = data.split(b"\n")
         i = int(rng.integers(len(lines)))
         try:
             lines[i] = damage(rng, lines[i])
-        except ValueError:
+        except (ValueError, RecursionError):
             lines[i] = b"{}"
         return b"\n".join(lines)
 

@@ -9,8 +9,7 @@ import pytest
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast import RaycastSimulator
-
-Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+from tests.simulators.habitat_golden import load_house, load_simple_room
 
 
 def compare(simulator, poses, golden):
@@ -24,22 +23,16 @@ def compare(simulator, poses, golden):
     return np.array(close), np.array(difference)
 
 
-def camera_of(golden):
-    K = golden["K"]
-    return Camera(256, 256, *(float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
-
-
 @pytest.fixture(scope="module")
 def house(shared):
-    golden = np.load(shared("golden", "habitat_small_house.npz"))
-    mesh = shared("scenes", "aws_small_house", "aws_small_house.glb")
-    return golden, load_world(mesh), Z_UP_FROM_Y_UP @ golden["c2w_opencv_glb"]
+    golden = load_house(shared)
+    return golden, load_world(golden.mesh)
 
 
 def test_the_house_looks_as_in_habitat(house):
-    golden, world, poses = house
-    simulator = RaycastSimulator(world, camera_of(golden), max_range=None, lighting=False)
-    close, difference = compare(simulator, poses, golden)
+    golden, world = house
+    simulator = RaycastSimulator(world, golden.camera, max_range=None, lighting=False)
+    close, difference = compare(simulator, golden.poses, golden.frames)
     assert close.mean() >= 0.9999
     assert close.min() >= 0.999
     assert difference.mean() <= 2.0  # 1.7 of 255; edges are smooth here and jagged there
@@ -47,22 +40,22 @@ def test_the_house_looks_as_in_habitat(house):
 
 
 def test_without_smooth_edges_the_house_is_nearer_still(house):
-    golden, world, poses = house
+    golden, world = house
     simulator = RaycastSimulator(
-        world, camera_of(golden), max_range=None, lighting=False, supersample=0
+        world, golden.camera, max_range=None, lighting=False, supersample=0
     )
-    few = {"rgb": golden["rgb"][::4], "depth": golden["depth"][::4]}
-    _, difference = compare(simulator, poses[::4], few)
+    few = {name: golden.frames[name][::4] for name in ("rgb", "depth")}
+    _, difference = compare(simulator, golden.poses[::4], few)
     assert difference.mean() <= 1.2
 
 
 def test_the_house_is_turned_upright(house):
-    _, world, _ = house
+    _, world = house
     np.testing.assert_allclose(world.bounds, [[-9.5, -5.7, 0.0], [9.5, 5.7, 3.0]], atol=0.01)
 
 
 def test_the_start_in_the_house_is_in_a_room(house):
-    _, world, _ = house
+    _, world = house
     simulator = RaycastSimulator(world, Camera.from_fov(64, 64, 60.0))
     start = simulator.start_pose
     assert simulator.clearance(start[None, :3, 3])[0] >= 1.0
@@ -72,12 +65,15 @@ def test_the_start_in_the_house_is_in_a_room(house):
 
 
 def test_a_flat_colored_room_with_holes_is_the_same(shared):
-    golden = np.load(shared("golden", "habitat_simple_room.npz"))
-    world = load_world(shared("golden", "habitat_simple_room.glb"), up="z")
+    golden = load_simple_room(shared)
     simulator = RaycastSimulator(
-        world, camera_of(golden), max_range=None, lighting=False, supersample=0
+        load_world(golden.mesh, golden.up),
+        golden.camera,
+        max_range=None,
+        lighting=False,
+        supersample=0,
     )
-    close, difference = compare(simulator, golden["c2w_opencv_glb"], golden)
+    close, difference = compare(simulator, golden.poses, golden.frames)
     assert close.min() >= 0.9999
     assert difference.max() <= 0.05
 

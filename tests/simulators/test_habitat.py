@@ -266,6 +266,7 @@ def test_a_device_that_is_asked_for_is_used(room, monkeypatch):
     assert fake.started[0][0].gpu_device_id == 1
 
 
+@pytest.mark.filterwarnings("ignore")  # its own, on import
 def test_the_real_habitat_gives_the_recorded_frames(golden):
     pytest.importorskip(
         "habitat_sim",

@@ -173,7 +173,13 @@ def test_a_pose_that_mirrors_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("up", "front"), [((0, 1, 0), (0, 1, 0)), ((0, 2, 0), (0, 0, -1)), ((0, 0, 0), (0, 0, -1))]
+    ("up", "front"),
+    [
+        ((0, 1, 0), (0, 1, 0)),
+        ((0, 2, 0), (0, 0, -1)),
+        ((0, 0, 0), (0, 0, -1)),
+        ((0, 1e308, 0), (1e308, 0, 1)),
+    ],
 )
 def test_axes_that_are_none(up, front):
     with pytest.raises(ValueError, match="right angles"):
