@@ -1,8 +1,8 @@
 """r3jax: where to look next, so that 3D Gaussian splatting of a place comes out well.
 
-The first open implementation of R3-RECON (arXiv 2601.07484). A light voxel map keeps what was
-seen, from where and how consistently; closed forms answer in milliseconds how well any view could
-be rendered.
+An open implementation of R3-RECON (arXiv 2601.07484), written from the paper. A light voxel map
+keeps what was seen, from where and how consistently; closed forms answer in milliseconds how well
+any view could be rendered.
 
     m = r3jax.empty_map()
     m = r3jax.integrate(m, frame)
