@@ -9,8 +9,7 @@ Images, depth images and poses belong together in the order of the sorted file n
 """
 
 import io
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,12 +17,12 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.files import read_bytes
 from r3jax.foreign.images import image_pixels, image_size
-from r3jax.formats.errors import FormatError
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.poses import mend_pose
 from r3jax.frame import Frame
-from r3jax.geometry.cameras import Camera, rigid_error
+from r3jax.geometry.cameras import Camera
 
 Up = Literal["y", "z"]
 
@@ -36,9 +35,6 @@ _Z_UP_FROM_Y_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 """(x, y, z) becomes (x, -z, y): right-handed stays right-handed."""
-
-_MAX_DRIFT = 0.02
-"""Rotations off by at most this (text with few digits, long chains of products) are mended."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,10 @@ def read_recording(path: Path | str, up: Up = "y") -> Recording:
     for image, depth in zip(image_paths, depth_paths, strict=True):
         if image.stem != depth.stem:
             raise FormatError(depth, f"the depth image of {image.name} should be here")
-    poses = np.stack([_mend_pose(path / "poses.txt", i, pose) for i, pose in enumerate(poses)])
+    source = path / "poses.txt"
+    poses = np.stack(
+        [mend_pose(source, f"pose {i} (line {i + 1})", pose) for i, pose in enumerate(poses)]
+    )
     if up == "y":
         poses = _Z_UP_FROM_Y_UP @ poses
     camera = _read_camera(path / "K.txt", image_paths[0])
@@ -124,7 +123,7 @@ def _list_images(folder: Path) -> tuple[Path, ...]:
 
 def _read_numbers(path: Path, columns: int) -> np.ndarray:
     """A table of numbers, [n, columns] float64; comments start with #."""
-    with _named(path):
+    with naming(path):
         data = read_bytes(path, _MAX_TEXT)
     rows: list[list[float]] = []
     for number, raw in enumerate(io.BytesIO(data), start=1):
@@ -143,26 +142,12 @@ def _read_numbers(path: Path, columns: int) -> np.ndarray:
     return np.asarray(rows)
 
 
-def _mend_pose(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
-    """Removes a small drift from a rotation (nearest rotation, by SVD); refuses a large one."""
-    if np.all(np.isfinite(pose)) and np.linalg.det(pose[:3, :3]) > 0.0:
-        u, _, vt = np.linalg.svd(pose[:3, :3])
-        nearest = u @ vt
-        if np.abs(nearest - pose[:3, :3]).max() <= _MAX_DRIFT:
-            pose = pose.copy()
-            pose[:3, :3] = nearest
-    problem = rigid_error(pose)
-    if problem is not None:
-        raise FormatError(path, f"pose {index} (line {index + 1}): {problem}")
-    return pose
-
-
 def _read_camera(path: Path, first_image: Path) -> Camera:
     """Intrinsics from K.txt, the size from the first image."""
     K = _read_numbers(path, columns=3)
     if K.shape != (3, 3) or not np.all(np.isfinite(K)):
         raise FormatError(path, "expected a finite 3x3 matrix")
-    with _named(first_image):
+    with naming(first_image):
         width, height = image_size(first_image, _FORMATS)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if not (fx > 0.0 and fy > 0.0):
@@ -180,19 +165,6 @@ def _read_image(path: Path, camera: Camera, *, is_depth: bool) -> np.ndarray:
     """[H, W, 3] uint8 or [H, W] uint16."""
     size = (camera.width, camera.height)
     modes = ("I;16", "I;16B", "I") if is_depth else ()
-    with _named(path):
+    with naming(path):
         pixels = image_pixels(path, _FORMATS, size, modes, "depth must be 16-bit")
     return pixels.astype(np.uint16) if is_depth else pixels
-
-
-@contextmanager
-def _named(path: Path) -> Generator[None]:
-    """Adds the name of the file to what is wrong with it."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise FormatError(path, "the file is missing") from None
-    except OSError as error:
-        raise FormatError(path, f"the file cannot be read ({error.strerror})") from None
-    except ForeignFileError as error:
-        raise FormatError(path, str(error)) from None

@@ -1,0 +1,1 @@
+"""COLMAP's sparse models: read, written, and made of a run."""

@@ -1,0 +1,130 @@
+"""A folder with a COLMAP model as posed images."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.names import below
+from r3jax.formats.captures import PosedImages, SparsePoints
+from r3jax.formats.colmap.binary import read_binary
+from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints, pose_of
+from r3jax.formats.colmap.text import read_text
+from r3jax.formats.errors import FormatError
+from r3jax.formats.lenses import Lens
+
+_MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
+"""Where COLMAP, its users and nerfstudio put the model of a capture."""
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder of the model in a capture's folder, None if there is none."""
+    for name in _MODEL_FOLDERS:
+        folder = path / name
+        if any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+            return folder
+    return None
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Reads a model and checks that its parts fit together. Binary goes first, as in COLMAP.
+
+    Raises:
+        FormatError: says which file is wrong and why.
+    """
+    if (folder / "cameras.bin").exists():
+        model, suffix = read_binary(folder), ".bin"
+    else:
+        model, suffix = read_text(folder), ".txt"
+    try:
+        _check_images(model)
+    except ForeignFileError as error:
+        raise FormatError(folder / f"images{suffix}", str(error)) from None
+    try:
+        _check_points(model.points)
+    except ForeignFileError as error:
+        raise FormatError(folder / f"points3D{suffix}", str(error)) from None
+    return model
+
+
+def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImages:
+    """Reads a capture that COLMAP has posed. Its images come in the order of their names.
+
+    Args:
+        path: the folder of the model, or the capture's, with the model in `sparse/0` or the like.
+        images: the folder that the images' names are relative to; by default `images` beside
+            the model or in one of the three folders above it.
+
+    Raises:
+        FormatError: there is no model, or a file of it is damaged. Images that are missing are
+            noticed when they are read.
+    """
+    path = Path(path)
+    folder = find_model(path)
+    if folder is None:
+        what = "the folder holds no COLMAP model (no cameras.bin or cameras.txt)"
+        raise FormatError(path, what if path.is_dir() else "there is no such folder")
+    model = read_model(folder)
+    base = Path(images) if images is not None else _image_folder(folder)
+    ordered = sorted(model.images, key=lambda image: image.name)
+    return PosedImages(
+        path=path,
+        image_paths=tuple(below(base, image.name) for image in ordered),
+        lenses=tuple(model.cameras[image.camera_id] for image in ordered),
+        poses=np.stack([pose_of(image.quaternion, image.translation) for image in ordered]),
+        depth_paths=(None,) * len(ordered),
+        points=_sparse_points(model.points, {image.id: i for i, image in enumerate(ordered)}),
+    )
+
+
+def _image_folder(model: Path) -> Path:
+    here = model.resolve()
+    for folder in (here, *here.parents[:3]):
+        if (folder / "images").is_dir():
+            return folder / "images"
+    return here.parent.parent / "images"
+
+
+def _check_images(model: ColmapModel) -> None:
+    if not model.images:
+        raise ForeignFileError("the model holds no images")
+    ids: set[int] = set()
+    names: set[str] = set()
+    for image in model.images:
+        below(Path(), image.name)
+        if image.id in ids or image.name in names:
+            raise ForeignFileError(f"the image {image.id} ({image.name[:80]!r}) occurs twice")
+        ids.add(image.id)
+        names.add(image.name)
+        _check_image(image, model.cameras)
+
+
+def _check_image(image: ColmapImage, cameras: Mapping[int, Lens]) -> None:
+    which = f"image {image.id} ({image.name[:80]!r})"
+    if image.camera_id not in cameras:
+        raise ForeignFileError(f"{which}: there is no camera {image.camera_id}")
+    if not np.all(np.isfinite(image.keypoints)):
+        raise ForeignFileError(f"{which}: keypoints that are not finite")
+    try:
+        pose_of(image.quaternion, image.translation)
+    except ForeignFileError as error:
+        raise ForeignFileError(f"{which}: {error}") from None
+
+
+def _check_points(points: ColmapPoints) -> None:
+    if not np.all(np.isfinite(points.xyz)):
+        bad = points.ids[np.argmin(np.isfinite(points.xyz).all(axis=1))]
+        raise ForeignFileError(f"the position of point {bad} is not finite")
+    if len(np.unique(points.ids)) != len(points.ids):
+        raise ForeignFileError("a point occurs twice")
+
+
+def _sparse_points(points: ColmapPoints, index: Mapping[int, int]) -> SparsePoints:
+    """Points by index instead of by id. What a track says of images that are gone is left out."""
+    seen_point = np.repeat(np.arange(len(points)), points.track_lengths)
+    known = np.array(sorted(index), np.int64)
+    at = np.minimum(np.searchsorted(known, points.track_images), len(known) - 1)
+    there = known[at] == points.track_images
+    indices = np.array([index[number] for number in known.tolist()], np.int64)
+    return SparsePoints(points.xyz, points.rgb, seen_point[there], indices[at[there]])

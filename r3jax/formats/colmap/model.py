@@ -1,0 +1,161 @@
+"""A sparse model as COLMAP stores it, and what it means.
+
+COLMAP's poses take points from the world to the camera, as a unit quaternion (Hamilton's, w first)
+and a translation; its camera axes are OpenCV's: x right, y down, z forward
+(https://colmap.github.io/format.html).
+
+Shape symbols: k keypoints of an image; m points; t track elements.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.formats.lenses import Lens
+from r3jax.formats.poses import MAX_DISTANCE, MAX_DRIFT
+
+NO_POINT = -1
+"""In place of a point's id, where a keypoint belongs to none."""
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """One registered image."""
+
+    id: int
+    name: str
+    """Path relative to the folder of the images."""
+
+    camera_id: int
+    quaternion: np.ndarray
+    """World to camera, w x y z, [4] float64."""
+
+    translation: np.ndarray
+    """World to camera, [3] float64."""
+
+    keypoints: np.ndarray
+    """Where features were found, column and row [px], [k, 2] float64."""
+
+    point_ids: np.ndarray
+    """Id of each keypoint's point, or `NO_POINT`, [k] int64."""
+
+
+@dataclass(frozen=True)
+class ColmapPoints:
+    """The points and their tracks."""
+
+    ids: np.ndarray
+    """[m] int64."""
+
+    xyz: np.ndarray
+    """[m, 3] float64."""
+
+    rgb: np.ndarray
+    """[m, 3] uint8."""
+
+    error: np.ndarray
+    """Mean reprojection error [px], negative where it was never computed, [m] float64."""
+
+    track_lengths: np.ndarray
+    """Number of track elements of each point, [m] int64; they sum to t."""
+
+    track_images: np.ndarray
+    """Ids of the images in the tracks, one track after the other, [t] int64."""
+
+    track_keypoints: np.ndarray
+    """Indices of the keypoints in those images, [t] int64."""
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.ids)
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Cameras, images and points that belong together."""
+
+    cameras: Mapping[int, Lens]
+    """By their ids."""
+
+    images: tuple[ColmapImage, ...]
+    points: ColmapPoints
+
+
+def points_without_tracks(xyz: np.ndarray, rgb: np.ndarray) -> ColmapPoints:
+    """Points that no image is known to see, numbered from 1.
+
+    Args:
+        xyz: [m, 3].
+        rgb: [m, 3] uint8.
+    """
+    none = np.zeros(0, np.int64)
+    return ColmapPoints(
+        ids=np.arange(1, len(xyz) + 1, dtype=np.int64),
+        xyz=xyz.astype(np.float64),
+        rgb=rgb,
+        error=np.full(len(xyz), -1.0),
+        track_lengths=np.zeros(len(xyz), np.int64),
+        track_images=none,
+        track_keypoints=none,
+    )
+
+
+def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+    """The rotation matrix [3, 3] of a quaternion w x y z [4]; rounding of its length is mended.
+
+    Raises:
+        ForeignFileError: not finite, or not of unit length.
+    """
+    length = float(np.sqrt(np.sum(np.square(quaternion))))
+    if not abs(length - 1.0) <= MAX_DRIFT:  # NaN makes the comparison false
+        raise ForeignFileError(f"the rotation is no unit quaternion, its length is {length:g}")
+    w, x, y, z = quaternion / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_of(R: np.ndarray) -> np.ndarray:
+    """The quaternion w x y z [4] of a rotation matrix [3, 3], with w >= 0.
+
+    Bar-Itzhack (2000): the eigenvector of the largest eigenvalue of a symmetric 4x4 matrix. It is
+    exact for rotations, stable for all angles, and of the nearest one where R has rounding.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = R.astype(np.float64).reshape(-1)
+    K = np.array(
+        [
+            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
+            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
+            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
+        ]
+    )
+    quaternion = np.linalg.eigh(K)[1][:, -1]
+    return -quaternion if quaternion[0] < 0.0 else quaternion
+
+
+def pose_of(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """`T_world_camera` [4, 4] float64 of COLMAP's world-to-camera pose.
+
+    Raises:
+        ForeignFileError: see `rotation_of`; a translation that is not finite, or too far away.
+    """
+    if not np.all(np.abs(translation) < MAX_DISTANCE):  # NaN makes the comparison false
+        raise ForeignFileError(f"no camera is at the translation {translation.tolist()}")
+    R = rotation_of(quaternion)
+    pose = np.eye(4)
+    pose[:3, :3] = R.T
+    pose[:3, 3] = -R.T @ translation
+    return pose
+
+
+def colmap_pose(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """COLMAP's quaternion [4] and translation [3] of a pose [4, 4]: inverse of `pose_of`."""
+    quaternion = quaternion_of(T_world_camera[:3, :3].T)
+    return quaternion, -rotation_of(quaternion) @ T_world_camera[:3, 3].astype(np.float64)

@@ -1,0 +1,138 @@
+"""Intrinsics of other people's cameras: COLMAP's models, by name, with their parameters.
+
+The parameters are COLMAP's: focal lengths and principal point [px] first, where the upper left
+pixel's center lies at (0.5, 0.5) as in this package, then the distortion. r3jax's own `Camera` is
+a pinhole; distortion is kept as data and never applied.
+"""
+
+import math
+from dataclasses import dataclass
+
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.geometry.cameras import Camera
+
+_SHARED_FOCAL, _TWO_FOCALS = "f cx cy", "fx fy cx cy"
+_FULL = "k1 k2 p1 p2 k3 k4"
+
+MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
+    name: (number, tuple(f"{focals} {distortion}".split()))
+    for number, name, focals, distortion in (
+        (0, "SIMPLE_PINHOLE", _SHARED_FOCAL, ""),
+        (1, "PINHOLE", _TWO_FOCALS, ""),
+        (2, "SIMPLE_RADIAL", _SHARED_FOCAL, "k"),
+        (3, "RADIAL", _SHARED_FOCAL, "k1 k2"),
+        (4, "OPENCV", _TWO_FOCALS, "k1 k2 p1 p2"),
+        (5, "OPENCV_FISHEYE", _TWO_FOCALS, "k1 k2 k3 k4"),
+        (6, "FULL_OPENCV", _TWO_FOCALS, f"{_FULL} k5 k6"),
+        (7, "FOV", _TWO_FOCALS, "omega"),
+        (8, "SIMPLE_RADIAL_FISHEYE", _SHARED_FOCAL, "k"),
+        (9, "RADIAL_FISHEYE", _SHARED_FOCAL, "k1 k2"),
+        (10, "THIN_PRISM_FISHEYE", _TWO_FOCALS, f"{_FULL} sx1 sy1"),
+        (
+            11,
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+            _TWO_FOCALS,
+            "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
+        ),
+        (12, "SIMPLE_DIVISION", _SHARED_FOCAL, "k"),
+        (13, "DIVISION", _TWO_FOCALS, "k"),
+        (14, "SIMPLE_FISHEYE", _SHARED_FOCAL, ""),
+        (15, "FISHEYE", _TWO_FOCALS, ""),
+        (16, "EUCM", _TWO_FOCALS, "alpha beta"),
+    )
+}
+"""COLMAP's number of every model, and the names of its parameters in order. Its panoramic model
+(17) has no focal length and is not read."""
+
+NAMES = {number: name for name, (number, _) in MODELS.items()}
+"""The name of every model, by COLMAP's number."""
+
+_PINHOLE_WITHOUT_DISTORTION = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+    *("SIMPLE_DIVISION", "DIVISION"),
+)
+"""Models that are a pinhole where all their distortion is zero; a fisheye lens never is."""
+
+MAX_SIDE = 1 << 16
+"""Images with more columns or rows come from no camera [px]."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera model with its parameters.
+
+    Raises:
+        ForeignFileError: an unknown model, the wrong number of parameters, a size or a focal
+            length that no camera has, numbers that are not finite.
+    """
+
+    model: str
+    """COLMAP's name of the model, such as OPENCV."""
+
+    width: int
+    """Columns [px]."""
+
+    height: int
+    """Rows [px]."""
+
+    params: tuple[float, ...]
+    """In the order of `MODELS`."""
+
+    def __post_init__(self) -> None:
+        """Refuses what is no camera."""
+        if self.model not in MODELS:
+            known = ", ".join(MODELS)
+            raise ForeignFileError(
+                f"the camera model {self.model[:40]!r} is not known, only {known}"
+            )
+        names = MODELS[self.model][1]
+        if len(self.params) != len(names):
+            raise ForeignFileError(
+                f"{self.model} has the {len(names)} parameters {' '.join(names)}, "
+                f"got {len(self.params)}"
+            )
+        if not all(math.isfinite(value) for value in self.params):
+            raise ForeignFileError("the camera has parameters that are not finite")
+        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
+            raise ForeignFileError(f"the camera's image is {self.width} x {self.height} pixels")
+        fx, fy, cx, cy = self.intrinsics
+        if min(fx, fy) < 1e-3 or max(fx, fy) > 1e9:
+            raise ForeignFileError(f"no camera has the focal lengths {fx:g} and {fy:g} [px]")
+        if max(abs(cx), abs(cy)) > 1e9:
+            raise ForeignFileError(f"no camera has the principal point ({cx:g}, {cy:g})")
+
+    @property
+    def named(self) -> dict[str, float]:
+        """All parameters by their names."""
+        return dict(zip(MODELS[self.model][1], self.params, strict=True))
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy [px]."""
+        if MODELS[self.model][1][0] == "f":
+            f, cx, cy = self.params[:3]
+            return f, f, cx, cy
+        fx, fy, cx, cy = self.params[:4]
+        return fx, fy, cx, cy
+
+    @property
+    def distortion(self) -> dict[str, float]:
+        """The parameters behind the principal point."""
+        skipped = 3 if MODELS[self.model][1][0] == "f" else 4
+        return dict(list(self.named.items())[skipped:])
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True if straight lines stay straight: `camera` is then all there is to know."""
+        return self.model in _PINHOLE_WITHOUT_DISTORTION and not any(self.distortion.values())
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera of the same focal lengths, whatever the distortion."""
+        return Camera(self.width, self.height, *self.intrinsics)
+
+
+def pinhole_lens(camera: Camera) -> Lens:
+    """The PINHOLE of a camera."""
+    values = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return Lens("PINHOLE", camera.width, camera.height, tuple(float(value) for value in values))

@@ -1,0 +1,216 @@
+"""Reads nerfstudio's transforms.json, also as instant-ngp, Blender and phone apps write it.
+
+Poses are in OpenGL axes and in the coordinates of the file, as are the points of `ply_file_path`:
+those are the capture's own, and suggested cameras have to come back in them. `applied_transform`
+says how they were made of the coordinates of an earlier program; it is kept and not undone.
+(https://docs.nerf.studio/quickstart/data_conventions.html)
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import check_fields, check_type
+from r3jax.foreign.files import read_bytes
+from r3jax.foreign.images import image_size
+from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.names import below
+from r3jax.formats.captures import IMAGE_FORMATS, DepthUnit, PosedImages
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.lenses import Lens
+from r3jax.formats.poses import mend_pose
+from r3jax.formats.transforms import OPENGL_FROM_OPENCV
+
+_MAX_BYTES = 256 << 20
+"""A frame takes a kilobyte."""
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+"""What may be missing from a name."""
+
+_SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_MODELS = {
+    **dict.fromkeys((*_SIMPLE, "PERSPECTIVE"), "OPENCV"),
+    **dict.fromkeys(("OPENCV_FISHEYE", "FISHEYE"), "OPENCV_FISHEYE"),
+}
+"""Names of camera models, and which polynomial their k1, k2, ... belong to."""
+
+_Fields = Mapping[str, Any]
+
+
+def read_transforms(path: Path | str) -> PosedImages:
+    """Reads a transforms.json. The images come in the order of the file.
+
+    Intrinsics of a frame go before those of the file. Without a principal point it is the
+    image's center, without a size the image is asked; names without a suffix get that of an
+    image that exists.
+
+    Args:
+        path: the file, or the folder that holds one of that name.
+
+    Raises:
+        FormatError: the file is missing or damaged; a field is missing or of another type; a pose
+            is not rigid; a camera is unknown; a path leads out of the folder. Images that are
+            missing are noticed when they are read.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "transforms.json"
+    with naming(path):
+        content = parse_json(read_bytes(path, _MAX_BYTES))
+        check_fields("transforms", content, {"frames": list[dict[str, Any]]})
+        frames: list[dict[str, Any]] = content["frames"]
+        if not frames:
+            raise ForeignFileError("it lists no frames")
+        images = [_image(path.parent, i, frame) for i, frame in enumerate(frames)]
+        points = content.get("ply_file_path")
+        check_type("ply_file_path", points, str | None)
+        points_path = None if points is None else below(path.parent, points)
+        moved, unit = _applied(content), _depth_unit(content)
+        depths = [_depth(path.parent, i, frame) for i, frame in enumerate(frames)]
+    lenses = [
+        _lens(path, f"frames[{i}]", {**content, **frame}, image)
+        for i, (frame, image) in enumerate(zip(frames, images, strict=True))
+    ]
+    poses = [_pose(path, f"frames[{i}]", frame) for i, frame in enumerate(frames)]
+    return PosedImages(
+        path=path,
+        image_paths=tuple(images),
+        lenses=tuple(lenses),
+        poses=np.stack(poses),
+        depth_paths=tuple(depths),
+        depth_unit=unit,
+        points_path=points_path,
+        T_capture_original=moved,
+    )
+
+
+def _image(folder: Path, index: int, frame: _Fields) -> Path:
+    check_fields(f"frames[{index}]", frame, {"file_path": str})
+    path = below(folder, frame["file_path"])
+    if path.suffix in _SUFFIXES or path.exists():
+        return path
+    found = [path.with_name(path.name + suffix) for suffix in _SUFFIXES]
+    return next((candidate for candidate in found if candidate.exists()), path)
+
+
+def _depth(folder: Path, index: int, frame: _Fields) -> Path | None:
+    name = frame.get("depth_file_path")
+    check_type(f"frames[{index}].depth_file_path", name, str | None)
+    return None if name is None else below(folder, name)
+
+
+def _depth_unit(content: _Fields) -> DepthUnit:
+    scale = content.get("depth_unit_scale_factor", DepthUnit.metres_per_step)
+    beyond = content.get("depth_beyond_range_value")
+    check_type("depth_unit_scale_factor", scale, float)
+    check_type("depth_beyond_range_value", beyond, int | None)
+    if not 1e-12 < scale < 1e6:
+        raise ForeignFileError(f"the depth_unit_scale_factor {scale:g} makes no sense")
+    return DepthUnit(float(scale), beyond)
+
+
+def _applied(content: _Fields) -> np.ndarray | None:
+    """`applied_transform` and `applied_scale` as one 4x4 matrix."""
+    rows, scale = content.get("applied_transform"), content.get("applied_scale")
+    if rows is None and scale is None:
+        return None
+    check_type("applied_scale", scale, float | None)
+    move = np.eye(4) if rows is None else _matrix("applied_transform", rows)
+    move[:3] *= 1.0 if scale is None else scale
+    return move
+
+
+def _matrix(name: str, rows: Any) -> np.ndarray:
+    """A 4x4 matrix; its last row may be left out."""
+    check_type(name, rows, list[list[float]])
+    if [len(row) for row in rows] not in ([4] * 3, [4] * 4):
+        raise ForeignFileError(f"`{name}` must be a 3x4 or a 4x4 matrix")
+    matrix = np.eye(4)
+    matrix[: len(rows)] = rows
+    return matrix
+
+
+def _pose(path: Path, which: str, frame: _Fields) -> np.ndarray:
+    """`T_world_camera` in OpenCV axes."""
+    name = f"{which}.transform_matrix"
+    with naming(path):
+        check_fields(which, frame, {"transform_matrix": list[Any]})
+        matrix = _matrix(name, frame["transform_matrix"])
+    return mend_pose(path, name, matrix @ OPENGL_FROM_OPENCV)
+
+
+def _lens(path: Path, which: str, fields: _Fields, image: Path) -> Lens:
+    """The camera of one frame."""
+    with naming(path):
+        try:
+            width, height = _size(fields, image)
+            return _lens_of(fields, width, height)
+        except ForeignFileError as error:
+            raise ForeignFileError(f"{which}: {error}") from None
+
+
+def _size(fields: _Fields, image: Path) -> tuple[int, int]:
+    if "w" in fields and "h" in fields:
+        return _whole(fields, "w"), _whole(fields, "h")
+    try:
+        return image_size(image, IMAGE_FORMATS)
+    except (OSError, ForeignFileError) as error:
+        raise FormatError(
+            image, f"its size is not in the file (w, h), nor here ({error})"
+        ) from None
+
+
+def _whole(fields: _Fields, name: str) -> int:
+    """A size; instant-ngp writes it with a decimal point."""
+    value = _value(fields, name)
+    if value != int(value):
+        raise ForeignFileError(f"`{name}` must be a whole number, got {value:g}")
+    return int(value)
+
+
+def _value(fields: _Fields, name: str, otherwise: float | None = None) -> float:
+    value = fields.get(name, otherwise)
+    check_type(name, value, float)
+    return float(value)
+
+
+def _lens_of(fields: _Fields, width: int, height: int) -> Lens:
+    fx, fy = _focal_lengths(fields, width, height)
+    values = (fx, fy, _value(fields, "cx", 0.5 * width), _value(fields, "cy", 0.5 * height))
+    name = fields.get("camera_model", "OPENCV")
+    check_type("camera_model", name, str)
+    if name not in _MODELS:
+        raise ForeignFileError(
+            f"the camera model {name[:40]!r} is not known, only {', '.join(_MODELS)}"
+        )
+    k1, k2, k3, k4, p1, p2 = (_value(fields, k, 0.0) for k in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if _MODELS[name] == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True:
+        return Lens("OPENCV_FISHEYE", width, height, (*values, k1, k2, k3, k4))
+    if k4:
+        raise ForeignFileError("k4 belongs to a fisheye camera, but the model is a perspective one")
+    if k3:
+        return Lens("FULL_OPENCV", width, height, (*values, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    if k1 or k2 or p1 or p2:
+        return Lens("OPENCV", width, height, (*values, k1, k2, p1, p2))
+    return Lens("PINHOLE", width, height, values)
+
+
+def _focal_lengths(fields: _Fields, width: int, height: int) -> tuple[float, float]:
+    """From `fl_x` and `fl_y`, else from the angles of view; one of them serves both axes."""
+    sides = {"x": width, "y": height}
+    found: list[float] = []
+    for axis, side in sides.items():
+        if f"fl_{axis}" in fields:
+            found.append(_value(fields, f"fl_{axis}"))
+        elif f"camera_angle_{axis}" in fields:
+            angle = _value(fields, f"camera_angle_{axis}")
+            if not 0.0 < angle < math.pi:
+                raise ForeignFileError(f"the camera_angle_{axis} {angle:g} is no angle of view")
+            found.append(0.5 * side / math.tan(0.5 * angle))
+    if not found:
+        raise ForeignFileError("there is no focal length (fl_x) and no camera_angle_x")
+    return found[0], found[-1]
