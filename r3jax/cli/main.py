@@ -13,6 +13,7 @@ from r3jax.cli.options import (
     Demo,
     Evaluate,
     Explore,
+    Export,
     Info,
     Merge,
     Policies,
@@ -28,6 +29,7 @@ _COMMANDS = {
     "benchmark": Benchmark,
     "replay": Replay,
     "merge": Merge,
+    "export": Export,
     "policies": Policies,
     "info": Info,
 }
@@ -67,7 +69,16 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(
-    command: Demo | Explore | Train | Evaluate | Benchmark | Replay | Merge | Policies | Info,
+    command: Demo
+    | Explore
+    | Train
+    | Evaluate
+    | Benchmark
+    | Replay
+    | Merge
+    | Export
+    | Policies
+    | Info,
 ) -> int:
     """Imports what the command needs and nothing else, so that --help does not wait for JAX."""
     if isinstance(command, Demo):
@@ -98,6 +109,10 @@ def _run(
         from r3jax.cli.merge import run_merge
 
         return run_merge(command)
+    if isinstance(command, Export):
+        from r3jax.cli.export import run_export
+
+        return run_export(command)
     if isinstance(command, Policies):
         from r3jax.cli.policies import run_policies
 

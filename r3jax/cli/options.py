@@ -147,6 +147,21 @@ class Merge:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Export a run for other programs: nerfstudio's transforms.json, or a COLMAP model."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+    """Where to: a folder that does not exist yet. It needs the run no longer."""
+
+    format: Literal["nerfstudio", "colmap", "colmap-text"] = "nerfstudio"
+    """`nerfstudio`: images, depth, points.ply, transforms.json. `colmap`: the same with
+    sparse/0/*.bin in place of transforms.json; `colmap-text`: with *.txt."""
+
+
+@dataclass(frozen=True)
 class Policies:
     """List who can choose views: every policy in a sentence, and where its rule comes from."""
 

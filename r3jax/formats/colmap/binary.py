@@ -42,10 +42,10 @@ def read_binary(folder: Path) -> ColmapModel:
     with naming(folder / "cameras.bin"):
         cameras = _cameras(_Cursor(read_bytes(folder / "cameras.bin", _MAX_BYTES)))
     with naming(folder / "images.bin"):
-        images = _images(_Cursor(read_bytes(folder / "images.bin", _MAX_BYTES)))
+        images = tuple(_images(_Cursor(read_bytes(folder / "images.bin", _MAX_BYTES))))
     with naming(folder / "points3D.bin"):
         points = _points(_Cursor(read_bytes(folder / "points3D.bin", _MAX_BYTES)))
-    return ColmapModel(cameras, tuple(images), points)
+    return ColmapModel(cameras, images, points)
 
 
 def write_binary(folder: Path, model: ColmapModel) -> None:

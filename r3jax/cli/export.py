@@ -1,0 +1,33 @@
+"""`r3jax export`: a run as a data set of nerfstudio or COLMAP."""
+
+from rich.console import Console
+
+from r3jax.cli.console import PLAIN
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import Export
+from r3jax.formats.errors import FormatError
+from r3jax.formats.exports import export_run
+from r3jax.trace.errors import RunError
+from r3jax.trace.images import DEPTH_STEPS_PER_METRE
+from r3jax.trace.reader import read_run
+
+
+def run_export(options: Export) -> int:
+    """Writes the folder.
+
+    Raises:
+        UserError: not a run, no views, a folder that holds something, a disk that is full.
+    """
+    console = Console(stderr=True)
+    try:
+        run = read_run(options.path)
+        with console.status("copying the images ..."):
+            points = export_run(run, options.out, options.format)
+    except (RunError, FormatError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    console.print(f"{len(run.rows)} images, {points} points", **PLAIN)
+    console.print(f"exported  {options.out}", **PLAIN)
+    if options.format == "nerfstudio":
+        unit = 1.0 / DEPTH_STEPS_PER_METRE
+        console.print(f"depth     nerfstudio-data --depth-unit-scale-factor {unit:g}", **PLAIN)
+    return 0

@@ -1,0 +1,94 @@
+"""A run as a folder that other programs train on: images, poses, points, nothing that is elsewhere.
+
+    nerfstudio     images/ depth/ points.ply transforms.json
+    colmap         images/ depth/ points.ply sparse/0/{cameras,images,points3D}.bin
+    colmap-text    the same with .txt
+
+Poses are the run's own: metres, z up, nothing turned, centered or scaled. Depth images are
+copies: uint16 in steps of 0.2 mm. COLMAP has no place for depth; it lies beside the images.
+"""
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from r3jax.files import write_atomic
+from r3jax.formats.colmap.binary import write_binary
+from r3jax.formats.colmap.export import model_of
+from r3jax.formats.colmap.text import write_text
+from r3jax.formats.errors import FormatError
+from r3jax.formats.pointcloud import voxel_points, write_points
+from r3jax.formats.transforms import transforms_of
+from r3jax.trace.reader import Run
+
+Format = Literal["nerfstudio", "colmap", "colmap-text"]
+
+_POINTS = "points.ply"
+
+
+def export_run(run: Run, out: Path, kind: Format) -> int:
+    """Writes the folder; it is complete or not there.
+
+    Args:
+        run: a run with at least one view.
+        out: a folder that does not exist yet, or is empty.
+        kind: what to write.
+
+    Returns:
+        The number of points: centers of the map's voxels; 0 where the run has no stored map.
+
+    Raises:
+        FormatError: the run has no views, or `out` holds something.
+        RunError: an image or the stored map cannot be read.
+        OSError: the disk is full, not writable, ...
+    """
+    if not run.rows:
+        raise FormatError(run.path, "the run has no views yet: there is nothing to export")
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise FormatError(out, "something is there already: give another folder")
+    xyz, rgb = _map_points(run)
+    out = out.resolve()  # "." has no name
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    try:
+        _fill(partial, run, kind, xyz, rgb)
+        os.replace(partial, out)  # takes the place of an empty folder
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return len(xyz)
+
+
+def _map_points(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    if not run.checkpoint_steps():
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    return voxel_points(run.checkpoint()[1])
+
+
+def _fill(out: Path, run: Run, kind: Format, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    for name in ("images", "depth"):
+        (out / name).mkdir(parents=True)
+    for row in run.rows:
+        image = run.image_path(row.step)
+        shutil.copyfile(image, out / "images" / image.name)
+        shutil.copyfile(run.depth_path(row.step), out / "depth" / image.name)
+    if len(xyz):
+        write_points(out / _POINTS, xyz, rgb)
+    if kind == "nerfstudio":
+        _write_transforms(out, run, _POINTS if len(xyz) else None)
+        return
+    model = model_of(run, xyz, rgb)
+    folder = out / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (write_binary if kind == "colmap" else write_text)(folder, model)
+
+
+def _write_transforms(out: Path, run: Run, points: str | None) -> None:
+    content = transforms_of(run, points)
+    for frame, row in zip(content["frames"], run.rows, strict=True):
+        name = run.image_path(row.step).name
+        frame |= {"file_path": f"images/{name}", "depth_file_path": f"depth/{name}"}
+    write_atomic(out / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
