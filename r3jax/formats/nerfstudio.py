@@ -20,7 +20,7 @@ from r3jax.foreign.images import image_size
 from r3jax.foreign.json_text import parse_json
 from r3jax.foreign.names import below
 from r3jax.formats.captures import IMAGE_FORMATS, DepthUnit, PosedImages
-from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.errors import naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.poses import mend_pose
 from r3jax.formats.transforms import OPENGL_FROM_OPENCV
@@ -156,12 +156,12 @@ def _lens(path: Path, which: str, fields: _Fields, image: Path) -> Lens:
 def _size(fields: _Fields, image: Path) -> tuple[int, int]:
     if "w" in fields and "h" in fields:
         return _whole(fields, "w"), _whole(fields, "h")
-    try:
-        return image_size(image, IMAGE_FORMATS)
-    except (OSError, ForeignFileError) as error:
-        raise FormatError(
-            image, f"its size is not in the file (w, h), nor here ({error})"
-        ) from None
+    with naming(image):
+        try:
+            return image_size(image, IMAGE_FORMATS)
+        except FileNotFoundError:
+            reason = "the file is missing, and its size is not in transforms.json (w, h)"
+            raise ForeignFileError(reason) from None
 
 
 def _whole(fields: _Fields, name: str) -> int:

@@ -9,8 +9,8 @@ from hypothesis import given
 from scipy.spatial.transform import Rotation
 
 from r3jax.formats.colmap.binary import read_binary, write_binary
-from r3jax.formats.colmap.captures import read_colmap
 from r3jax.formats.colmap.model import colmap_pose, pose_of, quaternion_of, rotation_of
+from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.colmap.text import read_text, write_text
 from r3jax.formats.errors import FormatError
 from tests.formats.colmap_models import assert_equal, random_model, random_pose, seeds
