@@ -6,6 +6,9 @@ from pathlib import Path
 
 from r3jax.foreign.errors import ForeignFileError
 
+_SMALL = 1 << 20
+"""Files of /proc say that they are empty and are not [bytes]."""
+
 
 def check_regular(path: str | Path) -> int:
     """Size of a regular file [bytes]; links are followed.
@@ -44,7 +47,8 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
             f"the file has {size >> 20} MiB, more than {limit >> 20} MiB: it is something else"
         )
     with open(path, "rb") as file:
-        return file.read(limit)
+        # Python makes room for all that is asked for, before it reads.
+        return file.read(min(limit, max(size, _SMALL)))
 
 
 def check_tree(folder: Path) -> None:

@@ -4,6 +4,9 @@ from pathlib import Path, PurePosixPath
 
 from r3jax.foreign.errors import ForeignFileError
 
+_LONGEST = 1000
+"""No folder structure needs longer names, and messages stay short [characters]."""
+
 
 def check_relative(name: str) -> PurePosixPath:
     """A relative path that stays below the folder it is relative to.
@@ -11,11 +14,14 @@ def check_relative(name: str) -> PurePosixPath:
     Links inside the folder may still lead elsewhere: they are the user's own.
 
     Raises:
-        ForeignFileError: empty, absolute, with a step upwards (`..`) or with a zero byte.
+        ForeignFileError: empty, absolute, far too long, with a step upwards (`..`), with a zero
+            byte.
     """
     shown = repr(name[:80])
     if not name.strip() or "\0" in name:
         raise ForeignFileError(f"{shown} is no name of a file")
+    if len(name) > _LONGEST:
+        raise ForeignFileError(f"a name of {len(name)} characters is no name of a file")
     path = PurePosixPath(name)
     if path.is_absolute():
         raise ForeignFileError(f"{shown} is an absolute path, it must be relative to the folder")
