@@ -86,7 +86,7 @@ class PosedImages:
     """None where the capture comes without."""
 
     points_path: Path | None = None
-    """A PLY with further points that nothing is known of but where they are."""
+    """A PLY with further points, of which nothing says who sees them: see `read_points`."""
 
     T_capture_original: np.ndarray | None = None
     """Where the program that wrote the capture moved it: takes points [4, 4] from the coordinates

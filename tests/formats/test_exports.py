@@ -12,6 +12,7 @@ from r3jax.cli.main import USER_ERROR, main
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.exports import export_run
 from r3jax.formats.nerfstudio import read_transforms
+from r3jax.formats.ply_points import read_points
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
@@ -114,11 +115,34 @@ def test_the_folder_needs_the_run_no_longer(run, tmp_path, kind):
 def test_frames_come_back_from_nerfstudio(run, tmp_path):
     export_run(run, tmp_path / "out", "nerfstudio")
     images = read_transforms(tmp_path / "out")
+    assert images.points_path is not None
+    assert len(read_points(images.points_path)[0]) == 2
     for again, first in zip(images.frames(), run.frames(), strict=True):
         assert again.camera == first.camera
         np.testing.assert_array_equal(again.rgb, first.rgb)
         np.testing.assert_array_equal(again.T_world_camera, first.T_world_camera)
         np.testing.assert_allclose(again.depth, first.depth, rtol=2e-7)
+
+
+DOCUMENTED = {
+    *("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"),
+    *("frames", "ply_file_path", "applied_transform"),
+}
+"""Fields of https://docs.nerf.studio/quickstart/data_conventions.html."""
+
+OURS = {"depth_unit_scale_factor", "depth_beyond_range_value"}
+"""Others read on when they meet these."""
+
+
+def test_the_file_holds_the_documented_fields(run, tmp_path):
+    export_run(run, tmp_path / "out", "nerfstudio")
+    content = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert content.keys() <= DOCUMENTED | OURS
+    assert content.keys() >= {"fl_x", "fl_y", "cx", "cy", "w", "h", "frames", "ply_file_path"}
+    assert content["camera_model"] == "OPENCV"
+    for frame in content["frames"]:
+        assert frame.keys() == {"file_path", "depth_file_path", "transform_matrix"}
+        assert np.shape(frame["transform_matrix"]) == (4, 4)
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap-text"])
