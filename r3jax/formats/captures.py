@@ -6,6 +6,7 @@ COLMAP model without known positions is not in metres, and its world may be upsi
 Shape symbols: n images; m points; t observations.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,6 +96,15 @@ class PosedImages:
     def __len__(self) -> int:
         """Number of images."""
         return len(self.image_paths)
+
+    def with_depth(self, folder: Path, unit: DepthUnit) -> "PosedImages":
+        """The same images with the depth images of a folder: 16-bit PNGs of the same names.
+
+        For formats that have no place for depth. Images without a PNG there have no depth.
+        """
+        candidates = [folder / f"{path.stem}.png" for path in self.image_paths]
+        found = tuple(path if path.is_file() else None for path in candidates)
+        return dataclasses.replace(self, depth_paths=found, depth_unit=unit)
 
     def frame(self, index: int) -> Frame:
         """One image with its depth. A depth image of another size is sampled at its nearest pixels.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from r3jax.cli.main import USER_ERROR, main
+from r3jax.formats.captures import DepthUnit
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.exports import export_run
 from r3jax.formats.nerfstudio import read_transforms
@@ -21,7 +22,7 @@ from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.trace.checkpoints import map_tables
 from r3jax.trace.header import camera_fields
-from r3jax.trace.images import frame_hash, stored_form
+from r3jax.trace.images import BEYOND_RANGE, DEPTH_STEPS_PER_METRE, frame_hash, stored_form
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.box_room import write_room
@@ -112,16 +113,28 @@ def test_the_folder_needs_the_run_no_longer(run, tmp_path, kind):
     assert not [path for path in tmp_path.rglob("*") if path.name.endswith(".partial")]
 
 
-def test_frames_come_back_from_nerfstudio(run, tmp_path):
-    export_run(run, tmp_path / "out", "nerfstudio")
-    images = read_transforms(tmp_path / "out")
-    assert images.points_path is not None
-    assert len(read_points(images.points_path)[0]) == 2
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_come_back(run, tmp_path, kind):
+    export_run(run, tmp_path / "out", kind)
+    images = read_back(tmp_path / "out", kind)
+    if kind == "nerfstudio":
+        assert images.points_path is not None
+        assert len(read_points(images.points_path)[0]) == 2
+    else:
+        unit = DepthUnit(1.0 / DEPTH_STEPS_PER_METRE, BEYOND_RANGE)
+        images = images.with_depth(tmp_path / "out" / "depth", unit)
     for again, first in zip(images.frames(), run.frames(), strict=True):
         assert again.camera == first.camera
         np.testing.assert_array_equal(again.rgb, first.rgb)
-        np.testing.assert_array_equal(again.T_world_camera, first.T_world_camera)
+        np.testing.assert_allclose(again.T_world_camera, first.T_world_camera, atol=1e-6)
         np.testing.assert_allclose(again.depth, first.depth, rtol=2e-7)
+
+
+def test_images_without_a_depth_image_have_none(run, tmp_path):
+    export_run(run, tmp_path / "out", "colmap")
+    (tmp_path / "out" / "depth" / "000001.png").unlink()
+    images = read_colmap(tmp_path / "out").with_depth(tmp_path / "out" / "depth", DepthUnit())
+    assert [path is None for path in images.depth_paths] == [False, True, False]
 
 
 DOCUMENTED = {

@@ -51,9 +51,12 @@ def damage(rng: np.random.Generator, data: bytes) -> bytes:
     """Damages one value of a JSON text.
 
     Raises:
-        ValueError: the data is no JSON.
+        ValueError: the data is no JSON, or nested too deeply by an earlier damage.
     """
-    tree = {"": json.loads(data)}
+    try:
+        tree = {"": json.loads(data)}
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
     places: list[tuple[Any, Any]] = []
     _collect(tree, places)
     # Strings (names of files among them) deserve their share beside long lists of numbers.
