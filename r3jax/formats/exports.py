@@ -10,6 +10,7 @@ copies: uint16 in steps of 0.2 mm. COLMAP has no place for depth; it lies beside
 
 import json
 import os
+import secrets
 import shutil
 from pathlib import Path
 from typing import Literal
@@ -42,18 +43,22 @@ def export_run(run: Run, out: Path, kind: Format) -> int:
         The number of points: centers of the map's voxels; 0 where the run has no stored map.
 
     Raises:
-        FormatError: the run has no views, or `out` holds something.
-        RunError: an image or the stored map cannot be read.
-        OSError: the disk is full, not writable, ...
+        FormatError: the run has no views, `out` holds something, or is no name of a folder.
+        RunError: the stored map cannot be read.
+        OSError: an image is missing, or the disk is full, not writable, ...
     """
     if not run.rows:
         raise FormatError(run.path, "the run has no views yet: there is nothing to export")
+    if "\0" in str(out):
+        raise FormatError(Path(repr(out.name)), "this cannot be the name of a folder")
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise FormatError(out, "something is there already: give another folder")
     xyz, rgb = _map_points(run)
-    out = out.resolve()  # "." has no name
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    out = out.absolute()  # "." has no name
+    partial = out.with_name(f".{out.name}.{secrets.token_hex(4)}.partial")
+    if not out.parent.is_dir():
+        out.parent.mkdir(parents=True, exist_ok=True)
+    partial.mkdir()
     try:
         _fill(partial, run, kind, xyz, rgb)
         os.replace(partial, out)  # takes the place of an empty folder
@@ -70,7 +75,7 @@ def _map_points(run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 def _fill(out: Path, run: Run, kind: Format, xyz: np.ndarray, rgb: np.ndarray) -> None:
     for name in ("images", "depth"):
-        (out / name).mkdir(parents=True)
+        (out / name).mkdir()
     for row in run.rows:
         image = run.image_path(row.step)
         shutil.copyfile(image, out / "images" / image.name)

@@ -61,6 +61,7 @@ COMMANDS = (
     ("benchmark", "--scenes", "flat", "--policies", "random", "--budget", "views:3", "--jobs", "0"),
     ("replay", "run"),
     ("merge", "run", "run", "--out", "out"),
+    ("export", "run", "--format", "colmap", "--out", "out"),
 )
 
 OPTIONS = {
@@ -68,7 +69,7 @@ OPTIONS = {
     for name, kind in {
         "info": options.Info, "policies": options.Policies, "explore": options.Explore,
         "train": options.Train, "evaluate": options.Evaluate, "benchmark": options.Benchmark,
-        "replay": options.Replay, "merge": options.Merge,
+        "replay": options.Replay, "merge": options.Merge, "export": options.Export,
     }.items()
 }  # fmt: skip
 """The options of each command."""
