@@ -1,5 +1,6 @@
 """COLMAP models: laws of writing and reading, by hand-written files, and by damaged ones."""
 
+import dataclasses
 import tempfile
 from pathlib import Path
 
@@ -106,6 +107,7 @@ def test_the_model_is_found_where_tools_put_it(tmp_path, place):
     write_binary(tmp_path / place, random_model(3))
     found = read_colmap(tmp_path)
     assert len(found) == len(random_model(3).images)
+    assert found.image_paths[0].is_relative_to(tmp_path / "images")  # where they should be
     elsewhere = read_colmap(tmp_path / place, images=tmp_path / "photos")
     assert elsewhere.image_paths[0].is_relative_to(tmp_path / "photos")
 
@@ -188,7 +190,8 @@ def test_a_binary_of_any_other_length_is_refused(tmp_path, name):
 
 def test_a_name_that_no_line_holds_is_not_written(tmp_path):
     model = random_model(0)
-    object.__setattr__(model.images[0], "name", "two\nlines.png")
+    torn = dataclasses.replace(model.images[0], name="two\nlines.png")
+    model = dataclasses.replace(model, images=(torn,))
     with pytest.raises(ValueError, match="text format cannot hold"):
         write_text(tmp_path, model)
 

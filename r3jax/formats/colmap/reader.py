@@ -66,7 +66,7 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
         what = "the folder holds no COLMAP model (no cameras.bin or cameras.txt)"
         raise FormatError(path, what if path.is_dir() else "there is no such folder")
     model = read_model(folder)
-    base = Path(images) if images is not None else _image_folder(folder)
+    base = Path(images) if images is not None else _image_folder(path, folder)
     ordered = sorted(model.images, key=lambda image: image.name)
     return PosedImages(
         path=path,
@@ -78,12 +78,12 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
     )
 
 
-def _image_folder(model: Path) -> Path:
+def _image_folder(path: Path, model: Path) -> Path:
     here = model.resolve()
     for folder in (here, *here.parents[:3]):
         if (folder / "images").is_dir():
             return folder / "images"
-    return here.parent.parent / "images"
+    return path / "images"
 
 
 def _check_images(model: ColmapModel) -> None:
