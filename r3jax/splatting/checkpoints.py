@@ -71,8 +71,8 @@ def only_training(folder: Path, *, is_new: bool) -> Generator[None]:
     """
     if is_new:
         folder.mkdir(parents=True, exist_ok=True)
-    elif not _checkpoints(folder):
-        raise CheckpointError(folder, "there is no checkpoint to resume from")
+    else:
+        _newest(folder)  # nothing is written into a folder that holds no training
     try:
         lock = lock_folder(folder)
     except BlockingIOError:
@@ -120,6 +120,13 @@ def _checkpoints(folder: Path) -> list[Path]:
     return sorted(p for p in folder.glob("[0-9]*") if p.is_dir() and p.name.isdigit())
 
 
+def _newest(folder: Path) -> Path:
+    found = _checkpoints(folder)
+    if not found:
+        raise CheckpointError(folder, "there is no checkpoint to resume from")
+    return found[-1]
+
+
 def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) -> TrainState:
     """The newest state of a training with these settings.
 
@@ -134,11 +141,8 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) ->
     """
     import orbax.checkpoint as ocp
 
-    found = _checkpoints(folder)
-    if not found:
-        raise CheckpointError(folder, "there is no checkpoint to resume from")
+    newest = _newest(folder)
     _check_settings(folder, settings)
-    newest = found[-1]
     sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     to_shape: Callable[[jax.Array], jax.ShapeDtypeStruct] = lambda x: jax.ShapeDtypeStruct(
         x.shape, x.dtype, sharding=sharding
