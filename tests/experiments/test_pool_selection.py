@@ -8,7 +8,8 @@ import pytest
 
 from experiments import pool_choice, pool_selection
 from experiments.pool_choice import SCORED, choose, pool_of
-from experiments.pool_selection import Options, mean_rows, result_rows
+from experiments.pool_selection import Options
+from experiments.pool_table import gain_rows, mean_rows, result_rows
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.policy import policy_names
 from r3jax.scenes.registry import open_scene
@@ -98,12 +99,18 @@ def test_what_has_no_score_is_refused():
         Options(policies=())
 
 
-def record(policy, seed, psnr):
+def record(policy, seed, psnr, scene="flat"):
     scores = {
-        views: {"psnr": value, "psnr_p5": value - 5, "poor_share": 0.25, "ssim": 0.5}
+        views: {
+            "psnr": value,
+            "psnr_p5": value - 5,
+            "poor_share": 0.25,
+            "ssim": 0.5,
+            "psnr_by_view": [value - 6.0, value, value + 6.0],
+        }
         for views, value in psnr.items()
     }
-    flight = {"scene": "flat", "seed": seed, "policy": policy, "commit": "abc"}
+    flight = {"scene": scene, "seed": seed, "policy": policy, "commit": "abc"}
     return {"flight": flight, "machine": "m", "scores": scores, "chosen": []}
 
 
@@ -118,11 +125,34 @@ RECORDS = [
 def test_tables_by_hand():
     rows = result_rows(RECORDS)
     assert [row["views"] for row in rows] == [10, 20] * 4
-    table = mean_rows(rows)
+    assert "psnr_by_view" not in rows[0]
+    table = mean_rows(RECORDS)
     assert [line["policy"] for line in table] == ["ours", "random"]
-    assert table[0]["PSNR at 10"] == "19.00 [14.00]"
-    assert table[1]["PSNR at 20"] == "22.00 [17.00]"
+    assert table[0]["PSNR at 10"].startswith("19.00 [")
+    assert table[1]["PSNR at 20"].startswith("22.00 [")
+    assert table[1]["5th percentile at 20"] == "17.00"
     assert table[0]["under 20 dB at 10"] == "25 %"
+
+
+def test_gains_are_taken_view_by_view():
+    """What all views have in common between two policies leaves no spread at all."""
+    table = gain_rows([*RECORDS[:2], record("unseen", 0, {"10": 16.0, "20": 21.0}),
+                       record("unseen", 1, {"10": 18.0, "20": 22.0})])  # fmt: skip
+    assert table == [
+        {"ours minus": "unseen", "all at 10": "+2.00 [+2.00, +2.00]",
+         "all at 20": "+1.00 [+1.00, +1.00]"}
+    ]  # fmt: skip
+    assert gain_rows(RECORDS[2:]) == []
+
+
+def test_gains_of_two_scenes_stand_apart_and_together():
+    numbers = {("ours", "flat"): 20.0, ("random", "flat"): 16.0,
+               ("ours", "office"): 15.0, ("random", "office"): 17.0}  # fmt: skip
+    records = [record(policy, 0, {"10": x}, scene) for (policy, scene), x in numbers.items()]
+    (line,) = gain_rows(records)
+    assert line["flat at 10"] == "+4.00 [+4.00, +4.00]"
+    assert line["office at 10"] == "-2.00 [-2.00, -2.00]"
+    assert line["all at 10"].startswith("+1.00 [")
 
 
 def test_results_say_where_they_come_from_and_are_kept(tmp_path, monkeypatch):
@@ -143,5 +173,6 @@ def test_results_say_where_they_come_from_and_are_kept(tmp_path, monkeypatch):
     rows = list(csv.DictReader(lines[3:]))
     assert [(row["policy"], row["views"]) for row in rows][:2] == [("ours", "8"), ("ours", "16")]
     assert (folder / "pool_selection.png").read_bytes().startswith(b"\x89PNG")
-    assert "| unseen | 12.00 [7.00]" not in (folder / "pool_selection.md").read_text()
-    assert "| unseen | 10.00 [5.00]" in (folder / "pool_selection.md").read_text()
+    page = (folder / "pool_selection.md").read_text()
+    assert "| unseen | 10.00 [" in page
+    assert "| unseen | +0.00 [+0.00, +0.00] | +0.00 [+0.00, +0.00] |" in page
