@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from r3jax.mapping.compact import positions_of_set, running_count
+from r3jax.mapping.compact import SPARE, positions_of_set, running_count, spare_places
 
 CHUNK = 1 << 12
 """Items at once."""
@@ -85,9 +85,9 @@ def narrow(
         order, count = kept
         passes = valid & test(index)
         place = running_count(passes)
-        order = order.at[jnp.where(passes, count + place - 1, room)].set(index, mode="drop")
-        return order, count + place[size - 1]
+        target = jnp.where(passes, count + place - 1, spare_places(room, size))
+        return order.at[target].set(index, mode="drop"), count + place[size - 1]
 
-    nothing = jnp.full(room, selection.num, dtype=jnp.int32)
+    nothing = jnp.full(room + SPARE, selection.num, dtype=jnp.int32)
     order, count = for_selected(selection, keep, (nothing, jnp.zeros((), jnp.int32)))
-    return Selection(order, count, selection.num)
+    return Selection(order[:room], count, selection.num)

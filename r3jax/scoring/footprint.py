@@ -12,6 +12,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from r3jax.mapping.compact import spare_places
 from r3jax.scoring.views import Placement, wrap
 
 _HALF_WIDTH = 0.51
@@ -44,7 +45,7 @@ def footprint(
     *,
     wraps: bool,
 ) -> list[Int[Array, " n"]]:
-    """Indices into the pyramid of the pixels that each voxel covers; out of bounds: dropped.
+    """Indices into the pyramid of the pixels that each voxel covers; behind its end: none.
 
     The level is the first on which the footprint spans at most two pixel centers an axis. A
     footprint is the octagon round the projected cube.
@@ -54,7 +55,7 @@ def footprint(
         valid: False for voxels to leave out.
         voxel_size: edge of a voxel [m].
         shapes: of the pyramid's levels.
-        offsets: where each level begins; one more for the end.
+        offsets: where each level begins; one more for the end, behind which lie spare places.
         wraps: True for an octahedral map.
     """
     half = voxel_size * (_HALF_WIDTH + _NEAR * voxel_size / place.distance)
@@ -71,6 +72,7 @@ def footprint(
     columns = _covered(place.column * scale, 0.5 * widths[0] * scale + spread)
     rows = _covered(place.row * scale, 0.5 * widths[1] * scale + spread)
     slanted = [half * w * scale + 2.0 * spread for w in (place.sum_scale, place.difference_scale)]
+    nowhere = spare_places(offsets[-1], level.shape[0])
     indices: list[Int[Array, " n"]] = []
     for r, covers_row, down in rows:
         for c, covers_column, right in columns:
@@ -82,7 +84,7 @@ def footprint(
             else:
                 is_in = is_in & (r >= 0) & (r < height) & (c >= 0) & (c < width)
                 r_in, c_in = r, c
-            indices.append(jnp.where(is_in, offset + r_in * width + c_in, offsets[-1]))
+            indices.append(jnp.where(is_in, offset + r_in * width + c_in, nowhere))
     return indices
 
 

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from r3jax.mapping.compact import SPARE
 from r3jax.scoring.chunks import Selection, for_selected, narrow, select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.footprint import footprint, pyramid
@@ -64,7 +65,7 @@ def depth_buffer(
             pixels = pixels.at[target].min(packed, mode="drop")
         return pixels
 
-    blank = jnp.full(offsets[-1], _NOTHING, dtype=jnp.uint32)
+    blank = jnp.full(offsets[-1] + SPARE, _NOTHING, dtype=jnp.uint32)
     finest = _push_down(for_selected(candidates, splat, blank), shapes, offsets)
     is_hit = finest != jnp.uint32(_NOTHING)
     item = jnp.where(is_hit, (finest & jnp.uint32((1 << item_bits) - 1)).astype(jnp.int32), num)

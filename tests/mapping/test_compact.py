@@ -63,10 +63,9 @@ MUTANTS = [
     Mutant("compact", "np.triu(", "np.tril(", law_counts),
     Mutant("compact", " - within[:, -1]", "", law_counts),
     Mutant("compact", "within + before[:, None]", "within", law_counts),
-    Mutant("compact", "running_count(flags) - 1, size)", "running_count(flags), size)", law_counts),
-    Mutant("compact", "running_count(flags) - 1, size)",
-           "running_count(flags) - 1, 0)", law_counts),
-    Mutant("compact", "jnp.full(size, n,", "jnp.full(size, n + 1,", law_counts),
+    Mutant("compact", "running_count(flags) - 1,", "running_count(flags),", law_counts),
+    Mutant("compact", "spare_places(size, n))", "spare_places(0, n))", law_counts),
+    Mutant("compact", "jnp.full(size + SPARE, n,", "jnp.full(size + SPARE, n + 1,", law_counts),
 ]  # fmt: skip
 
 
