@@ -1,6 +1,7 @@
 """A posed RGB-D image: all that a simulator, a recording or a robot hands over."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from r3jax.arrays import color_image, depth_image, own_matrix, pinhole_camera
 from r3jax.geometry.cameras import Camera, is_traced, rigid_error
 
 
@@ -39,6 +41,49 @@ class Frame(eqx.Module):
 
     camera: Camera
     """Intrinsics of both images."""
+
+    @staticmethod
+    def from_arrays(
+        rgb: Any,
+        depth: Any,
+        T_world_camera: Any,
+        camera: Any,
+        *,
+        depth_scale: float | int | None = None,
+        pixel_center: float | int = 0.0,
+    ) -> "Frame":
+        """A frame from the arrays of another program.
+
+        Arrays are NumPy's, JAX's, or anything with `__dlpack__`: a PyTorch tensor on the CPU, or
+        on a device that JAX uses too. They are copied; their memory may be written again.
+
+            frame = r3jax.Frame.from_arrays(tensor, depth_mm, pose, K, depth_scale=0.001)
+
+        Args:
+            rgb: colours, [H, W, 3]: uint8, or floats in [0, 1].
+            depth: z-depth, [H, W], not the length of the ray; 0 means no measurement and inf
+                that nothing lies within the sensor's range. Metres, or steps of `depth_scale`.
+            T_world_camera: camera-to-world pose, [4, 4]; OpenCV axes (x right, y down, z
+                forward), world z up [m].
+            camera: a `Camera`, or the 3x3 matrix of a pinhole for images of this size.
+            depth_scale: metres per step of the depth, 0.001 for millimetres. None: metres, which
+                only floats can be.
+            pixel_center: where the matrix has the center of the upper left pixel [px]: 0 in
+                OpenCV and ROS, 0.5 in COLMAP and nerfstudio. A `Camera` has it at 0.5.
+
+        Raises:
+            ValueError: what `Frame` refuses; colours or depth of a type or shape that cannot be
+                meant, whole numbers as depth without `depth_scale`, a matrix of other images.
+            TypeError: what is not an array, or cannot be handed over.
+        """
+        colors = color_image(rgb)
+        height, width = colors.shape[:2]
+        return Frame(
+            rgb=colors,
+            depth=depth_image(depth, depth_scale),
+            T_world_camera=own_matrix("T_world_camera", T_world_camera),
+            camera=pinhole_camera(camera, height, width, pixel_center),
+        )
 
     def __check_init__(self) -> None:
         """Refuses what would become a NaN or a silent error later."""

@@ -33,6 +33,9 @@ class Groups(eqx.Module):
     key: UInt32[Array, "2 P"]
     """Packed key of each point's voxel."""
 
+    leader: Int[Array, " P"]
+    """The point that stands for each point's voxel; P for points that take no part."""
+
     is_leader: Bool[Array, " P"]
     """True for one point of each touched voxel."""
 
@@ -65,7 +68,13 @@ def group_by_voxel(
     # One scatter of rows of four is as quick as a scatter of scalars.
     sums = jnp.broadcast_to(zero, (num, 4)).at[leader].add(rows, mode="drop")
     is_leader = leader == jnp.arange(num, dtype=jnp.int32)
-    return Groups(key=jnp.stack([low, high]), is_leader=is_leader, rgb_sum=sums)
+    return Groups(key=jnp.stack([low, high]), leader=leader, is_leader=is_leader, rgb_sum=sums)
+
+
+def group_means(groups: Groups, values: Float[Array, "P k"]) -> Float[Array, "P k"]:
+    """Mean of something over the points of each voxel: at the leaders, elsewhere 0."""
+    sums = jnp.zeros_like(values).at[groups.leader].add(values, mode="drop")
+    return sums / jnp.maximum(groups.rgb_sum[:, 3:], 1.0)
 
 
 def points_of_pixels(frame: Frame, depth: Float[Array, "H W"]) -> Float[Array, "3 P"]:

@@ -14,7 +14,13 @@ from r3jax.geometry.cameras import is_traced
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
 from r3jax.geometry.voxels import unpack, voxel_center
-from r3jax.mapping.associate import Groups, edge_pixels, group_by_voxel, points_of_pixels
+from r3jax.mapping.associate import (
+    Groups,
+    edge_pixels,
+    group_by_voxel,
+    group_means,
+    points_of_pixels,
+)
 from r3jax.mapping.compact import positions_of_set
 from r3jax.mapping.join import CHUNK, Statistics, bin_words, join
 from r3jax.mapping.state import MapState
@@ -25,12 +31,13 @@ def observe_voxels(
     key: UInt32[Array, "2 M"],
     valid: Bool[Array, " M"],
     rgb: Float[Array, "3 M"],
-    camera_position: Float[Array, " 3"],
+    camera_position: Float[Array, " 3"] | Float[Array, "3 M"],
     focal: Float[Array, ""],
 ) -> Statistics:
     """One observation of each voxel from a camera: direction bin, distance, mean colour."""
     center = voxel_center(jnp.stack(unpack(key[0], key[1])), state.voxel_size)
-    offset = camera_position[:, None] - center
+    position = camera_position if camera_position.ndim == 2 else camera_position[:, None]
+    offset = position - center
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     bins = nearest_bin(offset / distance[None, :], state.num_bins)
     return Statistics(
@@ -47,10 +54,17 @@ def observe_voxels(
 def integrate_groups(
     state: MapState,
     groups: Groups,
-    camera_position: Float[Array, " 3"],
+    camera_position: Float[Array, " 3"] | Float[Array, "P 3"],
     focal: Float[Array, ""],
 ) -> MapState:
-    """One observation per touched voxel joins the map, `CHUNK` voxels at a time."""
+    """One observation per touched voxel joins the map, `CHUNK` voxels at a time.
+
+    Args:
+        state: the map before.
+        groups: the points by voxel.
+        camera_position: where they were seen from; one for all, or one for each leader [m].
+        focal: focal length [px].
+    """
     num = groups.is_leader.shape[0]
     size = min(num, CHUNK)
     leaders = positions_of_set(groups.is_leader, -(-num // size) * size)
@@ -63,7 +77,8 @@ def integrate_groups(
         index = jnp.minimum(index, num - 1)
         sums = groups.rgb_sum[index].T
         rgb = sums[:3] / jnp.maximum(sums[3:], 1.0)
-        seen = observe_voxels(state, groups.key[:, index], valid, rgb, camera_position, focal)
+        position = camera_position[index].T if camera_position.ndim == 2 else camera_position
+        seen = observe_voxels(state, groups.key[:, index], valid, rgb, position, focal)
         return join(state, seen)
 
     return jax.lax.fori_loop(0, (num_voxels + (size - 1)) // size, join_chunk, state)
@@ -125,12 +140,17 @@ def _integrate_points(
     state: MapState,
     points_world: Float[Array, "P 3"],
     rgb: Float[Array, "P 3"],
-    camera_position: Float[Array, " 3"],
+    camera_position: Float[Array, " 3"] | Float[Array, "P 3"],
     focal: Float[Array, ""],
+    valid: Bool[Array, " P"],
 ) -> MapState:
-    valid = jnp.all(jnp.isfinite(points_world), axis=1)
+    valid = valid & jnp.all(jnp.isfinite(points_world), axis=1)
+    if camera_position.ndim == 2:
+        valid = valid & jnp.all(jnp.isfinite(camera_position), axis=1)
     points = jnp.where(valid[:, None], points_world, 0.0)
     groups = group_by_voxel(points.T, rgb, valid, state.voxel_size)
+    if camera_position.ndim == 2:
+        camera_position = group_means(groups, camera_position)
     return integrate_groups(state, groups, camera_position, focal)
 
 
@@ -140,17 +160,27 @@ def integrate_points(
     rgb: ArrayLike,
     camera_position: ArrayLike,
     focal: ArrayLike = 1.0,
+    *,
+    valid: ArrayLike | None = None,
 ) -> MapState:
-    """Points seen by one camera join the map: like `integrate`, from points.
+    """Points seen by one camera, or by a scanner, join the map: like `integrate`, from points.
 
-    Arrays of NumPy and JAX are welcome; shapes and values are checked here.
+    One call is one look: a voxel gets one observation, however many points fall into it. A LiDAR
+    has rays instead of pixels: its `focal` is one over the angle between neighboring rays [1/rad],
+    which gives points per metre where a camera gives pixels per metre. While it turns, it may move:
+    each point may have its own sensor position, and a voxel is seen from the mean of its points'.
+    So cut a long recording into scans; a colourless scanner's intensity, three times, will do.
+
+    Arrays of NumPy and JAX are welcome; shapes and values are checked here. Compiled on first use
+    for each number of points and capacity: pad scans to one length, and mask the padding out.
 
     Args:
         state: the map before.
         points_world: points [m], world, [P, 3].
         rgb: their colours in [0, 1], [P, 3].
-        camera_position: center of the camera that saw them [m], [3].
-        focal: its focal length [px]; with 1.0 the resolution is the paper's 1 / distance.
+        camera_position: where the camera or scanner was [m]: [3], or [P, 3] for each point.
+        focal: focal length [px]; with 1.0 the resolution is the paper's 1 / distance.
+        valid: False for padding, whatever stands there, [P] bool. None: every point counts.
 
     Raises:
         ValueError: shapes that do not fit; values that are not finite or colours outside [0, 1]
@@ -159,14 +189,20 @@ def integrate_points(
     points_world, rgb = jnp.asarray(points_world, dtype=jnp.float32), jnp.asarray(rgb)
     camera_position = jnp.asarray(camera_position, dtype=jnp.float32)
     focal = jnp.asarray(focal, dtype=jnp.float32)
-    _check_points(points_world, rgb, camera_position, focal)
-    if points_world.shape[0] == 0:
+    _check_shapes(points_world, rgb, camera_position, focal)
+    num = points_world.shape[0]
+    mask = jnp.ones(num, dtype=bool) if valid is None else jnp.asarray(valid)
+    if mask.shape != (num,) or mask.dtype != jnp.bool_:
+        raise ValueError(f"valid must be [{num}] bool, got {mask.dtype} of shape {mask.shape}")
+    if not is_traced(points_world, rgb, camera_position, focal, mask):
+        _check_values(points_world, rgb, camera_position, focal, np.asarray(mask))
+    if num == 0:
         return state
     rgb = rgb.astype(jnp.float32)
-    return _integrate_points(state, points_world, rgb, camera_position, focal)
+    return _integrate_points(state, points_world, rgb, camera_position, focal, mask)
 
 
-def _check_points(points: Array, rgb: Array, camera_position: Array, focal: Array) -> None:
+def _check_shapes(points: Array, rgb: Array, camera_position: Array, focal: Array) -> None:
     if focal.ndim != 0:
         raise ValueError(f"focal must be one number [px], got shape {focal.shape}")
     if points.ndim != 2 or points.shape[1] != 3:
@@ -175,22 +211,31 @@ def _check_points(points: Array, rgb: Array, camera_position: Array, focal: Arra
         raise ValueError(f"rgb must have the points' shape {points.shape}, got {rgb.shape}")
     if not jnp.issubdtype(rgb.dtype, jnp.floating):
         raise ValueError(f"rgb must be float32 in [0, 1], got {rgb.dtype}: divide by 255 first")
-    if camera_position.shape != (3,):
-        raise ValueError(f"camera_position must have shape [3], got {camera_position.shape}")
-    if is_traced(points, rgb, camera_position, focal):
-        return
-    is_bad = np.asarray(~np.isfinite(np.asarray(points)).all(axis=1))
+    if camera_position.shape not in ((3,), points.shape):
+        raise ValueError(
+            f"camera_position must have shape [3] or the points' {points.shape}, got "
+            f"{camera_position.shape}"
+        )
+
+
+def _check_values(
+    points: Array, rgb: Array, camera_position: Array, focal: Array, valid: np.ndarray
+) -> None:
+    is_bad = valid & ~np.isfinite(np.asarray(points)).all(axis=1)
     if is_bad.any():
         raise ValueError(
             f"{is_bad.sum()} of {len(is_bad)} points are not finite, the first is number "
             f"{int(is_bad.argmax())}: leave out points without a measurement"
         )
-    colors = np.asarray(rgb)
+    colors = np.asarray(rgb)[valid]
     if colors.size and not (colors.min() >= 0.0 and colors.max() <= 1.0):
         raise ValueError(
             f"rgb must lie in [0, 1], got values from {colors.min():.4g} to {colors.max():.4g}"
         )
-    if not np.isfinite(np.asarray(camera_position)).all():
-        raise ValueError(f"camera_position is not finite: {np.asarray(camera_position)}")
+    positions = np.asarray(camera_position)
+    used = positions[valid] if positions.ndim == 2 else positions[None]
+    is_bad = ~np.isfinite(used).all(axis=1)
+    if is_bad.any():
+        raise ValueError(f"camera_position is not finite: {used[is_bad.argmax()]}")
     if not (np.isfinite(float(focal)) and float(focal) > 0.0):
         raise ValueError(f"focal must be positive [px], got {float(focal)}")

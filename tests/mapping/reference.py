@@ -45,19 +45,20 @@ class ReferenceMap:
         """Smallest lead of a nearest bin's cosine over the second: below 1e-6 float32 may err."""
 
     def see(self, points: np.ndarray, rgb: np.ndarray, position: np.ndarray, focal: float) -> None:
-        """One frame: one observation per touched voxel."""
-        points, rgb, position = np.float64(points), np.float64(rgb), np.float64(position)
-        pixels: dict[Voxel, list[np.ndarray]] = {}
-        for index, color in zip(np.floor(points / self.voxel_size).astype(int), rgb, strict=True):
-            pixels.setdefault((int(index[0]), int(index[1]), int(index[2])), []).append(color)
-        for voxel, colors in pixels.items():
-            offset = position - (np.array(voxel) + 0.5) * self.voxel_size
+        """One frame: one observation per touched voxel. Each point may have its own position."""
+        points, rgb = np.float64(points), np.float64(rgb)
+        positions = np.broadcast_to(np.float64(position), points.shape)
+        pixels: dict[Voxel, list[int]] = {}
+        for i, index in enumerate(np.floor(points / self.voxel_size).astype(int)):
+            pixels.setdefault((int(index[0]), int(index[1]), int(index[2])), []).append(i)
+        for voxel, members in pixels.items():
+            offset = positions[members].mean(axis=0) - (np.array(voxel) + 0.5) * self.voxel_size
             distance = np.linalg.norm(offset)
             cosine = self.lattice @ (offset / distance)
             best, second = np.sort(cosine)[::-1][:2]
             self.clearance = min(self.clearance, best - second)
             self.bins.setdefault(voxel, set()).add(int(cosine.argmax()))
-            self.colors.setdefault(voxel, []).append(np.mean(colors, axis=0))
+            self.colors.setdefault(voxel, []).append(rgb[members].mean(axis=0))
             self.resolutions.setdefault(voxel, []).append(focal / distance)
 
     def rows(self) -> dict[Voxel, Row]:

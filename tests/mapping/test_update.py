@@ -191,7 +191,10 @@ def with_point(value: float) -> np.ndarray:
         ({"rgb": np.full((4, 3), 1.5)}, r"rgb must lie in \[0, 1\], got values from 1.5 to 1.5"),
         ({"rgb": np.full((4, 3), -0.1)}, r"rgb must lie in \[0, 1\], got values from -0.1"),
         ({"rgb": np.full((4, 3), np.nan)}, r"rgb must lie in \[0, 1\]"),
-        ({"camera_position": np.ones((3, 1))}, r"camera_position must have shape \[3\]"),
+        (
+            {"camera_position": np.ones((3, 1))},
+            r"camera_position must have shape \[3\] or the points' \(4, 3\), got \(3, 1\)",
+        ),
         ({"camera_position": np.array([0.0, np.nan, 0.0])}, "camera_position is not finite"),
         ({"focal": 0.0}, r"focal must be positive \[px\], got 0.0"),
         ({"focal": -3.0}, "focal must be positive"),
@@ -235,10 +238,9 @@ def law_padding(modules: Modules) -> None:
 
 CHAIN = ("r3jax.mapping.update",)
 MUTANTS = [
-    Mutant("update", "camera_position[:, None] - center",
-           "center - camera_position[:, None]", law_points),
-    Mutant("update", "offset = camera_position[:, None] - center",
-           "offset = camera_position[:, None] - center + 0.5 * state.voxel_size", law_points),
+    Mutant("update", "offset = position - center", "offset = center - position", law_points),
+    Mutant("update", "offset = position - center",
+           "offset = position - center + 0.5 * state.voxel_size", law_points),
     Mutant("update", "nearest_bin(offset / distance[None, :], state.num_bins)",
            "nearest_bin(offset / distance[None, :], 32)", law_points),
     Mutant("update", "count=valid.astype(jnp.float32)",

@@ -104,6 +104,17 @@ def test_frame_equals_its_points():
     assert_same_rows(read_map(map_of([frame], drop_edges=False)), read_map(alone))
 
 
+def test_frame_equals_the_scan_of_a_sensor_that_stands_still():
+    """Every pixel is a ray, those without a measurement are padding, one position for each."""
+    frame = FRAMES[1]
+    points = points_of_pixels(frame, jnp.where(is_measured(frame), frame.depth, jnp.nan)).T
+    rgb = frame.rgb.reshape(-1, 3)
+    positions = jnp.broadcast_to(frame.position, points.shape)
+    valid = is_measured(frame).reshape(-1)
+    scan = integrate_points(new_map(CAPACITY), points, rgb, positions, CAMERA.focal, valid=valid)
+    assert_same_rows(read_map(map_of([frame], drop_edges=False)), read_map(scan))
+
+
 def test_order_of_frames_does_not_matter():
     assert_same_rows(read_map(map_of(FRAMES[::-1])), read_map(map_of(FRAMES)))
 

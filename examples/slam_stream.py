@@ -1,0 +1,75 @@
+"""r3jax beside a SLAM system: it sends RGB-D frames, r3jax answers where to look next.
+
+    python examples/slam_stream.py
+
+Your SLAM system is any generator that yields its own arrays (NumPy, JAX, PyTorch, ...). Here a
+ray caster plays it: it drifts by 1 cm a view, then closes a loop and corrects all its poses.
+"""
+
+import dataclasses
+from collections.abc import Generator
+
+import jax
+import numpy as np
+
+import r3jax
+from r3jax.mapping.occupancy import mark_free_ball
+from r3jax.planning.policy import make_policy
+from r3jax.scenes.registry import open_scene
+from r3jax.scoring.sighting import look
+from r3jax.simulators.base import Simulator
+
+Message = tuple[np.ndarray, np.ndarray, list[np.ndarray]]
+integrate_depth = jax.jit(r3jax.integrate_depth)
+
+
+def slam(world: Simulator) -> Generator[Message, np.ndarray, None]:
+    """Yields colours, depth [mm] and the poses of all views so far; is sent where to go next."""
+    true, believed = [world.start_pose], [world.start_pose]
+    while True:
+        frame = world.render(true[-1])
+        depth = np.where(np.isfinite(frame.depth), 1000.0 * frame.depth, 0.0).astype(np.uint16)
+        goal = yield np.rint(255.0 * frame.rgb).astype(np.uint8), depth, list(believed)
+        drift = np.zeros((4, 4))
+        drift[2, 3] = 0.01 * (len(true) % 5)
+        if not drift.any():
+            believed = list(true)
+        believed, true = [*believed, goal], [*true, goal - drift]
+
+
+def main(views: int = 8, size: int = 128) -> list[r3jax.Frame]:
+    """Explores the flat together with a SLAM system; returns the frames that are in the map."""
+    world = open_scene("flat", camera=r3jax.Camera.from_fov(size, size))
+    nothing = r3jax.empty_map(capacity=1 << 12), r3jax.empty_grid(world.bounds)
+    m, grid = nothing
+    policy, key = make_policy("ours-pano", num_candidates=40, num_frontier=12), jax.random.key(0)
+    state = policy.init(world.camera, grid, key=key)
+    frames: list[r3jax.Frame] = []
+    stream = slam(world)
+    rgb, depth, poses = next(stream)
+    for view in range(views):
+        new = r3jax.Frame.from_arrays(rgb, depth, poses[view], world.camera, depth_scale=0.001)
+        to_add, frames = [new], [*frames, new]
+        if np.abs(np.stack([f.T_world_camera for f in frames]) - poses).max() > 1e-3:
+            # What a voxel has seen cannot be moved: keep the key frames, and map them again.
+            pairs = zip(frames, poses, strict=True)
+            frames = [dataclasses.replace(f, T_world_camera=pose) for f, pose in pairs]
+            to_add, (m, grid) = frames, nothing
+        for frame in to_add:
+            m = look(m, frame, max_range=5.0)  # the table doubles by itself before it is full
+            vouched = 0.5 if frame is frames[0] else 0.3  # round the start, round the robot [m]
+            grid = mark_free_ball(integrate_depth(grid, frame, 5.0), frame.position, vouched)
+        state = policy.observe(state, m, frames[-1])
+        goal, state, info = policy.decide(
+            state, m, grid, poses[view], key=jax.random.fold_in(key, view)
+        )
+        print(f"view {view}: {len(to_add)} frame(s) mapped, {int(m.num_occupied)} voxels", end="")
+        print(f" in {m.capacity} rows; {info.outcome.value}, {goal.length if goal else 0:.2f} m")
+        if goal is None:
+            break
+        rgb, depth, poses = stream.send(goal.T_world_camera)
+    return frames
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,30 @@
+"""The examples run as a reader would run them."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_slam_stream_is_planned_for_and_mapped_again_when_its_poses_change(capsys):
+    frames = load("slam_stream").main(views=7, size=64)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(frames) == len(lines) == 7
+    mapped = [int(line.split()[2]) for line in lines]
+    assert mapped == [1, 1, 1, 1, 1, 6, 1]  # the loop is closed at the sixth view
+    rows = [int(line.split()[7]) for line in lines]
+    assert rows[-1] > rows[0] == 1 << 12, "the map did not grow"
+    assert all("moved" in line for line in lines)
+    before = load("slam_stream").main(views=5, size=64)
+    sunk = [a.position[2] - b.position[2] for a, b in zip(before, frames[:5], strict=True)]
+    np.testing.assert_allclose(sunk, 0.01 * np.arange(5), atol=1e-5)
