@@ -40,7 +40,7 @@ def slam(world: Simulator) -> Generator[Message, np.ndarray, None]:
 def main(views: int = 8, size: int = 128) -> list[r3jax.Frame]:
     """Explores the flat together with a SLAM system; returns the frames that are in the map."""
     world = open_scene("flat", camera=r3jax.Camera.from_fov(size, size))
-    nothing = r3jax.empty_map(capacity=1 << 12), r3jax.empty_grid(world.bounds)
+    nothing = r3jax.empty_map(capacity=1 << 14), r3jax.empty_grid(world.bounds)
     m, grid = nothing
     policy, key = make_policy("ours-pano", num_candidates=40, num_frontier=12), jax.random.key(0)
     state = policy.init(world.camera, grid, key=key)
