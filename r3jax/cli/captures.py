@@ -1,27 +1,54 @@
-"""What can be trained on or judged: a run, or a recording, opened in the same way."""
+"""What can be trained on, judged or audited: runs, recordings, posed images, opened in one way."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from r3jax.cli.errors import UserError
+from r3jax.formats.captures import PosedImages
+from r3jax.formats.colmap.reader import find_model, read_colmap
+from r3jax.formats.nerfstudio import read_transforms
 from r3jax.formats.recordings import Recording, is_recording, read_recording
+from r3jax.formats.replica_slam import is_replica_slam, read_replica_slam
+from r3jax.formats.seven_scenes import is_seven_scenes, read_seven_scenes
+from r3jax.formats.tum import is_tum, read_tum
 from r3jax.frame import Frame
 from r3jax.trace.reader import Run, read_run
+
+_FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ...] = (
+    (is_replica_slam, read_replica_slam),
+    (is_tum, read_tum),
+    (is_seven_scenes, read_seven_scenes),
+    (lambda path: (path / "transforms.json").exists(), read_transforms),
+    (lambda path: find_model(path) is not None, read_colmap),
+)
+"""Folders of posed images: what each looks like, and its reader."""
+
+_KNOWN = (
+    "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json, a COLMAP "
+    "model (cameras.bin or cameras.txt, here or in sparse/0), a scene of Replica-SLAM (traj.txt, "
+    "results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes (frame-*.color.png)"
+)
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Posed RGB-D frames on disk."""
+    """Posed pictures on disk; with depth, unless they are posed images without."""
 
     path: Path
-    source: Run | Recording
+    source: Run | Recording | PosedImages
 
     @property
     def run(self) -> Run | None:
         """The run, if it is one."""
         return self.source if isinstance(self.source, Run) else None
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        path = self.path.resolve()
+        return path.parent.name if path.is_file() else path.name
 
     def __len__(self) -> int:
         return len(self.source.rows if isinstance(self.source, Run) else self.source)
@@ -32,23 +59,32 @@ class Capture:
 
     @property
     def models(self) -> Path:
-        """Folder of the models; a recording is somebody else's and stays untouched."""
+        """Folder of the models; somebody else's capture stays untouched."""
         if self.run is not None:
             return self.path / "models"
-        return Path("runs") / self.path.resolve().name / "models"
+        return Path("runs") / self.name / "models"
 
 
 def open_capture(path: Path, up: Literal["y", "z"] = "y") -> Capture:
-    """Opens a run folder or a recording.
+    """Opens a run, a recording, or posed images of any format.
+
+    Args:
+        path: the folder; of nerfstudio also the file.
+        up: axis of a recording's world that points up; the others stay as they are.
 
     Raises:
-        UserError: the folder is neither.
+        UserError: it is none of them.
         RunError, FormatError: it is one, but broken.
     """
+    if path.is_file() and path.suffix == ".json":
+        return Capture(path, read_transforms(path))
     if (path / "run.json").exists():
         return Capture(path, read_run(path))
     if is_recording(path):
         return Capture(path, read_recording(path, up))
+    for fits, read in _FORMATS:
+        if fits(path):
+            return Capture(path, read(path))
     if not path.is_dir():
         raise UserError(f"{path}: there is no such folder")
-    raise UserError(f"{path}: neither a run (no run.json) nor a recording (no poses.txt, images/)")
+    raise UserError(f"{path}: this is neither {_KNOWN}")

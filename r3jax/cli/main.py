@@ -9,6 +9,7 @@ import tyro
 
 from r3jax.cli.errors import UserError
 from r3jax.cli.options import (
+    Audit,
     Benchmark,
     Demo,
     Evaluate,
@@ -30,6 +31,7 @@ _COMMANDS = {
     "replay": Replay,
     "merge": Merge,
     "export": Export,
+    "audit": Audit,
     "policies": Policies,
     "info": Info,
 }
@@ -77,6 +79,7 @@ def _run(
     | Replay
     | Merge
     | Export
+    | Audit
     | Policies
     | Info,
 ) -> int:
@@ -113,6 +116,10 @@ def _run(
         from r3jax.cli.export import run_export
 
         return run_export(command)
+    if isinstance(command, Audit):
+        from r3jax.cli.audit import run_audit
+
+        return run_audit(command)
     if isinstance(command, Policies):
         from r3jax.cli.policies import run_policies
 

@@ -60,6 +60,9 @@ class DepthUnit:
     beyond_range: int | None = None
     """Stored where nothing lies within the sensor's range; None: there is no such number."""
 
+    invalid: int | None = None
+    """Stored, beside 0, where there is no measurement; None: there is no such number."""
+
 
 @dataclass(frozen=True)
 class PosedImages:
@@ -113,29 +116,45 @@ class PosedImages:
             FormatError: the image has distortion (undistort it first), there is no depth image,
                 or a file is missing, broken or of another size.
         """
-        lens, path, depth_path = (
-            self.lenses[index],
-            self.image_paths[index],
-            self.depth_paths[index],
-        )
+        lens, path = self.lenses[index], self.image_paths[index]
         if not lens.is_pinhole:
             raise FormatError(
                 path,
                 f"the image is distorted ({lens.model}): undistort the capture first, for example "
                 "by COLMAP's image_undistorter",
             )
-        if depth_path is None:
+        if self.depth_paths[index] is None:
             raise FormatError(path, "there is no depth image that belongs to it")
-        size = (lens.width, lens.height)
-        with naming(path):
-            image_size(path, IMAGE_FORMATS)  # refuses what would not fit into memory
-            rgb = image_pixels(path, IMAGE_FORMATS, size)
         return Frame(
-            rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
-            depth=jnp.asarray(_read_depth(depth_path, size, self.depth_unit)),
+            rgb=jnp.asarray(self.rgb(index).astype(np.float32) / np.float32(255.0)),
+            depth=jnp.asarray(self.depth(index)),
             T_world_camera=jnp.asarray(self.poses[index], dtype=jnp.float32),
             camera=lens.camera,
         )
+
+    def rgb(self, index: int) -> np.ndarray:
+        """The pixels of one image as they are, distortion included, [H, W, 3] uint8.
+
+        Raises:
+            FormatError: the file is missing, broken or of another size.
+        """
+        path, lens = self.image_paths[index], self.lenses[index]
+        with naming(path):
+            image_size(path, IMAGE_FORMATS)  # refuses what would not fit into memory
+            return image_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
+
+    def depth(self, index: int) -> np.ndarray | None:
+        """The depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
+
+        0 is no measurement, inf nothing within range.
+
+        Raises:
+            FormatError: the file is missing, broken, or no 16-bit image.
+        """
+        path, lens = self.depth_paths[index], self.lenses[index]
+        if path is None:
+            return None
+        return _read_depth(path, (lens.width, lens.height), self.depth_unit)
 
     def frames(self) -> Iterator[Frame]:
         """Every frame in order, read one by one."""
@@ -154,6 +173,8 @@ def _read_depth(path: Path, size: tuple[int, int], unit: DepthUnit) -> np.ndarra
     )
     steps = steps[rows[:, None], columns[None, :]]
     depth = (steps.astype(np.float64) * unit.metres_per_step).astype(np.float32)
+    if unit.invalid is not None:
+        depth = np.where(steps == unit.invalid, np.float32(0.0), depth)
     if unit.beyond_range is None:
         return depth
     return np.where(steps == unit.beyond_range, np.float32(np.inf), depth)

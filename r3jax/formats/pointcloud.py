@@ -1,5 +1,6 @@
 """Writes coloured points as a binary PLY: what 3DGS starts from."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -19,13 +20,19 @@ def voxel_points(map_state: MapState) -> tuple[np.ndarray, np.ndarray]:
     return centers.astype(np.float32), colors.clip(0, 255).astype(np.uint8)
 
 
-def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Writes a PLY with `x y z red green blue`.
+def write_points(
+    path: Path,
+    points: np.ndarray,
+    colors: np.ndarray,
+    properties: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Writes a PLY with `x y z red green blue`, and further properties behind them.
 
     Args:
         path: the file.
         points: [n, 3] [m].
         colors: [n, 3] uint8.
+        properties: further numbers of every point by their names, [n] each; stored as float32.
 
     Raises:
         ValueError: shapes that differ.
@@ -33,8 +40,14 @@ def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
     """
     if points.shape != colors.shape or points.shape[1:] != (3,):
         raise ValueError(f"points {points.shape} and colors {colors.shape} must both be [n, 3]")
+    properties = {} if properties is None else properties
     fields = [(name, "<f4") for name in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")]
+    fields += [(name, "<f4") for name in properties]
     table = np.empty(len(points), dtype=fields)
+    for name, values in properties.items():
+        if values.shape != (len(points),):
+            raise ValueError(f"{name} has the shape {values.shape} for {len(points)} points")
+        table[name] = values
     for axis, name in enumerate("xyz"):
         table[name] = points[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):

@@ -8,7 +8,6 @@
 Images, depth images and poses belong together in the order of the sorted file names.
 """
 
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +16,9 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.foreign.files import read_bytes
 from r3jax.foreign.images import image_pixels, image_size
 from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.numbers import read_numbers
 from r3jax.formats.poses import mend_pose
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
@@ -27,9 +26,6 @@ from r3jax.geometry.cameras import Camera
 Up = Literal["y", "z"]
 
 _FORMATS = ("PNG", "JPEG")
-
-_MAX_TEXT = 64 << 20
-"""A pose takes some hundred bytes."""
 
 _Z_UP_FROM_Y_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -94,7 +90,7 @@ def read_recording(path: Path | str, up: Up = "y") -> Recording:
         raise FormatError(path, "there is no such folder")
     image_paths = _list_images(path / "images")
     depth_paths = _list_images(path / "depth")
-    poses = _read_numbers(path / "poses.txt", columns=16).reshape(-1, 4, 4)
+    poses = read_numbers(path / "poses.txt", columns=16).reshape(-1, 4, 4)
     counts = {"images": len(image_paths), "depth images": len(depth_paths), "poses": len(poses)}
     if len(set(counts.values())) != 1:
         listed = ", ".join(f"{count} {what}" for what, count in counts.items())
@@ -121,30 +117,9 @@ def _list_images(folder: Path) -> tuple[Path, ...]:
     return found
 
 
-def _read_numbers(path: Path, columns: int) -> np.ndarray:
-    """A table of numbers, [n, columns] float64; comments start with #."""
-    with naming(path):
-        data = read_bytes(path, _MAX_TEXT)
-    rows: list[list[float]] = []
-    for number, raw in enumerate(io.BytesIO(data), start=1):
-        line = raw.decode("utf-8", errors="replace")
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        if len(words) != columns:
-            raise FormatError(path, f"line {number} has {len(words)} numbers, not {columns}")
-        try:
-            rows.append([float(word) for word in words])
-        except ValueError as error:
-            raise FormatError(path, f"line {number}: {error!s:.200}") from None
-    if not rows:
-        raise FormatError(path, "the file holds no numbers")
-    return np.asarray(rows)
-
-
 def _read_camera(path: Path, first_image: Path) -> Camera:
     """Intrinsics from K.txt, the size from the first image."""
-    K = _read_numbers(path, columns=3)
+    K = read_numbers(path, columns=3)
     if K.shape != (3, 3) or not np.all(np.isfinite(K)):
         raise FormatError(path, "expected a finite 3x3 matrix")
     with naming(first_image):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from r3jax.cli import benchmark, evaluate, explore, merge, options, replay, train
+from r3jax.cli import audit, benchmark, evaluate, explore, merge, options, replay, train
 from r3jax.cli.main import main
 from r3jax.evaluation import revisits
 from r3jax.exploration.config import ExplorationConfig
@@ -62,6 +62,8 @@ COMMANDS = (
     ("replay", "run"),
     ("merge", "run", "run", "--out", "out"),
     ("export", "run", "--format", "colmap", "--out", "out"),
+    ("audit", "recording", "--out", "out", "--voxel-size", "0.1"),
+    ("audit", "run", "--path", "recording", "--views", "3"),
 )
 
 OPTIONS = {
@@ -70,6 +72,7 @@ OPTIONS = {
         "info": options.Info, "policies": options.Policies, "explore": options.Explore,
         "train": options.Train, "evaluate": options.Evaluate, "benchmark": options.Benchmark,
         "replay": options.Replay, "merge": options.Merge, "export": options.Export,
+        "audit": options.Audit,
     }.items()
 }  # fmt: skip
 """The options of each command."""
@@ -176,6 +179,7 @@ def with_work_left_out() -> None:
     def begin(*_: Any, **__: Any) -> Any:
         raise Begun
 
+    audit.audit = begin
     explore.explore = begin
     train.train.fit = begin
     evaluate.judge = begin

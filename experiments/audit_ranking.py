@@ -1,0 +1,282 @@
+"""Does an audit know which views a model will fail at? Every frame of a capture, held out once.
+
+    python -m experiments.audit_ranking ../shared/recordings/hololens_lounge
+    python -m experiments.audit_ranking runs/flat-ours-pano-seed0
+
+The frames are dealt into folds; for each fold a vanilla 3DGS is trained on the others and judged
+on its frames, and the audit judges the same frames by a map of the same others. Neither has seen
+what it is asked about.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from scipy import stats
+
+from experiments.artefacts import (
+    Origin,
+    command_line,
+    markdown_table,
+    write_csv,
+    write_figure,
+    write_markdown,
+)
+from r3jax.audit.audit import Audit, audit
+from r3jax.audit.colors import COLOR_OF_CAUSE
+from r3jax.audit.source import source_of
+from r3jax.audit.survey import Wishes
+from r3jax.benchmark.record import machine, source_commit
+from r3jax.cli.captures import Capture, open_capture
+from r3jax.evaluation import style
+from r3jax.evaluation.judge import judge
+from r3jax.evaluation.statistics import partial_spearman, spearman
+from r3jax.files import write_atomic
+from r3jax.splatting.train import fit
+from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.views import Views, load_views
+
+NAME = "audit_ranking"
+
+PERMUTATIONS = 10_000
+"""Orders at random that the coefficient is held against."""
+
+WORST = 0.25
+"""Share of the frames that count as the worst."""
+
+SCORES = ("renderability", "coverage", "bias", "noise", "resolution", "nearness")
+"""What may rank the frames; the first is the audit's answer, the last a rule of thumb."""
+
+ERRORS = ("psnr", "psnr_corrected", "ssim")
+"""What they are ranked by."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare."""
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """A run or a recording with depth."""
+
+    folds: int = 8
+    """Models to train."""
+
+    iterations: int = 1500
+    """Steps of each training."""
+
+    resolution: int = 160
+    """Longer side of the images that are trained on and judged [px]."""
+
+    gaussians: int = 20_000
+    """At the start of each training; there may be twice as many."""
+
+    out: Path = Path("experiments/results")
+    """Folder of the results."""
+
+
+def main(options: Options) -> Path:
+    """Audits, trains, compares, and returns the folder of the results."""
+    capture = open_capture(options.capture, "z")
+    folder = options.out / NAME / capture.name
+    rows = [row for fold in range(options.folds) for row in finished_rows(folder, fold, options)]
+    if len(rows) < len(capture):
+        rows = all_rows(capture, folder, options)
+    source = Origin(command_line(f"experiments.{NAME}"), machine(), source_commit() or "unknown")
+    write_page(folder, capture, sorted(rows, key=lambda row: row["frame"]), options, source)
+    print(f"results  {folder}")
+    return folder
+
+
+def all_rows(capture: Capture, folder: Path, options: Options) -> list[dict[str, Any]]:
+    """A row for each frame; folds that are done are not done again."""
+    everything = Wishes(folds=options.folds, num_views=0, max_frames=len(capture))
+    found = audit(source_of(capture.source, capture.name), everything)
+    views = load_views(capture.frames(), options.resolution)
+    rows: list[dict[str, Any]] = []
+    for fold in range(len(found.seen.folds)):
+        done = finished_rows(folder, fold, options)
+        if not done:
+            done = fold_rows(found, views, fold, options)
+            (folder / "folds").mkdir(parents=True, exist_ok=True)
+            record = {"settings": settings(options), "rows": done}
+            write_atomic(folder / "folds" / f"{fold}.json", json.dumps(record, indent=1).encode())
+        rows += done
+        print(f"fold {fold + 1} of {len(found.seen.folds)}", flush=True)
+    return rows
+
+
+def finished_rows(folder: Path, fold: int, options: Options) -> list[dict[str, Any]]:
+    """The rows of a fold that an earlier call with the same settings has left; else none."""
+    path = folder / "folds" / f"{fold}.json"
+    if not path.exists():
+        return []
+    record = json.loads(path.read_bytes())
+    return record["rows"] if record["settings"] == settings(options) else []
+
+
+def settings(options: Options) -> dict[str, Any]:
+    """What a fold depends on."""
+    names = ("folds", "iterations", "resolution", "gaussians")
+    return {name: getattr(options, name) for name in names}
+
+
+def fold_rows(found: Audit, views: Views, fold: int, options: Options) -> list[dict[str, Any]]:
+    """A row for each frame of a fold: what the audit said, and how the render came out."""
+    is_out = found.seen.fold_of == fold
+    held_out, kept = np.flatnonzero(is_out), np.flatnonzero(~is_out)
+    config = TrainConfig(iterations=options.iterations, num_gaussians=options.gaussians)
+    scene = fit(views.take(kept), config).scene
+    test = views.take(held_out)
+    judgment = judge(scene, test, numbers=held_out.tolist())
+    near = nearness(found.source.poses, held_out, kept)
+    rows: list[dict[str, Any]] = []
+    for i, number in enumerate(held_out.tolist()):
+        frame, row = found.frames[number], judgment.rows[i]
+        truth = np.asarray(test.rgb[i])
+        rows.append(
+            {
+                "frame": number,
+                "fold": fold,
+                "renderability": frame.score.renderability,
+                "coverage": frame.score.coverage,
+                "bias": frame.score.bias,
+                "noise": frame.score.noise,
+                "resolution": frame.score.resolution,
+                "nearness": float(near[i]),
+                "cause": frame.score.cause,
+                "psnr": row.psnr,
+                "psnr_corrected": corrected_psnr(judgment.renders[i], truth),
+                "ssim": row.ssim,
+            }
+        )
+    return rows
+
+
+def nearness(poses: np.ndarray, asked: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Minus the distance to the nearest other camera; a radian between axes counts one unit."""
+    places, axes = poses[:, :3, 3], poses[:, :3, 2]
+    distance = np.linalg.norm(places[asked][:, None] - places[others][None], axis=-1)
+    cosine = np.clip(axes[asked] @ axes[others].T, -1.0, 1.0)
+    return -(distance + np.arccos(cosine)).min(axis=1)
+
+
+def corrected_psnr(render: np.ndarray, truth: np.ndarray) -> float:
+    """PSNR once each channel was multiplied and shifted to fit the truth best.
+
+    A camera that changes its exposure makes every render wrong, however well it was seen.
+
+    Args:
+        render: [H, W, 3] uint8.
+        truth: [H, W, 3] uint8.
+    """
+    squares: list[float] = []
+    for channel in range(3):
+        x, y = (image[..., channel].reshape(-1) / 255.0 for image in (render, truth))
+        design = np.stack([x, np.ones_like(x)], axis=1)
+        gain = np.linalg.lstsq(design, y, rcond=None)[0]
+        squares.append(float(np.mean((design @ gain - y) ** 2)))
+    return float(-10.0 * np.log10(max(np.mean(squares), 1e-10)))
+
+
+def permutation_p(score: np.ndarray, error: np.ndarray, seed: int = 0) -> float:
+    """Share of random orders whose Spearman coefficient is at least that of the true one."""
+    rank, other = stats.rankdata(score), stats.rankdata(error)
+    rank, other = rank - rank.mean(), other - other.mean()
+    rng = np.random.default_rng(seed)
+    drawn = np.array([rng.permutation(rank) @ other for _ in range(PERMUTATIONS)])
+    return float((1 + np.sum(drawn >= rank @ other - 1e-9)) / (1 + PERMUTATIONS))
+
+
+def shift_p(score: np.ndarray, error: np.ndarray) -> float:
+    """The same over circular shifts: neighbors of a video resemble each other in both columns."""
+    rank, other = stats.rankdata(score), stats.rankdata(error)
+    rank, other = rank - rank.mean(), other - other.mean()
+    products = np.array([np.roll(rank, k) @ other for k in range(len(rank))])
+    return float(np.mean(products >= products[0] - 1e-9))
+
+
+def worst_found(score: np.ndarray, error: np.ndarray) -> tuple[int, int]:
+    """Of the worst quarter by error, how many are in the worst quarter by score; and how many."""
+    count = max(1, round(WORST * len(score)))
+    worst = lambda x: set(np.argsort(x, kind="stable")[:count].tolist())
+    return len(worst(score) & worst(error)), count
+
+
+def comparison_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Spearman of every score with every error, with intervals."""
+    column = lambda name: np.array([row[name] for row in rows])
+    table: list[dict[str, Any]] = []
+    for score in SCORES:
+        line: dict[str, Any] = {"score": score}
+        for error in ERRORS:
+            r = spearman(column(score), column(error))
+            line[error] = f"{r.value:.2f} [{r.low:.2f}, {r.high:.2f}]"
+        table.append(line)
+    line = {"score": "renderability given coverage"}
+    for error in ERRORS:
+        r = partial_spearman(column("renderability"), column(error), [column("coverage")])
+        line[error] = f"{r.value:.2f} [{r.low:.2f}, {r.high:.2f}]"
+    return [*table, line]
+
+
+def write_page(
+    folder: Path, capture: Capture, rows: list[dict[str, Any]], options: Options, source: Origin
+) -> None:
+    """Writes the rows, the picture and the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "frames.csv", rows, source)
+    write_figure(folder / "ranking.png", ranking_figure(rows), source)
+    score = np.array([row["renderability"] for row in rows])
+    lines: list[str] = []
+    for error in ERRORS:
+        value = np.array([row[error] for row in rows])
+        hits, count = worst_found(score, value)
+        chance = count * count / len(rows)
+        lines.append(
+            f"- {error}: Spearman {spearman(score, value).value:.2f}; a random order does as well "
+            f"with p = {permutation_p(score, value):.4f}, a circular shift of the sequence with "
+            f"p = {shift_p(score, value):.3f}. Of the {count} worst renders {hits} are among the "
+            f"{count} frames that the audit calls worst (by chance {chance:.1f})."
+        )
+        print(lines[-1])
+    page = [
+        f"# Audit against held-out renders: {capture.name}",
+        f"{len(rows)} frames in {options.folds} folds; per fold a vanilla 3DGS of the other frames "
+        f"({options.iterations} steps, {options.resolution} px) and a map of the same others. "
+        "*psnr_corrected*: each channel of a render is first multiplied and shifted to fit the "
+        "truth best, which takes changes of exposure away. *nearness*: minus the distance to the "
+        "nearest training camera.",
+        "\n".join(lines),
+        "Spearman with 95 % bootstrap intervals over frames (neighboring frames resemble each "
+        "other, so the intervals are too narrow):",
+        markdown_table(comparison_rows(rows)),
+        "![ranking](ranking.png)",
+    ]
+    write_markdown(folder / f"{NAME}.md", page, source)
+
+
+def ranking_figure(rows: list[dict[str, Any]]) -> Figure:
+    """Renderability against PSNR, a dot a frame; and both along the capture."""
+    figure = style.new_figure(10.0, 3.8)
+    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.5])
+    score, psnr, frames = (
+        np.array([row[name] for row in rows]) for name in ("renderability", "psnr", "frame")
+    )
+    colors = [COLOR_OF_CAUSE[row["cause"]] for row in rows]
+    style.dress(left, "Each frame, held out", "renderability by the audit", "PSNR [dB]")
+    left.scatter(score, psnr, c=colors, s=22)
+    style.dress(right, "Along the capture", "frame", "PSNR [dB]")
+    right.plot(frames, psnr, color=style.ACCENT, marker="o", markersize=3, label="PSNR")
+    beside = right.twinx()
+    beside.plot(frames, score, color=style.SECOND, marker="o", markersize=3)
+    beside.set_ylabel("renderability", fontsize=9, color=style.SECOND)
+    beside.tick_params(labelsize=8, colors=style.MUTED)
+    return figure
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

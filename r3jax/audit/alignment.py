@@ -1,0 +1,118 @@
+"""From a capture's own coordinates to those in which it is audited, and back.
+
+The map, the free space and the standpoints need z up and lengths of a room's size; a capture has
+whatever its program gave it. A similarity leads from the one to the other:
+
+    x_audit = scale * rotation @ (x_capture - origin)
+
+Everything that leaves the audit goes back through it.
+
+Shape symbols: n points or poses.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_SNAP = 8.0
+"""An estimated vertical this near to an axis is that axis [deg]."""
+
+_WEAK = 1e-3
+"""Weight of the cameras' own up where their rows do not say (all of them parallel)."""
+
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+"""Names of the axes; `-y` is the opposite of `y`."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A similarity between two right-handed worlds."""
+
+    rotation: np.ndarray
+    """Takes the capture's directions to the audit's, [3, 3] float64."""
+
+    scale: float
+    """Length in the audit of one unit of the capture."""
+
+    origin: np.ndarray
+    """Where the audit's origin lies in the capture, [3] float64."""
+
+    def points(self, points_capture: np.ndarray) -> np.ndarray:
+        """Points [n, 3] of the capture, in the audit."""
+        return self.scale * (points_capture - self.origin) @ self.rotation.T
+
+    def points_back(self, points_audit: np.ndarray) -> np.ndarray:
+        """Points [n, 3] of the audit, in the capture: inverse of `points`."""
+        return points_audit.astype(np.float64) @ self.rotation / self.scale + self.origin
+
+    def poses(self, poses_capture: np.ndarray) -> np.ndarray:
+        """`T_world_camera` [n, 4, 4] of the capture, in the audit; they stay rigid."""
+        moved = poses_capture.astype(np.float64)
+        moved[:, :3, :3] = self.rotation @ moved[:, :3, :3]
+        moved[:, :3, 3] = self.points(moved[:, :3, 3])
+        return moved
+
+    def poses_back(self, poses_audit: np.ndarray) -> np.ndarray:
+        """`T_world_camera` [n, 4, 4] of the audit, in the capture: inverse of `poses`."""
+        moved = poses_audit.astype(np.float64)
+        moved[:, :3, :3] = self.rotation.T @ moved[:, :3, :3]
+        moved[:, :3, 3] = self.points_back(moved[:, :3, 3])
+        return moved
+
+    def directions_back(self, directions_audit: np.ndarray) -> np.ndarray:
+        """Directions [n, 3] of the audit, in the capture."""
+        return directions_audit.astype(np.float64) @ self.rotation
+
+
+def up_of(name: str) -> np.ndarray:
+    """The unit vector [3] of an axis' name, such as `y` or `-z`.
+
+    Raises:
+        ValueError: no such axis.
+    """
+    axis = name.removeprefix("-")
+    if axis not in AXES:
+        raise ValueError(f"up must be one of x, y, z, -x, -y, -z, got {name!r}")
+    return (-1.0 if name.startswith("-") else 1.0) * np.asarray(AXES[axis])
+
+
+def estimated_up(poses: np.ndarray) -> np.ndarray:
+    """The vertical of a capture that was held upright, [3], unit length.
+
+    Whoever holds a camera tilts it up and down and turns round, but keeps its rows level: the
+    vertical is what all rows x_i are perpendicular to. With m the mean of the cameras' own up,
+
+        up ~ (mean x_i x_i^T + w I)^-1 m
+
+    which is m itself where the rows say nothing. A result within 8 degrees of an axis is the axis.
+
+    Args:
+        poses: `T_world_camera`, [n, 4, 4], n >= 1.
+    """
+    rows, mean = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
+    level = rows.T @ rows / len(rows) + _WEAK * np.eye(3)
+    up = np.linalg.solve(level, mean)
+    length = np.linalg.norm(up)
+    if not length > 1e-9:  # as many cameras upside down as upright
+        return np.asarray(AXES["z"])
+    up /= length
+    axis = int(np.argmax(np.abs(up)))
+    if np.degrees(np.arccos(min(abs(up[axis]), 1.0))) <= _SNAP:
+        return np.sign(up[axis]) * np.eye(3)[axis]
+    return up
+
+
+def rotation_to_z(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation [3, 3] that takes a unit vector [3] to z; from -z, half a turn about x.
+
+    Rodrigues: with v = up x z and c = <up, z>, R = I + [v] + [v]^2 / (1 + c).
+    """
+    x, y, c = (float(value) for value in up)
+    if c < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    K = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    R = np.eye(3) + K + K @ K / (1.0 + c)
+    u, _, vt = np.linalg.svd(R)
+    exact = u @ vt
+    whole = np.round(exact)  # axes stay axes, without rounding
+    return whole if np.abs(whole - exact).max() < 1e-12 else exact

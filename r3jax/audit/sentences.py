@@ -1,0 +1,181 @@
+"""What an audit says in words: on the page and on the console."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from r3jax.audit.alignment import AXES
+from r3jax.audit.audit import NUM_STANDPOINTS, Audit
+from r3jax.audit.diagnosis import FEW, FINE
+from r3jax.audit.suggest import DIRECTIONS, Suggestion
+
+MEANING = {
+    "fine": f"R of at least {FINE:g} for those who stand about",
+    "angle": "seen, but only from directions far from those in which one would look at it",
+    "rare": f"seen from fewer than {FEW} directions",
+    "distance": "only seen from farther away than one would look at it",
+    "noise": "its color differs from picture to picture: reflections, exposure, poses that are off",
+    "unseen": "free space ends there in something that no picture shows",
+}
+"""Of every cause, for the table."""
+
+REMEDY = {
+    "fine": "",
+    "angle": "go round it: pictures from the missing sides",
+    "rare": "look there again, from several places",
+    "distance": "go nearer",
+    "noise": "lock exposure and white balance; avoid reflections; check the poses",
+    "unseen": "look into it, if it belongs to the place",
+}
+"""What one can do."""
+
+_SHORT = {
+    "angle": "only from other angles",
+    "rare": "too rarely",
+    "distance": "only from too far away",
+    "noise": "in contradictory colors",
+}
+
+_ORDINARY = ("angle", "rare", "distance", "noise")
+
+
+def length(audit: Audit, in_audit: float) -> str:
+    """A length of the audit, in the capture's units."""
+    return f"{audit.survey.length(in_audit):.3g} {audit.survey.unit}"
+
+
+def area(audit: Audit, in_audit: float) -> str:
+    """An area of the audit, in the capture's units."""
+    value = in_audit * audit.survey.length(1.0) ** 2
+    return f"{value:.3g} {audit.survey.unit}²"
+
+
+def point(position: np.ndarray) -> str:
+    """Coordinates, to be read."""
+    return ", ".join(f"{value:.2f}" for value in position)
+
+
+def verdict(audit: Audit) -> list[str]:
+    """What the audit comes to, a sentence each."""
+    found, plan = audit.diagnosis, audit.plan
+    shares = {cause: found.share(cause) for cause in _ORDINARY}
+    ordered = sorted(shares, key=lambda cause: -shares[cause])
+    parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
+    sentences = [
+        f"{100 * found.fine_share:.0f} % of the surface that one sees from where people could "
+        f"stand would render well (R ≥ {FINE:g})" + (f"; {_list(parts)}." if parts else ".")
+    ]
+    if audit.unseen:
+        sentences.append(
+            f"Free space ends in about {area(audit, audit.unseen_area)} that no picture shows."
+        )
+    mean = float(audit.renderability.mean())
+    worst = min(audit.frames, key=lambda frame: frame.score.renderability)
+    what = "A frame of this capture" if audit.is_own_path else "A frame of the path"
+    sentences.append(
+        f"{what} has a renderability of {mean:.2f} on average, the worst ({worst.label}) "
+        f"{worst.score.renderability:.2f}."
+    )
+    if plan.views:
+        drawn = f"; as many at random places {plan.random_mean[-1]:.2f}"
+        sentences.append(
+            f"{len(plan.views)} further views would raise the mean over all surfaces from "
+            f"{found.mean:.2f} to {plan.after.mean:.2f}, as far as it can be foreseen{drawn}."
+        )
+    return sentences
+
+
+def _list(parts: list[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
+    """Why a view is suggested."""
+    face = audit.survey.voxel_size**2
+    parts: list[str] = []
+    total = sum(view.causes.values())
+    if view.num_mended:
+        parts.append(f"makes about {area(audit, view.num_mended * face)} render well")
+    if total:
+        named = sorted(view.causes, key=lambda cause: -view.causes[cause])
+        shares = [f"{100 * view.causes[c] / total:.0f} % {c}" for c in named]
+        parts.append(
+            f"of {area(audit, total * face)} in sight that do not yet: {', '.join(shares)}"
+        )
+    if view.unseen_cells:
+        cells = area(audit, view.unseen_cells * audit.survey.cell_size**2)
+        parts.append(f"looks into about {cells} that no picture shows")
+    names = list(letters)
+    if names:
+        parts.append(f"regions {', '.join(names)}" if len(names) > 1 else f"region {names[0]}")
+    return "; ".join(parts) or "adds a direction to what it shows"
+
+
+def method(audit: Audit) -> list[str]:
+    """How the numbers came about, a sentence or two each."""
+    survey, source = audit.survey, audit.source
+    depth = {
+        "depth": "depth images",
+        "tracks": "the points whose tracks name the picture",
+        "cloud": "the cloud's points that no nearer one hides",
+    }[source.kind]
+    up = survey.alignment.directions_back(np.array([[0.0, 0.0, 1.0]]))[0]
+    sentences = [
+        f"{len(survey.chosen)} of {len(source)} pictures, every {_ordinal(source.stride)} pixel "
+        f"along rows and columns; depth from {depth}.",
+        f"Voxels of {length(audit, survey.voxel_size)}, cells of free space of "
+        f"{length(audit, survey.cell_size)}, visible up to {length(audit, 5.0)}; the depths have "
+        f"the median {survey.median_depth:.3g} {survey.unit} and the 95th percentile "
+        f"{survey.far_depth:.3g} {survey.unit}, and the sizes follow from them where they are not "
+        "given.",
+        f"Up is {_up_name(up)} of the capture.",
+        "Renderability R (arXiv 2601.07484) of a surface for a place to look from is bias × noise "
+        "× resolution: the angle to the nearest direction it was seen from, the consistency of "
+        "its color, and the best distance it was seen from.",
+        f"Surfaces: every voxel is asked from those of {min(NUM_STANDPOINTS, len(audit.places))} "
+        "standpoints that see it, with the camera of most pictures; its numbers are the means. "
+        "Areas count a face of a voxel each.",
+    ]
+    if audit.is_own_path:
+        count = len(audit.seen.folds)
+        sentences.append(
+            f"Frames: the capture's own, each judged by a map without every {_ordinal(count)} "
+            "picture, itself among them: what a model trained without these would have to invent. "
+            "R of a frame is the mean over its pixels; one that shows no voxel counts 0."
+        )
+    else:
+        sentences.append(
+            "Frames: the path's, judged by the map of all pictures. R of a frame is the mean over "
+            "its pixels; one that shows no voxel counts 0."
+        )
+    where = (
+        f"in space known to be free, {length(audit, 0.3)} from everything else, connected to where "
+        "the camera was and at its heights"
+        if source.is_dense
+        else f"within the hull of the camera's positions and {length(audit, 0.3)} round it, "
+        f"{length(audit, 0.3)} from every voxel"
+    )
+    sentences.append(
+        f"Views: the {DIRECTIONS} best directions of each of {len(audit.places)} places {where}; "
+        "of all these the one that raises the renderability of all surfaces most is imagined as "
+        "taken before the next one is chosen. What cannot be foreseen: surfaces that nobody has "
+        "seen, and colors."
+    )
+    if not source.is_metric:
+        sentences.append("Nobody knows what a unit of this capture is: u stands for one.")
+    if not source.has_images:
+        sentences.append("The images are missing: nothing can be said about noise.")
+    return sentences
+
+
+def _ordinal(count: int) -> str:
+    if 10 <= count % 100 <= 20:
+        return f"{count}th"
+    return f"{count}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(count % 10, 'th') }"
+
+
+def _up_name(up: np.ndarray) -> str:
+    best = int(np.argmax(np.abs(up)))
+    if abs(up[best]) > 0.9999:
+        return ("-" if up[best] < 0.0 else "") + list(AXES)[best]
+    return f"({point(up)})"

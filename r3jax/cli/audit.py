@@ -1,0 +1,173 @@
+"""`r3jax audit`: what a capture lacks, how its frames would render, which views would help."""
+
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.table import Table
+
+from r3jax.audit import sentences
+from r3jax.audit.audit import Audit, audit
+from r3jax.audit.camera_paths import CameraPath, is_camera_path, read_camera_path
+from r3jax.audit.ground_plan import letter
+from r3jax.audit.outputs import suggested_poses, write_outputs
+from r3jax.audit.report import write_report
+from r3jax.audit.source import source_of
+from r3jax.audit.survey import Wishes
+from r3jax.cli.captures import open_capture
+from r3jax.cli.console import PLAIN
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import Audit as Options
+from r3jax.formats.captures import PosedImages
+from r3jax.formats.errors import FormatError
+from r3jax.formats.lenses import pinhole_lens
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run
+
+_SHOWN = 5
+"""Regions that the console lists."""
+
+
+def run_audit(options: Options) -> int:
+    """Audits a capture and writes the report and what belongs to it.
+
+    Raises:
+        UserError: not a capture, a broken one, one that says nothing of depth; a setting that
+            makes no sense; a folder that holds something else; a disk that is full.
+    """
+    progress = Console(stderr=True)
+    try:
+        capture = open_capture(options.capture, "z")
+        folder = options.out or Path("runs") / "audit" / capture.name
+        _check_folder(folder)
+        path = None if options.path is None else _read_path(options.path)
+        source = source_of(capture.source, str(options.capture))
+        with Stages(progress) as stages:
+            found = audit(source, _wishes(options), path, stages.on_progress)
+            folder.mkdir(parents=True, exist_ok=True)
+            stages.on_progress("writing the report", 0)
+            written = write_outputs(found, folder)
+            page = write_report(found, folder, written.values())
+    except (ValueError, OSError, RunError, FormatError) as error:
+        raise UserError(one_line(error)) from error
+    _show(Console(), found, {"report": page, **written})
+    return 0
+
+
+def _wishes(options: Options) -> Wishes:
+    return Wishes(
+        voxel_size=options.voxel_size,
+        max_range=options.max_range,
+        up=options.up,
+        max_frames=options.max_frames,
+        folds=options.folds,
+        num_views=options.views,
+        seed=options.seed,
+    )
+
+
+def _check_folder(folder: Path) -> None:
+    """Only an earlier audit is replaced."""
+    if "\0" in str(folder):
+        raise UserError("--out: this cannot be the name of a folder")
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: this is a file, --out is a folder")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "audit.json").exists():
+        raise UserError(f"{folder} holds something that is no audit: give another --out")
+
+
+def _read_path(path: Path) -> CameraPath:
+    """The poses of a camera path or of a capture."""
+    if is_camera_path(path):
+        return read_camera_path(path)
+    source = open_capture(path, "z").source
+    if isinstance(source, PosedImages):
+        return CameraPath(source.poses, source.lenses)
+    if isinstance(source, Run):
+        if not source.rows:
+            raise UserError(f"{path}: the run has no views yet: there is no path to judge")
+        poses = np.stack([row.pose for row in source.rows]).astype(np.float64)
+    else:
+        poses = source.poses
+    return CameraPath(poses, (pinhole_lens(source.camera),) * len(poses))
+
+
+class Stages:
+    """A bar on a terminal, a line for each stage in a log."""
+
+    def __init__(self, console: Console):
+        """Shows nothing before it is entered."""
+        self._console = console
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=None)
+
+    def on_progress(self, stage: str, steps: int) -> None:
+        """A stage begins, or one of its steps is done (no name)."""
+        if not stage:
+            self._bar.advance(self._task, steps)
+            return
+        self._bar.reset(self._task, description=stage, total=max(steps, 1))
+        if not self._console.is_terminal:
+            self._console.print(stage, **PLAIN)
+
+    def __enter__(self) -> "Stages":
+        """Shows the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Takes the bar down."""
+        self._bar.stop()
+
+
+def _show(console: Console, found: Audit, written: dict[str, Path]) -> None:
+    for sentence in sentences.verdict(found):
+        console.print(sentence, highlight=False, markup=False)
+    if found.regions:
+        console.print(_regions(found))
+    if found.plan.views:
+        console.print(_views(found))
+    for what, path in written.items():
+        console.print(f"{what}  {path}", **PLAIN)
+
+
+def _regions(found: Audit) -> Table:
+    table = Table(title="Where it is worst", title_justify="left", title_style="bold", box=None)
+    for name in ("", "mostly"):
+        table.add_column(name)
+    for name in ("bad", "R", "middle (x, y, z)"):
+        table.add_column(name, justify="right")
+    for number, region in enumerate(found.regions[:_SHOWN]):
+        center = found.survey.alignment.points_back(region.center[None])[0]
+        table.add_row(
+            letter(number),
+            region.cause,
+            sentences.area(found, region.area),
+            f"{region.renderability:.2f}",
+            sentences.point(center),
+        )
+    return table
+
+
+def _views(found: Audit) -> Table:
+    table = Table(title="Views to take", title_justify="left", title_style="bold", box=None)
+    for name in ("", "from (x, y, z)", "towards", "mean R then"):
+        table.add_column(name, justify="right")
+    table.add_row("0", "", "", f"{found.diagnosis.mean:.3f}")
+    poses = suggested_poses(found)
+    for number, (view, pose) in enumerate(zip(found.plan.views, poses, strict=True), start=1):
+        table.add_row(
+            str(number),
+            sentences.point(pose[:3, 3]),
+            sentences.point(pose[:3, 2]),
+            f"{view.mean_after:.3f}",
+        )
+    return table

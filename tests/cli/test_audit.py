@@ -1,0 +1,152 @@
+"""`r3jax audit`, as a user meets it, on a small room in every format."""
+
+import json
+
+import numpy as np
+import pytest
+
+from r3jax.audit.camera_paths import write_camera_path
+from r3jax.cli.captures import open_capture
+from r3jax.cli.main import main
+from r3jax.formats.nerfstudio import read_transforms
+from tests.audit.room import (
+    LENS,
+    pose_at,
+    round_poses,
+    write_colmap,
+    write_nerfstudio,
+    write_recording,
+)
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    """The same room as a recording, with depth for nerfstudio, and as a COLMAP model."""
+    folder = tmp_path_factory.mktemp("captures")
+    write_recording(folder / "recording", round_poses())
+    write_nerfstudio(folder / "nerfstudio", round_poses(), depth=True)
+    write_colmap(folder / "colmap", round_poses(), scale=3.0)
+    return folder
+
+
+def audit(capture, out, *words):
+    options = ("--views", "2", "--folds", "4", "--out", str(out))
+    return main(["audit", str(capture), *options, *words])
+
+
+@pytest.fixture(scope="module")
+def audited(captures, tmp_path_factory):
+    out = tmp_path_factory.mktemp("audits") / "room"
+    assert audit(captures / "recording", out, "--voxel-size", "0.1") == 0
+    return out
+
+
+def test_an_audit_leaves_a_page_clouds_cameras_and_numbers(audited):
+    names = {path.name for path in audited.iterdir()}
+    assert names == {
+        "report.html", "voxels.ply", "causes.ply", "suggested.json", "suggested_transforms.json",
+        "audit.json",
+    }  # fmt: skip
+    record = json.loads((audited / "audit.json").read_text())
+    assert record["voxel_size"] == pytest.approx(0.1)
+    assert [frame["fold"] for frame in record["path"]["frames"]] == [0, 1, 2, 3] * 4
+    assert len(record["suggested"]) == 2
+    page = (audited / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 6
+    assert "http://" not in page
+    assert "https://" not in page
+    for word in ("Where it is worst", "Which views would help most", "region"):
+        assert word in page
+
+
+def test_the_suggested_views_are_a_capture_that_our_reader_opens(audited):
+    record = json.loads((audited / "audit.json").read_text())
+    images = read_transforms(audited / "suggested_transforms.json")
+    written = [view["camera_to_world_opengl"] for view in record["suggested"]]
+    np.testing.assert_array_equal(images.poses @ np.diag([1.0, -1, -1, 1]), written)
+    assert (images.lenses[0].width, images.lenses[0].height) == (LENS.width, LENS.height)
+
+
+def test_the_same_words_give_the_same_numbers(captures, audited, tmp_path):
+    assert audit(captures / "recording", tmp_path / "again", "--voxel-size", "0.1") == 0
+    for name in ("audit.json", "suggested_transforms.json", "voxels.ply"):
+        assert (tmp_path / "again" / name).read_bytes() == (audited / name).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["nerfstudio", "nerfstudio/transforms.json", "colmap"])
+def test_other_formats_are_audited(captures, tmp_path, name, capsys):
+    assert audit(captures / name, tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    assert "would render well" in said
+    assert "Views to take" in said
+    record = json.loads((tmp_path / "out" / "audit.json").read_text())
+    assert record["depth_from"] == ("tracks" if name == "colmap" else "depth")
+    assert record["unit"] == ("unknown" if name == "colmap" else "metre")
+    positions = np.array([v["camera_to_world_opengl"] for v in record["suggested"]])[:, :3, 3]
+    assert (positions > 0).all()
+    assert (positions < (3.0 if name == "colmap" else 1.0) * np.array([4.0, 3.0, 2.4])).all()
+
+
+def test_a_given_path_is_judged_frame_by_frame(captures, tmp_path, capsys):
+    poses = np.stack([pose_at([1.5, 1.5, 1.2], t) for t in ([4, 1, 1], [2, 3, 1], [0, 0, 2])])
+    write_camera_path(tmp_path / "path.json", poses, LENS.camera)
+    known = [str(tmp_path / "path.json"), str(captures / "recording")]
+    for path, count in zip(known, (3, 16), strict=True):
+        out = tmp_path / f"out{count}"
+        assert audit(captures / "recording", out, "--path", path, "--views", "0") == 0
+        record = json.loads((out / "audit.json").read_text())
+        assert record["path"]["own"] is False
+        assert len(record["path"]["frames"]) == count
+        assert not (out / "suggested.json").exists()
+        assert 0.3 < record["path"]["mean"] <= 1.0
+
+
+def refused(capsys, *words):
+    assert main(["audit", *map(str, words)]) == 2
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    return said
+
+
+def test_what_is_no_capture_is_named(captures, tmp_path, capsys):
+    assert "there is no such folder" in refused(capsys, tmp_path / "nowhere")
+    assert "this is neither a run" in refused(capsys, tmp_path)
+    bare = write_nerfstudio(tmp_path / "bare", round_poses(2), depth=False)
+    content = json.loads((bare / "transforms.json").read_text())
+    del content["ply_file_path"]
+    (bare / "transforms.json").write_text(json.dumps(content))
+    assert "neither depth images nor points" in refused(capsys, bare)
+    said = refused(capsys, captures / "recording", "--path", tmp_path / "nowhere.json")
+    assert "no such folder" in said
+
+
+def test_nothing_but_an_audit_is_overwritten(captures, tmp_path, capsys):
+    (tmp_path / "thesis.txt").write_text("precious")
+    said = refused(capsys, captures / "recording", "--out", tmp_path)
+    assert "holds something that is no audit" in said
+    said = refused(capsys, captures / "recording", "--out", tmp_path / "thesis.txt")
+    assert "this is a file" in said
+
+
+def test_settings_without_sense_are_named(captures, tmp_path, capsys):
+    for words, message in (
+        (("--voxel-size", "0"), "--voxel-size must be positive"),
+        (("--voxel-size", "1e-7"), "voxels along an axis"),
+        (("--voxel-size", "30"), "larger than a fifth of the range"),
+        (("--folds", "1"), "--folds must be at least 2"),
+    ):
+        said = refused(capsys, captures / "recording", "--out", tmp_path / "out", *words)
+        assert message in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_picture_is_named(captures, tmp_path, capsys):
+    capture = write_nerfstudio(tmp_path / "holes", round_poses(3), depth=True)
+    (capture / "images" / "001.png").unlink()
+    assert "001.png" in refused(capsys, capture, "--out", tmp_path / "out")
+
+
+def test_the_name_of_a_capture_is_that_of_its_folder(captures):
+    assert open_capture(captures / "nerfstudio" / "transforms.json").name == "nerfstudio"
+    assert open_capture(captures / "colmap").name == "colmap"
+    assert open_capture(captures / "colmap").models.parts == ("runs", "colmap", "models")

@@ -1,0 +1,170 @@
+"""Replica-SLAM, TUM and 7-Scenes: pixels, metres, poses and intrinsics as their pages say."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from r3jax.cli.captures import open_capture
+from r3jax.formats.errors import FormatError
+from r3jax.formats.replica_slam import is_replica_slam, read_replica_slam
+from r3jax.formats.seven_scenes import is_seven_scenes, read_seven_scenes
+from r3jax.formats.tum import is_tum, nearest, read_tum
+from tests.formats import sequences
+from tests.formats.sequences import HEIGHT, NUM, WIDTH, pixels, poses
+from tests.fuzz.tree import lay_out
+
+READERS = {
+    "replica_slam": (is_replica_slam, read_replica_slam),
+    "tum": (is_tum, read_tum),
+    "seven_scenes": (is_seven_scenes, read_seven_scenes),
+}
+
+
+@pytest.fixture(params=READERS)
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def folder(tmp_path, name):
+    path = tmp_path / name
+    lay_out(path, getattr(sequences, name)())
+    return path
+
+
+def test_each_is_told_from_the_others(folder, name):
+    for other, (fits, _) in READERS.items():
+        assert fits(folder) == (other == name)
+        assert not fits(folder / "nowhere")
+    capture = open_capture(folder)
+    images = READERS[name][1](folder)
+    assert capture.source.image_paths == images.image_paths
+    assert len(capture) == len(images)
+
+
+def test_poses_are_camera_to_world_in_opencv_axes(folder, name):
+    images = READERS[name][1](folder)
+    np.testing.assert_allclose(images.poses, poses(len(images)), atol=2e-7)
+
+
+def test_replica_slam_has_its_own_scale_and_its_pixels_count_from_their_centers(tmp_path):
+    lay_out(tmp_path / "room0", sequences.replica_slam())
+    images = read_replica_slam(tmp_path / "room0")
+    assert len(images) == NUM
+    _, steps = pixels(1)
+    np.testing.assert_allclose(images.depth(1), steps / 6553.5, rtol=1e-6)
+    assert images.lenses[0].params == (8.0, 8.0, 5.0, 4.0)
+    assert images.frame(1).rgb.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_the_camera_of_replica_slam_may_lie_beside_the_scene(tmp_path):
+    lay_out(tmp_path / "room0", sequences.replica_slam())
+    (tmp_path / "room0" / "cam_params.json").rename(tmp_path / "cam_params.json")
+    assert read_replica_slam(tmp_path / "room0").lenses[0].width == WIDTH
+
+
+def test_tum_joins_by_time_and_leaves_out_what_has_no_partner(tmp_path):
+    lay_out(tmp_path, sequences.tum())
+    images = read_tum(tmp_path)
+    assert len(images) == NUM  # the last image has no depth
+    assert [p.name for p in images.image_paths] == [f"100.{i}00000.png" for i in range(NUM)]
+    rgb, steps = pixels(2)
+    np.testing.assert_array_equal(images.rgb(2), rgb)
+    np.testing.assert_allclose(images.depth(2), steps / 5000.0, rtol=1e-6)
+
+
+def test_tum_without_k_takes_the_benchmarks_camera_for_its_own_size_only(tmp_path):
+    files = sequences.tum()
+    del files["K.txt"]
+    lay_out(tmp_path, files)
+    with pytest.raises(FormatError, match=r"K\.txt: the file is missing, and the images are 10x8"):
+        read_tum(tmp_path)
+    large = sequences.encoded(np.zeros((480, 640, 3), np.uint8))
+    lay_out(tmp_path, files | {n: large for n in files if n.startswith("rgb/")})
+    assert read_tum(tmp_path).lenses[0].params == (525.0, 525.0, 320.0, 240.0)
+
+
+def test_seven_scenes_has_two_numbers_for_no_measurement(tmp_path):
+    lay_out(tmp_path, sequences.seven_scenes())
+    images = read_seven_scenes(tmp_path)
+    depth = images.frame(0).depth
+    _, steps = pixels(0)
+    assert depth.shape == (480, 640)
+    assert not np.isinf(depth).any()
+    np.testing.assert_array_equal(np.asarray(depth)[30, [32, 96]], 0.0)
+    np.testing.assert_allclose(np.asarray(depth)[30::60, 32::64][1:], steps[1:] / 1000, rtol=1e-6)
+    assert images.lenses[0].params == (585.0, 585.0, 320.0, 240.0)
+
+
+times = hnp.arrays(np.float64, st.integers(1, 12), elements=st.floats(0, 1, width=32))
+
+
+@given(times, times, st.floats(0.0, 0.5))
+def test_the_nearest_in_time_is_taken_unless_it_is_too_far(asked, others, gap):
+    found = nearest(asked, others, gap)
+    distance = np.abs(asked[:, None] - others[None])
+    for i, j in enumerate(found):
+        least = distance[i].min()
+        if j < 0:
+            assert least > gap
+        else:
+            assert distance[i, j] == least <= gap
+
+
+def cut(name, at):
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:at])
+
+
+def put(name, text):
+    return lambda folder: (folder / name).write_text(text)
+
+
+def remove(name):
+    return lambda folder: (folder / name).unlink()
+
+
+DAMAGES = {
+    "replica_slam": {
+        "no pose": (put("traj.txt", ""), r"traj\.txt: the file holds no numbers"),
+        "cut": (cut("traj.txt", 500), r"traj\.txt: line \d has \d+ numbers, not 16"),
+        "fewer": (remove("results/frame000001.jpg"), "2 images, 3 depth images, 3 poses"),
+        "no camera": (remove("cam_params.json"), r"cam_params\.json: the file is missing"),
+        "camera": (put("cam_params.json", '{"camera": {"w": 1}}'), "`camera` lacks cx"),
+        "scale": (
+            lambda f: put("cam_params.json", json.dumps({"camera": dict(
+                w=10, h=8, fx=1, fy=1, cx=1, cy=1, scale=0)}))(f), "scale 0 makes no sense",
+        ),
+    },
+    "tum": {
+        "leads out": (put("rgb.txt", "100.0 ../x.png\n"), r"rgb\.txt: line 1: .*leads out"),
+        "no list": (put("depth.txt", "# nothing\n"), r"depth\.txt: the file lists no pictures"),
+        "word": (put("depth.txt", "now x.png\n"), r"depth\.txt: line 1: could not"),
+        "not finite": (put("depth.txt", "inf x.png\n"), "timestamps that are not finite"),
+        "columns": (put("rgb.txt", "100.0\n"), "line 1 is not a timestamp and a path"),
+        "other time": (put("groundtruth.txt", "7 0 0 0 0 0 0 1\n"), "no image has a depth image"),
+        "quaternion": (
+            put("groundtruth.txt", "100 0 0 0 0 0 0 2\n"), r"pose at 100\.0000 s: .*no unit",
+        ),
+        "far": (put("groundtruth.txt", "100 1e13 0 0 0 0 0 1\n"), "the position is"),
+    },
+    "seven_scenes": {
+        "no pose": (remove("frame-000001.pose.txt"), r"000001\.pose\.txt: the file is missing"),
+        "short": (put("frame-000001.pose.txt", "1 0 0 0\n"), "expected a 4x4 matrix, got 1 lines"),
+        "lost": (
+            put("frame-000000.pose.txt", "\n".join(["nan nan nan nan"] * 4)), "not finite",
+        ),
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "damage"), [(k, d) for k in DAMAGES for d in DAMAGES[k]])
+def test_a_damaged_sequence_is_named(tmp_path, kind, damage):
+    break_it, message = DAMAGES[kind][damage]
+    lay_out(tmp_path / kind, getattr(sequences, kind)())
+    break_it(tmp_path / kind)
+    with pytest.raises(FormatError, match=message):
+        READERS[kind][1](tmp_path / kind)
