@@ -48,7 +48,10 @@ PERMUTATIONS = 10_000
 WORST = 0.25
 """Share of the frames that count as the worst."""
 
-SCORES = ("renderability", "coverage", "bias", "noise", "resolution", "nearness")
+SCORES = (
+    "renderability", "coverage", "renderability of what is known", "bias", "noise", "resolution",
+    "nearness",
+)  # fmt: skip
 """What may rank the frames; the first is the audit's answer, the last a rule of thumb."""
 
 ERRORS = ("psnr", "psnr_corrected", "ssim")
@@ -208,6 +211,8 @@ def worst_found(score: np.ndarray, error: np.ndarray) -> tuple[int, int]:
 
 def comparison_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Spearman of every score with every error, with intervals."""
+    known = "renderability of what is known"
+    rows = [row | {known: row["renderability"] / max(row["coverage"], 1e-9)} for row in rows]
     column = lambda name: np.array([row[name] for row in rows])
     table: list[dict[str, Any]] = []
     for score in SCORES:

@@ -36,8 +36,8 @@ NUM_STANDPOINTS = 24
 """Places from which every surface is judged; the first of the places."""
 
 _WORTH_OF_UNSEEN = 0.05
-"""A cell that nobody has looked at counts as this share of the voxels that it may hide: most of it
-is air. Who audits a capture wants it to render well first, and larger second."""
+"""A cell at the edge of the known counts as this share of the voxels that it may hide: who audits a
+capture wants it to render well first, and larger second."""
 
 _IN_VAIN = 3
 """Unexplored cells that so many pictures looked at in vain (glass, black) are left alone."""
@@ -158,7 +158,7 @@ def audit(
     plan = suggest(
         seen.state, open_grid, task, places, wishes.num_views, seed=wishes.seed, on_view=step
     )
-    edges = unseen_edges(seen.grid, np.asarray(open_grid.unexplored))
+    edges = np.asarray(open_grid.unexplored)
     return Audit(
         source=source,
         survey=survey,
@@ -226,7 +226,7 @@ def _judged(
 def _open_grid(
     source: Source, survey: Survey, seen: Seen, cameras: np.ndarray, config: ScoringConfig
 ) -> OccupancyGrid:
-    """The grid in which only those cells are unexplored that somebody could still look at."""
+    """The grid in which only edges are unexplored: where free space ends in what could be seen."""
     grid = seen.grid
     if not source.is_dense:
         return without_cells(grid, grid.unexplored)
@@ -239,4 +239,6 @@ def _open_grid(
     for index, pose in zip(survey.chosen.tolist(), poses, strict=True):
         T = jnp.asarray(pose, dtype=jnp.float32)
         looks += np.asarray(visible_unexplored(seen.state, grid, source.camera(index), T, config))
-    return mask_unexplorable(grid, reached, looks >= _IN_VAIN)
+    explorable = np.asarray(mask_unexplorable(grid, reached, looks >= _IN_VAIN).unexplored)
+    edges = unseen_edges(grid, explorable)
+    return without_cells(grid, grid.unexplored & ~jnp.asarray(edges))

@@ -32,7 +32,7 @@ FINE = 0.5
 """A voxel whose mean renderability is at least this counts as fine."""
 
 FEW = 3
-"""A voxel that fewer directions have seen was seen too rarely."""
+"""A voxel that was measured in fewer pictures was seen too rarely."""
 
 
 class Demand(eqx.Module):
@@ -145,7 +145,8 @@ def ask(state: MapState, demand: Demand, focal: Float[Array, ""], config: Scorin
         focal: focal length of the camera that would render [px], in the map's unit.
         config: of the closed forms.
     """
-    ids = jnp.arange(demand.position.shape[0], dtype=jnp.int32)
+    # Numbers of the standpoints; candidates are floats to whoever deals them out.
+    ids = jnp.arange(demand.position.shape[0], dtype=jnp.float32)
     part = functools.partial(_answers, voxels_of(state, config.delta), demand, focal, config)
     value, terms, costs = deal(part, ids)
     return Answers(value, jnp.sum(terms, axis=0), jnp.sum(costs, axis=0))
@@ -157,12 +158,13 @@ def _answers(
     demand: Demand,
     focal: Float[Array, ""],
     config: ScoringConfig,
-    ids: Int[Array, " q"],
+    ids: Float[Array, " q"],
 ) -> tuple[Float[Array, "q N"], Float[Array, "q 3 N"], Float[Array, "q 3 N"]]:
     """Values, terms and costs of some of the standpoints."""
     num = voxels.count.shape[0]
 
-    def answer(index: Int[Array, ""]) -> tuple[Array, Array, Array]:
+    def answer(number: Float[Array, ""]) -> tuple[Array, Array, Array]:
+        index = number.astype(jnp.int32)
         position = demand.position[index]
 
         def score(
@@ -205,22 +207,22 @@ def diagnose(state: MapState, demand: Demand, answers: Answers) -> Diagnosis:
         noise=noise,
         resolution=resolution,
         num_directions=directions,
-        cause=cause_of(value, np.asarray(answers.costs), directions),
+        cause=cause_of(value, np.asarray(answers.costs), np.asarray(state.count)),
     )
 
 
-def cause_of(value: np.ndarray, costs: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def cause_of(value: np.ndarray, costs: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Index into `CAUSES` of each voxel, [N]: the dearest term, where the product is not fine.
 
-    A low bias of a voxel that hardly any direction has seen is called rare; of others, angle.
+    A low bias of a voxel that hardly any picture has measured is called rare; of others, angle.
 
     Args:
         value: mean renderability, [N].
         costs: sums of -log of bias, noise and resolution, [3, N].
-        directions: direction bins that have seen the voxel, [N].
+        count: pictures that have measured the voxel, [N].
     """
     dearest = np.argmax(costs, axis=0)
-    of_bias = np.where(directions < FEW, CAUSES.index("rare"), CAUSES.index("angle"))
+    of_bias = np.where(count < FEW, CAUSES.index("rare"), CAUSES.index("angle"))
     of_others = np.where(dearest == 1, CAUSES.index("noise"), CAUSES.index("distance"))
     found = np.where(dearest == 0, of_bias, of_others)
     return np.where(value >= FINE, CAUSES.index("fine"), found)

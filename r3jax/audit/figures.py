@@ -9,13 +9,18 @@ from r3jax.audit.audit import Audit, JudgedFrame
 from r3jax.audit.colors import COLOR_OF_CAUSE
 from r3jax.audit.foresight import foresee
 from r3jax.audit.sight import sight
+from r3jax.audit.suggest import Suggestion
 from r3jax.evaluation import style
 from r3jax.evaluation.pictures import panorama_picture
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.voxels import voxels_of
 
 _FINE_BUFFER = 320
 """Pixels along the longer side of pictures of the map."""
+
+_SAMPLED = 500
+"""Voxels of a view that are looked for in other pictures."""
 
 _EMPTY = 0.93
 """Grey of pixels that show no voxel."""
@@ -67,7 +72,7 @@ def gain_figure(audit: Audit) -> Figure:
 def panorama_strip(audit: Audit, count: int = 3) -> Figure:
     """All directions from some standpoints: colors above, renderability below."""
     standpoints = audit.standpoints[:count]
-    figure = style.new_figure(10.0, 3.15 * len(standpoints))
+    figure = style.new_figure(10.0, 2.55 * len(standpoints))
     grid = figure.subplots(len(standpoints), 2, squeeze=False)
     image = None
     for number, (line, position) in enumerate(zip(grid, standpoints, strict=True), start=1):
@@ -101,9 +106,9 @@ def view_figures(audit: Audit) -> list[Figure]:
         after, _ = foresee(state, audit.camera, pose, audit.config)
         colors, before = _pictures(state, audit, view.pose, fine)
         _, later = _pictures(after, audit, view.pose, fine)
-        nearest, _ = nearest_picture(audit, view.pose)
-        photo, _ = audit.source.read(nearest)
-        named = f"nearest picture: {_short(audit.source.labels[nearest])}"
+        like, _ = likest_picture(audit, view)
+        photo, _ = audit.source.read(like)
+        named = f"the likest so far: {_short(audit.source.labels[like])}"
         figures.append(
             _row((named, photo), ("the map from here", colors), ("R now", before),
                  ("R once it is taken", later))
@@ -139,6 +144,7 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
     for (upper, lower), frame, (shown, value) in zip(grid.T, frames, pictures, strict=False):
         upper.imshow(shown)
         upper.set_title(_short(frame.label), fontsize=8, color=style.MUTED, loc="left", pad=2)
+        lower.set_facecolor("#e5e7eb")
         lower.imshow(value, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
         lower.set_title(
             f"R {frame.score.renderability:.2f}, {frame.score.cause}", fontsize=8,
@@ -147,15 +153,27 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
     return figure
 
 
-def nearest_picture(audit: Audit, pose: np.ndarray) -> tuple[int, float]:
-    """The picture of the capture taken nearest to a pose, and how far away [audit units].
+def likest_picture(audit: Audit, view: Suggestion) -> tuple[int, float]:
+    """The picture with most of what a view shows, and how far away it was taken [audit units].
 
-    A radian between the two directions counts as much as one unit of distance.
+    What hides it is not asked. A radian between the two axes and a unit between the two places
+    cost a tenth of the view each.
     """
     poses = audit.survey.alignment.poses(audit.source.poses[audit.survey.chosen])
-    distance = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
-    angle = np.arccos(np.clip(poses[:, :3, 2] @ pose[:3, 2], -1.0, 1.0))
-    best = int(np.argmin(distance + angle))
+    distance = np.linalg.norm(poses[:, :3, 3] - view.pose[:3, 3], axis=1)
+    angle = np.arccos(np.clip(poses[:, :3, 2] @ view.pose[:3, 2], -1.0, 1.0))
+    centers = np.asarray(voxels_of(audit.seen.state).center, np.float64).T[view.shown]
+    centers = centers[:: max(1, len(centers) // _SAMPLED)]
+    shares: list[float] = []
+    for index, pose in zip(audit.survey.chosen.tolist(), poses, strict=True):
+        camera = audit.source.camera(index)
+        x, y, z = ((centers - pose[:3, 3]) @ pose[:3, :3]).T
+        z_safe = np.where(z > 0.05, z, np.inf)
+        column = float(camera.fx) * x / z_safe + float(camera.cx)
+        row = float(camera.fy) * y / z_safe + float(camera.cy)
+        is_in = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        shares.append(float((is_in & (z > 0.05)).mean()) if len(centers) else 0.0)
+    best = int(np.argmax(np.asarray(shares) - 0.1 * (distance + angle)))
     return int(audit.survey.chosen[best]), float(distance[best])
 
 

@@ -26,6 +26,8 @@ from r3jax.scoring.chunks import for_selected, select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.utility import visible_unexplored
+from r3jax.scoring.views import pinhole_view
+from r3jax.scoring.visibility import candidates_of, depth_buffer
 from r3jax.scoring.voxels import voxels_of
 
 _ENOUGH = 0.95
@@ -55,6 +57,28 @@ def view_gains(
     T = jnp.asarray(poses, dtype=jnp.float32)
     part = functools.partial(_gains, state, grid, demand, answers, camera, config)
     return np.asarray(deal(part, T), np.float64)
+
+
+def view_coverage(
+    state: MapState, camera: Camera, poses: np.ndarray, config: ScoringConfig
+) -> np.ndarray:
+    """Share of the pixels of every view that show a voxel, [C]; arguments as in `view_gains`."""
+    T = jnp.asarray(poses, dtype=jnp.float32)
+    return np.asarray(deal(functools.partial(_coverage, state, camera, config), T), np.float64)
+
+
+@jax.jit
+def _coverage(
+    state: MapState, camera: Camera, config: ScoringConfig, poses: Float[Array, "C 4 4"]
+) -> Float[Array, " C"]:
+    voxels = voxels_of(state, config.delta)
+
+    def share(pose: Float[Array, "4 4"]) -> Float[Array, ""]:
+        view = pinhole_view(camera, pose, config)
+        buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
+        return jnp.mean(buffer.item < state.capacity, dtype=jnp.float32)
+
+    return jax.lax.map(share, poses)
 
 
 @jax.jit

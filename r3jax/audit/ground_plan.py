@@ -4,11 +4,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
+from matplotlib.patheffects import withStroke
 
 from r3jax.audit.alignment import Alignment
 from r3jax.audit.audit import Audit
 from r3jax.audit.colors import COLOR_OF_CAUSE
-from r3jax.audit.regions import BLOCK
+from r3jax.audit.regions import BLOCK, Region
 from r3jax.evaluation import style
 from r3jax.evaluation.pictures import floor_picture
 from r3jax.scoring.voxels import voxels_of
@@ -18,6 +19,11 @@ _HEADROOM = 0.35
 
 _WEDGE = 0.45
 """Length of a suggested view's field of view [audit units]."""
+
+_TOO_NEAR = 0.35
+"""Letters nearer to each other than this would cover each other [audit units]."""
+
+_HALO = withStroke(linewidth=2.0, foreground="white")
 
 _PALE = 0.55
 """How much white covers the colors below marks."""
@@ -36,9 +42,9 @@ def plan_figure(audit: Audit) -> Figure:
     low, high = _used(audit, height)
     size = high - low
     is_wide = size[0] > 1.15 * size[1]
-    figure = style.new_figure(10.0, float(np.clip(20.0 * size[1] / size[0], 7.0, 15.0)))
-    if not is_wide:
-        figure.set_size_inches(10.0, float(np.clip(5.0 * size[1] / size[0] + 0.9, 4.6, 9.0)))
+    panel = 8.6 if is_wide else 4.3  # inches
+    height_of_all = (2.0 if is_wide else 1.0) * (panel * size[1] / size[0] + 0.55)
+    figure = style.new_figure(10.0, float(np.clip(height_of_all, 3.5, 16.0)))
     panels = figure.subplots(*((2, 1) if is_wide else (1, 2)))
     unit = 1.0 / audit.survey.alignment.scale
     shown = tuple(unit * value for value in extent)
@@ -140,7 +146,8 @@ def _draw_path(axes: Axes, audit: Audit, unit: float) -> None:
 
 def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
     """Bad regions as lettered circles in the color of their cause; unseen ones dotted."""
-    for number, region in enumerate((*audit.regions, *audit.unseen)):
+    regions = (*audit.regions, *audit.unseen)
+    for region in regions:
         is_unseen = region.cause == "unseen"
         center, color = unit * region.center[:2], COLOR_OF_CAUSE[region.cause]
         radius = 0.5 * unit * BLOCK
@@ -156,10 +163,25 @@ def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
                 zorder=3,
             )
         )
+    for center, names, color in _labels(regions):
         axes.annotate(
-            letter(number), (center[0], center[1]), ha="center", va="center", fontsize=9,
-            fontweight="bold", color=color, zorder=5,
+            names, tuple(unit * center), ha="center", va="center", fontsize=9,
+            fontweight="bold", color=color, zorder=5, path_effects=[_HALO],
         )  # fmt: skip
+
+
+def _labels(regions: tuple[Region, ...]) -> list[tuple[np.ndarray, str, str]]:
+    """Where to write which letters in which color: regions above each other share a place."""
+    places: list[tuple[np.ndarray, str, str]] = []
+    for number, region in enumerate(regions):
+        center = region.center[:2]
+        for i, (place, names, color) in enumerate(places):
+            if np.linalg.norm(place - center) < _TOO_NEAR:
+                places[i] = place, f"{names} {letter(number)}", color
+                break
+        else:
+            places.append((center, letter(number), COLOR_OF_CAUSE[region.cause]))
+    return places
 
 
 def _draw_views(axes: Axes, audit: Audit, unit: float) -> None:

@@ -134,7 +134,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
             {
                 "camera_to_world_opengl": (pose @ OPENGL_FROM_OPENCV).tolist(),
                 "gain_in_voxels": view.gain,
-                "unseen_cells": view.unseen_cells,
+                "unseen_cells": len(view.cells),
                 "voxels_shown": len(view.shown),
                 "voxels_mended": view.num_mended,
                 "causes": view.causes,

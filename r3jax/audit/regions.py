@@ -17,7 +17,10 @@ BLOCK = 1.0
 """Regions are as large, and their middles as far apart [audit units]."""
 
 MOST = 10
-"""Regions of each kind that are listed."""
+"""Bad regions that are listed."""
+
+MOST_UNSEEN = 6
+"""Unseen regions that are listed."""
 
 _SMALLEST = 0.02
 """Smaller regions are not worth a line [square audit units]."""
@@ -45,7 +48,7 @@ class Region:
     """Bad voxels among those of the block that can be seen; 1 where nothing is known."""
 
     rows: np.ndarray
-    """Rows of its bad voxels in the map; none where nothing is known."""
+    """Rows of its bad voxels in the map; where nothing is known flat indices of its cells."""
 
 
 def bad_regions(state: MapState, diagnosis: Diagnosis, most: int = MOST) -> list[Region]:
@@ -105,7 +108,7 @@ def unseen_edges(grid: OccupancyGrid, open_cells: np.ndarray) -> np.ndarray:
     return open_cells & ndimage.binary_dilation(np.asarray(grid.free), _FACES)
 
 
-def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST) -> list[Region]:
+def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST_UNSEEN) -> list[Region]:
     """Where a capture ends: blocks of unseen cells beside free space, the largest first.
 
     Args:
@@ -115,13 +118,13 @@ def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST) -> 
     """
     cell = float(grid.cell_size)
     points = np.asarray(grid.origin, np.float64) + (np.argwhere(edges) + 0.5) * cell
+    flat = np.flatnonzero(edges)
     left = np.ones(len(points), dtype=bool)
     found: list[Region] = []
     while len(found) < most and left.any():
         middle = _worst_block(points[left], np.ones(int(left.sum())))
         is_near = left & (np.abs(points - middle).max(axis=1) <= max(0.5 * BLOCK, cell))
         area = float(is_near.sum()) * cell * cell
-        none = np.zeros(0, dtype=np.int64)
-        found.append(Region(points[is_near].mean(axis=0), area, "unseen", 0.0, 1.0, none))
+        found.append(Region(points[is_near].mean(axis=0), area, "unseen", 0.0, 1.0, flat[is_near]))
         left &= ~is_near
     return found

@@ -15,6 +15,7 @@ from r3jax.audit.colors import COLOR_OF_CAUSE
 from r3jax.audit.ground_plan import letter, plan_figure
 from r3jax.audit.outputs import suggested_poses
 from r3jax.audit.region_pictures import region_figure
+from r3jax.audit.regions import Region
 from r3jax.audit.suggest import Suggestion
 from r3jax.evaluation import style
 from r3jax.files import write_atomic
@@ -43,6 +44,7 @@ _PAGE = Template(
  th, td { text-align: left; padding: 4px 12px 4px 0; border-bottom: 1px solid #e5e7eb;
    vertical-align: top }
  th { color: #6b7280; font-weight: 600; font-size: 13px }
+ td.k { white-space: nowrap }
  td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
  i.dot { display: inline-block; width: 11px; height: 11px; border-radius: 3px; margin-right: 7px }
  i.bar { display: inline-block; height: 9px; border-radius: 3px; margin-left: 8px }
@@ -135,7 +137,7 @@ def _cause_table(audit: Audit) -> str:
         bar = "" if share is None else _bar(share, COLOR_OF_CAUSE[cause])
         amount = "" if share is None else f"{100 * share:.0f} %"
         rows.append(
-            f"<tr><td>{_dot(cause)}{cause}</td><td class=n>{amount}</td><td>{bar}</td>"
+            f"<tr><td class=k>{_dot(cause)}{cause}</td><td class=n>{amount}</td><td>{bar}</td>"
             f"<td class=n>{sentences.area(audit, covers)}</td><td>{meaning}</td>"
             f"<td>{sentences.REMEDY[cause]}</td></tr>"
         )
@@ -172,23 +174,25 @@ def _region_table(audit: Audit) -> str:
         center = audit.survey.alignment.points_back(region.center[None])[0]
         value = "" if region.cause == "unseen" else f"{region.renderability:.2f}"
         share = "" if region.cause == "unseen" else f"{100 * region.bad_share:.0f} %"
-        seen_by = [i for i, view in enumerate(audit.plan.views, 1) if _shows(view, region.rows)]
+        seen_by = [i for i, view in enumerate(audit.plan.views, 1) if _shows(view, region)]
         rows.append(
-            f"<tr><td><b>{letter(number)}</b></td><td>{_dot(region.cause)}{region.cause}</td>"
+            f"<tr><td><b>{letter(number)}</b></td>"
+            f"<td class=k>{_dot(region.cause)}{region.cause}</td>"
             f"<td class=n>{sentences.area(audit, region.area)}</td><td class=n>{share}</td>"
             f"<td class=n>{value}</td><td class=n>{sentences.point(center)}</td>"
             f"<td class=n>{', '.join(map(str, seen_by)) or '–'}</td></tr>"
         )
     head = (
-        "<tr><th></th><th>mostly</th><th class=n>bad</th><th class=n>of what is there</th>"
-        "<th class=n>its R</th><th class=n>middle (x, y, z)</th><th class=n>views</th></tr>"
+        "<tr><th></th><th>mostly</th><th class=n>bad</th><th class=n>of the surface there</th>"
+        "<th class=n>R of it</th><th class=n>middle (x, y, z)</th><th class=n>views</th></tr>"
     )
     return f"<table>{head}{''.join(rows)}</table>" if rows else "<p>Nowhere.</p>"
 
 
-def _shows(view: Suggestion, rows: np.ndarray) -> bool:
+def _shows(view: Suggestion, region: Region) -> bool:
     """True if a view shows most of a region."""
-    return len(rows) > 0 and float(np.isin(rows, view.shown).mean()) >= 0.5
+    shown = view.cells if region.cause == "unseen" else view.shown
+    return len(region.rows) > 0 and float(np.isin(region.rows, shown).mean()) >= 0.5
 
 
 def _views_section(audit: Audit) -> str:
@@ -198,13 +202,18 @@ def _views_section(audit: Audit) -> str:
     for number, (view, pose, figure) in enumerate(
         zip(audit.plan.views, poses, drawn, strict=True), start=1
     ):
-        nearest, gap = figures.nearest_picture(audit, view.pose)
-        near = html.escape(audit.source.labels[nearest])
-        letters = [letter(i) for i, region in enumerate(audit.regions) if _shows(view, region.rows)]
+        like, gap = figures.likest_picture(audit, view)
+        near = html.escape(audit.source.labels[like])
+        letters = [
+            letter(i)
+            for i, region in enumerate((*audit.regions, *audit.unseen))
+            if _shows(view, region)
+        ]
         parts.append(
             f'<h3><b class="num">{number}</b>at ({sentences.point(pose[:3, 3])}), looking along '
-            f"({sentences.point(pose[:3, 2])}), {sentences.length(audit, gap)} from {near}</h3>"
-            f'<p class="why">{html.escape(sentences.reason(audit, view, letters))}.</p>'
+            f"({sentences.point(pose[:3, 2])})</h3>"
+            f'<p class="why">{html.escape(sentences.reason(audit, view, letters))}. The likest '
+            f"picture so far, {near}, was taken {sentences.length(audit, gap)} away.</p>"
             + _image(figure)
         )
     note = (

@@ -7,12 +7,12 @@ import numpy as np
 from r3jax.audit.alignment import AXES
 from r3jax.audit.audit import NUM_STANDPOINTS, Audit
 from r3jax.audit.diagnosis import FEW, FINE
-from r3jax.audit.suggest import DIRECTIONS, Suggestion
+from r3jax.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 
 MEANING = {
     "fine": f"R of at least {FINE:g} for those who stand about",
     "angle": "seen, but only from directions far from those in which one would look at it",
-    "rare": f"seen from fewer than {FEW} directions",
+    "rare": f"seen in fewer than {FEW} pictures",
     "distance": "only seen from farther away than one would look at it",
     "noise": "its color differs from picture to picture: reflections, exposure, poses that are off",
     "unseen": "free space ends there in something that no picture shows",
@@ -22,7 +22,7 @@ MEANING = {
 REMEDY = {
     "fine": "",
     "angle": "go round it: pictures from the missing sides",
-    "rare": "look there again, from several places",
+    "rare": "take more pictures of it, from several places",
     "distance": "go nearer",
     "noise": "lock exposure and white balance; avoid reflections; check the poses",
     "unseen": "look into it, if it belongs to the place",
@@ -60,9 +60,9 @@ def verdict(audit: Audit) -> list[str]:
     found, plan = audit.diagnosis, audit.plan
     shares = {cause: found.share(cause) for cause in _ORDINARY}
     ordered = sorted(shares, key=lambda cause: -shares[cause])
-    parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
+    parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
     sentences = [
-        f"{100 * found.fine_share:.0f} % of the surface that one sees from where people could "
+        f"{100 * found.fine_share:.0f} % of the surface that one sees from where people could "
         f"stand would render well (R ≥ {FINE:g})" + (f"; {_list(parts)}." if parts else ".")
     ]
     if audit.unseen:
@@ -102,9 +102,9 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
         parts.append(
             f"of {area(audit, total * face)} in sight that do not yet: {', '.join(shares)}"
         )
-    if view.unseen_cells:
-        cells = area(audit, view.unseen_cells * audit.survey.cell_size**2)
-        parts.append(f"looks into about {cells} that no picture shows")
+    if len(view.cells):
+        cells = area(audit, len(view.cells) * audit.survey.cell_size**2)
+        parts.append(f"looks into about {cells} of what no picture shows")
     names = list(letters)
     if names:
         parts.append(f"regions {', '.join(names)}" if len(names) > 1 else f"region {names[0]}")
@@ -156,7 +156,9 @@ def method(audit: Audit) -> list[str]:
         f"{length(audit, 0.3)} from every voxel"
     )
     sentences.append(
-        f"Views: the {DIRECTIONS} best directions of each of {len(audit.places)} places {where}; "
+        f"Views: of {len(audit.places)} places {where}, {DIRECTIONS} directions each, those of "
+        f"which {100 * OVERLAP:.0f} % or more show what is known (or a picture could not be "
+        "registered); "
         "of all these the one that raises the renderability of all surfaces most is imagined as "
         "taken before the next one is chosen. What cannot be foreseen: surfaces that nobody has "
         "seen, and colors."

@@ -1,11 +1,11 @@
 """Which further views would help most: one after the other, each imagined before the next.
 
 Candidates: every place where somebody could stand gets its panorama (arXiv 2601.07484), the worth
-of all directions at once, and looks along its best directions. Of all candidates the one with the
-largest gain (`gains`) is taken, the map goes on as if it had been (`foresight`), the unexplored
-cells that it shows count no longer, and the others are asked again. A gain hardly ever grows by
-other views, so an old one is as good as an upper bound: only candidates whose old gain is above
-the best new one are asked again (Minoux 1978).
+of all directions at once, and looks along its best directions; views that show too little of what
+is known are left out. Of all candidates the one with the largest gain (`gains`) is taken, the map
+goes on as if it had been (`foresight`), the unexplored cells that it shows count no longer, and the
+others are asked again. A gain hardly ever grows by other views, so an old one is as good as an
+upper bound: only candidates whose old gain is above the best new one are asked again (Minoux 1978).
 
 Beside it, as many views at random from the same places say how much of the gain is owed to the
 choice.
@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool
 
 from r3jax.audit.diagnosis import CAUSES, FINE, Answers, Demand, Diagnosis, ask, diagnose
 from r3jax.audit.foresight import foresee
-from r3jax.audit.gains import view_gains
+from r3jax.audit.gains import view_coverage, view_gains
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid
@@ -33,11 +33,15 @@ from r3jax.scoring.batch import score_positions
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
 
-DIRECTIONS = 3
+DIRECTIONS = 6
 """Directions in which a candidate looks from every place."""
 
 _APART = 40.0
 """Between the directions of one place [deg]."""
+
+OVERLAP = 0.4
+"""Share of a view's pixels that must show what is known already: a picture of nothing but the
+unknown cannot be registered with the others."""
 
 _BATCH = 8
 """Candidates that are asked again at once."""
@@ -56,8 +60,8 @@ class Suggestion:
     gain: float
     """What it was chosen for [voxels]; see `gains`."""
 
-    unseen_cells: int
-    """Unexplored cells that it shows."""
+    cells: np.ndarray
+    """Unseen edges that it shows, as flat indices of the grid's cells."""
 
     shown: np.ndarray
     """Rows of the voxels that it shows."""
@@ -161,7 +165,9 @@ def candidate_poses(
     poses = poses_along(np.repeat(places, DIRECTIONS, axis=0), chosen)
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     poses[:, :3, :3] = u @ vt
-    return poses
+    known = view_coverage(state, task.camera, poses, task.config)
+    # Where the map has gaps everywhere, the fullest half of the views is full enough.
+    return poses[known >= min(OVERLAP, float(np.median(known)))]
 
 
 def _apart(scores: np.ndarray, lattice: np.ndarray) -> np.ndarray:
@@ -207,12 +213,13 @@ def _best(
 
 def _take(
     state: MapState, grid: OccupancyGrid, task: Task, pose: np.ndarray
-) -> tuple[MapState, OccupancyGrid, np.ndarray, int]:
-    """Map and grid once a view is taken, the rows that it shows, and its unexplored cells."""
+) -> tuple[MapState, OccupancyGrid, np.ndarray, np.ndarray]:
+    """Map and grid once a view is taken, the rows and the unexplored cells that it shows."""
     T = jnp.asarray(pose, dtype=jnp.float32)
     cells = visible_unexplored(state, grid, task.camera, T, task.config)
     after, shown = foresee(state, task.camera, T, task.config)
-    return after, without_cells(grid, cells), np.flatnonzero(np.asarray(shown)), int(cells.sum())
+    rows, edges = (np.flatnonzero(np.asarray(mask)) for mask in (shown, cells))
+    return after, without_cells(grid, cells), rows, edges
 
 
 def without_cells(grid: OccupancyGrid, cells: Bool[Array, "X Y Z"]) -> OccupancyGrid:
@@ -224,7 +231,7 @@ def without_cells(grid: OccupancyGrid, cells: Bool[Array, "X Y Z"]) -> Occupancy
 def _suggestion(
     pose: np.ndarray,
     gain: float,
-    cells: int,
+    cells: np.ndarray,
     shown: np.ndarray,
     now: Diagnosis,
     after: Diagnosis,
@@ -234,7 +241,7 @@ def _suggestion(
     return Suggestion(
         pose=pose,
         gain=gain,
-        unseen_cells=cells,
+        cells=cells,
         shown=shown,
         num_mended=int((after.value[bad] >= FINE).sum()),
         causes={name: int(n) for name, n in zip(CAUSES, counts, strict=True) if n},

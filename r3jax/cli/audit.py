@@ -42,7 +42,7 @@ def run_audit(options: Options) -> int:
         folder = options.out or Path("runs") / "audit" / capture.name
         _check_folder(folder)
         path = None if options.path is None else _read_path(options.path)
-        source = source_of(capture.source, str(options.capture))
+        source = source_of(capture.source, capture.name)
         with Stages(progress) as stages:
             found = audit(source, _wishes(options), path, stages.on_progress)
             folder.mkdir(parents=True, exist_ok=True)
