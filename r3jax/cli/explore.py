@@ -1,13 +1,17 @@
 """`r3jax explore`: begin a run, go on with one, or fork one; write what comes out of it."""
 
+import contextlib
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from r3jax.cli.console import PLAIN
 from r3jax.cli.errors import UserError, check_folder_name, one_line
 from r3jax.cli.options import Explore
+from r3jax.cli.pages import check_viser
 from r3jax.cli.progress import RunProgress
 from r3jax.cli.setup import (
     Plan,
@@ -30,14 +34,15 @@ from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import package_versions
 from r3jax.trace.reader import Run, read_run
+from r3jax.trace.rows import StepRow
 from r3jax.trace.writer import RunWriter
 
 _EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
 
-_WITH_RESUME = ("resume", "budget")
+_WITH_RESUME = ("resume", "budget", "live", "port")
 _WITH_FORK = (
     "fork", "at", "policy", "budget", "name", "out", "overwrite", "candidates", "lambda1",
-    "lambda2",
+    "lambda2", "live", "port",
 )  # fmt: skip
 """Options that make sense beside these; all others are fixed by the recorded run."""
 
@@ -62,29 +67,75 @@ def run_explore(options: Explore) -> int:
             one that cannot be gone on with.
     """
     console = Console(stderr=True)
-    try:
-        expedition = _set_out(options, console)
-    except (ValueError, OSError, ImportError) as error:
-        raise UserError(one_line(error)) from error
-    plan = expedition.plan
-    with expedition.recorder as recorder, RunProgress(console, plan.budget) as progress:
+    with contextlib.ExitStack() as stack:
+        # A port that is in use must be told before there is a folder.
+        page = _open_page(options, stack) if options.live else None
+        try:
+            expedition = _set_out(options, console)
+        except (ValueError, OSError, ImportError) as error:
+            raise UserError(one_line(error)) from error
+        plan, recorder = expedition.plan, stack.enter_context(expedition.recorder)
+        policy, on_view = plan.policy, lambda row: None
+        if page is not None:
+            feed = stack.enter_context(page(expedition))
+            policy, on_view = feed.watch(policy), feed.on_step
+            console.print(f"live      {feed.url}", **PLAIN)
+        progress = stack.enter_context(RunProgress(console, plan.budget))
+
+        def on_step(row: StepRow) -> None:
+            progress.on_step(row)
+            on_view(row)
+
         try:
             result = explore(
                 expedition.simulator,
-                plan.policy,
+                policy,
                 budget=plan.budget,
                 seed=expedition.seed,
                 config=plan.config,
                 recorder=recorder,
                 resume=expedition.recorded,
                 decided_from=expedition.decided_from,
-                on_step=progress.on_step,
+                on_step=on_step,
                 on_stage=progress.on_stage,
             )
         except RunError as error:
             raise UserError(one_line(error)) from error
     _conclude(console, recorder.path, result)
     return _EXIT_CODES.get(result.reason, 0)
+
+
+def _open_page(options: Explore, stack: contextlib.ExitStack) -> Callable[[Expedition], Any]:
+    """A server for a page that will show an expedition; the stack closes it.
+
+    Returns:
+        Makes the `viewer.live.LiveFeed` of the expedition, once there is one.
+
+    Raises:
+        UserError: viser is not installed, or the port is in use.
+    """
+    check_viser()
+    from r3jax.viewer.live import open_live
+    from r3jax.viewer.server import close_server, open_server
+
+    try:
+        server = open_server("127.0.0.1", options.port)
+    except (ValueError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    stack.callback(close_server, server)
+
+    def fill(expedition: Expedition) -> Any:
+        return open_live(
+            server,
+            expedition.simulator.camera,
+            expedition.simulator.bounds,
+            expedition.plan.config,
+            title=f"{expedition.plan.policy.name}, live",
+            subtitle=str(expedition.recorder.path),
+            earlier=expedition.recorded,
+        )
+
+    return fill
 
 
 def _set_out(options: Explore, console: Console) -> Expedition:

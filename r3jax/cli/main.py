@@ -20,6 +20,7 @@ from r3jax.cli.options import (
     Policies,
     Replay,
     Train,
+    View,
 )
 
 _COMMANDS = {
@@ -32,6 +33,7 @@ _COMMANDS = {
     "merge": Merge,
     "export": Export,
     "audit": Audit,
+    "view": View,
     "policies": Policies,
     "info": Info,
 }
@@ -80,6 +82,7 @@ def _run(
     | Merge
     | Export
     | Audit
+    | View
     | Policies
     | Info,
 ) -> int:
@@ -120,6 +123,10 @@ def _run(
         from r3jax.cli.audit import run_audit
 
         return run_audit(command)
+    if isinstance(command, View):
+        from r3jax.cli.view import run_view
+
+        return run_view(command)
     if isinstance(command, Policies):
         from r3jax.cli.policies import run_policies
 

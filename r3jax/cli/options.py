@@ -103,6 +103,12 @@ class Explore:
     lambda2: Annotated[float | None, tyro.conf.arg(metavar="WEIGHT")] = None
     """Weight of the path length against the utility (policy's default: 0.5)."""
 
+    live: bool = False
+    """Show the exploration in the browser while it runs, on this machine only (extra `viewer`)."""
+
+    port: int = 8080
+    """Port of the page that --live shows; 0 takes any free one."""
+
 
 @dataclass(frozen=True)
 class Info:
@@ -198,6 +204,36 @@ class Audit:
 
     seed: int = 0
     """Of the random views that the suggested ones are compared with."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a run in the browser: the map over time, and what a camera that you drag would see.
+
+    Or, with --export, write the pictures without a browser.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+    port: int = 8080
+    """Port of the page; 0 takes any free one."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at. By default nobody but this machine can see the page; 0.0.0.0 shows it
+    to everybody who can reach the machine."""
+
+    name: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    """Name of the trained model, as given to `r3jax train`; by default `last` or the newest."""
+
+    no_scene: bool = False
+    """Do not open the scene that the run was recorded in: no true image, no mesh."""
+
+    export: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Write pictures of the map and one for every view into a folder that does not exist yet."""
+
+    video: bool = False
+    """With --export: a film of the run too (MP4)."""
 
 
 @dataclass(frozen=True)

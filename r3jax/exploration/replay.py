@@ -57,7 +57,7 @@ def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, Oc
     for run in runs[1:]:
         check_alike(first, run)
     bounds = np.asarray(first.header.bounds, dtype=np.float64)
-    grid = first_grid(bounds, [pose for run in runs for pose in _starts_of(run)], config)
+    grid = first_grid(bounds, [pose for run in runs for pose in starts_of(run)], config)
     map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
     for run in runs:
         for frame in _frames(run, views):
@@ -107,7 +107,7 @@ def parts_of(run: Run) -> list[int]:
     return (run.header.parent or {}).get("merged_views", [len(run.rows)])
 
 
-def _starts_of(run: Run) -> list[np.ndarray]:
+def starts_of(run: Run) -> list[np.ndarray]:
     """Where a run began; a merged one began several times."""
     if not run.rows:
         raise RunError(run.path, "the run has no view")

@@ -1,0 +1,245 @@
+"""`r3jax view`: a run in the browser, or as pictures and a film without one."""
+
+import contextlib
+import functools
+import threading
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from r3jax.cli.captures import Capture
+from r3jax.cli.console import PLAIN
+from r3jax.cli.errors import UserError, check_folder_name, one_line
+from r3jax.cli.options import Evaluate, View
+from r3jax.cli.pages import check_viser
+from r3jax.cli.selection import find_training
+from r3jax.cli.setup import plan_of_run
+from r3jax.exploration.replay import config_of
+from r3jax.formats.errors import FormatError
+from r3jax.scenes.registry import open_scene, scene_hash
+from r3jax.simulators.base import Simulator
+from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.splatting.ply import read_scene
+from r3jax.splatting.scene import GaussianScene
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run, read_run
+from r3jax.viewer.decisions import Offer, decide_again
+from r3jax.viewer.film import export_film
+from r3jax.viewer.glb import world_glb
+from r3jax.viewer.known import scoring_of
+from r3jax.viewer.look import Photographer
+from r3jax.viewer.shapes import recorded_points
+from r3jax.viewer.video import load_av
+
+
+def run_view(options: View) -> int:
+    """Shows a run until Ctrl-C, or writes its pictures.
+
+    Raises:
+        UserError: not a run, no views, a port that is in use, a folder that holds something, a
+            missing package.
+    """
+    console = Console(stderr=True)
+    try:
+        run = read_run(options.path)
+        if not run.rows:
+            raise UserError(f"{run.path}: the run has no views yet: there is nothing to see")
+        config_of(run)  # says what is wrong with it
+        if options.export is not None:
+            return _export(run, options.export, options.video, console)
+        if options.video:
+            raise UserError("--video belongs to --export FOLDER")
+        with open_viewer(options, run, console) as viewer:
+            console.print(f"view      {viewer.url}", **PLAIN)
+            console.print("Ctrl-C ends it", **PLAIN)
+            with contextlib.suppress(KeyboardInterrupt):
+                until_interrupted()
+    except (RunError, FormatError, ValueError, OSError, ImportError) as error:
+        raise UserError(one_line(error)) from error
+    return 0
+
+
+def until_interrupted() -> None:
+    """Waits for Ctrl-C."""
+    threading.Event().wait()
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """A page that is being shown."""
+
+    url: str
+    app: Any
+    """A `viewer.app.App`, which cannot be named where viser may not be installed."""
+
+
+@contextlib.contextmanager
+def open_viewer(options: View, run: Run, console: Console) -> Generator[Viewer]:
+    """The page of a run, for as long as the context lasts.
+
+    Raises:
+        UserError: viser is not installed, or there is no such model.
+        ValueError, OSError: the port is in use, the address is not this machine's.
+    """
+    check_viser()
+    from r3jax.viewer.answers import Extras
+    from r3jax.viewer.app import App
+    from r3jax.viewer.server import LOOPBACK, close_server, open_server, url_of
+    from r3jax.viewer.story import RecordedStory
+    from r3jax.viewer.surface import Sources
+
+    server = open_server(options.host, options.port)
+    try:
+        if options.host not in LOOPBACK:
+            text = f"everybody who can reach {options.host} sees the page, and can use it"
+            console.print(text, style="yellow", **PLAIN)
+        with console.status("opening the run ..."):
+            splats = _splats(run, options.name)
+            scene = Scene(None, "") if options.no_scene else _scene(run)
+            header = run.header
+            extras = Extras(
+                Sources(
+                    None if splats is None else splats.model,
+                    functools.partial(recorded_points, run),
+                    scene.mesh,
+                ),
+                (0.0, 0.0, 0.0) if splats is None else splats.background,
+                scene.photographer,
+                functools.partial(_decisions, run),
+                scene.remark,
+            )
+            app = App(
+                server,
+                RecordedStory(run),
+                scoring_of(header),
+                np.asarray(header.bounds, np.float64),
+                title=f"{header.policy['name']} in {header.scene['name']}",
+                subtitle=f"{run.path}; {run.outcome}",
+                extras=extras,
+            )
+        try:
+            yield Viewer(url_of(server), app)
+        finally:
+            app.close()
+    finally:
+        close_server(server)
+
+
+def _decisions(run: Run) -> Iterator[tuple[int, Offer | None]]:
+    plan = plan_of_run(run)
+    return decide_again(run, plan.policy, plan.config)
+
+
+@dataclass(frozen=True)
+class Splats:
+    """A trained model."""
+
+    model: GaussianScene
+    background: tuple[float, float, float]
+    """What it was trained with."""
+
+
+def _splats(run: Run, name: str | None) -> Splats | None:
+    """The model of that name; without one `last`, or else the newest, or else none.
+
+    Raises:
+        UserError: there is no model of that name.
+        ValueError: its file is damaged.
+    """
+    if name is not None:
+        check_folder_name(name)
+    else:
+        found = sorted((run.path / "models").glob("*/scene.ply"), key=_written)
+        if not found:
+            return None
+        names = [path.parent.name for path in found]
+        name = "last" if "last" in names else names[-1]
+    options = Evaluate(path=run.path, name=name)
+    training = find_training(options, Capture(run.path, run))
+    red, green, blue = training.background.tolist()
+    return Splats(read_scene(training.model), (red, green, blue))
+
+
+def _written(path: Path) -> float:
+    return path.stat().st_mtime
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The scene that a run was recorded in, if it can be opened."""
+
+    simulator: Simulator | None
+    remark: str
+    """Why it cannot be opened."""
+
+    @property
+    def photographer(self) -> Photographer | None:
+        """Takes true pictures."""
+        return None if self.simulator is None else functools.partial(_photograph, self.simulator)
+
+    @property
+    def mesh(self) -> Callable[[], bytes] | None:
+        """Its triangles as GLB."""
+        if not isinstance(self.simulator, RaycastSimulator):
+            return None
+        return functools.partial(world_glb, self.simulator.world)
+
+
+def _photograph(simulator: Simulator, T_world_camera: np.ndarray) -> np.ndarray:
+    return np.asarray(simulator.render(T_world_camera).rgb)
+
+
+def _scene(run: Run) -> Scene:
+    """Opens the scene again, for small pictures without noise and without a limit of range."""
+    from r3jax.viewer.answers import picture_camera
+
+    scene = run.header.scene
+    try:
+        simulator = open_scene(
+            scene["name"],
+            up=scene.get("up"),
+            camera=picture_camera(run.camera),
+            noise=0.0,
+            max_range=None,
+            seed=run.header.seed,
+        )
+        if scene_hash(simulator) == scene.get("hash"):
+            return Scene(simulator, "")
+        reason = "its content has changed since"
+    except (ValueError, OSError, ImportError) as error:
+        reason = one_line(error)
+    return Scene(None, f"no true image: the scene {scene['name']} cannot be opened ({reason})")
+
+
+def _export(run: Run, out: Path, video: bool, console: Console) -> int:
+    """Writes the pictures.
+
+    Raises:
+        FormatError, RunError, ImportError, OSError: as `export_film`.
+    """
+    if video:
+        load_av()  # says what is missing before an hour has passed
+    with Progress(
+        TextColumn("drawing"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
+    ) as bar:
+        task = bar.add_task("", total=None)
+        written = export_film(
+            run,
+            out,
+            video=video,
+            on_picture=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    for path in written:
+        console.print(f"written   {path}", **PLAIN)
+    return 0

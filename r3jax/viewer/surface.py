@@ -1,0 +1,191 @@
+"""What is drawn of the place: the map's voxels, the recorded points, the splats or the mesh."""
+
+import functools
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from r3jax.scoring.config import ScoringConfig
+from r3jax.splatting.scene import GaussianScene
+from r3jax.viewer.blocks import BUDGET, Blocks, block_colors
+from r3jax.viewer.controls import PLACES, Controls, Wishes
+from r3jax.viewer.known import Known, known_at
+from r3jax.viewer.shapes import splat_arrays
+from r3jax.viewer.stage import Stage
+from r3jax.viewer.story import Story
+from r3jax.viewer.terms import surface_terms
+from r3jax.viewer.timeline import Moment
+
+_KNOWN_KEPT = 6
+"""Moments whose blocks and terms are kept: a slider goes back and forth."""
+
+_NODES = {"voxels": "/map", "recorded points": "/points", "splats": "/splats", "mesh": "/mesh"}
+_POINT_EDGE = 0.02
+
+Points = tuple[np.ndarray, np.ndarray]
+"""Points [n, 3] float32 [m] and their colors [n, 3] uint8."""
+
+Show = Callable[[], None]
+"""Puts a part of an answer on the page."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What can be drawn beside the voxels. Functions are called when first needed."""
+
+    model: GaussianScene | None = None
+    """The trained splats."""
+
+    points: Callable[[], Points] | None = None
+    """The recorded points."""
+
+    mesh: Callable[[], bytes] | None = None
+    """The scene as GLB."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What there is to draw, the voxels first."""
+        known = {"recorded points": self.points, "splats": self.model, "mesh": self.mesh}
+        return ("voxels", *(name for name, what in known.items() if what is not None))
+
+
+class Surface:
+    """Draws the place, and knows what is drawn. For one thread at a time."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        controls: Controls,
+        story: Story,
+        config: ScoringConfig,
+        sources: Sources,
+        remark: str,
+    ):
+        """Draws nothing yet.
+
+        Args:
+            stage: where to draw.
+            controls: where to say what is drawn.
+            story: whose camera asks for the resolution.
+            config: of the scores.
+            sources: what can be drawn.
+            remark: what is always said.
+        """
+        self._stage, self._controls, self._story = stage, controls, story
+        self._config, self._sources, self._remark = config, sources, remark
+        self._known: OrderedDict[tuple[int, bool], Known] = OrderedDict()
+        self._points: Points | None = None
+        self._drawn: tuple[object, ...] | None = None
+        self._sent: set[str] = set()
+
+    def draw(self, wishes: Wishes, T_world_camera: np.ndarray, moment: Moment) -> Iterator[Show]:
+        """What is wished for, unless it is what is drawn already.
+
+        Args:
+            wishes: of the user.
+            T_world_camera: of the dragged camera, [4, 4].
+            moment: what was known.
+        """
+        key: tuple[object, ...] = (wishes.surface, wishes.cut)
+        if wishes.surface == "voxels":
+            key += (moment.step, wishes.quantity, wishes.place)
+            if wishes.place != PLACES[0] and wishes.quantity != "color":
+                key += (T_world_camera[:3, 3].tobytes(),)
+        if self._drawn == key:
+            return
+        if wishes.surface == "voxels":
+            show = self._voxels(wishes, T_world_camera[:3, 3], moment)
+        elif wishes.surface == "recorded points":
+            show = self._recorded(wishes.cut)
+        else:
+            show = self._whole(wishes.surface)
+
+        def show_it() -> None:
+            show()
+            self._stage.show_only(_NODES[wishes.surface], tuple(_NODES.values()))
+            self._drawn = key
+
+        yield show_it
+
+    def _say(self, text: str) -> None:
+        self._controls.show_note("; ".join(part for part in (text, self._remark) if part))
+
+    def _voxels(self, wishes: Wishes, position: np.ndarray, moment: Moment) -> Show:
+        """The map, colored as wished and cut open."""
+        has_score, state = wishes.quantity != "color", moment.map_state
+        from_free_space = wishes.place == PLACES[0]
+        known = self._known_at(moment, with_terms=has_score and from_free_space)
+        terms = known.terms
+        if has_score and not from_free_space:
+            terms = surface_terms(state, self._story.camera, position[None], self._config)
+        blocks = known.blocks
+        colors = block_colors(blocks, state, terms, wishes.quantity)
+        low = blocks.centers[:, 2] <= wishes.cut
+        text = voxel_note(blocks) + ("; gray: in view of none of the places" if has_score else "")
+
+        def show() -> None:
+            self._stage.show_points("/map", blocks.centers[low], colors[low], blocks.edge)
+            self._say(text)
+
+        return show
+
+    def _known_at(self, moment: Moment, *, with_terms: bool) -> Known:
+        """Blocks and terms of a moment, from the few that are kept or made anew."""
+        for has_terms in (True, with_terms):
+            if (moment.step, has_terms) in self._known:
+                return self._known[moment.step, has_terms]
+        camera, config = self._story.camera, self._config
+        known = known_at(moment, camera, config, BUDGET, with_terms=with_terms)
+        self._known[moment.step, with_terms] = known
+        if len(self._known) > _KNOWN_KEPT:
+            self._known.popitem(last=False)
+        return known
+
+    def _recorded(self, cut: float) -> Show:
+        """The measured points, cut open."""
+        if self._points is None:
+            assert self._sources.points is not None
+            self._points = self._sources.points()
+        points, colors = self._points
+        low = points[:, 2] <= cut
+
+        def show() -> None:
+            self._stage.show_points("/points", points[low], colors[low], _POINT_EDGE)
+            self._say(f"{len(points)} measured points, the same number from each view")
+
+        return show
+
+    def _whole(self, surface: str) -> Show:
+        """Splats or the mesh: sent once, then only shown."""
+        if surface in self._sent:
+            return lambda: None
+        if surface == "mesh":
+            assert self._sources.mesh is not None
+            glb = self._sources.mesh()
+            send = functools.partial(self._stage.show_mesh, _NODES[surface], glb)
+            text = f"the scene's own mesh, {len(glb) / 1e6:.1f} MB, without its lamps"
+        else:
+            assert self._sources.model is not None
+            arrays = splat_arrays(self._sources.model)
+            total = int(np.asarray(self._sources.model.is_alive).sum())
+            send = functools.partial(self._stage.show_splats, _NODES[surface], arrays)
+            text = f"{len(arrays[0])} of {total} Gaussians, without view-dependent color"
+
+        def show() -> None:
+            send()
+            self._sent.add(surface)
+            self._say(text)
+
+        return show
+
+
+def voxel_note(blocks: Blocks) -> str:
+    """How many voxels are drawn, and how."""
+    if blocks.num_voxels == len(blocks.centers):
+        return f"{blocks.num_voxels} voxels of {100 * blocks.edge:.3g} cm"
+    return (
+        f"{blocks.num_voxels} voxels, drawn as {len(blocks.centers)} blocks of "
+        f"{100 * blocks.edge:.3g} cm"
+    )

@@ -1,0 +1,126 @@
+"""`r3jax view` and `explore --live`, as a user meets them."""
+
+import shutil
+import socket
+import sys
+
+import pytest
+
+from r3jax.cli.main import main
+from r3jax.trace.reader import read_run
+from tests.box_room import write_room
+from tests.cli.small_runs import explore
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("view")
+    assert explore(write_room(folder / "room.ply"), folder) == 0
+    return folder / "box"
+
+
+def say(words, capsys) -> str:
+    """Runs a command that must fail with one line; the line."""
+    assert main([str(word) for word in words]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.strip().splitlines()
+    assert lines[-1].startswith("r3jax: ")
+    return lines[-1]
+
+
+@pytest.fixture
+def busy_port():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        yield other.getsockname()[1]
+
+
+def test_a_folder_that_is_no_run_is_told(tmp_path, capsys):
+    assert "this folder is not a run" in say(["view", tmp_path], capsys)
+    assert "this folder is not a run" in say(["view", tmp_path / "nowhere"], capsys)
+
+
+def test_a_run_without_views_is_told(path, tmp_path, capsys):
+    copy = shutil.copytree(path, tmp_path / "copy")
+    (copy / "trace.jsonl").write_text("")
+    for words in ([], ["--export", tmp_path / "out"]):
+        assert "no views yet: there is nothing to see" in say(["view", copy, *words], capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_port_in_use_is_told(path, busy_port, capsys):
+    pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
+    line = say(["view", path, "--port", busy_port], capsys)
+    assert f"port {busy_port} of 127.0.0.1 is in use" in line
+
+
+def test_a_port_in_use_leaves_no_run_behind(tmp_path, busy_port, capsys):
+    pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
+    room, out = write_room(tmp_path / "room.ply"), tmp_path / "runs"
+    assert explore(room, out, "--live", "--port", str(busy_port)) == 2
+    assert "is in use" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_without_viser_the_extra_is_named(path, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install 'r3jax[viewer]'" in say(["view", path], capsys)
+    room = write_room(tmp_path / "room.ply")
+    assert explore(room, tmp_path / "runs", "--live") == 2
+    assert "pip install 'r3jax[viewer]'" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
+def test_without_av_the_extra_is_named_before_anything_is_drawn(
+    path, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "av", None)
+    out = tmp_path / "out"
+    line = say(["view", path, "--export", out, "--video"], capsys)
+    assert "pip install 'r3jax[viewer]'" in line
+    assert not out.exists()
+
+
+def test_a_film_without_a_folder_is_told(path, capsys):
+    assert "--video belongs to --export FOLDER" in say(["view", path, "--video"], capsys)
+
+
+def test_a_model_that_is_not_there_is_told(path, capsys):
+    pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
+    line = say(["view", path, "--port", "0", "--name", "other"], capsys)
+    assert "there is no such model; there is none yet" in line
+    line = say(["view", path, "--port", "0", "--name", "../other"], capsys)
+    assert "without a path" in line
+
+
+def test_a_folder_that_holds_something_is_told(path, tmp_path, capsys):
+    (tmp_path / "mine.txt").write_text("mine")
+    assert "something is there already" in say(["view", path, "--export", tmp_path], capsys)
+
+
+def test_pictures_are_written_without_viser_and_the_run_stays_as_it_is(
+    path, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    before = {p: p.read_bytes() for p in path.rglob("*") if p.is_file()}
+    out = tmp_path / "deep" / "out"
+    assert main(["view", str(path), "--export", str(out)]) == 0
+    assert str(out / "oblique-renderability.png") in capsys.readouterr().err
+    assert len(list((out / "views").iterdir())) == len(read_run(path).rows)
+    assert {p: p.read_bytes() for p in path.rglob("*") if p.is_file()} == before
+
+
+def test_a_page_is_shown_until_it_is_interrupted(path, capsys, monkeypatch):
+    pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
+    from r3jax.cli import view
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(view, "until_interrupted", interrupt)
+    assert main(["view", str(path), "--port", "0"]) == 0
+    shown = capsys.readouterr()
+    assert "view      http://127.0.0.1:" in shown.err
+    assert shown.out == ""
