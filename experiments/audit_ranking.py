@@ -8,8 +8,10 @@ on its frames, and the audit judges the same frames by a map of the same others.
 what it is asked about.
 """
 
+import functools
 import json
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +28,7 @@ from experiments.artefacts import (
     write_figure,
     write_markdown,
 )
-from r3jax.audit.audit import Audit, audit
+from r3jax.audit.audit import audit
 from r3jax.audit.colors import COLOR_OF_CAUSE
 from r3jax.audit.source import source_of
 from r3jax.audit.survey import Wishes
@@ -80,45 +82,61 @@ class Options:
     out: Path = Path("experiments/results")
     """Folder of the results."""
 
+    work: Path = Path("runs")
+    """Folder of what is done so far: a call that was cut off goes on."""
+
 
 def main(options: Options) -> Path:
     """Audits, trains, compares, and returns the folder of the results."""
     capture = open_capture(options.capture, "z")
     folder = options.out / NAME / capture.name
-    rows = [row for fold in range(options.folds) for row in finished_rows(folder, fold, options)]
-    if len(rows) < len(capture):
-        rows = all_rows(capture, folder, options)
+    rows = all_rows(capture, options)
     source = Origin(command_line(f"experiments.{NAME}"), machine(), source_commit() or "unknown")
     write_page(folder, capture, sorted(rows, key=lambda row: row["frame"]), options, source)
     print(f"results  {folder}")
     return folder
 
 
-def all_rows(capture: Capture, folder: Path, options: Options) -> list[dict[str, Any]]:
-    """A row for each frame; folds that are done are not done again."""
-    everything = Wishes(folds=options.folds, num_views=0, max_frames=len(capture))
-    found = audit(source_of(capture.source, capture.name), everything)
-    views = load_views(capture.frames(), options.resolution)
+def all_rows(capture: Capture, options: Options) -> list[dict[str, Any]]:
+    """A row for each frame; what is done is not done again."""
+    work = options.work / NAME / capture.name
+    scores = kept(work / "scores.json", {"folds": options.folds}, lambda: audited(capture, options))
+    views = functools.cache(lambda: load_views(capture.frames(), options.resolution))
+    poses = functools.cache(lambda: source_of(capture.source, capture.name).poses)
     rows: list[dict[str, Any]] = []
-    for fold in range(len(found.seen.folds)):
-        done = finished_rows(folder, fold, options)
-        if not done:
-            done = fold_rows(found, views, fold, options)
-            (folder / "folds").mkdir(parents=True, exist_ok=True)
-            record = {"settings": settings(options), "rows": done}
-            write_atomic(folder / "folds" / f"{fold}.json", json.dumps(record, indent=1).encode())
-        rows += done
-        print(f"fold {fold + 1} of {len(found.seen.folds)}", flush=True)
+    for fold in range(options.folds):
+        rows += kept(
+            work / f"fold{fold}.json",
+            settings(options),
+            lambda k=fold: fold_rows(scores, poses(), views(), k, options),
+        )
+        print(f"fold {fold + 1} of {options.folds}", flush=True)
     return rows
 
 
-def finished_rows(folder: Path, fold: int, options: Options) -> list[dict[str, Any]]:
-    """The rows of a fold that an earlier call with the same settings has left; else none."""
-    path = folder / "folds" / f"{fold}.json"
-    if not path.exists():
-        return []
-    record = json.loads(path.read_bytes())
-    return record["rows"] if record["settings"] == settings(options) else []
+def kept(
+    path: Path, key: dict[str, Any], make: Callable[[], list[dict[str, Any]]]
+) -> list[dict[str, Any]]:
+    """Rows that an earlier call with the same settings has left; else they are made and left."""
+    if path.exists():
+        record = json.loads(path.read_bytes())
+        if record["settings"] == key:
+            return record["rows"]
+    rows = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, json.dumps({"settings": key, "rows": rows}, indent=1).encode())
+    return rows
+
+
+def audited(capture: Capture, options: Options) -> list[dict[str, Any]]:
+    """What the audit says of every frame, in order."""
+    everything = Wishes(folds=options.folds, num_views=0, max_frames=len(capture))
+    found = audit(source_of(capture.source, capture.name), everything)
+    folds = found.seen.fold_of.tolist()
+    return [
+        {"frame": frame.index, "fold": fold, **asdict(frame.score)}
+        for frame, fold in zip(found.frames, folds, strict=True)
+    ]
 
 
 def settings(options: Options) -> dict[str, Any]:
@@ -127,35 +145,27 @@ def settings(options: Options) -> dict[str, Any]:
     return {name: getattr(options, name) for name in names}
 
 
-def fold_rows(found: Audit, views: Views, fold: int, options: Options) -> list[dict[str, Any]]:
+def fold_rows(
+    scores: list[dict[str, Any]], poses: np.ndarray, views: Views, fold: int, options: Options
+) -> list[dict[str, Any]]:
     """A row for each frame of a fold: what the audit said, and how the render came out."""
-    is_out = found.seen.fold_of == fold
-    held_out, kept = np.flatnonzero(is_out), np.flatnonzero(~is_out)
+    is_out = np.array([row["fold"] == fold for row in scores])
+    held_out, others = np.flatnonzero(is_out), np.flatnonzero(~is_out)
     config = TrainConfig(iterations=options.iterations, num_gaussians=options.gaussians)
-    scene = fit(views.take(kept), config).scene
+    scene = fit(views.take(others), config).scene
     test = views.take(held_out)
     judgment = judge(scene, test, numbers=held_out.tolist())
-    near = nearness(found.source.poses, held_out, kept)
+    near = nearness(poses, held_out, others)
     rows: list[dict[str, Any]] = []
     for i, number in enumerate(held_out.tolist()):
-        frame, row = found.frames[number], judgment.rows[i]
-        truth = np.asarray(test.rgb[i])
-        rows.append(
-            {
-                "frame": number,
-                "fold": fold,
-                "renderability": frame.score.renderability,
-                "coverage": frame.score.coverage,
-                "bias": frame.score.bias,
-                "noise": frame.score.noise,
-                "resolution": frame.score.resolution,
-                "nearness": float(near[i]),
-                "cause": frame.score.cause,
-                "psnr": row.psnr,
-                "psnr_corrected": corrected_psnr(judgment.renders[i], truth),
-                "ssim": row.ssim,
-            }
-        )
+        row = judgment.rows[i]
+        found = {
+            "nearness": float(near[i]),
+            "psnr": row.psnr,
+            "psnr_corrected": corrected_psnr(judgment.renders[i], np.asarray(test.rgb[i])),
+            "ssim": row.ssim,
+        }
+        rows.append(scores[number] | found)
     return rows
 
 

@@ -29,12 +29,6 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
 from r3jax.scoring.voxels import voxels_of
 
-NUM_PLACES = 64
-"""Places at which views are looked for."""
-
-NUM_STANDPOINTS = 24
-"""Places from which every surface is judged; the first of the places."""
-
 _WORTH_OF_UNSEEN = 0.05
 """A cell at the edge of the known counts as this share of the voxels that it may hide: who audits a
 capture wants it to render well first, and larger second."""
@@ -74,7 +68,10 @@ class Audit:
     """Of the suggested views: that of most pictures."""
 
     places: np.ndarray
-    """Where views were looked for, [p, 3]; the first of them are the standpoints."""
+    """Where views were looked for, [p, 3] [audit units]."""
+
+    standpoints: np.ndarray
+    """From where surfaces were judged, the first of the places, [q, 3] [audit units]."""
 
     frames: tuple[JudgedFrame, ...]
     """The path."""
@@ -103,11 +100,6 @@ class Audit:
     def camera(self) -> Camera:
         """Of the suggested views, thinned out as the map's pictures were."""
         return thinned(self.lens.camera, self.source.stride)
-
-    @property
-    def standpoints(self) -> np.ndarray:
-        """From where surfaces were judged, [p, 3]."""
-        return self.places[:NUM_STANDPOINTS]
 
     @property
     def renderability(self) -> np.ndarray:
@@ -149,12 +141,13 @@ def audit(
     lens = Counter(source.lenses).most_common(1)[0][0]
     camera = thinned(lens.camera, source.stride)
     cameras = survey.alignment.points(source.poses[survey.chosen, :3, 3])
-    places = _places(source, survey, seen, cameras)
+    places = _places(source, survey, seen, cameras, wishes.num_places)
+    standpoints = places[: wishes.num_standpoints]
     on_progress("judging frames", 0)
     frames = tuple(_judged(source, survey, seen, config, path, step, on_progress))
     open_grid = _open_grid(source, survey, seen, cameras, config)
     on_progress("choosing views", wishes.num_views)
-    task = Task(camera, demand_of(seen.state, places[:NUM_STANDPOINTS], config), config)
+    task = Task(camera, demand_of(seen.state, standpoints, config), config)
     plan = suggest(
         seen.state, open_grid, task, places, wishes.num_views, seed=wishes.seed, on_view=step
     )
@@ -166,6 +159,7 @@ def audit(
         config=config,
         lens=lens,
         places=places,
+        standpoints=standpoints,
         frames=frames,
         is_own_path=path is None,
         regions=tuple(bad_regions(seen.state, plan.before)),
@@ -175,7 +169,9 @@ def audit(
     )
 
 
-def _places(source: Source, survey: Survey, seen: Seen, cameras: np.ndarray) -> np.ndarray:
+def _places(
+    source: Source, survey: Survey, seen: Seen, cameras: np.ndarray, num: int
+) -> np.ndarray:
     """Where views are looked for; where no space is known to be free, where the camera was."""
     if source.is_dense:
         places = places_in_free_space(seen.grid, cameras)
@@ -183,7 +179,7 @@ def _places(source: Source, survey: Survey, seen: Seen, cameras: np.ndarray) -> 
         places = places_in_hull(cameras, _centers(seen.state))
     if not len(places):
         places = cameras
-    return places[spread(places, NUM_PLACES)]
+    return places[spread(places, num)]
 
 
 def _centers(state: MapState) -> np.ndarray:

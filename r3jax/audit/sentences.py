@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from r3jax.audit.alignment import AXES
-from r3jax.audit.audit import NUM_STANDPOINTS, Audit
+from r3jax.audit.audit import Audit
 from r3jax.audit.diagnosis import FEW, FINE
 from r3jax.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 
@@ -132,7 +132,7 @@ def method(audit: Audit) -> list[str]:
         "Renderability R (arXiv 2601.07484) of a surface for a place to look from is bias × noise "
         "× resolution: the angle to the nearest direction it was seen from, the consistency of "
         "its color, and the best distance it was seen from.",
-        f"Surfaces: every voxel is asked from those of {min(NUM_STANDPOINTS, len(audit.places))} "
+        f"Surfaces: every voxel is asked from those of {len(audit.standpoints)} "
         "standpoints that see it, with the camera of most pictures; its numbers are the means. "
         "Areas count a face of a voxel each.",
     ]

@@ -10,8 +10,8 @@ import numpy as np
 
 from r3jax.geometry.cameras import Camera
 
-_BLOCK = 8
-"""Side of the blocks in which the nearest point of a cloud hides the others [px]."""
+_BLOCKS_ACROSS = 80
+"""Blocks per row of an image, in which the nearest point of a cloud hides the others."""
 
 _SLACK = 1.05
 """Points at most this many times as far as the nearest one of their block are seen."""
@@ -43,9 +43,10 @@ def sparse_depth(
     kept = np.flatnonzero(is_in)
     row, column, z = row[kept].astype(np.int64), column[kept].astype(np.int64), z[kept]
     if hides and len(kept):
-        wide = -(-shape[1] // _BLOCK)
-        block = (row // _BLOCK) * wide + column // _BLOCK
-        nearest = np.full(wide * -(-shape[0] // _BLOCK), np.inf)
+        side = max(1, round(shape[1] / _BLOCKS_ACROSS))
+        wide = -(-shape[1] // side)
+        block = (row // side) * wide + column // side
+        nearest = np.full(wide * -(-shape[0] // side), np.inf)
         np.minimum.at(nearest, block, z)
         is_front = z <= _SLACK * nearest[block]
         kept, row, column, z = kept[is_front], row[is_front], column[is_front], z[is_front]

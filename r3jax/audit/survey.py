@@ -84,8 +84,14 @@ class Wishes:
     num_views: int = 10
     """Views to suggest."""
 
+    num_places: int = 64
+    """Places at which views are looked for, at most."""
+
+    num_standpoints: int = 24
+    """Places from which every surface is judged: the first of the others, at most."""
+
     seed: int = 0
-    """Of the random choices: standpoints to begin with, views to compare with."""
+    """Of the random views that the suggested ones are compared with."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r3jax.audit import seen
 from r3jax.audit.audit import Audit, audit
 from r3jax.audit.camera_paths import CameraPath
 from r3jax.audit.diagnosis import CAUSES, FINE, cause_of
@@ -29,13 +30,24 @@ from tests.audit.room import (
     write_recording,
 )
 
-WISHES = Wishes(voxel_size=0.1, num_views=3, folds=4)
+VOXEL = 0.15
+WISHES = Wishes(voxel_size=VOXEL, num_views=3, folds=4, num_places=16, num_standpoints=8)
+FEW_VIEWS = dataclasses.replace(WISHES, voxel_size=None, num_views=2)
+NO_VIEWS = dataclasses.replace(WISHES, num_views=0)
 
 
 def corner_poses() -> np.ndarray:
     """All pictures from one corner of the room, towards the other half."""
     targets = [[4, y, z] for y in (0.5, 1.5, 2.5) for z in (0.4, 2.0)] + [[2, 0, 1.2], [2, 3, 1.2]]
     return np.stack([pose_at([0.5 + 0.05 * i, 0.6, 1.2], t) for i, t in enumerate(targets)])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_maps():
+    """A room needs no more rows: everything else is three times as quick."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(seen, "_CAPACITY", 1 << 13)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +64,7 @@ def corner(folder) -> Audit:
 @pytest.fixture(scope="module")
 def cloud(folder) -> Audit:
     images = read_transforms(write_nerfstudio(folder / "cloud", round_poses(), depth=False))
-    return audit(source_of(images, "cloud"), Wishes(num_views=2, folds=4))
+    return audit(source_of(images, "cloud"), FEW_VIEWS)
 
 
 def centers(found: Audit) -> np.ndarray:
@@ -63,7 +75,7 @@ def test_what_was_seen_from_one_side_only_is_seen_from_wrong_angles_or_from_afar
     found = corner.diagnosis
     judged = found.is_judged
     far = judged & (centers(corner)[:, 0] > 3.0)
-    assert far.sum() > 200
+    assert far.sum() > 100
     bad = far & (found.value < FINE)
     names = {CAUSES[i] for i in np.unique(found.cause[bad])}
     assert names <= {"angle", "rare", "distance"}
@@ -76,7 +88,9 @@ def test_the_capture_ends_behind_its_cameras(corner):
     assert corner.unseen_area > 0.2
     assert any(region.center[0] < 1.6 for region in corner.unseen)
     total = sum(region.area for region in corner.unseen)
-    assert 0.5 * corner.unseen_area < total <= corner.unseen_area + 1e-6
+    assert 0 < total <= corner.unseen_area + 1e-6
+    areas = [region.area for region in corner.unseen]
+    assert areas[0] >= 0.5 * max(areas)
 
 
 def test_suggested_views_are_in_the_open_and_promise_more_than_random_ones(corner):
@@ -93,6 +107,18 @@ def test_suggested_views_are_in_the_open_and_promise_more_than_random_ones(corne
         assert view.gain >= 1
 
 
+def test_a_gain_is_what_all_surfaces_gain_together(corner):
+    """Two ways to the same number: view by view, and standpoint by standpoint."""
+    judged = corner.diagnosis.is_judged.sum()
+    before = corner.diagnosis.mean
+    for view in corner.plan.views:
+        surfaces = (view.mean_after - before) * judged
+        cells = float(corner.config.lambda1) * len(view.cells)
+        # Voxels that are nearly perfect are left out of gains.
+        assert view.gain == pytest.approx(surfaces + cells, rel=0.03, abs=0.5)
+        before = view.mean_after
+
+
 def test_regions_hold_bad_voxels_and_do_not_overlap(corner):
     found = corner.diagnosis
     rows = [region.rows for region in corner.regions]
@@ -102,8 +128,8 @@ def test_regions_hold_bad_voxels_and_do_not_overlap(corner):
     assert (found.value[joined] < FINE).all()
     for region in corner.regions:
         place = centers(corner)[region.rows]
-        assert (np.ptp(place, axis=0) <= 1.0 + 0.1).all()
-        assert region.area == pytest.approx(len(region.rows) * 0.01, rel=1e-3)
+        assert (np.ptp(place, axis=0) <= 1.0 + VOXEL).all()
+        assert region.area == pytest.approx(len(region.rows) * VOXEL**2, rel=1e-3)
         assert 0 < region.bad_share <= 1
     losses = [((1 - found.value)[r]).sum() for r in rows]
     assert losses[0] >= 0.8 * max(losses)
@@ -121,7 +147,7 @@ def test_nothing_bad_makes_no_region(corner):
 def test_own_frames_are_judged_without_themselves(corner):
     poses = corner.source.poses
     path = CameraPath(poses, (LENS,) * len(poses))
-    whole = audit(corner.source, dataclasses.replace(WISHES, num_views=0), path)
+    whole = audit(corner.source, NO_VIEWS, path)
     assert not whole.is_own_path
     assert len(whole.frames) == len(corner.frames) == len(poses)
     assert (whole.renderability >= corner.renderability - 1e-6).all()
@@ -139,7 +165,7 @@ def test_colors_that_contradict_are_noise(corner):
         return np.clip(rgb * gains[index], 0, 255).astype(np.uint8), depth
 
     changed = dataclasses.replace(corner.source, read=flickering)
-    found = audit(changed, dataclasses.replace(WISHES, num_views=0))
+    found = audit(changed, NO_VIEWS)
     assert found.diagnosis.noise[found.diagnosis.is_judged].mean() < 0.9
     calm = corner.diagnosis.noise[corner.diagnosis.is_judged].mean()
     assert calm > 0.97
@@ -166,7 +192,7 @@ def test_units_and_axes_of_a_capture_change_nothing_but_the_coordinates(cloud, f
         return rgb, depth * 25.0
 
     turned = dataclasses.replace(cloud.source, poses=poses, read=read)
-    other = audit(turned, Wishes(num_views=2, folds=4))
+    other = audit(turned, FEW_VIEWS)
     assert other.survey.unit == "u"
     assert other.survey.median_depth == pytest.approx(25 * cloud.survey.median_depth, rel=1e-5)
     np.testing.assert_allclose(other.renderability, cloud.renderability, atol=0.03)
@@ -195,7 +221,7 @@ def test_tracks_of_a_model_are_as_good_as_a_cloud(folder, cloud):
     images = read_colmap(write_colmap(folder / "model", round_poses()))
     source = source_of(images, "model")
     assert (source.kind, source.is_metric, source.has_images) == ("tracks", False, True)
-    found = audit(source, Wishes(num_views=0, folds=4))
+    found = audit(source, dataclasses.replace(FEW_VIEWS, num_views=0))
     np.testing.assert_allclose(found.renderability, cloud.renderability, atol=0.15)
     assert found.diagnosis.fine_share > 0.3
 
@@ -206,7 +232,7 @@ def test_a_model_without_images_is_audited_by_its_points(folder):
         image.unlink()
     source = source_of(read_colmap(path), "bare")
     assert not source.has_images
-    found = audit(source, Wishes(num_views=0, folds=2))
+    found = audit(source, dataclasses.replace(FEW_VIEWS, num_views=0))
     assert found.diagnosis.share("noise") == 0.0
     assert "nothing can be said about noise" in method(found)[-1]
 

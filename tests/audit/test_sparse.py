@@ -31,16 +31,18 @@ def test_a_pixel_has_the_depth_of_the_wall_that_it_shows(index):
 
 
 def test_a_near_point_hides_the_one_behind_it_only_if_asked():
+    camera = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
     xyz = np.array([[0.02, 0.0, 2.0], [0.0, 0.0, 4.0], [1.5, 0.0, 4.0], [0.0, 0.0, -3.0]])
     rgb = np.arange(12, dtype=np.uint8).reshape(4, 3)
-    both = sparse_depth(CAMERA, np.eye(4), xyz, rgb, hides=False)[0]
-    front = sparse_depth(CAMERA, np.eye(4), xyz, rgb, hides=True)[0]
+    every = sparse_depth(camera, np.eye(4), xyz, rgb, hides=False)[0]
+    front = sparse_depth(camera, np.eye(4), xyz, rgb, hides=True)[0]
+    assert sorted(every[every > 0]) == [2.0, 4.0, 4.0]
     assert sorted(front[front > 0]) == [2.0, 4.0]  # the one aside stays
     # In one pixel the nearest counts, hidden or not.
-    assert sorted(both[both > 0]) == [2.0, 4.0]
-    apart = np.array([[0.2, 0.0, 2.0], [0.0, 0.0, 4.0]])
-    assert (sparse_depth(CAMERA, np.eye(4), apart, rgb[:2], hides=False)[0] > 0).sum() == 2
-    assert (sparse_depth(CAMERA, np.eye(4), apart, rgb[:2], hides=True)[0] > 0).sum() == 1
+    column = xyz[:2] * [0.0, 1.0, 1.0]
+    depth, colors = sparse_depth(camera, np.eye(4), column, rgb[:2], hides=False)
+    assert depth[depth > 0].tolist() == [2.0]
+    assert colors[depth > 0].tolist() == [rgb[0].tolist()]
 
 
 def test_no_points_are_no_depth():
