@@ -134,7 +134,8 @@ def method(audit: Audit) -> list[str]:
         "its color, and the best distance it was seen from.",
         f"Surfaces: every voxel is asked from those of {len(audit.standpoints)} "
         "standpoints that see it, with the camera of most pictures; its numbers are the means. "
-        "Areas count a face of a voxel each.",
+        "Areas count a face of a voxel each; where depth is noisy, walls are several voxels thick, "
+        "and areas too large by that.",
     ]
     if audit.is_own_path:
         count = len(audit.seen.folds)

@@ -14,7 +14,10 @@ POSES = round_poses()
 
 @given(st.integers(0, len(POSES) - 1))
 def test_a_pixel_has_the_depth_of_the_wall_that_it_shows(index):
-    """A point lies anywhere in its pixel: its depth lies between those of the pixels around."""
+    """A point lies anywhere in its pixel: its depth lies between those of the pixels around.
+
+    In a corner of the room it is deeper than all of them, by less than a pixel is wide.
+    """
     xyz, rgb = wall_points()
     depth, colors = sparse_depth(CAMERA, POSES[index], xyz, rgb, hides=True)
     truth_rgb, truth = picture(POSES[index])
@@ -24,7 +27,7 @@ def test_a_pixel_has_the_depth_of_the_wall_that_it_shows(index):
     around = np.stack([truth[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
     assert len(row) > 60
     assert (depth[row, column] >= around.min(axis=0) - 1e-3).all()
-    assert (depth[row, column] <= around.max(axis=0) + 1e-3).all()
+    assert (depth[row, column] <= around.max(axis=0) * (1 + 1 / FOCAL)).all()
     off = np.abs(colors[row, column].astype(int) - truth_rgb[row, column]).max(axis=1)
     assert np.median(off) < 8
     assert not colors[depth == 0].any()
