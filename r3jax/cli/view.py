@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,7 @@ from r3jax.trace.reader import Run, read_run
 from r3jax.viewer.decisions import Offer, decide_again
 from r3jax.viewer.film import export_film
 from r3jax.viewer.glb import world_glb
-from r3jax.viewer.known import scoring_of
-from r3jax.viewer.look import Photographer
+from r3jax.viewer.known import scoring_of, title_of
 from r3jax.viewer.shapes import recorded_points
 from r3jax.viewer.video import load_av
 
@@ -100,25 +99,25 @@ def open_viewer(options: View, run: Run, console: Console) -> Generator[Viewer]:
             console.print(text, style="yellow", **PLAIN)
         with console.status("opening the run ..."):
             splats = _splats(run, options.name)
-            scene = Scene(None, "") if options.no_scene else _scene(run)
+            scene = None if options.no_scene else Scene(run)
             header = run.header
             extras = Extras(
                 Sources(
                     None if splats is None else splats.model,
                     functools.partial(recorded_points, run),
-                    scene.mesh,
+                    None if scene is None else scene.mesh,
                 ),
                 (0.0, 0.0, 0.0) if splats is None else splats.background,
-                scene.photographer,
+                None if scene is None else scene.photograph,
                 functools.partial(_decisions, run),
-                scene.remark,
+                lambda: "" if scene is None else scene.remark,
             )
             app = App(
                 server,
                 RecordedStory(run),
                 scoring_of(header),
                 np.asarray(header.bounds, np.float64),
-                title=f"{header.policy['name']} in {header.scene['name']}",
+                title=title_of(header),
                 subtitle=f"{run.path}; {run.outcome}",
                 extras=extras,
             )
@@ -169,51 +168,53 @@ def _written(path: Path) -> float:
     return path.stat().st_mtime
 
 
-@dataclass(frozen=True)
 class Scene:
-    """The scene that a run was recorded in, if it can be opened."""
+    """The scene that a run was recorded in, opened when first asked for: large ones take long."""
 
-    simulator: Simulator | None
-    remark: str
-    """Why it cannot be opened."""
+    def __init__(self, run: Run):
+        """Opens nothing yet."""
+        self._run = run
+        self.remark = ""
+        """Why it cannot be opened, once that is known."""
 
-    @property
-    def photographer(self) -> Photographer | None:
-        """Takes true pictures."""
-        return None if self.simulator is None else functools.partial(_photograph, self.simulator)
-
-    @property
-    def mesh(self) -> Callable[[], bytes] | None:
-        """Its triangles as GLB."""
-        if not isinstance(self.simulator, RaycastSimulator):
+    def photograph(self, T_world_camera: np.ndarray) -> np.ndarray | None:
+        """The true picture at a pose, [H, W, 3]; None if the scene cannot be opened."""
+        if self._simulator is None:
             return None
-        return functools.partial(world_glb, self.simulator.world)
+        return np.asarray(self._simulator.render(T_world_camera).rgb)
 
+    def mesh(self, top: float) -> bytes:
+        """The triangles as GLB, without what lies above a height [m].
 
-def _photograph(simulator: Simulator, T_world_camera: np.ndarray) -> np.ndarray:
-    return np.asarray(simulator.render(T_world_camera).rgb)
+        Raises:
+            ValueError: the scene cannot be opened, or is too large to be shown.
+        """
+        if not isinstance(self._simulator, RaycastSimulator):
+            raise ValueError(self.remark or "the simulator of this scene has no mesh to show")
+        return world_glb(self._simulator.world, top)
 
+    @functools.cached_property
+    def _simulator(self) -> Simulator | None:
+        """For small pictures without noise and without a limit of range."""
+        from r3jax.viewer.answers import picture_camera
 
-def _scene(run: Run) -> Scene:
-    """Opens the scene again, for small pictures without noise and without a limit of range."""
-    from r3jax.viewer.answers import picture_camera
-
-    scene = run.header.scene
-    try:
-        simulator = open_scene(
-            scene["name"],
-            up=scene.get("up"),
-            camera=picture_camera(run.camera),
-            noise=0.0,
-            max_range=None,
-            seed=run.header.seed,
-        )
-        if scene_hash(simulator) == scene.get("hash"):
-            return Scene(simulator, "")
-        reason = "its content has changed since"
-    except (ValueError, OSError, ImportError) as error:
-        reason = one_line(error)
-    return Scene(None, f"no true image: the scene {scene['name']} cannot be opened ({reason})")
+        scene = self._run.header.scene
+        try:
+            simulator = open_scene(
+                scene["name"],
+                up=scene.get("up"),
+                camera=picture_camera(self._run.camera),
+                noise=0.0,
+                max_range=None,
+                seed=self._run.header.seed,
+            )
+            if scene_hash(simulator) == scene.get("hash"):
+                return simulator
+            reason = "its content has changed since"
+        except (ValueError, OSError, ImportError) as error:
+            reason = one_line(error)
+        self.remark = f"no true image: the scene cannot be opened ({reason})"
+        return None
 
 
 def _export(run: Run, out: Path, video: bool, console: Console) -> int:

@@ -47,8 +47,8 @@ class Extras:
     decisions: Callable[[], Iterator[tuple[int, Offer | None]]] | None = None
     """Decides the whole run again, for its candidates."""
 
-    remark: str = ""
-    """What the user should know, such as why there is no true image."""
+    remark: Callable[[], str] = lambda: ""
+    """What the user should know by now, such as why there is no true image."""
 
 
 @dataclass(frozen=True)
@@ -223,5 +223,6 @@ class Answers:
 
 
 def _color_of(glance: Glance) -> Color:
+    """The color of R, darker than the map's, so that lines stand out before it."""
     red, green, blue = paint(np.asarray([glance.renderability]))[0].tolist()
-    return red, green, blue
+    return round(0.7 * red), round(0.7 * green), round(0.7 * blue)

@@ -68,7 +68,7 @@ class App:
         self.worker: LatestWorker[Question, Show] = LatestWorker(
             self._answers.work,
             lambda question, show: show(),
-            lambda question, error: self.controls.show_note(f"{type(error).__name__}: {error}"),
+            lambda question, error: self.controls.show_note(str(error) or type(error).__name__),
             quiet=_QUIET,
             idle=self._answers.prepare,
         )

@@ -181,7 +181,7 @@ class Controls:
         with self._server.atomic():
             self._picture.image, self._panorama.image = picture, panorama
             self._picture.label = "this view"
-            self._panorama.label = "worth of every direction; ring: suggested, cross: the camera's"
+            self._panorama.label = "worth of every direction (ring: suggested)"
         self._is_pending = False
 
     def show_note(self, text: str) -> None:

@@ -8,6 +8,7 @@ Shape symbols: F faces of the world; f faces of one material.
 
 import io
 import json
+import math
 import struct
 from dataclasses import dataclass, field
 from typing import Any
@@ -64,10 +65,15 @@ class _File:
         return self.add("accessors", entry | more)
 
 
-def world_glb(world: World) -> bytes:
+def world_glb(world: World, top: float = math.inf) -> bytes:
     """The triangles of a world with their textures.
 
-    Surfaces are seen from their front only, so that one looks into a room from outside.
+    Surfaces are seen from their front only.
+
+    Args:
+        world: the world.
+        top: triangles that lie above this height as a whole are left out, so that one looks into
+            a room from above [m].
 
     Raises:
         ValueError: more triangles than `MAX_FACES`.
@@ -78,9 +84,10 @@ def world_glb(world: World) -> bytes:
             "browser is given"
         )
     file = _File()
+    is_low = world.vertices[world.faces, 2].min(axis=1) <= top
     primitives: list[dict[str, Any]] = []
     for number, material in enumerate(world.materials):
-        chosen = np.flatnonzero(world.face_material == number)
+        chosen = np.flatnonzero((world.face_material == number) & is_low)
         if len(chosen):
             attributes = _attributes(file, world, chosen)
             primitives.append(
@@ -90,7 +97,8 @@ def world_glb(world: World) -> bytes:
                     "mode": _TRIANGLES,
                 }
             )
-    file.add("meshes", {"primitives": primitives})
+    if primitives:  # a mesh without any would be no valid glTF
+        file.add("meshes", {"primitives": primitives})
     return _packed(file)
 
 
@@ -151,13 +159,13 @@ def _packed(file: _File) -> bytes:
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "buffers": [{"byteLength": file.length}],
+        "nodes": [{"mesh": 0}] if file.content["meshes"] else [{}],
+        "buffers": [{"byteLength": max(file.length, 4)}],
         **{name: entries for name, entries in file.content.items() if entries},
     }
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)
-    data = b"".join(file.parts)
+    data = b"".join(file.parts) or b"\0\0\0\0"
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -58,6 +58,12 @@ def scoring_of(header: RunHeader) -> ScoringConfig:
     return ScoringConfig(max_range=jnp.asarray(max_range, dtype=jnp.float32))
 
 
+def title_of(header: RunHeader) -> str:
+    """Who explored what, in a few words; a file's name without its folders."""
+    scene = str(header.scene.get("name", "")).rpartition("/")[2]
+    return f"{header.policy.get('name', '')} in {scene}"
+
+
 def cut_height(rows: Sequence[StepRow], points: np.ndarray) -> float:
     """Height above which nothing is drawn, so that one looks in from above [m].
 

@@ -29,8 +29,9 @@ from r3jax.splatting.scene import GaussianScene
 TERMS = ("renderability", "bias", "noise", "resolution")
 """R and its factors, in the order in which they are shown."""
 
-Photographer = Callable[[np.ndarray], np.ndarray]
-"""The true picture at a pose `T_world_camera` [4, 4]: RGB in [0, 1], [H, W, 3]."""
+Photographer = Callable[[np.ndarray], np.ndarray | None]
+"""The true picture at a pose `T_world_camera` [4, 4], RGB in [0, 1], [H, W, 3]; None: there is
+none."""
 
 
 @dataclass(frozen=True)

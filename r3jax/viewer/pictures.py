@@ -73,12 +73,20 @@ def panorama_image(look: Look, width: int = 360) -> np.ndarray:
     return np.asarray(image)
 
 
-def fitted(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """A picture made to fit into a frame, in its middle, [height, width, 3] uint8."""
+def fitted(picture: np.ndarray, width: int, height: int, *, is_photo: bool = False) -> np.ndarray:
+    """A picture made to fit into a frame, in its middle, [height, width, 3] uint8.
+
+    Args:
+        picture: [H, W, 3] uint8.
+        width: of the frame [px].
+        height: of the frame [px].
+        is_photo: whether its pixels may be smoothed when it is made larger.
+    """
     image = Image.fromarray(np.ascontiguousarray(picture))
     scale = min(width / image.width, height / image.height)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
-    way = Image.Resampling.NEAREST if scale > 1.0 else Image.Resampling.BOX
+    larger = Image.Resampling.BICUBIC if is_photo else Image.Resampling.NEAREST
+    way = larger if scale > 1.0 else Image.Resampling.BOX
     canvas = Image.new("RGB", (width, height), _PAPER)
     canvas.paste(image.resize(size, way), ((width - size[0]) // 2, (height - size[1]) // 2))
     return np.asarray(canvas)

@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw
 
 from r3jax.trace.reader import Run
 from r3jax.viewer.colors import SCORES, UNSEEN, paint
+from r3jax.viewer.known import title_of
 from r3jax.viewer.pictures import fitted, font
 
 _INK, _MUTED, _PAPER = (31, 41, 55), (107, 114, 128), (255, 255, 255)
@@ -69,8 +70,7 @@ class Sheet:
             image: its image, [H, W, 3] uint8.
             quantity: what the colors show, one of `blocks.QUANTITIES`.
         """
-        row, header = run.rows[step], run.header
-        scene = str(header.scene.get("name", "")).rpartition("/")[2]
+        row = run.rows[step]
         facts = (
             ("view", f"{step + 1} of {len(run.rows)}"),
             ("mission clock", f"{row.seconds:.1f} s"),
@@ -81,7 +81,7 @@ class Sheet:
         )
         curve = [r.coverage.mean_renderability for r in run.rows[: step + 1]]
         return Sheet(
-            title=f"{header.policy.get('name', '')} in {scene}",
+            title=title_of(run.header),
             subtitle=_TITLES[quantity],
             image=image,
             facts=facts,
@@ -102,13 +102,13 @@ def compose(picture: np.ndarray, sheet: Sheet) -> np.ndarray:
     if sheet.has_scale:
         _scale(canvas, pen, _EDGE, height - 48)
     left, side = width, _COLUMN - _EDGE
-    canvas.paste(Image.fromarray(fitted(sheet.image, side, side)), (left, _EDGE))
+    canvas.paste(Image.fromarray(fitted(sheet.image, side, side, is_photo=True)), (left, _EDGE))
     top = _EDGE + side + 16
     for name, value in sheet.facts:
         pen.text((left, top), name, fill=_MUTED, font=font(16))
         pen.text((left + side, top), value, fill=_INK, font=font(16), anchor="ra")
         top += 25
-    _curve(pen, sheet, (left, top + 34, left + side, height - 30))
+    _curve(pen, sheet, (left, top + 34, left + side - 6, height - 30))
     return np.asarray(canvas)
 
 

@@ -36,15 +36,15 @@ class Stage:
         self._views: dict[int, viser.CameraFrustumHandle] = {}
         scene.configure_default_lights(cast_shadow=False)
         self.gizmo = scene.add_transform_controls(
-            "/camera", scale=0.6, line_width=3.0, depth_test=False
+            "/camera", scale=0.6, line_width=3.5, depth_test=False
         )
         """The handles by which the camera is dragged."""
         self._body = scene.add_camera_frustum(
             "/camera/body",
             self._fov,
             self._aspect,
-            scale=0.3,
-            thickness=0.012,
+            scale=0.45,
+            thickness=0.02,
             color=_CAMERA_COLOR,
             cast_shadow=False,
             receive_shadow=False,
@@ -161,7 +161,7 @@ class Stage:
             colors,
             point_size=edge,
             point_shape="square",
-            point_shading="flat",
+            point_shading="gradient",
             precision="float32",
         )
 
@@ -188,9 +188,9 @@ class Stage:
             "/suggestion",
             np.stack([position, position + 0.9 * direction])[None].astype(np.float32),
             _SUGGESTED,
-            shaft_radius=0.012,
-            head_radius=0.035,
-            head_length=0.09,
+            shaft_radius=0.018,
+            head_radius=0.05,
+            head_length=0.12,
         )
 
     def hide_suggestion(self) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -25,6 +25,7 @@ _OFFERS_KEPT = 200
 """Decisions whose candidates are kept: 100 of them take 7 kB."""
 
 
+@runtime_checkable
 class Story(Protocol):
     """Views in order, what they showed, and what was known after them."""
 

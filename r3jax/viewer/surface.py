@@ -1,6 +1,5 @@
 """What is drawn of the place: the map's voxels, the recorded points, the splats or the mesh."""
 
-import functools
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -41,8 +40,8 @@ class Sources:
     points: Callable[[], Points] | None = None
     """The recorded points."""
 
-    mesh: Callable[[], bytes] | None = None
-    """The scene as GLB."""
+    mesh: Callable[[float], bytes] | None = None
+    """The scene as GLB, without what lies above a height [m]."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -61,7 +60,7 @@ class Surface:
         story: Story,
         config: ScoringConfig,
         sources: Sources,
-        remark: str,
+        remark: Callable[[], str],
     ):
         """Draws nothing yet.
 
@@ -71,14 +70,14 @@ class Surface:
             story: whose camera asks for the resolution.
             config: of the scores.
             sources: what can be drawn.
-            remark: what is always said.
+            remark: what is said beside it.
         """
         self._stage, self._controls, self._story = stage, controls, story
         self._config, self._sources, self._remark = config, sources, remark
         self._known: OrderedDict[tuple[int, bool], Known] = OrderedDict()
         self._points: Points | None = None
         self._drawn: tuple[object, ...] | None = None
-        self._sent: set[str] = set()
+        self._gaussians: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def draw(self, wishes: Wishes, T_world_camera: np.ndarray, moment: Moment) -> Iterator[Show]:
         """What is wished for, unless it is what is drawn already.
@@ -99,8 +98,10 @@ class Surface:
             show = self._voxels(wishes, T_world_camera[:3, 3], moment)
         elif wishes.surface == "recorded points":
             show = self._recorded(wishes.cut)
+        elif wishes.surface == "splats":
+            show = self._splats(wishes.cut)
         else:
-            show = self._whole(wishes.surface)
+            show = self._mesh(wishes.cut)
 
         def show_it() -> None:
             show()
@@ -110,7 +111,7 @@ class Surface:
         yield show_it
 
     def _say(self, text: str) -> None:
-        self._controls.show_note("; ".join(part for part in (text, self._remark) if part))
+        self._controls.show_note("; ".join(part for part in (text, self._remark()) if part))
 
     def _voxels(self, wishes: Wishes, position: np.ndarray, moment: Moment) -> Show:
         """The map, colored as wished and cut open."""
@@ -123,7 +124,7 @@ class Surface:
         blocks = known.blocks
         colors = block_colors(blocks, state, terms, wishes.quantity)
         low = blocks.centers[:, 2] <= wishes.cut
-        text = voxel_note(blocks) + ("; gray: in view of none of the places" if has_score else "")
+        text = voxel_note(blocks) + ("; gray: no such place sees them" if has_score else "")
 
         def show() -> None:
             self._stage.show_points("/map", blocks.centers[low], colors[low], blocks.edge)
@@ -157,26 +158,31 @@ class Surface:
 
         return show
 
-    def _whole(self, surface: str) -> Show:
-        """Splats or the mesh: sent once, then only shown."""
-        if surface in self._sent:
-            return lambda: None
-        if surface == "mesh":
-            assert self._sources.mesh is not None
-            glb = self._sources.mesh()
-            send = functools.partial(self._stage.show_mesh, _NODES[surface], glb)
-            text = f"the scene's own mesh, {len(glb) / 1e6:.1f} MB, without its lamps"
-        else:
-            assert self._sources.model is not None
-            arrays = splat_arrays(self._sources.model)
-            total = int(np.asarray(self._sources.model.is_alive).sum())
-            send = functools.partial(self._stage.show_splats, _NODES[surface], arrays)
-            text = f"{len(arrays[0])} of {total} Gaussians, without view-dependent color"
+    def _splats(self, cut: float) -> Show:
+        """The trained splats, cut open."""
+        model = self._sources.model
+        assert model is not None
+        if self._gaussians is None:
+            self._gaussians = splat_arrays(model)
+        centers, covariances, colors, opacities = self._gaussians
+        low = centers[:, 2] <= cut
+        total = int(np.asarray(model.is_alive).sum())
 
         def show() -> None:
-            send()
-            self._sent.add(surface)
-            self._say(text)
+            arrays = centers[low], covariances[low], colors[low], opacities[low]
+            self._stage.show_splats("/splats", arrays)
+            self._say(f"{len(centers)} of {total} Gaussians, without view-dependent color")
+
+        return show
+
+    def _mesh(self, cut: float) -> Show:
+        """The scene's own triangles, but for those above the cut."""
+        assert self._sources.mesh is not None
+        glb = self._sources.mesh(cut)
+
+        def show() -> None:
+            self._stage.show_mesh("/mesh", glb)
+            self._say(f"the scene's own mesh, {len(glb) / 1e6:.1f} MB, without its lamps")
 
         return show
 

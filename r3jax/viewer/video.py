@@ -37,8 +37,10 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], rate: int) -> str:
                     raise ValueError(f"a film needs even sizes, got {width} x {height}")
                 stream = container.add_stream(name, rate=rate)
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-                stream.options = {"crf": "18"} if name == "libx264" else {}
-                stream.bit_rate = 4_000_000 if name != "libx264" else stream.bit_rate
+                if name == "libx264":
+                    stream.options = {"crf": "18"}
+                else:
+                    stream.bit_rate = 4_000_000
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
             container.mux(stream.encode(frame))
         if stream is None:

@@ -48,6 +48,12 @@ def test_every_triangle_is_there_once():
     assert corners(meshes) == sorted(world.vertices[world.faces].tolist())
 
 
+def test_triangles_above_the_top_are_left_out_and_those_across_it_stay():
+    world = make_world(faces=np.array([[0, 1, 2], [0, 1, 3], [3, 3, 3]], np.int32))
+    assert corners(read(world_glb(world, 2.0))) == sorted(world.vertices[world.faces[:2]].tolist())
+    assert read(world_glb(world, -1.0)) == []
+
+
 def test_colors_are_linear_factors_and_textures_keep_their_rows():
     plain, textured = read(world_glb(make_world()))
     factor = np.asarray(plain.visual.material.baseColorFactor)[:3] / 255.0

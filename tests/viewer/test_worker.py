@@ -5,6 +5,9 @@ import threading
 import pytest
 
 from r3jax.viewer.worker import LatestWorker
+from tests.mutants import Mutant, assert_caught, each, load
+
+CHAIN = ("r3jax.viewer.worker",)
 
 PATIENCE = 30.0  # seconds after which a test gives up
 
@@ -12,12 +15,12 @@ PATIENCE = 30.0  # seconds after which a test gives up
 class Bench:
     """A worker whose answers wait for a sign, and what it has shown."""
 
-    def __init__(self, parts=("a", "b"), idle=None):
-        self.shown, self.failed, self.worked = [], [], []
+    def __init__(self, parts=("a", "b"), idle=None, make=LatestWorker):
+        self.shown, self.failed, self.worked, self.marked = [], [], [], []
         self.parts = parts
         self.begun = threading.Semaphore(0)
         self.may_go_on = threading.Semaphore(0)
-        self.worker = LatestWorker(
+        self.worker = make(
             self.answer,
             lambda question, part: self.shown.append((question, part)),
             lambda question, error: self.failed.append((question, str(error))),
@@ -56,15 +59,39 @@ def test_an_answer_is_shown_part_by_part(bench):
     assert bench.shown == [("one", "a"), ("one", "b")]
 
 
-def test_the_last_of_several_questions_wins(bench):
+def last_wins(modules) -> None:
+    bench = Bench(make=modules["worker"].LatestWorker)
     bench.worker.ask("first")
     bench.wait_for_work()
     for question in ("second", "third", "fourth"):
-        bench.worker.ask(question)
-    bench.let_go(3)
+        bench.worker.ask(question, lambda question=question: bench.marked.append(question))
+    bench.may_go_on.release(100)
+    assert bench.worker.wait(PATIENCE)
+    bench.worker.close()
+    assert bench.marked == ["second", "third", "fourth"]
     assert bench.shown == [("fourth", "a"), ("fourth", "b")]
     # Nothing was worked out for those in between, nor more than was under way for the first.
     assert bench.worked == [("first", "a"), ("fourth", "a"), ("fourth", "b")]
+
+
+def test_the_last_of_several_questions_wins():
+    last_wins(load(CHAIN))
+
+
+def mutant(original: str, mutated: str) -> Mutant:
+    return Mutant("worker", original, mutated, last_wins)
+
+
+MUTANTS = [
+    mutant("number == self._asked and not self._closed", "not self._closed"),
+    mutant("                        break\n", "                        pass\n"),
+    mutant("                mark()\n", "                pass\n"),
+]
+
+
+@each(MUTANTS)
+def test_a_planted_fault_is_noticed(mutant):
+    assert_caught(CHAIN, mutant)
 
 
 def test_a_part_that_is_shown_before_is_marked_before_the_next_question(bench):
