@@ -34,7 +34,7 @@ from r3jax.planning.policies.cover import SeenBins, coverage_of_pixels
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import Renderability, score_voxels
 from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer
+from r3jax.scoring.visibility import voxels_in_pixels
 from r3jax.scoring.voxels import voxels_of
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene
@@ -93,14 +93,10 @@ def expect(
     state: MapState, camera: Camera, T_world_camera: Float[Array, "4 4"], config: ScoringConfig
 ) -> Expected:
     """Every prediction of one view, pixel by pixel as `renderability_image` has it."""
-    voxels = voxels_of(state, config.delta)
     view = pinhole_view(camera, T_world_camera, config)
-    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
-    shape, position = buffer.item.shape, T_world_camera[:3, 3]
-    item = buffer.item.reshape(-1)
-    is_hit = item < voxels.present.shape[0]
-    seen = voxels.take(jnp.where(is_hit, item, 0), is_hit)
-    hit = is_hit.astype(jnp.float32)
+    seen, row = voxels_in_pixels(voxels_of(state, config.delta), view, config)
+    shape, position = row.shape, T_world_camera[:3, 3]
+    hit = seen.present.astype(jnp.float32)
     bins = SeenBins(seen.visited.reshape(-1, *shape), seen.num_bins)
     offset = (position[:, None] - seen.center).reshape(3, *shape)
     coverage = jnp.mean(hit)

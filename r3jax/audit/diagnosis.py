@@ -22,7 +22,7 @@ from r3jax.scoring.chunks import for_selected, select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.views import panorama_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, visible_voxels
+from r3jax.scoring.visibility import seen_in
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 CAUSES = ("fine", "angle", "rare", "distance", "noise")
@@ -128,10 +128,8 @@ def _visible(
     voxels: Voxels, config: ScoringConfig, positions: Float[Array, "p 3"]
 ) -> Bool[Array, "p N"]:
     def seen_from(position: Float[Array, " 3"]) -> Bool[Array, " N"]:
-        view = panorama_view(position, config)
-        candidates = candidates_of(voxels, view)
-        buffer = depth_buffer(voxels, candidates, view, config)
-        return visible_voxels(voxels, candidates, view, buffer).mask
+        _, visible = seen_in(voxels, panorama_view(position, config), config)
+        return visible.mask
 
     return jax.lax.map(seen_from, positions)
 

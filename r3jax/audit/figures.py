@@ -8,12 +8,12 @@ from matplotlib.lines import Line2D
 from r3jax.audit.audit import Audit, JudgedFrame
 from r3jax.audit.colors import COLOR_OF_CAUSE
 from r3jax.audit.foresight import foresee
-from r3jax.audit.sight import sight
 from r3jax.audit.suggest import Suggestion
 from r3jax.evaluation import style
 from r3jax.evaluation.pictures import panorama_picture
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.renderability import term_images
 from r3jax.scoring.voxels import voxels_of
 
 _FINE_BUFFER = 320
@@ -181,7 +181,7 @@ def _pictures(
     state: MapState, audit: Audit, pose: np.ndarray, config: ScoringConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean colors [h, w, 3] and renderability [h, w] (NaN without a voxel) of a view of a map."""
-    seen = sight(state, audit.camera, jnp.asarray(pose, dtype=jnp.float32), config)
+    seen = term_images(state, audit.camera, jnp.asarray(pose, dtype=jnp.float32), config)
     row = np.asarray(seen.row)
     is_hit = row < state.capacity
     row = np.where(is_hit, row, 0)

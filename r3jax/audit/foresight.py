@@ -27,7 +27,7 @@ from r3jax.mapping.state import MapState
 from r3jax.scoring.chunks import for_selected
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, visible_voxels
+from r3jax.scoring.visibility import seen_in
 from r3jax.scoring.voxels import voxels_of
 
 
@@ -51,9 +51,7 @@ def foresee(
     """
     voxels = voxels_of(state, config.delta)
     view = pinhole_view(camera, T_world_camera, config)
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, config)
-    visible = visible_voxels(voxels, candidates, view, buffer)
+    _, visible = seen_in(voxels, view, config)
     position = T_world_camera[:3, 3]
     num_words = state.visited.shape[0]
 

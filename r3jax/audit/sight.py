@@ -1,70 +1,20 @@
-"""What a view shows of the map, pixel by pixel, and what its renderability is made of.
-
-Shape symbols: h w size of the depth buffer; N rows of the map.
-"""
+"""How well one view of the map would render, and what its renderability is made of."""
 
 from dataclasses import dataclass
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.renderability import score_voxels
-from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer
-from r3jax.scoring.voxels import voxels_of
+from r3jax.scoring.renderability import term_images
 
 TERMS = ("bias", "noise", "resolution")
 """Factors of renderability, in the paper's order."""
 
 LEAST = 1e-3
 """Terms are not counted lower, so that their logarithm stays finite."""
-
-
-class Sight(eqx.Module):
-    """One view of the map."""
-
-    row: Int[Array, "h w"]
-    """Row of the voxel in each pixel; N where there is none."""
-
-    value: Float[Array, "h w"]
-    """Its renderability from here; 0 where there is none."""
-
-    bias: Float[Array, "h w"]
-    """Factor of the angle to the nearest direction it was seen from; 0 where there is none."""
-
-    noise: Float[Array, "h w"]
-    """Factor of its color's consistency; 0 where there is none."""
-
-    resolution: Float[Array, "h w"]
-    """Factor of the distance it was seen from; 0 where there is none."""
-
-
-@jax.jit
-def sight(
-    state: MapState, camera: Camera, T_world_camera: Float[Array, "4 4"], config: ScoringConfig
-) -> Sight:
-    """One view: as `renderability_image`, term by term."""
-    voxels = voxels_of(state, config.delta)
-    view = pinhole_view(camera, T_world_camera, config)
-    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
-    item = buffer.item.reshape(-1)
-    is_hit = item < state.capacity
-    seen = voxels.take(jnp.where(is_hit, item, 0), is_hit)
-    terms = score_voxels(seen, T_world_camera[:3, 3], camera.focal, config.kappa)
-    shaped = lambda x: x.reshape(buffer.item.shape)
-    return Sight(
-        row=buffer.item,
-        value=shaped(terms.value),
-        bias=shaped(terms.bias),
-        noise=shaped(terms.noise),
-        resolution=shaped(terms.resolution),
-    )
 
 
 @dataclass(frozen=True)
@@ -105,7 +55,7 @@ def view_score(
         pose: `T_world_camera`, [4, 4] [audit units].
         config: range and size of the depth buffer.
     """
-    seen = sight(state, camera, jnp.asarray(pose, dtype=jnp.float32), config)
+    seen = term_images(state, camera, jnp.asarray(pose, dtype=jnp.float32), config)
     value, is_hit = np.asarray(seen.value), np.asarray(seen.row) < state.capacity
     coverage = float(is_hit.mean())
     images = {name: np.asarray(getattr(seen, name))[is_hit] for name in TERMS}

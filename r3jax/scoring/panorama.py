@@ -16,7 +16,7 @@ from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.views import panorama_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, visible_voxels
+from r3jax.scoring.visibility import seen_in
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
@@ -73,9 +73,7 @@ def panorama_of(
     """`panorama` of voxels and cells that are already at hand."""
     num_bins = config.panorama_bins
     view = panorama_view(position, config)
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, config)
-    visible = visible_voxels(voxels, candidates, view, buffer)
+    buffer, visible = seen_in(voxels, view, config)
     bins = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, num_bins)
     unexplored = unexplored_by_direction(cells, view, buffer, view.position, num_bins)
     bins = bins + config.lambda1 * unexplored

@@ -22,7 +22,7 @@ from r3jax.scoring.chunks import for_selected, select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.directions import seen_directions
 from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer
+from r3jax.scoring.visibility import voxels_in_pixels
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
@@ -149,6 +149,48 @@ def voxel_renderability(
     return _voxel_renderability(state, position, focal, kappa)
 
 
+class TermImages(eqx.Module):
+    """What one view shows of the map, pixel by pixel; every term is 0 where it shows nothing."""
+
+    row: Int[Array, "h w"]
+    """Row of the voxel that a pixel sees; the map's capacity where it sees none."""
+
+    value: Float[Array, "h w"]
+    """R, the product of the terms."""
+
+    bias: Float[Array, "h w"]
+    """b: the angle to the nearest direction that the voxel was seen from."""
+
+    noise: Float[Array, "h w"]
+    """eps: the consistency of its color."""
+
+    resolution: Float[Array, "h w"]
+    """gamma: the sharpness that it was seen with."""
+
+
+@jax.jit
+def term_images(
+    state: MapState,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+) -> TermImages:
+    """R and its terms, of the voxel that each pixel of one view sees.
+
+    The images are a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or
+    high, with the camera's field of view. Differentiable with respect to the pose: which voxel
+    a pixel sees is held fixed, its terms vary.
+    """
+    config = ScoringConfig() if config is None else config
+    view = pinhole_view(camera, T_world_camera, config)
+    seen, row = voxels_in_pixels(voxels_of(state, config.delta), view, config)
+    terms = score_voxels(seen, T_world_camera[:3, 3], camera.focal, config.kappa)
+    image: Callable[[Array], Array] = lambda term: term.reshape(row.shape)
+    return TermImages(
+        row, image(terms.value), image(terms.bias), image(terms.noise), image(terms.resolution)
+    )
+
+
 @jax.jit
 def renderability_image(
     state: MapState,
@@ -158,20 +200,9 @@ def renderability_image(
 ) -> Float[Array, "h w"]:
     """R of the voxel that each pixel of one view sees; 0 where it sees none.
 
-    The image is a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or
-    high, with the camera's field of view. Differentiable with respect to the pose: which voxel
-    a pixel sees is held fixed, its R varies.
+    As `term_images`, of which it is one.
     """
-    config = ScoringConfig() if config is None else config
-    voxels = voxels_of(state, config.delta)
-    view = pinhole_view(camera, T_world_camera, config)
-    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
-    shape = buffer.item.shape
-    item = buffer.item.reshape(-1)
-    is_hit = item < voxels.present.shape[0]
-    seen = voxels.take(jnp.where(is_hit, item, 0), is_hit)
-    value = score_voxels(seen, T_world_camera[:3, 3], camera.focal, config.kappa).value
-    return value.reshape(shape)
+    return term_images(state, camera, T_world_camera, config).value
 
 
 @jax.jit

@@ -23,7 +23,7 @@ from r3jax.mapping.state import MapState
 from r3jax.mapping.update import integrate
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, visible_voxels
+from r3jax.scoring.visibility import seen_in
 from r3jax.scoring.voxels import voxels_of
 
 _MAX_LOAD = 0.7
@@ -123,9 +123,8 @@ def _hidden_by_none(
     farthest = jnp.sqrt(jnp.max(squared_distance)) + state.voxel_size
     config = ScoringConfig(max_range=farthest)
     voxels, view = voxels_of(state), pinhole_view(frame.camera, frame.T_world_camera, config)
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, config)
-    return visible_voxels(voxels, candidates, view, buffer).mask
+    _, visible = seen_in(voxels, view, config)
+    return visible.mask
 
 
 _mark_seen = jax.jit(mark_seen)

@@ -12,7 +12,7 @@ from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, is_visible, visible_voxels
+from r3jax.scoring.visibility import candidates_of, depth_buffer, is_visible, seen_in
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
@@ -56,9 +56,7 @@ def utility_of_view(
 ) -> ViewUtility:
     """`view_utility` of voxels and cells that are already at hand."""
     view = pinhole_view(camera, T_world_camera, config)
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, config)
-    visible = visible_voxels(voxels, candidates, view, buffer)
+    buffer, visible = seen_in(voxels, view, config)
     position = T_world_camera[:3, 3]
     rendering = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, 1)[0]
     exploration = unexplored_by_direction(cells, view, buffer, position, 1)[0]

@@ -8,21 +8,17 @@ Shape symbols: h w size of the depth buffer; H W size of a picture; B directions
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.panorama import panorama
-from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.renderability import term_images
 from r3jax.scoring.utility import view_utility
-from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer
-from r3jax.scoring.voxels import voxels_of
 from r3jax.splatting.render import render
 from r3jax.splatting.scene import GaussianScene
 
@@ -112,9 +108,10 @@ class Look:
 def glance_from(around: Surroundings, T_world_camera: np.ndarray) -> Glance:
     """R and its terms in the view at one pose [4, 4]."""
     pose = jnp.asarray(T_world_camera, dtype=jnp.float32)
-    terms, hit = _terms(around.map_state, around.camera, pose, around.config)
-    is_hit = np.asarray(hit)
-    images = dict(zip(TERMS, np.asarray(terms), strict=True))
+    shown = term_images(around.map_state, around.camera, pose, around.config)
+    is_hit = np.asarray(shown.row) < around.map_state.capacity
+    found = (shown.value, shown.bias, shown.noise, shown.resolution)
+    images = {name: np.asarray(image) for name, image in zip(TERMS, found, strict=True)}
     return Glance(
         means={name: float(image.mean()) for name, image in images.items()},
         seen=float(is_hit.mean()),
@@ -150,25 +147,6 @@ def look_from(
         splats=_splats(around, pose),
         truth=None if around.photographer is None else around.photographer(T_world_camera),
     )
-
-
-@jax.jit
-def _terms(
-    state: MapState, camera: Camera, T_world_camera: Float[Array, "4 4"], config: ScoringConfig
-) -> tuple[Float[Array, "4 h w"], Bool[Array, "h w"]]:
-    """R and its terms of the voxel that each pixel sees, 0 where it sees none, and where it does.
-
-    As `r3jax.renderability_image`, with the terms kept.
-    """
-    voxels = voxels_of(state, config.delta)
-    view = pinhole_view(camera, T_world_camera, config)
-    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
-    item = buffer.item.reshape(-1)
-    is_hit = item < voxels.present.shape[0]
-    seen = voxels.take(jnp.where(is_hit, item, 0), is_hit)
-    terms = score_voxels(seen, T_world_camera[:3, 3], camera.focal, config.kappa)
-    stacked = jnp.stack([terms.value, terms.bias, terms.noise, terms.resolution])
-    return stacked.reshape(4, *buffer.item.shape), is_hit.reshape(buffer.item.shape)
 
 
 def _splats(around: Surroundings, pose: Float[Array, "4 4"]) -> np.ndarray | None:

@@ -20,7 +20,7 @@ from r3jax.scoring.chunks import for_selected
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.views import panorama_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, visible_voxels
+from r3jax.scoring.visibility import seen_in
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 NUM_PROBES = 24
@@ -109,10 +109,7 @@ def _add_sightings(
     totals: Float[Array, "5 N"],
 ) -> Float[Array, "5 N"]:
     """Adds the terms of the voxels that one position sees, and one sighting each."""
-    view = panorama_view(position, config)
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, config)
-    visible = visible_voxels(voxels, candidates, view, buffer)
+    _, visible = seen_in(voxels, panorama_view(position, config), config)
     num = totals.shape[1]
 
     def add(
