@@ -1,10 +1,8 @@
 """The report of an audit: one HTML page that opens from disk, with everything inside."""
 
-import base64
 import html
 from collections.abc import Iterable
 from pathlib import Path
-from string import Template
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,49 +16,8 @@ from r3jax.audit.region_pictures import region_figure
 from r3jax.audit.regions import Region
 from r3jax.audit.suggest import Suggestion
 from r3jax.evaluation import style
+from r3jax.evaluation.page import image, page, section
 from r3jax.files import write_atomic
-
-_PAGE = Template(
-    """<!doctype html>
-<html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>r3jax audit: $title</title>
-<style>
- body { font: 15px/1.5 system-ui, sans-serif; color: #1f2937; background: #f3f4f6; margin: 0 }
- main { max-width: 1060px; margin: 0 auto; padding: 28px 20px 60px }
- h1 { font-size: 26px; margin: 0 0 6px } h2 { font-size: 18px; margin: 0 0 4px }
- h3 { font-size: 15px; margin: 22px 0 2px }
- .lead { font-size: 17px; margin: 0 0 18px } .lead p { margin: 0 0 6px }
- section { background: white; border-radius: 10px; padding: 18px 22px; margin: 16px 0;
-   box-shadow: 0 1px 3px #0001 }
- .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px }
- .card { background: white; border-radius: 10px; padding: 12px 16px; box-shadow: 0 1px 3px #0001 }
- .card b { display: block; font-size: 23px; line-height: 1.3 } .card span { color: #6b7280;
-   font-size: 13px }
- p.note { color: #6b7280; font-size: 13.5px; margin: 0 0 10px }
- p.why { margin: 0 0 6px; font-size: 14px }
- img { max-width: 100%; display: block; margin: 0 auto }
- table { border-collapse: collapse; font-size: 14px; width: 100%; margin-top: 6px }
- th, td { text-align: left; padding: 4px 12px 4px 0; border-bottom: 1px solid #e5e7eb;
-   vertical-align: top }
- th { color: #6b7280; font-weight: 600; font-size: 13px }
- td.k { white-space: nowrap }
- td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
- i.dot { display: inline-block; width: 11px; height: 11px; border-radius: 3px; margin-right: 7px }
- i.bar { display: inline-block; height: 9px; border-radius: 3px; margin-left: 8px }
- b.num { display: inline-block; min-width: 21px; height: 21px; border-radius: 11px; color: white;
-   background: #075985; text-align: center; font-size: 13px; line-height: 21px;
-   margin-right: 6px }
- code { font: 13px ui-monospace, monospace; overflow-wrap: anywhere }
- ul { padding-left: 20px; margin: 4px 0; font-size: 14px; color: #374151 }
-</style></head><body><main>
-<h1>$title</h1>
-<div class="lead">$lead</div>
-<div class="cards">$cards</div>
-$sections
-</main></body></html>
-"""
-)
 
 
 def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path:
@@ -78,7 +35,7 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         OSError: the disk is full, not writable, ...
     """
     parts = [
-        _section(
+        section(
             "From above",
             "Letters: regions to mend, in the color of their cause; dotted circles: where the "
             "capture ends. Numbers: suggested views, the wedge is what they show. Dots: frames, "
@@ -86,30 +43,25 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
             "out.",
             _image(plan_figure(audit)),
         ),
-        _section(
+        section(
             "What is wrong, and how much of it",
             "Shares of the surface that one sees from where people could stand.",
             _cause_table(audit),
         ),
-        _section(
+        section(
             "Where it is worst", _region_note(audit), _region_pictures(audit) + _region_table(audit)
         ),
     ]
     if audit.plan.views:
         parts.append(_views_section(audit))
     parts += [_frames_section(audit), _panorama_section(audit), _method_section(audit, files)]
-    page = _PAGE.substitute(
-        title=html.escape(f"Audit of {audit.source.name}"),
-        lead="".join(f"<p>{html.escape(text)}</p>" for text in sentences.verdict(audit)),
-        cards=_cards(audit),
-        sections="\n".join(parts),
-    )
+    title = f"Audit of {audit.source.name}"
     path = folder / "report.html"
-    write_atomic(path, page.encode())
+    write_atomic(path, page("audit", title, sentences.verdict(audit), _cards(audit), parts))
     return path
 
 
-def _cards(audit: Audit) -> str:
+def _cards(audit: Audit) -> dict[str, str]:
     found, plan = audit.diagnosis, audit.plan
     bad = (1.0 - found.fine_share) * found.is_judged.sum() * audit.survey.voxel_size**2
     cards = {
@@ -121,8 +73,7 @@ def _cards(audit: Audit) -> str:
     if plan.views:
         gain = f"{found.mean:.2f} → {plan.after.mean:.2f}"
         cards[f"mean R of the surfaces after {len(plan.views)} views"] = gain
-    card = '<div class="card"><b>{}</b><span>{}</span></div>'
-    return "".join(card.format(html.escape(v), html.escape(k)) for k, v in cards.items())
+    return cards
 
 
 def _cause_table(audit: Audit) -> str:
@@ -221,7 +172,7 @@ def _views_section(audit: Audit) -> str:
         "<code>suggested.json</code> (nerfstudio's camera path) and "
         "<code>suggested_transforms.json</code>, in the capture's own coordinates."
     )
-    return _section("Which views would help most", note, "".join(parts))
+    return section("Which views would help most", note, "".join(parts))
 
 
 def _frames_section(audit: Audit) -> str:
@@ -232,7 +183,7 @@ def _frames_section(audit: Audit) -> str:
     )
     body = _image(figures.frames_figure(audit)) + "<h3>The worst</h3>"
     body += _image(figures.worst_figure(audit))
-    return _section("How well the frames would render", own, body)
+    return section("How well the frames would render", own, body)
 
 
 def _panorama_section(audit: Audit) -> str:
@@ -240,21 +191,15 @@ def _panorama_section(audit: Audit) -> str:
         "All directions from some of the standpoints; the middle of a picture is the first axis "
         "along the ground. Grey: nothing within range."
     )
-    return _section("Looking round", note, _image(figures.panorama_strip(audit)))
+    return section("Looking round", note, _image(figures.panorama_strip(audit)))
 
 
 def _method_section(audit: Audit, files: Iterable[Path]) -> str:
     items = "".join(f"<li>{html.escape(text)}</li>" for text in sentences.method(audit))
     names = ", ".join(f"<code>{html.escape(path.name)}</code>" for path in files)
     beside = f"<p class=note>Beside this page: {names}.</p>" if names else ""
-    return _section("How this was computed", "", f"<ul>{items}</ul>{beside}")
-
-
-def _section(title: str, note: str, body: str) -> str:
-    lead = f'<p class="note">{note}</p>' if note else ""
-    return f"<section><h2>{title}</h2>{lead}{body}</section>"
+    return section("How this was computed", "", f"<ul>{items}</ul>{beside}")
 
 
 def _image(figure: Figure) -> str:
-    data = base64.b64encode(style.to_png(figure)).decode()
-    return f'<img alt="" src="data:image/png;base64,{data}">'
+    return image(style.to_png(figure))

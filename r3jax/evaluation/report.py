@@ -1,10 +1,8 @@
 """The report of a run: PNG figures and one HTML page that opens from disk."""
 
-import base64
 import html
 import json
 from pathlib import Path
-from string import Template
 
 from matplotlib.figure import Figure
 
@@ -16,6 +14,7 @@ from r3jax.evaluation.model_report import (
     read_judged_model,
     training_figure,
 )
+from r3jax.evaluation.page import image, page, section
 from r3jax.evaluation.pictures import panorama_picture
 from r3jax.evaluation.summary import StageTime, stage_times, summary
 from r3jax.files import write_atomic
@@ -23,38 +22,6 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
-
-_PAGE = Template(
-    """<!doctype html>
-<html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>r3jax run: $title</title>
-<style>
- body { font: 15px/1.5 system-ui, sans-serif; color: #1f2937; background: #f3f4f6; margin: 0 }
- main { max-width: 1020px; margin: 0 auto; padding: 28px 20px 60px }
- h1 { font-size: 26px; margin: 0 0 2px } h2 { font-size: 17px; margin: 0 0 4px }
- .lead { color: #4b5563; margin: 0 0 20px }
- section { background: white; border-radius: 10px; padding: 18px 20px; margin: 16px 0;
-   box-shadow: 0 1px 3px #0001 }
- .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px }
- .card { background: white; border-radius: 10px; padding: 12px 16px; box-shadow: 0 1px 3px #0001 }
- .card b { display: block; font-size: 23px; line-height: 1.3 } .card span { color: #6b7280;
-   font-size: 13px }
- p.note { color: #6b7280; font-size: 13.5px; margin: 0 0 10px }
- img { max-width: 100%; display: block; margin: 0 auto }
- table { border-collapse: collapse; font-size: 14px; width: 100% }
- th, td { text-align: left; padding: 4px 10px 4px 0; border-bottom: 1px solid #e5e7eb;
-   vertical-align: top }
- td.n, th.n { text-align: right; font-variant-numeric: tabular-nums }
- code { font: 13px ui-monospace, monospace; overflow-wrap: anywhere }
-</style></head><body><main>
-<h1>$title</h1>
-<p class="lead">$lead</p>
-<div class="cards">$cards</div>
-$sections
-</main></body></html>
-"""
-)
 
 _NOTES = {
     "plan": (
@@ -123,9 +90,10 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
         # What came out of it all stands first.
         sections[:0] = _model_sections(folder, model)
     sections.append(_settings_section(run))
-    page = folder / "report.html"
-    write_atomic(page, _page(run, sections, model).encode())
-    return page
+    title = f"{run.header.policy.get('name')} in {run.header.scene.get('name')}"
+    path = folder / "report.html"
+    write_atomic(path, page("run", title, [f"{run.outcome}."], _cards(run, model), sections))
+    return path
 
 
 def _model_sections(folder: Path, model: JudgedModel) -> list[str]:
@@ -136,14 +104,14 @@ def _model_sections(folder: Path, model: JudgedModel) -> list[str]:
         curves = style.to_png(training_figure(model.history))
         write_atomic(folder / "training.png", curves)
     table = quality_table(model.evaluation)
-    sections = [_section("The splats trained on these views", note, curves, table)]
+    sections = [_picture_section("The splats trained on these views", note, curves, table)]
     if model.sheet is not None:
         note = "Ground truth, render, error, and what the map had expected; worst views first."
-        sections.append(_section("Renders", note, model.sheet, ""))
+        sections.append(_picture_section("Renders", note, model.sheet))
     return sections
 
 
-def _page(run: Run, sections: list[str], model: JudgedModel | None) -> str:
+def _cards(run: Run, model: JudgedModel | None) -> dict[str, str]:
     last = run.rows[-1]
     cards = {
         "views": str(len(run.rows)),
@@ -155,25 +123,17 @@ def _page(run: Run, sections: list[str], model: JudgedModel | None) -> str:
     }
     if model is not None:
         cards["PSNR of test views"] = f"{model.evaluation['metrics']['psnr']['mean']:.1f} dB"
-    card = '<div class="card"><b>{}</b><span>{}</span></div>'
-    return _PAGE.substitute(
-        title=html.escape(f"{run.header.policy.get('name')} in {run.header.scene.get('name')}"),
-        lead=html.escape(f"{run.outcome}."),
-        cards="".join(card.format(html.escape(v), html.escape(k)) for k, v in cards.items()),
-        sections="\n".join(sections),
-    )
+    return cards
 
 
 def _figure_section(name: str, png: bytes, extra: str) -> str:
     title, note = _NOTES[name]
-    return _section(title, note, png, extra)
+    return _picture_section(title, note, png, extra)
 
 
-def _section(title: str, note: str, png: bytes, extra: str) -> str:
+def _picture_section(title: str, note: str, png: bytes, extra: str = "") -> str:
     """A title, a note, a picture (if it is not empty) and more."""
-    data = base64.b64encode(png).decode()
-    image = f'<img alt="{title}" src="data:image/png;base64,{data}">' if png else ""
-    return f'<section><h2>{title}</h2><p class="note">{note}</p>{image}{extra}</section>'
+    return section(title, note, (image(png, title) if png else "") + extra)
 
 
 def _stage_table(stages: list[StageTime]) -> str:
@@ -206,7 +166,7 @@ def _settings_section(run: Run) -> str:
         f"<tr><th>{html.escape(name)}</th><td><code>{html.escape(text)}</code></td></tr>"
         for name, text in groups.items()
     )
-    return f"<section><h2>Outcome and settings</h2><table>{rows}</table></section>"
+    return section("Outcome and settings", "", f"<table>{rows}</table>")
 
 
 def _compact(settings: object) -> str:
