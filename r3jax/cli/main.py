@@ -42,6 +42,9 @@ INTERRUPTED = 130
 USER_ERROR = 2
 """Exit code where the user can mend it: an unknown name, a folder that exists, a broken file."""
 
+NO_READER = 141
+"""Exit code where whoever read the output has gone (`r3jax info | head`), as shells have it."""
+
 
 def main(args: Sequence[str] | None = None) -> int:
     """Runs one command.
@@ -51,8 +54,17 @@ def main(args: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0 done, 1 stopped by the disk, a cell failed or a replay differed, 2 wrong
-        input, 130 interrupted.
+        input, 130 interrupted, 141 nobody reads the output any more.
     """
+    try:
+        return _main(args)
+    except BrokenPipeError:
+        # Python would fail once more when it flushes at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NO_READER
+
+
+def _main(args: Sequence[str] | None) -> int:
     command = tyro.extras.subcommand_cli_from_dict(
         _COMMANDS,
         prog="r3jax",

@@ -1,6 +1,7 @@
 """The command line, as a user meets it: help, mistakes, a run, an interrupt, a recording."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -163,6 +164,15 @@ def test_help_reads_well_and_waits_for_nothing_heavy(words):
     assert done.returncode == 0, done.stderr
     assert "--budget" in done.stdout or words[0] != "explore"
     assert max(len(line) for line in done.stdout.splitlines()) <= 200
+
+
+def test_output_that_nobody_reads_is_no_traceback():
+    program = "import sys\nfrom r3jax.cli import main\nsys.exit(main(['audit', '--help']))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-c", program], stdout=writer, stderr=subprocess.PIPE)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, b"")
 
 
 def test_progress_says_what_is_happening():

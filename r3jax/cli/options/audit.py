@@ -1,0 +1,46 @@
+"""The options of `r3jax audit`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Audit:
+    """Audit a capture: what it lacks for splats, how frames would render, which views to add."""
+
+    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
+    """nerfstudio's transforms.json or its folder, a COLMAP model, a scene of Replica-SLAM, TUM or
+    7-Scenes, a recording (images/, depth/, poses.txt, K.txt), or a run."""
+
+    path: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Camera path to judge, in the capture's coordinates: nerfstudio's camera_path.json, or any
+    capture. By default the capture's own frames, each judged without itself."""
+
+    views: int = 10
+    """Further views to suggest."""
+
+    out: Path | None = None
+    """Folder of the audit; by default runs/audit/NAME. An earlier audit in it is replaced."""
+
+    voxel_size: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
+    """Edge of a voxel in the capture's units; by default 5 cm, or from the depths."""
+
+    max_range: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
+    """Surfaces farther from a camera count as invisible, in the capture's units; by default 5 m,
+    or from the depths."""
+
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Axis of the capture that points up (`--up=-y` where it points down); by default as its
+    cameras were held."""
+
+    max_frames: int = 400
+    """Pictures to use at most, evenly spread."""
+
+    folds: int = 8
+    """Own frames are judged by a map without every N-th picture, themselves among them."""
+
+    seed: int = 0
+    """Of the random views that the suggested ones are compared with."""

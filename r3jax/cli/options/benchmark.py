@@ -1,0 +1,88 @@
+"""The options of `r3jax benchmark`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Compare policies on equal terms: explore, train and judge scenes x policies x seeds."""
+
+    scenes: Annotated[str, tyro.conf.arg(metavar="A,B")] = "flat,office"
+    """Embedded scenes by name, or `mesh:<file>`, with commas between."""
+
+    policies: Annotated[str, tyro.conf.arg(metavar="A,B")] = "ours,ours-pano,frontier,random"
+    """Who chooses the views, with commas between."""
+
+    seeds: Annotated[str, tyro.conf.arg(metavar="0,1")] = "0"
+    """Each makes an exploration and a training of its own."""
+
+    budget: Annotated[str, tyro.conf.arg(metavar="BUDGET")] = "views:60"
+    """Of every exploration: `views:N`, `seconds:S` of the mission clock, or `metres:M`."""
+
+    snapshots: Annotated[str | None, tyro.conf.arg(metavar="A,B")] = None
+    """Where a model is trained and judged, for example `views:30,views:60`; by default at the
+    budget."""
+
+    out: Path = Path("runs/benchmark")
+    """Folder of the results. What is done in it is not done again; an interrupted benchmark
+    goes on when it is started again with the same words."""
+
+    clock: Literal["wall", "model"] = "wall"
+    """`wall`: measured planning and mapping + flight. `model`: fixed costs, repeatable."""
+
+    resolution: int = 256
+    """Width and height of the explored images [px]."""
+
+    train_resolution: int = 128
+    """Width and height of the images that are trained on and judged [px]."""
+
+    iterations: int = 2000
+    """Steps of every training."""
+
+    gaussians: int = 20_000
+    """Gaussians at the start of every training."""
+
+    capacity: int = 40_000
+    """Gaussians that there may ever be."""
+
+    test_views: int = 120
+    """Test views of a scene at most, 6 or more; 0 takes all of the lattice."""
+
+    lpips: Literal["alex", "vgg", "none"] = "alex"
+    """Network of LPIPS; `none` leaves it out."""
+
+    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Settings of all policies: `num_candidates=50`, `lambda2=0.3`, `scoring.lambda1=8`, ..."""
+
+    voxel_size: float = 0.05
+    """Edge of a voxel of the map [m]."""
+
+    max_range: float = 5.0
+    """Range of the depth sensor [m]."""
+
+    noise: float = 0.01
+    """Standard deviation of the explored depth as a share of the depth; test views have none."""
+
+    fov: float = 60.0
+    """Field of view [degrees]."""
+
+    up: Literal["y", "z"] | None = None
+    """Vertical axis of mesh files; by default y for GLB and glTF, z for the others."""
+
+    backend: Literal["auto", "numba", "xla", "splax"] = "auto"
+    """Rasteriser: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
+
+    engine: Literal["local", "slurm"] = "local"
+    """`local`: processes on this machine, one GPU each where there are several. `slurm`: an array
+    job, pre-emption safe."""
+
+    jobs: int = 1
+    """Cells at a time; 0: one by one in this very process, for debugging."""
+
+    slurm: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Parameters of the array job, as submitit calls them: `timeout_min=240`,
+    `slurm_partition=gpu`, `gpus_per_node=1`, ..."""

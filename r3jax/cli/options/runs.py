@@ -1,0 +1,99 @@
+"""The options of the commands that take a run as it is."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Info:
+    """List scenes, policies and versions; or show a run or a recording, given its folder."""
+
+    path: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run folder, or a recording (images/, depth/, poses.txt, K.txt)."""
+
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None
+    """PNG for a recording's renderability, frame by frame."""
+
+    up: Literal["y", "z"] = "y"
+    """Axis of a recording's world that points up."""
+
+    voxel_size: float = 0.05
+    """Edge of a voxel when a recording is mapped [m]."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Rebuild the map of a run from its recorded frames, and compare it with the stored one."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Merge two runs of one scene: their frames in one data set, and the map that saw both."""
+
+    first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+    second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Another one: the same scene, sensor, voxels and cells."""
+
+    out: Path | None = None
+    """Folder of the merged run; by default both names joined by `+`, beside the first."""
+
+    overwrite: bool = False
+    """Replace the run that is there."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Export a run for other programs: nerfstudio's transforms.json, or a COLMAP model."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+    """Where to: a folder that does not exist yet. It needs the run no longer."""
+
+    format: Literal["nerfstudio", "colmap", "colmap-text"] = "nerfstudio"
+    """`nerfstudio`: images, depth, points.ply, transforms.json. `colmap`: the same with
+    sparse/0/*.bin in place of transforms.json; `colmap-text`: with *.txt."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a run in the browser: the map over time, and what a camera that you drag would see.
+
+    Or, with --export, write the pictures without a browser.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+    port: int = 8080
+    """Port of the page; 0 takes any free one."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at. By default nobody but this machine can see the page; 0.0.0.0 shows it
+    to everybody who can reach the machine."""
+
+    name: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    """Name of the trained model, as given to `r3jax train`; by default `last` or the newest."""
+
+    no_scene: bool = False
+    """Do not open the scene that the run was recorded in: no true image, no mesh."""
+
+    export: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Write pictures of the map and one for every view into a folder that does not exist yet."""
+
+    video: bool = False
+    """With --export: a film of the run too (MP4)."""
+
+
+@dataclass(frozen=True)
+class Policies:
+    """List who can choose views: every policy in a sentence, and where its rule comes from."""
