@@ -190,16 +190,15 @@ def relive(
         frame: its frame, read back.
         decide: ask the policy again, for what it remembers of its decision. Policies are pure:
             the same state and key give the same decision. False for a policy that did not
-            choose this view.
+            choose this view: it is told the way.
     """
-    if decide and row.choice is not None:
-        _, policy_state, _ = mission.policy.decide(
-            state.policy_state,
-            state.map_state,
-            state.grid,
-            state.T_world_camera,
-            key=jax.random.fold_in(mission.key, state.views),
-        )
+    if row.choice is not None:
+        now = state.policy_state, state.map_state, state.grid, state.T_world_camera
+        if decide:
+            key = jax.random.fold_in(mission.key, state.views)
+            _, policy_state, _ = mission.policy.decide(*now, key=key)
+        else:
+            policy_state = mission.policy.follow(*now, row.choice.waypoints)
         state = replace(state, policy_state=policy_state)
     state, _ = _map_frame(state, mission, frame)
     return _arrive(state, frame, 0.0 if row.choice is None else row.choice.length, row.charged)

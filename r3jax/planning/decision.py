@@ -93,6 +93,19 @@ def look_round(
     return state, travel, mask_unexplorable(grid, travel.reachable, is_exhausted)
 
 
+def follow_way(
+    state: PlannerState,
+    map_state: MapState,
+    grid: OccupancyGrid,
+    T_world_camera: np.ndarray,
+    waypoints: np.ndarray,
+    config: PlannerConfig,
+) -> PlannerState:
+    """The memory of a robot that goes a way which its policy did not choose."""
+    state, travel, _ = look_round(state, map_state, grid, T_world_camera, config)
+    return _with_way(state, travel, waypoints)
+
+
 def no_decision(
     travel: Travel, config: PlannerConfig, stopwatch: Stopwatch
 ) -> tuple[None, PlanInfo]:
@@ -137,8 +150,12 @@ def settle(
         utilities=utilities,
     )
     info = PlanInfo(Outcome.MOVED, len(poses), int(is_reachable.sum()), stopwatch.seconds)
+    return best, decision, _with_way(state, travel, waypoints), info
+
+
+def _with_way(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> PlannerState:
     trail = jnp.asarray(np.asarray(state.trail) | travel.cells_along(waypoints))
-    return best, decision, eqx.tree_at(lambda s: s.trail, state, trail), info
+    return eqx.tree_at(lambda s: s.trail, state, trail)
 
 
 def net_utility(utility: np.ndarray, path: np.ndarray, lambda2: float) -> np.ndarray:

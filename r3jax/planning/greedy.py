@@ -24,6 +24,7 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decision import (
     PlannerState,
     Stopwatch,
+    follow_way,
     initial_state,
     look_round,
     net_utility,
@@ -151,6 +152,17 @@ class GreedyPolicy(ABC):
         best, decision, state, info = settle(state, travel, poses, utilities, stopwatch)
         memory = self.conclude(situation, poses, utilities, best)
         return decision, replace(state, memory=memory), info
+
+    def follow(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        waypoints: np.ndarray,
+    ) -> PlannerState:
+        """The cells on the way, and what the latest view failed to show."""
+        return follow_way(state, map_state, grid, T_world_camera, waypoints, self.config)
 
 
 def free_views(situation: Situation, num: int, radius: float, *, key: Array) -> np.ndarray:

@@ -89,6 +89,25 @@ class Policy(Protocol):
         """The next view, or None with the reason in the info."""
         ...
 
+    def follow(
+        self,
+        state: Any,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        waypoints: np.ndarray,
+    ) -> Any:
+        """Takes note of a way that somebody else chose, before it is gone: a fork takes over.
+
+        Args:
+            state: what the policy remembers.
+            map_state: the map, the latest view included.
+            grid: the grid, the same.
+            T_world_camera: where the latest view was taken.
+            waypoints: the way to the next one, [K, 3] [m].
+        """
+        ...
+
 
 def _registry() -> dict[str, Any]:
     """Every policy by name. Imported late: the policies import this module."""

@@ -114,6 +114,17 @@ class WatchedPolicy:
             self._on_decision(answer[0], grid)
         return answer
 
+    def follow(
+        self,
+        state: Any,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        waypoints: np.ndarray,
+    ) -> Any:
+        """Takes note of a way that another policy chose."""
+        return self._policy.follow(state, map_state, grid, T_world_camera, waypoints)
+
 
 @dataclass(frozen=True)
 class _RecordedWorld:

@@ -75,6 +75,9 @@ class Watched:
         self._search((decision, state, info))
         return decision, state, info
 
+    def follow(self, state, map_state, grid, T_world_camera, waypoints):
+        return self.inner.follow(state, map_state, grid, T_world_camera, waypoints)
+
 
 @pytest.mark.parametrize("name", policy_names())
 def test_no_policy_holds_the_simulator(name):

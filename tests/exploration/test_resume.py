@@ -94,6 +94,26 @@ def test_a_run_in_two_parts_is_the_run_in_one(tmp_path, whole, name):
     assert_same_run(tmp_path / "run", whole(name))
 
 
+def test_who_takes_over_knows_the_way_that_another_policy_came(tmp_path, whole):
+    shutil.copytree(whole("ours-pano"), tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    run = read_run(tmp_path / "run")
+    result = explore(
+        BoxRoom(),
+        policy_of("frontier"),
+        budget=f"views:{VIEWS}",
+        config=CONFIG,
+        resume=run,
+        decided_from=VIEWS,
+    )
+    taken_over = result.state.policy_state
+    own = read_run(whole("ours-pano")).load_checkpoint(VIEWS - 1)["policy"]
+    assert own["trail"].any()
+    assert own["looks"].any()
+    np.testing.assert_array_equal(np.asarray(taken_over.trail), own["trail"])
+    np.testing.assert_array_equal(np.asarray(taken_over.looks), own["looks"])
+
+
 def damage(path, how):
     checkpoints = path / "checkpoints"
     newest = sorted(checkpoints.iterdir())[-1]

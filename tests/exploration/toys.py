@@ -86,3 +86,6 @@ class Wander:
         )
         info = PlanInfo(Outcome.MOVED, 5, 5, {"scoring": 0.01})
         return decision, state | {"decisions": state["decisions"] + 1}, info
+
+    def follow(self, state, map_state, grid, T_world_camera, waypoints):
+        return state
