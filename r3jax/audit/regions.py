@@ -84,7 +84,8 @@ def bad_regions(state: MapState, diagnosis: Diagnosis, most: int = MOST) -> list
             )
             found.append(region)
         left &= ~is_near
-    return found
+    # A region is not quite the block that it was found by.
+    return sorted(found, key=lambda region: -float((1.0 - diagnosis.value[region.rows]).sum()))
 
 
 def _worst_block(points: np.ndarray, loss: np.ndarray) -> np.ndarray:
