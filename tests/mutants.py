@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unittest import mock
 
 import pytest
@@ -84,7 +84,17 @@ def assert_caught(chain: tuple[str, ...], mutant: Mutant) -> None:
         mutant.law(modules)
 
 
-def each(mutants: list[Mutant]) -> pytest.MarkDecorator:
-    """Runs a test for each mutant, named by the module and the fault."""
-    names = [f"{mutant.module}: {' '.join(mutant.mutated.split())}" for mutant in mutants]
-    return pytest.mark.parametrize("mutant", mutants, ids=names)
+def each(mutants: list[Mutant], in_gate: int | None = None) -> pytest.MarkDecorator:
+    """Runs a test for each mutant, named by the module and the fault.
+
+    Args:
+        mutants: the list.
+        in_gate: so many of them run every time, the others with `pytest -m slow`: where each
+            compiles for seconds, and the laws change seldom. None: all.
+    """
+    cases: list[Any] = []
+    for number, mutant in enumerate(mutants):
+        name = f"{mutant.module}: {' '.join(mutant.mutated.split())}"
+        is_rare = in_gate is not None and number >= in_gate
+        cases.append(pytest.param(mutant, id=name, marks=[pytest.mark.slow] if is_rare else []))
+    return pytest.mark.parametrize("mutant", cases)

@@ -147,6 +147,7 @@ def without_clock(record):
     return {name: value for name, value in record.items() if name not in ("commit", "machine")}
 
 
+@pytest.mark.slow
 def test_a_cell_that_is_killed_again_and_again_ends_in_the_same_record(finished, room, tmp_path):
     (cell,) = make_cells(room, tmp_path)
     paths = paths_of(tmp_path, cell)

@@ -105,6 +105,7 @@ def test_jobs_that_are_preempted_and_requeued_go_on_with_their_cells(
     assert_same_records(tmp_path, finished[0])
 
 
+@pytest.mark.slow
 def test_a_job_that_is_killed_fails_alone_and_the_next_benchmark_ends_its_cell(
     slurm, finished, room, tmp_path
 ):

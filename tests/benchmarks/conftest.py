@@ -1,4 +1,7 @@
-"""A real map to measure on: an apartment, seen through the paper's camera with its noise."""
+"""A real map to measure on: an apartment, seen through the paper's camera with its noise.
+
+Without --benchmark-enable the benchmarks are only tried: on a small map, and each in one size.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,21 +13,30 @@ from r3jax.scenes import procedural
 from r3jax.scenes.registry import open_scene
 from r3jax.scoring.config import ScoringConfig
 
-VOXELS = 60_000
+VOXELS, EDGE = 60_000, 512
+TRIED_VOXELS, TRIED_EDGE = 6_000, 96
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leaves out the larger sizes (`measured`) where nothing is measured."""
+    if config.getoption("benchmark_disable"):
+        larger = [item for item in items if item.get_closest_marker("measured")]
+        items[:] = [item for item in items if item not in larger]
+        config.hook.pytest_deselected(items=larger)
 
 
 class Explored:
-    """An apartment whose map holds some 60 000 voxels, and the last frame that joined it."""
+    """An apartment whose map holds so many voxels, and the last frame that joined it."""
 
-    def __init__(self):
-        self.simulator = open_scene("apartment", camera=r3jax.Camera.from_fov(512, 512, 60.0))
+    def __init__(self, voxels, edge):
+        self.simulator = open_scene("apartment", camera=r3jax.Camera.from_fov(edge, edge, 60.0))
         self.camera = self.simulator.camera
         self.map = r3jax.empty_map()
         self.grid = r3jax.empty_grid(self.simulator.bounds)
         self.frames = []
         rooms = list(procedural.rooms("apartment").values())
         rng = np.random.default_rng(0)
-        while int(self.map.num_occupied) < VOXELS:
+        while int(self.map.num_occupied) < voxels:
             x0, y0, x1, y1 = rooms[len(self.frames) % len(rooms)]
             position = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 1.4], dtype=np.float32)
             direction = (rng.standard_normal(3) * [1.0, 1.0, 0.3]).astype(np.float32)
@@ -43,8 +55,10 @@ class Explored:
 
 
 @pytest.fixture(scope="session")
-def explored() -> Explored:
-    return Explored()
+def explored(pytestconfig) -> Explored:
+    if pytestconfig.getoption("benchmark_disable"):
+        return Explored(TRIED_VOXELS, TRIED_EDGE)
+    return Explored(VOXELS, EDGE)
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,12 @@ from r3jax.splatting.scene import GaussianScene
 ROOM = np.array([6.0, 4.5, 2.7])
 """Length, width, height [m]."""
 
-SIZES = [(20_000, 128), (50_000, 256), (100_000, 512), (200_000, 512)]
+SIZES = [
+    (20_000, 128),
+    pytest.param(50_000, 256, marks=pytest.mark.measured),
+    pytest.param(100_000, 512, marks=pytest.mark.measured),
+    pytest.param(200_000, 512, marks=pytest.mark.measured),
+]
 """Gaussians and edge of the image [px]."""
 
 

@@ -26,7 +26,7 @@ from tests.audit.room import (
 @pytest.fixture(scope="module", autouse=True)
 def _little_work():
     """Few places and small maps: the room is small."""
-    few = functools.partial(Wishes, num_places=12, num_standpoints=6)
+    few = functools.partial(Wishes, num_places=16, num_standpoints=8)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "Wishes", few)
         patch.setattr(seen, "_CAPACITY", 1 << 13)
