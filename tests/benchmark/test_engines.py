@@ -96,6 +96,7 @@ def children_of(pid):
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
+@pytest.mark.slow
 def test_on_a_cluster_a_job_that_is_preempted_goes_on_with_its_cell(finished, room, tmp_path):
     """submitit's own stand-in for a cluster: each job a process, pre-empted by a signal."""
     pytest.importorskip("submitit")

@@ -35,7 +35,7 @@ def assert_no_collision(world, segments) -> None:
     assert world.clearance(points.reshape(-1, 3)).min() >= CLEARANCE
 
 
-@pytest.mark.parametrize(("scene", "policy"), [("flat", "ours-pano"), ("office", "random")])
+@pytest.mark.parametrize(("scene", "policy"), [("flat", "ours-pano")])
 def test_no_run_touches_the_mesh(scene, policy):
     world, segments, result = fly(scene, policy, views=16)
     assert len(result.rows) == 16
