@@ -120,7 +120,7 @@ def test_the_examples_reach_both_sides_of_every_branch():
     assert (terms["delta"] < 0.7).any()
 
 
-@each(MUTANTS, in_gate=3)
+@each(MUTANTS, in_gate=2)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)
 

@@ -232,7 +232,7 @@ def test_a_view_shows_what_rays_meet(law):
     law({"pixels": pixels})
 
 
-@each(MUTANTS, in_gate=3)
+@each(MUTANTS, in_gate=2)
 def test_faults_are_noticed(mutant):
     assert_caught(CHAIN, mutant)
 
