@@ -14,6 +14,8 @@ from unittest import mock
 
 import pytest
 
+PACKAGE = Path(__file__).resolve().parents[1] / "r3jax"
+
 Modules = dict[str, ModuleType]
 """Loaded modules by the last part of their names."""
 
@@ -77,6 +79,15 @@ def _replaced(source: str, mutant: Mutant, path: Path) -> str:
     return source.replace(mutant.original, mutant.mutated)
 
 
+def _require_snippet(mutant: Mutant) -> None:
+    """A list that runs seldom must not fall behind the code unnoticed."""
+    paths = [p for p in PACKAGE.rglob(f"{mutant.module}.py") if mutant.original in p.read_text()]
+    if len(paths) != 1:
+        raise LookupError(
+            f"{len(paths)} files {mutant.module}.py hold {mutant.original!r}, not one"
+        )
+
+
 def assert_caught(chain: tuple[str, ...], mutant: Mutant) -> None:
     """Fails unless the mutant breaks its law."""
     modules = load(chain, mutant)
@@ -96,5 +107,7 @@ def each(mutants: list[Mutant], in_gate: int | None = None) -> pytest.MarkDecora
     for number, mutant in enumerate(mutants):
         name = f"{mutant.module}: {' '.join(mutant.mutated.split())}"
         is_rare = in_gate is not None and number >= in_gate
+        if is_rare:
+            _require_snippet(mutant)
         cases.append(pytest.param(mutant, id=name, marks=[pytest.mark.slow] if is_rare else []))
     return pytest.mark.parametrize("mutant", cases)

@@ -135,7 +135,7 @@ def test_what_is_hidden_is_not_foreseen():
     law_hidden({"foresight": real})
 
 
-CHAIN = ("r3jax.audit.foresight",)
+CHAIN = ("r3jax.scoring.visibility", "r3jax.audit.foresight")
 MUTANTS = [
     Mutant("foresight", "visited[:, index] | words", "words", law_value),
     Mutant("foresight", "visited[:, index] | words", "visited[:, index]", law_observation),
@@ -145,9 +145,9 @@ MUTANTS = [
     Mutant("foresight", "camera.focal / distance", "camera.focal * distance", law_observation),
     Mutant("foresight", "[row].max(camera", "[row].set(camera", law_order),
     Mutant(
-        "foresight",
-        "voxels, candidates, view, buffer)\n    position",
-        "voxels, candidates, view, buffer)\n    visible = candidates\n    position",
+        "visibility",
+        "return buffer, visible_voxels(voxels, candidates, view, buffer)",
+        "return buffer, candidates",
         law_hidden,
     ),
 ]
