@@ -123,7 +123,7 @@ def test_each_device_scores_its_share_only():
     law_each_device_scores_its_share_only({"batch": batch})
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_faults_are_noticed(mutant):
     assert_caught(CHAIN, mutant)
 
