@@ -177,9 +177,7 @@ def term_images(
 ) -> TermImages:
     """R and its terms, of the voxel that each pixel of one view sees.
 
-    The images are a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or
-    high, with the camera's field of view. Differentiable with respect to the pose: which voxel
-    a pixel sees is held fixed, its terms vary.
+    In the pixels of `renderability_image`, and differentiable as it is.
     """
     config = ScoringConfig() if config is None else config
     view = pinhole_view(camera, T_world_camera, config)
@@ -200,7 +198,9 @@ def renderability_image(
 ) -> Float[Array, "h w"]:
     """R of the voxel that each pixel of one view sees; 0 where it sees none.
 
-    As `term_images`, of which it is one.
+    The image is a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or
+    high, with the camera's field of view. Differentiable with respect to the pose: which voxel
+    a pixel sees is held fixed, its R varies. One of `term_images`.
     """
     return term_images(state, camera, T_world_camera, config).value
 
