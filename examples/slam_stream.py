@@ -2,8 +2,8 @@
 
     python examples/slam_stream.py
 
-Your SLAM system is any generator that yields its own arrays (NumPy, JAX, PyTorch, ...). Here a
-ray caster plays it: it drifts by 1 cm a view, then closes a loop and corrects all its poses.
+Your SLAM system is any generator of arrays (NumPy, JAX, PyTorch, ...). Here a ray caster plays
+it: it drifts by 1 cm a view, then closes a loop and corrects all its poses.
 """
 
 import dataclasses
@@ -11,6 +11,7 @@ from collections.abc import Generator
 
 import jax
 import numpy as np
+from numpy import ndarray as Array
 
 import r3jax
 from r3jax.mapping.occupancy import mark_free_ball
@@ -19,11 +20,10 @@ from r3jax.scenes.registry import open_scene
 from r3jax.scoring.sighting import look
 from r3jax.simulators.base import Simulator
 
-Message = tuple[np.ndarray, np.ndarray, list[np.ndarray]]
 integrate_depth = jax.jit(r3jax.integrate_depth)
 
 
-def slam(world: Simulator) -> Generator[Message, np.ndarray, None]:
+def slam(world: Simulator) -> Generator[tuple[Array, Array, list[Array]], Array, None]:
     """Yields colours, depth [mm] and the poses of all views so far; is sent where to go next."""
     true, believed = [world.start_pose], [world.start_pose]
     while True:
@@ -40,10 +40,10 @@ def slam(world: Simulator) -> Generator[Message, np.ndarray, None]:
 def main(views: int = 8, size: int = 128) -> list[r3jax.Frame]:
     """Explores the flat together with a SLAM system; returns the frames that are in the map."""
     world = open_scene("flat", camera=r3jax.Camera.from_fov(size, size))
-    nothing = r3jax.empty_map(capacity=1 << 14), r3jax.empty_grid(world.bounds)
-    m, grid = nothing
-    policy, key = make_policy("ours-pano", num_candidates=40, num_frontier=12), jax.random.key(0)
-    state = policy.init(world.camera, grid, key=key)
+    m, grid = nothing = r3jax.empty_map(capacity=1 << 14), r3jax.empty_grid(world.bounds)
+    policy = make_policy("ours-pano", num_candidates=40, num_frontier=12)
+    start, *keys = jax.random.split(jax.random.key(0), views + 1)
+    state = policy.init(world.camera, grid, key=start)
     frames: list[r3jax.Frame] = []
     stream = slam(world)
     rgb, depth, poses = next(stream)
@@ -60,9 +60,7 @@ def main(views: int = 8, size: int = 128) -> list[r3jax.Frame]:
             vouched = 0.5 if frame is frames[0] else 0.3  # round the start, round the robot [m]
             grid = mark_free_ball(integrate_depth(grid, frame, 5.0), frame.position, vouched)
         state = policy.observe(state, m, frames[-1])
-        goal, state, info = policy.decide(
-            state, m, grid, poses[view], key=jax.random.fold_in(key, view)
-        )
+        goal, state, info = policy.decide(state, m, grid, poses[view], key=keys[view])
         print(f"view {view}: {len(to_add)} frame(s) mapped, {int(m.num_occupied)} voxels", end="")
         print(f" in {m.capacity} rows; {info.outcome.value}, {goal.length if goal else 0:.2f} m")
         if goal is None:
