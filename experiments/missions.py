@@ -55,10 +55,10 @@ class Size:
 
 SIZES: dict[SizeName, Size] = {
     "smoke": Size(("flat",), (0,), 25, 128, 6),
-    "small": Size(("flat", "apartment"), (0,), 201, 256, 25),
+    "small": Size(("apartment",), (0,), 201, 256, 25),
     "paper": Size(("flat", "apartment", "office", "gallery"), (0, 1, 2), 301, 512, 25),
 }
-"""Ten minutes on two cores; an hour on two cores; the paper's budget, for GPUs."""
+"""Ten minutes on two cores; half an hour on two cores; the paper's budget, for GPUs."""
 
 
 @dataclass(frozen=True)

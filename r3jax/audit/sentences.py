@@ -77,10 +77,16 @@ def verdict(audit: Audit) -> list[str]:
         f"{worst.score.renderability:.2f}."
     )
     if plan.views:
-        drawn = f"; as many at random places {plan.random_mean[-1]:.2f}"
+        count = len(plan.views)
+        views, drawn = (
+            ("One further view", "one at a random place")
+            if count == 1
+            else (f"{count} further views", "as many at random places")
+        )
         sentences.append(
-            f"{len(plan.views)} further views would raise the mean over all surfaces from "
-            f"{found.mean:.2f} to {plan.after.mean:.2f}, as far as it can be foreseen{drawn}."
+            f"{views} would raise the mean over all surfaces from {found.mean:.2f} to "
+            f"{plan.after.mean:.2f}, as far as it can be foreseen; {drawn} "
+            f"{plan.random_mean[-1]:.2f}."
         )
     return sentences
 

@@ -258,6 +258,15 @@ def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
         assert text.endswith(".")
 
 
+def test_one_view_is_spoken_of_as_one(cloud):
+    assert len(cloud.plan.views) > 1
+    alone = dataclasses.replace(cloud.plan, views=cloud.plan.views[:1])
+    said = verdict(dataclasses.replace(cloud, plan=alone))[-1]
+    assert said.startswith("One further view would")
+    assert "; one at a random place 0." in said
+    assert verdict(cloud)[-1].startswith(f"{len(cloud.plan.views)} further views would")
+
+
 def one_picture(depth: np.ndarray) -> Source:
     rgb = np.zeros((36, 48, 3), np.uint8)
     return Source("one", np.eye(4)[None], (LENS,), ("a",), "depth", True, None, 1,
