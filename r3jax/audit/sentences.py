@@ -65,6 +65,8 @@ def verdict(audit: Audit) -> list[str]:
         f"{100 * found.fine_share:.0f} % of the surface that one sees from where people could "
         f"stand would render well (R ≥ {FINE:g})" + (f"; {_list(parts)}." if parts else ".")
     ]
+    if audit.source.remark is not None:
+        sentences.insert(0, audit.source.remark)
     if audit.unseen:
         sentences.append(
             f"Free space ends in about {area(audit, audit.unseen_area)} that no picture shows."

@@ -68,6 +68,9 @@ class Source:
     has_images: bool = True
     """False where only points are there: their colors say nothing about noise."""
 
+    remark: str | None = None
+    """What the capture holds beside its pictures, a sentence."""
+
     def __len__(self) -> int:
         """Number of pictures."""
         return len(self.poses)
@@ -142,7 +145,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
     if any(path is not None for path in images.depth_paths):
         return Source(
             name, images.poses, images.lenses, labels, "depth", True, None, stride,
-            lambda index: _read_dense(images, index, stride),
+            lambda index: _read_dense(images, index, stride), remark=images.remark,
         )  # fmt: skip
     has_images = any(path.is_file() for path in images.image_paths)
     if images.points is not None and len(images.points.seen_point):
@@ -167,8 +170,9 @@ def _of_images(images: PosedImages, name: str) -> Source:
         return colors, depth
 
     return Source(
-        name, images.poses, images.lenses, labels, kind, False, None, stride, read, has_images
-    )
+        name, images.poses, images.lenses, labels, kind, False, None, stride, read, has_images,
+        images.remark,
+    )  # fmt: skip
 
 
 def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:

@@ -96,6 +96,9 @@ class PosedImages:
     """Where the program that wrote the capture moved it: takes points [4, 4] from the coordinates
     it was given to those of the poses; None: it does not say."""
 
+    remark: str | None = None
+    """What else is there but not among the images, a sentence; None: nothing is left out."""
+
     def __len__(self) -> int:
         """Number of images."""
         return len(self.image_paths)

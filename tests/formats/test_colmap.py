@@ -112,6 +112,42 @@ def test_the_model_is_found_where_tools_put_it(tmp_path, place):
     assert elsewhere.image_paths[0].is_relative_to(tmp_path / "photos")
 
 
+@pytest.fixture
+def split(tmp_path):
+    """A capture that COLMAP could not join: three models, and pictures without a pose."""
+    models = {"0": random_model(3), "1": random_model(1), "10": random_model(2)}
+    for name, model in models.items():
+        (tmp_path / "sparse" / name).mkdir(parents=True)
+        write_binary(tmp_path / "sparse" / name, model)
+    (tmp_path / "sparse" / "old").mkdir()
+    return tmp_path, {name: len(model.images) for name, model in models.items()}
+
+
+def test_of_several_models_the_one_with_most_images_is_taken(split):
+    folder, counts = split
+    best = max(counts, key=counts.__getitem__)
+    assert best != "0"
+    assert list(counts.values()).count(counts[best]) == 1
+    images = read_colmap(folder)
+    assert len(images) == counts[best]
+    others = ", ".join(str(counts[name]) for name in counts if name != best)
+    assert images.remark == (
+        f"COLMAP did not join all: of its 3 models sparse/{best} is used, with {counts[best]} "
+        f"pictures; the other ones have {others}."
+    )
+    asked_for = read_colmap(folder / "sparse" / "0")
+    assert len(asked_for) == counts["0"]
+    assert asked_for.remark is None
+
+
+def test_pictures_without_a_pose_are_counted(capture):
+    (capture / "images").mkdir()
+    assert read_colmap(capture).remark is None
+    for name in ("second image.png", "third.png", "notes.txt"):
+        (capture / "images" / name).touch()
+    assert read_colmap(capture).remark == "2 of 3 pictures have a pose."
+
+
 def test_binary_goes_before_text(capture):
     write_binary(capture / "sparse" / "0", random_model(1))
     assert len(read_colmap(capture)) == len(random_model(1).images)

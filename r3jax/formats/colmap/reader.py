@@ -1,5 +1,6 @@
 """A folder with a COLMAP model as posed images."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -52,7 +53,8 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
     """Reads a capture that COLMAP has posed. Its images come in the order of their names.
 
     Args:
-        path: the folder of the model, or the capture's, with the model in `sparse/0` or the like.
+        path: the folder of the model, or the capture's, with the model in `sparse/0` or the like;
+            if there are several, `sparse/1` and so on, the one with most images is taken.
         images: the folder that the images' names are relative to; by default `images` beside
             the model or in one of the three folders above it.
 
@@ -65,17 +67,56 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
     if folder is None:
         what = "the folder holds no COLMAP model (no cameras.bin or cameras.txt)"
         raise FormatError(path, what if path.is_dir() else "there is no such folder")
-    model = read_model(folder)
+    models = {part: read_model(part) for part in _parts(path, folder)}
+    folder = max(models, key=lambda part: len(models[part].images))
+    model = models[folder]
     base = Path(images) if images is not None else _image_folder(path, folder)
     ordered = sorted(model.images, key=lambda image: image.name)
+    image_paths = tuple(below(base, image.name) for image in ordered)
     return PosedImages(
         path=path,
-        image_paths=tuple(below(base, image.name) for image in ordered),
+        image_paths=image_paths,
         lenses=tuple(model.cameras[image.camera_id] for image in ordered),
         poses=np.stack([pose_of(image.quaternion, image.translation) for image in ordered]),
         depth_paths=(None,) * len(ordered),
         points=_sparse_points(model.points, {image.id: i for i, image in enumerate(ordered)}),
+        remark=_left_out(folder, models, image_paths),
     )
+
+
+def _parts(path: Path, folder: Path) -> list[Path]:
+    """COLMAP numbers its models, one for every part of a capture that it could not join."""
+    if not folder.name.isdigit() or folder.resolve() == path.resolve():
+        return [folder]
+    found = [part for part in folder.parent.iterdir() if part.name.isdigit()]
+    return sorted((p for p in found if find_model(p) == p), key=lambda p: int(p.name))
+
+
+def _left_out(
+    folder: Path, models: Mapping[Path, ColmapModel], image_paths: tuple[Path, ...]
+) -> str | None:
+    """A sentence on the other models and the pictures that this one has no pose for."""
+    posed = set(image_paths)
+    suffixes = {path.suffix for path in posed}
+    beside = {file for place in {path.parent for path in posed} for file in _files(place)}
+    num_unposed = sum(file.suffix in suffixes for file in beside - posed)
+    number = len(posed)
+    said = [f"{number} of {number + num_unposed} pictures have a pose"] if num_unposed else []
+    if len(models) > 1:
+        others = [str(len(models[part].images)) for part in models if part != folder]
+        said.append(
+            f"COLMAP did not join all: of its {len(models)} models {folder.parent.name}/"
+            f"{folder.name} is used, with {number} pictures; the other "
+            f"{'has' if len(others) == 1 else 'ones have'} {', '.join(others)}"
+        )
+    return "; ".join(said) + "." if said else None
+
+
+def _files(folder: Path) -> list[Path]:
+    # os.path: a name of a foreign file may be longer than a folder's can be.
+    if not os.path.isdir(folder):
+        return []
+    return [entry for entry in folder.iterdir() if entry.is_file()]
 
 
 def _image_folder(path: Path, model: Path) -> Path:
