@@ -65,6 +65,10 @@ def verdict(audit: Audit) -> list[str]:
         f"{100 * found.fine_share:.0f} % of the surface that one sees from where people could "
         f"stand would render well (R ≥ {FINE:g})" + (f"; {_list(parts)}." if parts else ".")
     ]
+    if not audit.source.is_dense:
+        sentences.append(
+            "Without depth images only surfaces with points are judged; plain walls may have none."
+        )
     if audit.source.remark is not None:
         sentences.insert(0, audit.source.remark)
     if audit.unseen:

@@ -267,6 +267,14 @@ def test_one_view_is_spoken_of_as_one(cloud):
     assert verdict(cloud)[-1].startswith(f"{len(cloud.plan.views)} further views would")
 
 
+def test_what_points_leave_out_is_said(cloud, corner):
+    told = [any("plain walls" in text for text in verdict(found)) for found in (cloud, corner)]
+    assert told == [True, False]
+    remark = "2 of 3 pictures have a pose."
+    partial = dataclasses.replace(cloud, source=dataclasses.replace(cloud.source, remark=remark))
+    assert verdict(partial)[0] == remark
+
+
 def one_picture(depth: np.ndarray) -> Source:
     rgb = np.zeros((36, 48, 3), np.uint8)
     return Source("one", np.eye(4)[None], (LENS,), ("a",), "depth", True, None, 1,
