@@ -24,10 +24,14 @@ program that is compiled to run once. A flag that XLA does not know ends the pro
 set for the version that these were measured with alone."""
 
 
+def is_measured(config: pytest.Config) -> bool:
+    """True with --benchmark-enable; `benchmark_disable` is always set, by our defaults."""
+    return bool(config.getoption("benchmark_enable", default=False))
+
+
 def pytest_configure(config):
     """Compiles quickly, unless it is measured how long things take."""
-    is_measured = not config.getoption("benchmark_disable", default=True)
-    if not is_measured and jax.__version_info__[:2] == (0, 10):
+    if not is_measured(config) and jax.__version_info__[:2] == (0, 10):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_QUICK_COMPILER}"
 
 

@@ -165,9 +165,10 @@ def latency_figure(latency: Samples, title: str = "") -> Figure:
         band.set_linewidth(0)
         axes.plot(frames, p50, color=color, linewidth=2.0, label="p50")
         axes.plot(frames, p99, color=color, linewidth=1.0, linestyle=":", label="p99")
-        overall = (
-            f"{p} {np.nanpercentile(samples, int(p[1:])):.3g}" for p in ("p50", "p95", "p99")
-        )
+        overall = [
+            f"p{p} {value:.0f}" if value >= 100.0 else f"p{p} {value:.3g}"
+            for p, value in ((p, np.nanpercentile(samples, p)) for p in (50, 95, 99))
+        ]
         axes.annotate(
             f"all: {', '.join(overall)} ms", (0.0, 1.0), xycoords="axes fraction", xytext=(0, 4),
             textcoords="offset points", fontsize=8, color=style.MUTED,

@@ -12,6 +12,7 @@ from r3jax.mapping.occupancy import mark_free_ball
 from r3jax.scenes import procedural
 from r3jax.scenes.registry import open_scene
 from r3jax.scoring.config import ScoringConfig
+from tests.conftest import is_measured
 
 VOXELS, EDGE = 60_000, 512
 TRIED_VOXELS, TRIED_EDGE = 6_000, 96
@@ -19,7 +20,7 @@ TRIED_VOXELS, TRIED_EDGE = 6_000, 96
 
 def pytest_collection_modifyitems(config, items):
     """Leaves out the larger sizes (`measured`) where nothing is measured."""
-    if config.getoption("benchmark_disable"):
+    if not is_measured(config):
         larger = [item for item in items if item.get_closest_marker("measured")]
         items[:] = [item for item in items if item not in larger]
         config.hook.pytest_deselected(items=larger)
@@ -56,9 +57,9 @@ class Explored:
 
 @pytest.fixture(scope="session")
 def explored(pytestconfig) -> Explored:
-    if pytestconfig.getoption("benchmark_disable"):
-        return Explored(TRIED_VOXELS, TRIED_EDGE)
-    return Explored(VOXELS, EDGE)
+    if is_measured(pytestconfig):
+        return Explored(VOXELS, EDGE)
+    return Explored(TRIED_VOXELS, TRIED_EDGE)
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,18 @@
+"""What is measured is the real thing."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+
+
+def test_large_sizes_are_measured():
+    """Without --benchmark-enable they are left out, which once held with it too."""
+    command = [sys.executable, "-m", "pytest", str(FOLDER), "--collect-only", "--benchmark-enable"]
+    done = subprocess.run(
+        command, cwd=FOLDER.parents[1], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert "test_full_step[20000-128-numba]" in done.stdout
+    assert "test_full_step[200000-512-numba]" in done.stdout
+    assert "test_query_at_key_frame[300]" in done.stdout
