@@ -3,6 +3,7 @@
 Shape symbols: n pictures; h, w size of a thinned picture.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -115,7 +116,7 @@ def source_of(capture: Run | Recording | PosedImages, name: str) -> Source:
     if not len(capture.rows if isinstance(capture, Run) else capture):
         raise FormatError(capture.path, "there are no views to audit")
     if isinstance(capture, PosedImages):
-        return _of_images(capture, name)
+        return dataclasses.replace(_of_images(capture, name), remark=capture.remark)
     if isinstance(capture, Run):
         poses = np.stack([row.pose for row in capture.rows]).astype(np.float64)
         labels = tuple(f"view {row.step + 1}" for row in capture.rows)
@@ -145,7 +146,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
     if any(path is not None for path in images.depth_paths):
         return Source(
             name, images.poses, images.lenses, labels, "depth", True, None, stride,
-            lambda index: _read_dense(images, index, stride), remark=images.remark,
+            lambda index: _read_dense(images, index, stride),
         )  # fmt: skip
     has_images = any(path.is_file() for path in images.image_paths)
     if images.points is not None and len(images.points.seen_point):
@@ -170,9 +171,8 @@ def _of_images(images: PosedImages, name: str) -> Source:
         return colors, depth
 
     return Source(
-        name, images.poses, images.lenses, labels, kind, False, None, stride, read, has_images,
-        images.remark,
-    )  # fmt: skip
+        name, images.poses, images.lenses, labels, kind, False, None, stride, read, has_images
+    )
 
 
 def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:

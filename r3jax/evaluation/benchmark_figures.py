@@ -167,7 +167,7 @@ def latency_figure(latency: Samples, title: str = "") -> Figure:
         axes.plot(frames, p99, color=color, linewidth=1.0, linestyle=":", label="p99")
         overall = [
             f"p{p} {value:.0f}" if value >= 100.0 else f"p{p} {value:.3g}"
-            for p, value in ((p, np.nanpercentile(samples, p)) for p in (50, 95, 99))
+            for p, value in zip((50, 95, 99), np.nanpercentile(samples, (50, 95, 99)), strict=True)
         ]
         axes.annotate(
             f"all: {', '.join(overall)} ms", (0.0, 1.0), xycoords="axes fraction", xytext=(0, 4),

@@ -86,9 +86,9 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
 
 def _parts(path: Path, folder: Path) -> list[Path]:
     """COLMAP numbers its models, one for every part of a capture that it could not join."""
-    if not folder.name.isdigit() or folder.resolve() == path.resolve():
+    if not folder.name.isdecimal() or folder.resolve() == path.resolve():
         return [folder]
-    found = [part for part in folder.parent.iterdir() if part.name.isdigit()]
+    found = [part for part in folder.parent.iterdir() if part.name.isdecimal()]
     return sorted((p for p in found if find_model(p) == p), key=lambda p: int(p.name))
 
 
