@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.spatial import KDTree
 
 from r3jax.geometry.cameras import pose_along
 from r3jax.planning.travel import Travel, segment_is_inside
@@ -80,26 +79,40 @@ def region_of_interest(
         Positions and the targets' centres, [n, 3] float64 each [m], n <= num.
     """
     rng = host_generator(key)
-    stops, goals = np.argwhere(travel.goals), np.argwhere(targets)
-    if num == 0 or len(stops) == 0 or len(goals) == 0:
-        return np.zeros((0, 3)), np.zeros((0, 3))
+    goals = np.argwhere(targets)
+    positions, aims = [], []
     # Some draws end behind a corner: twice as many as wanted.
-    drawn = travel.centers(goals[rng.integers(len(goals), size=2 * num)])
+    drawn = goals[rng.integers(len(goals), size=2 * num)] if len(goals) else goals
+    for target, aim in zip(drawn, travel.centers(drawn), strict=True):
+        if len(positions) == num:
+            break
+        stops = travel.centers(_stops_round(travel, target))
+        if len(stops) == 0:
+            continue
+        position = _jitter(stops[rng.integers(len(stops))], travel.cell_size, rng)
+        if in_plain_view(travel, position, aim):
+            positions.append(position)
+            aims.append(aim)
+    return np.reshape(positions, (-1, 3)), np.reshape(aims, (-1, 3))
+
+
+def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
+    """Of the nearest cells where the robot may stop, those at a distance to look at `target`.
+
+    Asks a window round the target only: the work does not grow with the scene.
+
+    Returns:
+        Indices of cells, [n, 3], n <= 256.
+    """
     closest, farthest = VIEW_DISTANCE
-    tree = KDTree(travel.centers(stops))
-    count = min(_NEIGHBORS, len(stops))
-    distance, index = tree.query(drawn, k=count, distance_upper_bound=farthest)
-    distance, index = distance.reshape(-1, count), index.reshape(-1, count)
-    # The largest of random weights over the allowed neighbours: a uniform choice.
-    weight = np.where((distance >= closest) & (distance <= farthest), rng.random(index.shape), -1.0)
-    best = weight.argmax(axis=1)
-    is_possible = weight.max(axis=1) >= 0.0
-    stop = stops[index[np.arange(2 * num), best][is_possible]]
-    aim = drawn[is_possible]
-    positions = _jitter(travel.centers(stop), travel.cell_size, rng)
-    is_visible = [in_plain_view(travel, a, b) for a, b in zip(positions, aim, strict=True)]
-    keep = np.flatnonzero(is_visible)[:num]
-    return positions[keep], aim[keep]
+    reach = int(np.ceil(farthest / travel.cell_size))
+    low = np.maximum(target - reach, 0)
+    window = tuple(slice(a, b) for a, b in zip(low, target + reach + 1, strict=True))
+    cells = np.argwhere(travel.goals[window]) + low
+    distance = np.linalg.norm(cells - target, axis=1) * travel.cell_size
+    nearest = np.argsort(distance, kind="stable")[:_NEIGHBORS]
+    is_apart = (distance[nearest] >= closest) & (distance[nearest] <= farthest)
+    return cells[nearest[is_apart]]
 
 
 def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.75)) -> np.ndarray:

@@ -69,6 +69,26 @@ def test_regions_of_interest_are_in_plain_view(travel):
     assert all(in_plain_view(travel, a, b) for a, b in zip(positions, aims, strict=True))
 
 
+def test_a_target_is_looked_at_from_the_nearest_cells_alike(travel):
+    """Against the definition over all cells: of the 256 nearest, those 0.3 m away or more."""
+    target = np.array([6, 12, 4])  # by the wall: its nearest 256 reach beyond 0.8 m
+    targets = np.zeros(travel.free.shape, bool)
+    targets[tuple(target)] = True
+    stops = np.argwhere(travel.goals)
+    distance = np.linalg.norm(stops - target, axis=1) * CELL
+    limit = np.sort(distance)[255]
+    assert limit < 2.0
+    positions, _ = region_of_interest(travel, targets, 4000, key=KEY)
+    drawn, counts = np.unique(cells_of(positions), axis=0, return_counts=True)
+    far = np.linalg.norm(drawn - target, axis=1) * CELL
+    assert far.min() >= 0.3 and far.max() <= limit + 1e-9
+    is_sure = (distance >= 0.3) & (distance < limit - 1e-9)
+    in_view = [in_plain_view(travel, center(*c), center(*target)) for c in stops[is_sure]]
+    missed = set(map(tuple, stops[is_sure][in_view])) - set(map(tuple, drawn))
+    assert not missed
+    assert counts.max() < 6 * counts.mean()
+
+
 def test_no_region_of_interest_gives_no_position(travel):
     nothing = np.zeros(travel.free.shape, bool)
     for num in (0, 10):
