@@ -81,7 +81,8 @@ def test_a_target_is_looked_at_from_the_nearest_cells_alike(travel):
     positions, _ = region_of_interest(travel, targets, 4000, key=KEY)
     drawn, counts = np.unique(cells_of(positions), axis=0, return_counts=True)
     far = np.linalg.norm(drawn - target, axis=1) * CELL
-    assert far.min() >= 0.3 and far.max() <= limit + 1e-9
+    assert far.min() >= 0.3
+    assert far.max() <= limit + 1e-9
     is_sure = (distance >= 0.3) & (distance < limit - 1e-9)
     in_view = [in_plain_view(travel, center(*c), center(*target)) for c in stops[is_sure]]
     missed = set(map(tuple, stops[is_sure][in_view])) - set(map(tuple, drawn))
