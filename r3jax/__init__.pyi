@@ -5,6 +5,7 @@ from .mapping.lookup import lookup
 from .mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth
 from .mapping.state import MapState, empty_map
 from .mapping.update import integrate, integrate_points
+from .planning.next_views import NextViews, next_views
 from .scoring.config import ScoringConfig
 from .scoring.panorama import Panorama, panorama
 from .scoring.renderability import (
@@ -28,6 +29,7 @@ __all__ = [
     "Frame",
     "GaussianScene",
     "MapState",
+    "NextViews",
     "OccupancyGrid",
     "Panorama",
     "RasterConfig",
@@ -48,6 +50,7 @@ __all__ = [
     "look_at",
     "lookup",
     "merge",
+    "next_views",
     "panorama",
     "pose_along",
     "read_scene",

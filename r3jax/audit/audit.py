@@ -17,13 +17,14 @@ from r3jax.audit.sampling import thinned
 from r3jax.audit.seen import Seen, see
 from r3jax.audit.sight import ViewScore, view_score
 from r3jax.audit.source import Source
-from r3jax.audit.standpoints import places_in_free_space, places_in_hull, spread
+from r3jax.audit.standpoints import places_in_free_space, places_in_hull
 from r3jax.audit.suggest import Plan, Task, suggest, without_cells
 from r3jax.audit.survey import RANGE, Survey, Wishes, survey_of
 from r3jax.formats.lenses import Lens
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import spread
 from r3jax.planning.explorable import mask_unexplorable
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored

@@ -7,12 +7,12 @@ from matplotlib.lines import Line2D
 
 from r3jax.audit.audit import Audit, JudgedFrame
 from r3jax.audit.colors import COLOR_OF_CAUSE
-from r3jax.audit.foresight import foresee
 from r3jax.audit.suggest import Suggestion
 from r3jax.evaluation import style
 from r3jax.evaluation.pictures import panorama_picture
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.foresight import foresee
 from r3jax.scoring.renderability import term_images
 from r3jax.scoring.voxels import voxels_of
 

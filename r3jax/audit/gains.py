@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.audit.diagnosis import Answers, Demand
-from r3jax.audit.foresight import foresee
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.batch import deal
 from r3jax.scoring.chunks import for_selected, select
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.foresight import foresee
 from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.utility import visible_unexplored
 from r3jax.scoring.views import pinhole_view

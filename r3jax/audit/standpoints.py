@@ -4,7 +4,7 @@ With depth images: in known free space, a margin from everything that is not kno
 connected to where the camera was, at heights at which it was held. Without: within the hull of the
 camera's positions and a margin round it, and a margin from every voxel.
 
-Shape symbols: n cameras; m voxels; c places to choose from; p places chosen.
+Shape symbols: n cameras; m voxels; c places.
 """
 
 import numpy as np
@@ -68,25 +68,3 @@ def places_in_hull(cameras: np.ndarray, voxels: np.ndarray) -> np.ndarray:
         return inside
     distance, _ = KDTree(voxels).query(inside)
     return inside[np.asarray(distance) >= MARGIN]
-
-
-def spread(places: np.ndarray, num: int) -> np.ndarray:
-    """Indices of up to `num` places, each the farthest from those before (Gonzalez 1985).
-
-    The first is the one nearest to the middle of all: it does not depend on their order, but for
-    ties.
-
-    Args:
-        places: [c, 3], c >= 1.
-        num: p at most.
-    """
-    first = int(np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1)))
-    chosen = [first]
-    gap = np.linalg.norm(places - places[first], axis=1)
-    while len(chosen) < min(num, len(places)):
-        farthest = int(np.argmax(gap))
-        if gap[farthest] <= 0.0:
-            break  # the rest repeats what is there
-        chosen.append(farthest)
-        gap = np.minimum(gap, np.linalg.norm(places - places[farthest], axis=1))
-    return np.asarray(chosen)

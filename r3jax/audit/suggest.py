@@ -22,7 +22,6 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from r3jax.audit.diagnosis import CAUSES, FINE, Answers, Demand, Diagnosis, ask, diagnose
-from r3jax.audit.foresight import foresee
 from r3jax.audit.gains import view_coverage, view_gains
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
@@ -31,6 +30,7 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
 from r3jax.scoring.batch import score_positions
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.foresight import foresee
 from r3jax.scoring.utility import visible_unexplored
 
 DIRECTIONS = 6

@@ -3,7 +3,7 @@
 Positions lie in cells where the robot may stop (`Travel.goals`), away from the cell's faces: at
 most a quarter of a cell from its centre.
 
-Shape symbols: X Y Z cells along the axes; n candidates.
+Shape symbols: X Y Z cells along the axes; n candidates; c places to choose from; p places chosen.
 """
 
 import jax
@@ -135,6 +135,28 @@ def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.7
     cells = np.unique(np.floor(points / travel.cell_size + 1e-3).astype(np.int64), axis=0)
     cells = cells[np.all(cells < np.array(shape), axis=1)]
     return travel.centers(cells[travel.goals[tuple(cells.T)]])
+
+
+def spread(places: np.ndarray, num: int) -> np.ndarray:
+    """Indices of up to `num` places, each the farthest from those before (Gonzalez 1985).
+
+    The first is the one nearest to the middle of all: it does not depend on their order, but for
+    ties.
+
+    Args:
+        places: [c, 3], c >= 1.
+        num: p at most.
+    """
+    first = int(np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1)))
+    chosen = [first]
+    gap = np.linalg.norm(places - places[first], axis=1)
+    while len(chosen) < min(num, len(places)):
+        farthest = int(np.argmax(gap))
+        if gap[farthest] <= 0.0:
+            break  # the rest repeats what is there
+        chosen.append(farthest)
+        gap = np.minimum(gap, np.linalg.norm(places - places[farthest], axis=1))
+    return np.asarray(chosen)
 
 
 def in_plain_view(travel: Travel, a: np.ndarray, b: np.ndarray) -> bool:

@@ -47,7 +47,7 @@ def score_views(
     """`view_utility` of every pose; fields of shape [C]. Not to be called under jit."""
     poses = jnp.asarray(poses, dtype=jnp.float32)
     voxels, cells, _ = near(state, grid, poses[:, :3, 3], config)
-    return deal(functools.partial(_score_views, voxels, cells, camera, config), poses)
+    return score_views_near(voxels, cells, camera, poses, config)
 
 
 def score_positions(
@@ -60,6 +60,28 @@ def score_positions(
     """`panorama` of every position; fields of shape [C, ...]. Not to be called under jit."""
     positions = jnp.asarray(positions, dtype=jnp.float32)
     voxels, cells, _ = near(state, grid, positions, config)
+    return score_positions_near(voxels, cells, camera, positions, config)
+
+
+def score_views_near(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    poses: Float[Array, "C 4 4"],
+    config: ScoringConfig,
+) -> ViewUtility:
+    """`score_views` of voxels and cells that `near` gathered."""
+    return deal(functools.partial(_score_views, voxels, cells, camera, config), poses)
+
+
+def score_positions_near(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    positions: Float[Array, "C 3"],
+    config: ScoringConfig,
+) -> Panorama:
+    """`score_positions` of voxels and cells that `near` gathered."""
     return deal(functools.partial(_score_positions, voxels, cells, camera, config), positions)
 
 

@@ -108,3 +108,9 @@ def over_visible(
 
     in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
     return for_selected(select(cells.unexplored & in_view), of_chunk, start)
+
+
+def visible_mask(cells: Cells, view: View, buffer: DepthBuffer) -> Bool[Array, " c"]:
+    """The unexplored cells whose center the view sees."""
+    place = view.place(jnp.stack([cells.x, cells.y, cells.z]))
+    return cells.unexplored & is_visible(view, place, buffer.distance)

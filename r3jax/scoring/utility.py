@@ -2,17 +2,16 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
+from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_mask
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, is_visible, seen_in
+from r3jax.scoring.visibility import candidates_of, depth_buffer, seen_in
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 
@@ -75,6 +74,4 @@ def visible_unexplored(
     voxels, cells = voxels_of(state, config.delta), cells_of(grid)
     view = pinhole_view(camera, T_world_camera, config)
     buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
-    place = view.place(jnp.stack([cells.x, cells.y, cells.z]))
-    is_seen = cells.unexplored & is_visible(view, place, buffer.distance)
-    return is_seen.reshape(grid.log_odds.shape)
+    return visible_mask(cells, view, buffer).reshape(grid.log_odds.shape)

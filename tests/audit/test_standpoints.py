@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.audit.standpoints import places_in_free_space, places_in_hull, spread
+from r3jax.audit.standpoints import places_in_free_space, places_in_hull
 from r3jax.audit.survey import MARGIN
 from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid, empty_grid
 
@@ -69,15 +69,3 @@ def test_one_camera_alone_leaves_the_box_round_it():
     places = places_in_hull(np.array([[1.0, 2.0, 3.0]]), np.array([[9.0, 9.0, 9.0]]))
     assert len(places) > 4
     assert np.abs(places - [1, 2, 3]).max() <= MARGIN
-
-
-@given(st.integers(0, 500), st.integers(1, 12))
-def test_spread_takes_distinct_places_and_each_the_farthest(seed, num):
-    rng = np.random.default_rng(seed)
-    places = rng.integers(0, 5, (int(rng.integers(1, 20)), 3)).astype(float)
-    chosen = spread(places, num)
-    assert len(set(chosen.tolist())) == len(chosen) <= num
-    assert len(chosen) == min(num, len(np.unique(places, axis=0)))
-    for k in range(1, len(chosen)):
-        gap = np.linalg.norm(places[:, None] - places[chosen[:k]][None], axis=-1).min(axis=1)
-        assert gap[chosen[k]] == gap.max()

@@ -3,6 +3,8 @@
 import jax
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from r3jax.planning.candidates import (
     in_plain_view,
@@ -11,6 +13,7 @@ from r3jax.planning.candidates import (
     poses_along,
     random_directions,
     region_of_interest,
+    spread,
 )
 from r3jax.planning.travel import plan_travel
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, two_rooms
@@ -134,3 +137,15 @@ def test_the_same_key_draws_the_same_candidates(travel):
     assert not np.array_equal(first, other)
     raw = local_random(travel, 20, key=jax.random.key_data(KEY))
     np.testing.assert_array_equal(first, raw)
+
+
+@given(st.integers(0, 500), st.integers(1, 12))
+def test_spread_takes_distinct_places_and_each_the_farthest(seed, num):
+    rng = np.random.default_rng(seed)
+    places = rng.integers(0, 5, (int(rng.integers(1, 20)), 3)).astype(float)
+    chosen = spread(places, num)
+    assert len(set(chosen.tolist())) == len(chosen) <= num
+    assert len(chosen) == min(num, len(np.unique(places, axis=0)))
+    for k in range(1, len(chosen)):
+        gap = np.linalg.norm(places[:, None] - places[chosen[:k]][None], axis=-1).min(axis=1)
+        assert gap[chosen[k]] == gap.max()

@@ -6,12 +6,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.audit import foresight as real
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_points
+from r3jax.scoring import foresight as real
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import voxel_renderability
 from r3jax.scoring.voxels import consistency
@@ -135,15 +135,15 @@ def test_what_is_hidden_is_not_foreseen():
     law_hidden({"foresight": real})
 
 
-CHAIN = ("r3jax.scoring.visibility", "r3jax.audit.foresight")
+CHAIN = ("r3jax.scoring.visibility", "r3jax.scoring.foresight")
 MUTANTS = [
     Mutant("foresight", "visited[:, index] | words", "words", law_value),
     Mutant("foresight", "visited[:, index] | words", "visited[:, index]", law_observation),
-    Mutant("foresight", "state.m2 * n /", "state.m2 /", law_observation),
-    Mutant("foresight", "state.m2 * n / jnp.maximum(n - 1.0, 1.0)", "3.0 * state.m2", law_value),
+    Mutant("foresight", "voxels.m2 * n /", "voxels.m2 /", law_observation),
+    Mutant("foresight", "voxels.m2 * n / jnp.maximum(n - 1.0, 1.0)", "3.0 * voxels.m2", law_value),
     Mutant("foresight", "n + shown.astype", "n + 2.0 * shown.astype", law_observation),
-    Mutant("foresight", "camera.focal / distance", "camera.focal * distance", law_observation),
-    Mutant("foresight", "[row].max(camera", "[row].set(camera", law_order),
+    Mutant("foresight", "max(focal / distance", "max(focal * distance", law_observation),
+    Mutant("foresight", "[row].max(focal", "[row].set(focal", law_order),
     Mutant(
         "visibility",
         "return buffer, visible_voxels(voxels, candidates, view, buffer)",

@@ -1,0 +1,172 @@
+"""Several next views at once, each chosen as if those before it had been taken.
+
+The utility of a view never rises by another view: what that one shows renders no worse, and its
+unexplored cells are found (`scoring.foresight`). So the value of a set of views, the sum of what
+each adds when it is taken, is the same kind of sum that greedy choice is good for, and an old score
+is a bound on the new one: only the candidates whose bound is the greatest are scored again
+(lazy greedy, Minoux 1978). The views chosen are those of scoring all of them every time.
+
+Shape symbols: C candidates; k views.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+
+from r3jax.geometry.cameras import Camera, rigid_error
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import spread
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.explorable import mask_unexplorable
+from r3jax.planning.travel import safe_cells
+from r3jax.scoring.batch import near, score_positions_near, score_views_near
+from r3jax.scoring.cells import Cells
+from r3jax.scoring.foresight import foresee_near
+from r3jax.scoring.voxels import Voxels
+
+_AT_ONCE = 8
+"""Bounds that are renewed together: two shapes of candidates compile, C and this."""
+
+
+class NextViews(eqx.Module):
+    """Views to take, the most useful first."""
+
+    T_world_camera: Float[np.ndarray, "k 4 4"]
+    """Poses."""
+
+    utility: Float[np.ndarray, " k"]
+    """lambda1 U_G + U_R of each, as if those before it had been taken; never rising."""
+
+
+Ask = Callable[[Voxels, Cells, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""From voxels, cells and numbers of candidates [m] to their poses [m, 4, 4], turned where they may
+turn, and the utility of each [m]."""
+
+
+def next_views(
+    state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    k: int,
+    *,
+    poses: ArrayLike | None = None,
+    config: PlannerConfig | None = None,
+) -> NextViews:
+    """The k most useful views, each on top of those before it. Not to be called under jit.
+
+    For one camera that will take them all, for several that take one each, for a person with a
+    list. The way between them is not counted: a robot's next view is a policy's `decide`.
+
+    Args:
+        state: the map.
+        grid: the coarse grid; its free space is where views may be taken.
+        camera: that will take them.
+        k: how many.
+        poses: what to choose from, [C, 4, 4], each at most once. By default `config.num_candidates`
+            positions, spread over all known free space that keeps the safety margin; each looks
+            where its panorama is worth most.
+        config: candidates, safety margin, and `scoring`: lambda1 and the range.
+
+    Raises:
+        ValueError: k is less than 1 or more than the poses, a pose is not rigid, or no free
+            space is known.
+    """
+    config = PlannerConfig() if config is None else config
+    free = np.asarray(grid.free)
+    safe = safe_cells(free, float(grid.cell_size), config.safety_margin)
+    if k < 1:
+        raise ValueError(f"k must be at least 1, got {k}")
+    if poses is None:
+        positions = _positions_in(grid, safe, config)
+        ask, most = _score_turned(positions, camera, config), k
+    else:
+        checked = _checked(poses, k)
+        positions = checked[:, :3, 3]
+        ask, most = _score_as_given(checked, camera, config), 1
+    known_grid = mask_unexplorable(grid, safe) if safe.any() else grid
+    places = jnp.asarray(positions, dtype=jnp.float32)
+    voxels, cells, _ = near(state, known_grid, places, config.scoring)
+    left = np.full(len(positions), most)
+    return _lazy_greedy(ask, voxels, cells, camera, left, k, config)
+
+
+def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) -> np.ndarray:
+    """Positions [C, 3] float64 [m], spread over the cells that keep the margin."""
+    cells = np.argwhere(safe)
+    if len(cells) == 0:
+        raise ValueError(
+            "the grid knows no free cell that keeps the safety margin of "
+            f"{config.safety_margin} m: integrate a frame with depth, or give poses"
+        )
+    centers = np.asarray(grid.origin, np.float64) + (cells + 0.5) * float(grid.cell_size)
+    return centers[spread(centers, config.num_candidates)]
+
+
+def _checked(poses: ArrayLike, k: int) -> np.ndarray:
+    checked = np.asarray(poses, dtype=np.float64)
+    if checked.ndim != 3 or checked.shape[1:] != (4, 4):
+        raise ValueError(f"poses must have shape [C, 4, 4], got {checked.shape}")
+    if len(checked) < k:
+        raise ValueError(f"{k} views cannot be chosen from {len(checked)} poses, each at most once")
+    for i, pose in enumerate(checked):
+        if (error := rigid_error(pose)) is not None:
+            raise ValueError(f"pose {i}: {error}")
+    return checked
+
+
+def _score_as_given(poses: np.ndarray, camera: Camera, config: PlannerConfig) -> Ask:
+    def ask(voxels: Voxels, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        T = jnp.asarray(poses[ids], dtype=jnp.float32)
+        scores = score_views_near(voxels, cells, camera, T, config.scoring)
+        return poses[ids], np.asarray(scores.total, dtype=np.float64)
+
+    return ask
+
+
+def _score_turned(positions: np.ndarray, camera: Camera, config: PlannerConfig) -> Ask:
+    def ask(voxels: Voxels, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        places = jnp.asarray(positions[ids], dtype=jnp.float32)
+        scores = score_positions_near(voxels, cells, camera, places, config.scoring)
+        poses = np.array(scores.T_world_camera, dtype=np.float64)
+        poses[:, :3, 3] = positions[ids]
+        return poses, np.asarray(scores.best_score, dtype=np.float64)
+
+    return ask
+
+
+def _lazy_greedy(
+    ask: Ask,
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    left: np.ndarray,
+    k: int,
+    config: PlannerConfig,
+) -> NextViews:
+    """K times the candidate of the greatest utility; each may be taken `left` [C] times."""
+    poses, bound = ask(voxels, cells, np.arange(len(left)))
+    is_new = np.ones(len(left), dtype=bool)
+    taken: list[np.ndarray] = []
+    worth: list[float] = []
+    while True:
+        best = int(np.argmax(np.where(left > 0, bound, -np.inf)))
+        if not is_new[best]:
+            stale = np.flatnonzero(~is_new & (left > 0))
+            ids = stale[np.argsort(-bound[stale], kind="stable")][:_AT_ONCE]
+            padded = ids[np.arange(_AT_ONCE) % len(ids)]
+            turned, values = ask(voxels, cells, padded)
+            poses[ids], bound[ids], is_new[ids] = turned[: len(ids)], values[: len(ids)], True
+            continue
+        taken.append(poses[best].copy())
+        worth.append(float(bound[best]))
+        if len(taken) == k:
+            return NextViews(np.stack(taken), np.asarray(worth))
+        left[best] -= 1
+        is_new[:] = False
+        T = jnp.asarray(poses[best], dtype=jnp.float32)
+        voxels, cells = foresee_near(voxels, cells, camera, T, config.scoring)

@@ -1,0 +1,123 @@
+"""A view that nobody has taken yet, as if it had been: what the map would know then.
+
+A hypothetical observation of every voxel that the view would show:
+
+    bins        the bin towards the camera joins them
+    resolution  focal / distance, if that is better
+    count       n + 1
+    m2          m2 n / (n - 1) for n > 1: the variance m2 / (n - 1) stays, as it would on average if
+                the new color scattered like the others. A view cannot talk noise away.
+
+Colors and surfaces stay: what nobody has seen cannot be foreseen. So no renderability ever falls,
+from wherever it is asked; and the order of hypothetical views does not matter.
+
+Shape symbols: N rows of the map; n voxels; c cells; M voxels at a time.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.geometry.cameras import Camera
+from r3jax.geometry.numerics import safe_norm
+from r3jax.geometry.sphere import nearest_bin
+from r3jax.mapping.join import bin_words
+from r3jax.mapping.state import MapState
+from r3jax.scoring.cells import Cells, visible_mask
+from r3jax.scoring.chunks import Selection, for_selected
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.views import pinhole_view
+from r3jax.scoring.visibility import seen_in
+from r3jax.scoring.voxels import Voxels, voxels_of
+
+
+@jax.jit
+def foresee(
+    state: MapState,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+) -> tuple[MapState, Bool[Array, " N"]]:
+    """The map after a view that is only imagined.
+
+    Args:
+        state: the map before.
+        camera: of the view; its focal length in the unit that the map was made with.
+        T_world_camera: pose of the view.
+        config: range and size of the depth buffer.
+
+    Returns:
+        The map, and the voxels that the view shows.
+    """
+    voxels = voxels_of(state, config.delta)
+    _, visible = seen_in(voxels, pinhole_view(camera, T_world_camera, config), config)
+    seen = observed(voxels, visible, T_world_camera[:3, 3], camera.focal)
+    after = eqx.tree_at(
+        lambda m: (m.visited, m.resolution, m.count, m.m2),
+        state,
+        (seen.visited, seen.resolution, seen.count, seen.m2),
+    )
+    return after, visible.mask
+
+
+@jax.jit
+def foresee_near(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+) -> tuple[Voxels, Cells]:
+    """Voxels and cells at hand after a view that is only imagined.
+
+    The unexplored cells that the view shows are no longer unexplored.
+
+    Args:
+        voxels: those that hide or are seen; `scoring.batch.near` gathers them.
+        cells: of the coarse grid.
+        camera: of the view.
+        T_world_camera: pose of the view.
+        config: range and size of the depth buffer.
+    """
+    view = pinhole_view(camera, T_world_camera, config)
+    buffer, visible = seen_in(voxels, view, config)
+    after = observed(voxels, visible, T_world_camera[:3, 3], camera.focal)
+    left = cells.unexplored & ~visible_mask(cells, view, buffer)
+    return after, eqx.tree_at(lambda c: c.unexplored, cells, left)
+
+
+def observed(
+    voxels: Voxels, visible: Selection, position: Float[Array, " 3"], focal: Float[Array, ""]
+) -> Voxels:
+    """The voxels with one more, imagined, observation of those that are visible.
+
+    Args:
+        voxels: before.
+        visible: which of them a camera sees.
+        position: its center [m].
+        focal: its focal length [px].
+    """
+    num, (num_words, _) = voxels.count.shape[0], voxels.visited.shape
+
+    def observe(
+        index: Int[Array, " M"], valid: Bool[Array, " M"], marks: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
+        visited, resolution = marks
+        row = jnp.where(valid, index, num)
+        offset = position[:, None] - voxels.center_of(index)
+        distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
+        words = bin_words(nearest_bin(offset / distance[None, :], voxels.num_bins), num_words)
+        # Rows are distinct: the order of the writes does not matter.
+        visited = visited.at[:, row].set(visited[:, index] | words, mode="drop")
+        return visited, resolution.at[row].max(focal / distance, mode="drop")
+
+    visited, resolution = for_selected(visible, observe, (voxels.visited, voxels.resolution))
+    shown, n = visible.mask, voxels.count
+    grows = shown & (n > 1.0)
+    m2 = jnp.where(grows, voxels.m2 * n / jnp.maximum(n - 1.0, 1.0), voxels.m2)
+    return eqx.tree_at(
+        lambda v: (v.visited, v.resolution, v.count, v.m2),
+        voxels,
+        (visited, resolution, n + shown.astype(n.dtype), m2),
+    )

@@ -1,0 +1,178 @@
+"""Several views at once: against scoring everything again on the whole map after every view."""
+
+import functools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import r3jax
+from r3jax.geometry.cameras import Camera, look_at, pose_along
+from r3jax.mapping.occupancy import LOG_ODDS_LIMIT
+from r3jax.planning import next_views as real
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.explorable import mask_unexplorable
+from r3jax.planning.travel import safe_cells
+from r3jax.scoring.batch import score_positions, score_views
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.foresight import foresee
+from r3jax.scoring.utility import view_utility, visible_unexplored
+from tests.exploration.hall import Hall
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+
+CAMERA = Camera.from_fov(32, 32, 70.0)
+SCORING = ScoringConfig(zbuffer_size=32, panorama_size=32, max_range=4.0)
+CONFIG = PlannerConfig(num_candidates=20, num_frontier=0, scoring=SCORING)
+NUM = 24
+
+
+@functools.cache
+def known():
+    """A third of a small hall, seen from its corner, and its grid."""
+    hall = Hall((4.0, 3.0, 2.4), Camera.from_fov(48, 48, 90.0))
+    state = r3jax.empty_map(1 << 13, 0.08)
+    grid = r3jax.empty_grid(hall.bounds, 0.2)
+    for direction in ([1.0, 1.0, 0.0], [1.0, -0.2, -0.3], [0.2, 1.0, 0.2]):
+        pose = pose_along(jnp.asarray([1.0, 0.9, 1.2]), jnp.asarray(direction))
+        frame = hall.render(np.asarray(pose, np.float64))
+        state = r3jax.integrate(state, frame)
+        grid = r3jax.integrate_depth(grid, frame)
+    return state, grid
+
+
+def safe_grid():
+    state, grid = known()
+    safe = safe_cells(np.asarray(grid.free), 0.2, CONFIG.safety_margin)
+    return state, mask_unexplorable(grid, safe), safe
+
+
+def poses_of(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    eyes = rng.uniform([0.5, 0.5, 0.6], [2.5, 2.2, 1.8], (NUM, 3))
+    return np.float64([look_at(eye, eye + rng.normal(size=3) * [1.0, 1.0, 0.5]) for eye in eyes])
+
+
+def by_brute_force(poses: np.ndarray, k: int) -> tuple[list[int], list[float]]:
+    """All left are scored again after every view, one by one, with every row of the map."""
+    state, grid, _ = safe_grid()
+    T = jnp.asarray(poses, jnp.float32)
+    left, chosen, worth = set(range(len(poses))), [], []
+    for _ in range(k):
+        utility = {i: float(view_utility(state, grid, CAMERA, T[i], SCORING).total) for i in left}
+        best = max(utility, key=lambda i: utility[i])
+        chosen.append(best)
+        worth.append(utility[best])
+        left.remove(best)
+        shown = visible_unexplored(state, grid, CAMERA, T[best], SCORING)
+        state, _ = foresee(state, CAMERA, T[best], SCORING)
+        log_odds = jnp.where(shown, LOG_ODDS_LIMIT, grid.log_odds)
+        grid = eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+    return chosen, worth
+
+
+def law_greedy(modules: Modules, seed: int = 0) -> None:
+    state, grid = known()
+    poses = poses_of(seed)
+    views = modules["next_views"].next_views(state, grid, CAMERA, 5, poses=poses, config=CONFIG)
+    chosen, worth = by_brute_force(poses, 5)
+    np.testing.assert_allclose(views.utility, worth, rtol=2e-5)
+    np.testing.assert_array_equal(views.T_world_camera, poses[chosen])
+    assert (np.diff(views.utility) <= 1e-3).all()
+    assert worth[-1] < 0.9 * worth[0]  # or nothing was conditioned on anything
+
+
+def law_each_once(modules: Modules) -> None:
+    state, grid = known()
+    poses = poses_of(1)
+    views = modules["next_views"].next_views(state, grid, CAMERA, NUM, poses=poses, config=CONFIG)
+    order = [np.flatnonzero((poses == T).all(axis=(1, 2)))[0] for T in views.T_world_camera]
+    assert sorted(order) == list(range(NUM))
+
+
+def test_no_pose_is_taken_twice():
+    law_each_once({"next_views": real})
+
+
+@given(st.integers(0, 300))
+@settings(max_examples=5)
+def test_lazy_choice_is_that_of_scoring_all_again(seed):
+    law_greedy({"next_views": real}, seed)
+
+
+@given(st.integers(0, 300))
+@settings(max_examples=10)
+def test_a_view_never_adds_more_after_other_views(seed):
+    """Diminishing returns, and so a path's value never falls by a view."""
+    state, grid, _ = safe_grid()
+    first, second, view = jnp.asarray(poses_of(seed)[:3], jnp.float32)
+    utility = lambda s: float(view_utility(s, grid, CAMERA, view, SCORING).rendering)
+    one, _ = foresee(state, CAMERA, first, SCORING)
+    both, _ = foresee(one, CAMERA, second, SCORING)
+    assert utility(state) + 1e-3 >= utility(one)
+    assert utility(one) + 1e-3 >= utility(both) >= 0.0
+
+
+def test_a_batch_of_one_is_the_next_best_view():
+    state, grid, _ = safe_grid()
+    poses = poses_of(3)
+    scores = np.asarray(score_views(state, grid, CAMERA, poses, SCORING).total)
+    views = r3jax.next_views(*known(), CAMERA, 1, poses=poses, config=CONFIG)
+    np.testing.assert_array_equal(views.T_world_camera[0], poses[scores.argmax()])
+    assert views.utility[0] == scores.max()
+
+
+def test_without_poses_free_space_is_searched_in_all_directions():
+    state, grid, safe = safe_grid()
+    views = r3jax.next_views(*known(), CAMERA, 4, config=CONFIG)
+    assert views.T_world_camera.shape == (4, 4, 4)
+    origin = np.asarray(grid.origin, np.float64)
+    cells = np.floor((views.T_world_camera[:, :3, 3] - origin) / 0.2).astype(int)
+    assert safe[tuple(cells.T)].all()
+    assert (np.diff(views.utility) <= 1e-3).all()
+    again = r3jax.next_views(*known(), CAMERA, 4, config=CONFIG)
+    np.testing.assert_array_equal(views.T_world_camera, again.T_world_camera)
+    # The first is the best of the panoramas of the same places.
+    centers = origin + (np.argwhere(safe) + 0.5) * float(grid.cell_size)
+    places = centers[real.spread(centers, CONFIG.num_candidates)]
+    panoramas = score_positions(state, grid, CAMERA, places, SCORING)
+    assert views.utility[0] == pytest.approx(float(panoramas.best_score.max()), rel=1e-5)
+
+
+def test_what_cannot_be_chosen_from_is_refused():
+    state, grid = known()
+    poses = poses_of(0)
+    ask = functools.partial(r3jax.next_views, state, grid, CAMERA, config=CONFIG)
+    with pytest.raises(ValueError, match="k must be at least 1"):
+        ask(0, poses=poses)
+    with pytest.raises(ValueError, match="25 views cannot be chosen from 24 poses"):
+        ask(25, poses=poses)
+    with pytest.raises(ValueError, match=r"shape \[C, 4, 4\]"):
+        ask(1, poses=poses[0])
+    poses[2, 0, 0] = np.nan
+    with pytest.raises(ValueError, match=r"pose 2: .*not finite"):
+        ask(1, poses=poses)
+    unknown = eqx.tree_at(lambda g: g.log_odds, grid, jnp.zeros_like(grid.log_odds))
+    with pytest.raises(ValueError, match="no free cell that keeps the safety margin"):
+        r3jax.next_views(state, unknown, CAMERA, 1, config=CONFIG)
+
+
+CHAIN = ("r3jax.scoring.foresight", "r3jax.planning.next_views")
+MUTANTS = [
+    Mutant("next_views", "is_new[:] = False", "is_new[:] = True", law_greedy),
+    Mutant("next_views", "left[best] -= 1", "left[best] -= 0", law_each_once),
+    Mutant("next_views", "np.argsort(-bound[stale]", "np.argsort(bound[stale]", law_greedy),
+    Mutant("foresight", "& ~visible_mask", "| visible_mask", law_greedy),
+    Mutant("foresight", "visited[:, index] | words", "visited[:, index]", law_greedy),
+]
+
+
+def test_the_law_holds_without_a_fault():
+    law_greedy(load(CHAIN))
+
+
+@each(MUTANTS, in_gate=2)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
