@@ -44,6 +44,7 @@ class Look:
 _POLICIES = {
     "ours-pano": ("#D55E00", "o", "-"),
     "ours": ("#E69F00", "s", "-"),
+    "ours-ahead": ("#8f2d00", ">", "-"),
     "active-gs": ("#0072B2", "^", "-"),
     "active-gs-no-depth": ("#0072B2", "<", "--"),
     "active-gamer": ("#56B4E9", "v", "-"),

@@ -40,6 +40,21 @@ class PlannerConfig:
     scoring: ScoringConfig = field(default_factory=ScoringConfig)
     """Settings of the utilities, lambda1 among them."""
 
+    horizon: int = 4
+    """Views of the paths that `ours-ahead` compares."""
+
+    num_spread: int = 40
+    """How many of the candidates of `ours-ahead` are spread over all reachable space."""
+
+    beam: int = 4
+    """Paths that `ours-ahead` keeps for every further view."""
+
+    branching: int = 6
+    """Places that `ours-ahead` tries for the next view of each path."""
+
+    view_seconds: float = 1.0
+    """What `ours-ahead` counts for a view, beside the way to it at 1 m/s [s]."""
+
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""
         if not 1 <= self.num_candidates <= MAX_CANDIDATES:
@@ -51,7 +66,10 @@ class PlannerConfig:
                 f"num_frontier must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.num_frontier}"
             )
-        for name in ("radius", "lambda2", "safety_margin"):
+        for name, least in (("horizon", 1), ("num_spread", 0), ("beam", 1), ("branching", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        for name in ("radius", "lambda2", "safety_margin", "view_seconds"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} must be a finite number >= 0, got {value}")

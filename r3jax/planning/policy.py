@@ -113,6 +113,7 @@ def _registry() -> dict[str, Any]:
     """Every policy by name. Imported late: the policies import this module."""
     from r3jax.planning.policies.active_gamer import ActiveGamer
     from r3jax.planning.policies.active_gs import ActiveGS, ActiveGSNoDepth
+    from r3jax.planning.policies.ahead import OursAhead
     from r3jax.planning.policies.cover import Cover
     from r3jax.planning.policies.frontier import Frontier
     from r3jax.planning.policies.random import Random
@@ -123,6 +124,7 @@ def _registry() -> dict[str, Any]:
     known = (
         Ours,
         OursPano,
+        OursAhead,
         ActiveGS,
         ActiveGSNoDepth,
         ActiveGamer,

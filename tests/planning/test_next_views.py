@@ -10,43 +10,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import r3jax
-from r3jax.geometry.cameras import Camera, look_at, pose_along
-from r3jax.mapping.occupancy import LOG_ODDS_LIMIT
+from r3jax.geometry.cameras import look_at
 from r3jax.planning import next_views as real
-from r3jax.planning.config import PlannerConfig
-from r3jax.planning.explorable import mask_unexplorable
-from r3jax.planning.travel import safe_cells
 from r3jax.scoring.batch import score_positions, score_views
-from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.foresight import foresee
-from r3jax.scoring.utility import view_utility, visible_unexplored
-from tests.exploration.hall import Hall
+from r3jax.scoring.utility import view_utility
 from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.planning.known_hall import (
+    CAMERA,
+    CONFIG,
+    SCORING,
+    after_view,
+    for_scoring,
+    known,
+    safe_mask,
+)
 
-CAMERA = Camera.from_fov(32, 32, 70.0)
-SCORING = ScoringConfig(zbuffer_size=32, panorama_size=32, max_range=4.0)
-CONFIG = PlannerConfig(num_candidates=20, num_frontier=0, scoring=SCORING)
 NUM = 24
-
-
-@functools.cache
-def known():
-    """A third of a small hall, seen from its corner, and its grid."""
-    hall = Hall((4.0, 3.0, 2.4), Camera.from_fov(48, 48, 90.0))
-    state = r3jax.empty_map(1 << 13, 0.08)
-    grid = r3jax.empty_grid(hall.bounds, 0.2)
-    for direction in ([1.0, 1.0, 0.0], [1.0, -0.2, -0.3], [0.2, 1.0, 0.2]):
-        pose = pose_along(jnp.asarray([1.0, 0.9, 1.2]), jnp.asarray(direction))
-        frame = hall.render(np.asarray(pose, np.float64))
-        state = r3jax.integrate(state, frame)
-        grid = r3jax.integrate_depth(grid, frame)
-    return state, grid
-
-
-def safe_grid():
-    state, grid = known()
-    safe = safe_cells(np.asarray(grid.free), 0.2, CONFIG.safety_margin)
-    return state, mask_unexplorable(grid, safe), safe
 
 
 def poses_of(seed: int) -> np.ndarray:
@@ -57,19 +37,16 @@ def poses_of(seed: int) -> np.ndarray:
 
 def by_brute_force(poses: np.ndarray, k: int) -> tuple[list[int], list[float]]:
     """All left are scored again after every view, one by one, with every row of the map."""
-    state, grid, _ = safe_grid()
+    world = for_scoring()
     T = jnp.asarray(poses, jnp.float32)
     left, chosen, worth = set(range(len(poses))), [], []
     for _ in range(k):
-        utility = {i: float(view_utility(state, grid, CAMERA, T[i], SCORING).total) for i in left}
+        utility = {i: float(view_utility(*world, CAMERA, T[i], SCORING).total) for i in left}
         best = max(utility, key=lambda i: utility[i])
         chosen.append(best)
         worth.append(utility[best])
         left.remove(best)
-        shown = visible_unexplored(state, grid, CAMERA, T[best], SCORING)
-        state, _ = foresee(state, CAMERA, T[best], SCORING)
-        log_odds = jnp.where(shown, LOG_ODDS_LIMIT, grid.log_odds)
-        grid = eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+        world = after_view(world, T[best])
     return chosen, worth
 
 
@@ -106,7 +83,7 @@ def test_lazy_choice_is_that_of_scoring_all_again(seed):
 @settings(max_examples=10)
 def test_a_view_never_adds_more_after_other_views(seed):
     """Diminishing returns, and so a path's value never falls by a view."""
-    state, grid, _ = safe_grid()
+    state, grid = for_scoring()
     first, second, view = jnp.asarray(poses_of(seed)[:3], jnp.float32)
     utility = lambda s: float(view_utility(s, grid, CAMERA, view, SCORING).rendering)
     one, _ = foresee(state, CAMERA, first, SCORING)
@@ -116,7 +93,7 @@ def test_a_view_never_adds_more_after_other_views(seed):
 
 
 def test_a_batch_of_one_is_the_next_best_view():
-    state, grid, _ = safe_grid()
+    state, grid = for_scoring()
     poses = poses_of(3)
     scores = np.asarray(score_views(state, grid, CAMERA, poses, SCORING).total)
     views = r3jax.next_views(*known(), CAMERA, 1, poses=poses, config=CONFIG)
@@ -125,7 +102,8 @@ def test_a_batch_of_one_is_the_next_best_view():
 
 
 def test_without_poses_free_space_is_searched_in_all_directions():
-    state, grid, safe = safe_grid()
+    state, grid = for_scoring()
+    safe = safe_mask()
     views = r3jax.next_views(*known(), CAMERA, 4, config=CONFIG)
     assert views.T_world_camera.shape == (4, 4, 4)
     origin = np.asarray(grid.origin, np.float64)

@@ -1,0 +1,79 @@
+"""Ours, several views ahead: the first view of the best path through all reachable space.
+
+Candidates are those of Ours-Pano, local ones and some in sight of the frontier, and places that are
+spread over all space that the robot can reach. The best path of `horizon` views among them
+(`planning.lookahead`) decides; its first view is taken, and then all is planned anew. So a room
+that is done is left for one that is not, however far, if nothing nearer is worth its time.
+
+Shape symbols: C candidates.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from r3jax.planning.candidates import poses_along, spread
+from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_positions
+from r3jax.planning.lookahead import Outlook, lengths_between, search
+from r3jax.scoring.batch import near, score_positions_near
+
+
+@dataclass(frozen=True)
+class OursAhead(GreedyPolicy):
+    """The first view of the best path of several, each as if those before it had been taken."""
+
+    name = "ours-ahead"
+    source = "look-ahead on Ours-Pano, this project"
+
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """Positions of Ours, and some spread over all reachable space; no directions yet."""
+        travel = situation.travel
+        num = self.config.num_candidates
+        num_spread = min(self.config.num_spread, num - 1)
+        num_own = num - num_spread
+        own = replace(
+            self.config, num_candidates=num_own, num_frontier=min(self.config.num_frontier, num_own)
+        )
+        positions, _ = draw_positions(travel, situation.scoring_grid, own, key=key)
+        centers = travel.centers(np.argwhere(travel.goals))
+        if len(positions) == 0 or len(centers) == 0:
+            return Drawn(np.zeros((0, 4, 4)), situation.memory)
+        wide = centers[spread(centers, num_spread)] if num_spread else centers[:0]
+        positions = np.concatenate([positions, wide])
+        positions = positions[np.arange(num) % len(positions)]  # few places: repeat, one shape
+        return Drawn(poses_along(positions, np.tile([1.0, 0.0, 0.0], (num, 1))), situation.memory)
+
+    def score(
+        self, situation: Situation, poses: np.ndarray, *, key: Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Every position's best direction and its worth; `ahead`, the rate of its best path.
+
+        A position from which no path of the beam begins has no rate: -inf.
+        """
+        del key
+        scoring, travel = self.config.scoring, situation.travel
+        positions = poses[:, :3, 3]
+        places = jnp.asarray(positions, dtype=jnp.float32)
+        voxels, cells, _ = near(situation.map_state, situation.scoring_grid, places, scoring)
+        panorama = score_positions_near(voxels, cells, situation.camera, places, scoring)
+        turned = np.array(panorama.T_world_camera, dtype=np.float64)
+        turned[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
+        utility = np.asarray(panorama.best_score, dtype=np.float64)
+        outlook = Outlook(
+            turned,
+            utility,
+            travel.lengths(positions),
+            lengths_between(travel, positions),
+            situation.camera,
+            self.config,
+        )
+        rate = np.full(len(positions), -np.inf)
+        for path in search(outlook, voxels, cells):
+            rate[path.places[0]] = max(rate[path.places[0]], path.rate)
+        return turned, {"utility": utility, "ahead": rate}
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """The rate of the best path: the way is in it."""
+        return utilities["ahead"]

@@ -1,0 +1,177 @@
+"""The search of paths against all paths, worked out on the whole map, and ways between places."""
+
+import dataclasses
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r3jax.planning import lookahead as real
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.travel import plan_travel
+from r3jax.scoring.batch import near, score_positions
+from r3jax.scoring.panorama import panorama
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.planning.known_hall import CAMERA, CONFIG, SCORING, after_view, for_scoring
+from tests.planning.rooms import center, grid_of, two_rooms
+
+PLACES = np.array([[1.0, 0.9, 1.2], [1.9, 0.9, 1.2], [1.0, 1.8, 1.2], [1.9, 1.7, 1.2]])
+"""Each 0.7 m or more from the others."""
+
+WIDE = dataclasses.replace(CONFIG, horizon=3, beam=100, branching=len(PLACES) + 1)
+
+
+def outlook_of(config: PlannerConfig, view_seconds: float = 1.0) -> real.Outlook:
+    """The places, seen from the first one; ways are straight."""
+    state, grid = for_scoring()
+    panoramas = score_positions(state, grid, CAMERA, PLACES, SCORING)
+    poses = np.array(panoramas.T_world_camera, np.float64)
+    poses[:, :3, 3] = PLACES
+    gap = np.linalg.norm(PLACES[:, None] - PLACES, axis=2)
+    config = dataclasses.replace(config, view_seconds=view_seconds)
+    utility = np.asarray(panoramas.best_score, np.float64)
+    return real.Outlook(poses, utility, gap[0], gap, CAMERA, config)
+
+
+def at_hand():
+    state, grid = for_scoring()
+    voxels, cells, _ = near(state, grid, jnp.asarray(PLACES, jnp.float32), SCORING)
+    return voxels, cells
+
+
+def all_paths(outlook: real.Outlook, horizon: int) -> dict[tuple[int, ...], float]:
+    """The rate of every path, each view on the whole map as it is after those before it."""
+    rates, worlds = {}, {(): (for_scoring(), 0.0, 0.0)}
+    for length in range(1, horizon + 1):
+        for path in itertools.product(range(len(PLACES)), repeat=length):
+            world, gained, seconds = worlds[path[:-1]]
+            place = jnp.asarray(PLACES[path[-1]], jnp.float32)
+            view = panorama(*world, CAMERA, place, SCORING)
+            way = outlook.between[path[-2], path[-1]] if length > 1 else outlook.lengths[path[-1]]
+            gained = gained + float(view.best_score)
+            seconds = seconds + way + outlook.config.view_seconds
+            worlds[path] = (after_view(world, view.T_world_camera), gained, seconds)
+            if length == horizon:
+                rates[path] = gained / seconds
+    return rates
+
+
+def law_paths(modules: Modules) -> None:
+    """With room for all of them, the search finds the best path of three views."""
+    outlook = outlook_of(WIDE)
+    found = modules["lookahead"].search(outlook, *at_hand())
+    rates = all_paths(outlook, 3)
+    best = max(rates, key=lambda path: rates[path])
+    assert found[0].places == best
+    for path in found[:20]:
+        assert path.rate == pytest.approx(rates[path.places], rel=1e-4)
+    assert found[0].rate > 1.02 * rates[0, 0, 0]  # or it did not matter where it went
+    assert [p.rate for p in found] == sorted((p.rate for p in found), reverse=True)
+
+
+def test_a_beam_with_room_for_all_finds_the_best_path():
+    law_paths({"lookahead": real})
+
+
+def test_a_narrow_beam_keeps_its_promise():
+    """Not the best path, perhaps, but its rate is true, and views never add less than nothing."""
+    outlook = outlook_of(dataclasses.replace(CONFIG, horizon=3, beam=2, branching=5))
+    rates = all_paths(outlook, 3)
+    found = real.search(outlook, *at_hand())
+    assert len(found) == 2
+    for path in found:
+        assert path.rate == pytest.approx(rates[path.places], rel=1e-4)
+        assert min(path.gains) >= 0.0
+    assert found[0].rate >= 0.9 * max(rates.values())
+
+
+def law_one_view(modules: Modules) -> None:
+    """A horizon of one is the next-best view, by gain over time."""
+    outlook = outlook_of(dataclasses.replace(WIDE, horizon=1), view_seconds=0.3)
+    found = modules["lookahead"].search(outlook, *at_hand())
+    rate = outlook.utility / (0.3 + outlook.lengths)
+    assert found[0].places == (int(np.argmax(rate)),)
+    assert found[0].rate == pytest.approx(rate.max())
+
+
+def test_a_horizon_of_one_is_the_next_best_view():
+    law_one_view({"lookahead": real})
+
+
+def law_apart(modules: Modules) -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[1, 0, 3] = 0.1  # as good as the first
+    poses[2, 0, 3] = 0.75
+    poses[3, :3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # turned by 90 degrees
+    apart = modules["lookahead"]._apart
+    assert apart([1, 0, 2, 3], poses, (), 4) == [1, 3]
+    assert apart([0, 1, 2, 3], poses, (), 4) == [0, 2, 3]
+    assert apart([0, 1, 2, 3], poses, (), 2) == [0, 2]
+    assert apart([0, 1, 2, 3], poses, (poses[2],), 4) == [0, 3]
+
+
+def test_choices_lie_apart():
+    law_apart({"lookahead": real})
+
+
+def test_no_way_no_path():
+    outlook = dataclasses.replace(outlook_of(WIDE), lengths=np.full(len(PLACES), np.inf))
+    assert real.search(outlook, *at_hand()) == []
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=10)
+def test_ways_between_places_are_ways(seed):
+    """Symmetric, no shorter than the shortest, no longer than back past the robot."""
+    rng = np.random.default_rng(seed)
+    travel = plan_travel(grid_of(*two_rooms()), center(6, 5, 4))
+    cells = np.argwhere(travel.goals)
+    positions = travel.centers(cells[rng.choice(len(cells), 12, replace=False)])
+    between = real.lengths_between(travel, positions)
+    own = travel.lengths(positions)
+    np.testing.assert_allclose(between, between.T)
+    np.testing.assert_array_equal(np.diag(between), 0.0)
+    assert (between <= own[:, None] + own[None] + 1e-9).all()
+    for i in range(3):
+        other = plan_travel(grid_of(*two_rooms()), positions[i])
+        straight = np.linalg.norm(positions - positions[i], axis=1)
+        assert (between[i] >= straight - 1e-9).all()
+        # Ways over cells turn by 45 degrees: up to 13 % longer than a free one.
+        assert (between[i] >= other.lengths(positions) / 1.14 - 0.2).all()
+
+
+def test_ways_between_rooms_lead_through_the_door():
+    travel = plan_travel(grid_of(*two_rooms()), center(6, 5, 4))
+    ends = np.stack([center(10, 11, 4), center(14, 11, 4)])  # either side of the wall
+    between = real.lengths_between(travel, ends)
+    assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.8)
+    assert between[0, 1] > 1.6
+
+
+CHAIN = ("r3jax.scoring.foresight", "r3jax.planning.lookahead")
+_TAKEN = "T = jnp.asarray(path.poses[-1]"
+_SECONDS = "seconds=path.seconds + float(cost[i])"
+_FIRST = "cost = config.view_seconds + outlook.lengths"
+MUTANTS = [
+    Mutant("lookahead", _TAKEN, "T = jnp.asarray(path.poses[0]", law_paths),
+    Mutant("lookahead", "outlook.between[last]", "outlook.lengths", law_paths),
+    Mutant("lookahead", _SECONDS, "seconds=float(cost[i])", law_paths),
+    Mutant("lookahead", "return sum(self.gains) /", "return self.gains[-1] /", law_paths),
+    Mutant("lookahead", _FIRST, "cost = outlook.lengths", law_one_view),
+    Mutant("lookahead", "< _TURNED", "> _TURNED", law_apart),
+    Mutant("lookahead", "others = list(taken)", "others = []", law_apart),
+]
+
+
+def test_laws_hold_without_a_fault():
+    modules = load(CHAIN)
+    for law in (law_paths, law_one_view, law_apart):
+        law(modules)
+
+
+@each(MUTANTS, in_gate=2)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
