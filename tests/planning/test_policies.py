@@ -264,6 +264,11 @@ def test_an_unknown_name_lists_the_known_ones():
         ("radius", np.inf),
         ("lambda2", -0.5),
         ("safety_margin", np.nan),
+        ("horizon", 0),
+        ("num_spread", -1),
+        ("beam", 0),
+        ("branching", 0),
+        ("view_seconds", -1.0),
     ],
 )
 def test_impossible_settings_are_named(setting, value):
