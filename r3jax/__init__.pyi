@@ -7,6 +7,7 @@ from .mapping.state import MapState, empty_map
 from .mapping.update import integrate, integrate_points
 from .planning.next_views import NextViews, next_views
 from .scoring.config import ScoringConfig
+from .scoring.explain import Explanation, explain_view
 from .scoring.panorama import Panorama, panorama
 from .scoring.renderability import (
     Renderability,
@@ -25,6 +26,7 @@ from .splatting.views import Views, load_views
 
 __all__ = [
     "Camera",
+    "Explanation",
     "FitResult",
     "Frame",
     "GaussianScene",
@@ -41,6 +43,7 @@ __all__ = [
     "Views",
     "empty_grid",
     "empty_map",
+    "explain_view",
     "fit",
     "grow",
     "integrate",

@@ -111,6 +111,7 @@ def over_visible(
 
 
 def visible_mask(cells: Cells, view: View, buffer: DepthBuffer) -> Bool[Array, " c"]:
-    """The unexplored cells whose center the view sees."""
-    place = view.place(jnp.stack([cells.x, cells.y, cells.z]))
-    return cells.unexplored & is_visible(view, place, buffer.distance)
+    """The unexplored cells whose center the view sees: those that `over_visible` adds up."""
+    points = jnp.stack([cells.x, cells.y, cells.z])
+    in_view = view.may_see(points, jnp.zeros(()))
+    return cells.unexplored & in_view & is_visible(view, view.place(points), buffer.distance)

@@ -1,0 +1,131 @@
+"""Why a view is worth what it is worth: its utility, divided among four causes.
+
+    U = lambda1 U_G + sum of (1 - R),    R = bias x noise x resolution        (arXiv 2601.07484)
+
+The first term is space that was never seen. What a visible voxel lacks, 1 - R, is divided among
+the factors of R in proportion to their logarithms, because these add up to that of R. A factor
+of 1 so takes nothing, the order of the factors makes no difference, and a factor that falls to 0
+takes all: the limit of the rule, so no floor is needed. The paper has no such division.
+
+Shape symbols: n voxels; F factors; N capacity of the map; X Y Z cells of the grid.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.scoring.cells import cells_of, visible_mask
+from r3jax.scoring.chunks import Selection, for_selected
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.views import pinhole_view
+from r3jax.scoring.visibility import seen_in
+from r3jax.scoring.voxels import Voxels, voxels_of
+
+CAUSES = ("never seen", "too oblique", "inconsistent", "too far")
+"""What a utility comes from: unexplored cells, then the factors bias, noise and resolution."""
+
+_LEAST = float(jnp.finfo(jnp.float32).tiny)
+"""What is smaller has no logarithm on every device: it counts as 0."""
+
+_Sums = tuple[Float[Array, "3 N"], Float[Array, " 3"]]
+"""Shares of every row, and their totals."""
+
+
+class Explanation(eqx.Module):
+    """What a view promises (`ViewUtility`), by cause, in the order of `CAUSES`."""
+
+    totals: Float[Array, " 4"]
+    """Of the whole view; they sum to its utility lambda1 U_G + U_R."""
+
+    shares: Float[Array, "3 N"]
+    """Of each row of the map: too oblique, inconsistent, too far. They sum to the 1 - R of a row
+    that the view sees, and are 0 for the others."""
+
+    visible: Bool[Array, " N"]
+    """Rows that the view sees."""
+
+    cells: Bool[Array, "X Y Z"]
+    """Unexplored cells that the view sees: each is lambda1 of what was never seen."""
+
+
+@jax.jit
+def explain_view(
+    state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+) -> Explanation:
+    """The utility of one view, divided among its causes, for every voxel and in total.
+
+    It sees what `view_utility` of the same view sees. A voxel that was observed once only is
+    never called inconsistent: nothing was measured against it.
+
+    Args:
+        state: the map.
+        grid: whose unexplored cells count; planners count those worth a look only.
+        camera: of the view, its focal length in the unit that the map was made with.
+        T_world_camera: the view.
+        config: lambda1, range, and settings of the closed forms.
+    """
+    config = ScoringConfig() if config is None else config
+    voxels, cells = voxels_of(state, config.delta), cells_of(grid)
+    view = pinhole_view(camera, T_world_camera, config)
+    buffer, visible = seen_in(voxels, view, config)
+    unseen = visible_mask(cells, view, buffer)
+    position = T_world_camera[:3, 3]
+    shares, rendering = _divide_visible(voxels, visible, position, camera.focal, config.kappa)
+    exploration = config.lambda1 * jnp.sum(unseen, dtype=jnp.float32)
+    return Explanation(
+        totals=jnp.concatenate([exploration[None], rendering]),
+        shares=shares,
+        visible=visible.mask,
+        cells=unseen.reshape(grid.log_odds.shape),
+    )
+
+
+def _divide_visible(
+    voxels: Voxels,
+    visible: Selection,
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    kappa: str,
+) -> _Sums:
+    """What the visible voxels lack, by cause; summed in the order in which U_R is."""
+    num = visible.num
+
+    def add(index: Int[Array, " K"], valid: Bool[Array, " K"], sums: _Sums) -> _Sums:
+        shares, totals = sums
+        terms = score_voxels(voxels.take(index, valid), position, focal, kappa)
+        factors = jnp.stack([terms.bias, terms.noise, terms.resolution])
+        part = jnp.where(valid[None, :], divide_lack(1.0 - terms.value, factors), 0.0)
+        target = jnp.where(valid, index, num)  # out of range on purpose: dropped
+        return shares.at[:, target].set(part, mode="drop"), totals + jnp.sum(part, axis=1)
+
+    start = jnp.zeros((3, num), dtype=jnp.float32), jnp.zeros(3, dtype=jnp.float32)
+    return for_selected(visible, add, start)
+
+
+def divide_lack(lack: Float[Array, " n"], factors: Float[Array, "F n"]) -> Float[Array, "F n"]:
+    """Divides what products of factors lack to 1 among the factors.
+
+    share of f = lack log(f) / sum of the logarithms; if factors are 0, they share alike, and
+    the others take nothing.
+
+    Args:
+        lack: 1 - the product of the factors.
+        factors: each in [0, 1].
+
+    Returns:
+        Shares >= 0 that sum to `lack`; all 0 where nothing lacks.
+    """
+    is_zero = factors < _LEAST
+    cost = -jnp.log(jnp.where(is_zero, 1.0, factors))
+    weight = jnp.where(jnp.any(is_zero, axis=0)[None, :], is_zero.astype(factors.dtype), cost)
+    total = jnp.sum(weight, axis=0)
+    return weight * (lack / jnp.where(total > 0.0, total, 1.0))[None, :]
