@@ -12,7 +12,7 @@ import numpy as np
 from r3jax.cli.options import Explore
 from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.replay import config_of
+from r3jax.exploration.replay import config_of, planner_config_of
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policy import Policy, make_policy
@@ -90,9 +90,7 @@ def plan_of_run(run: Run) -> Plan:
     """
     header = run.header
     try:
-        settings = dict(header.policy["settings"])
-        scoring = ScoringConfig(**settings.pop("scoring", {}))
-        policy = make_policy(header.policy["name"], scoring=scoring, **settings)
+        policy = make_policy(header.policy["name"], **vars(planner_config_of(run)))
         return Plan(parse_budget(header.budget), config_of(run), policy)
     except RunError:
         raise

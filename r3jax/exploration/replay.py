@@ -1,7 +1,7 @@
 """Recorded frames rebuild the map and the grid of a run, and those of several runs together."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -12,6 +12,8 @@ from r3jax.exploration.step import add_to_grid, first_grid
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
+from r3jax.planning.config import PlannerConfig
+from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.sighting import look
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
@@ -43,6 +45,20 @@ def config_of(run: Run) -> ExplorationConfig:
         raise RunError(run.path / "run.json", f"a setting of the loop: {error}") from None
 
 
+def planner_config_of(run: Run) -> PlannerConfig:
+    """The settings of the policy that a run was made with.
+
+    Raises:
+        RunError: a setting that this version does not know, or cannot work with.
+    """
+    try:
+        settings = dict(run.header.policy["settings"])
+        scoring = ScoringConfig(**settings.pop("scoring", {}))
+        return PlannerConfig(scoring=scoring, **settings)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(run.path / "run.json", f"a setting of the policy: {error}") from None
+
+
 def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, OccupancyGrid]:
     """The map and the grid that have seen what the runs have seen, one run after the other.
 
@@ -53,23 +69,53 @@ def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, Oc
     Raises:
         RunError: the runs do not fit together, or a frame is missing or broken.
     """
-    first, config = runs[0], config_of(runs[0])
     for run in runs[1:]:
-        check_alike(first, run)
-    bounds = np.asarray(first.header.bounds, dtype=np.float64)
-    grid = first_grid(bounds, [pose for run in runs for pose in starts_of(run)], config)
-    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
+        check_alike(runs[0], run)
+    config = config_of(runs[0])
+    map_state, grid = _nothing_known(runs)
     for run in runs:
         for frame in _frames(run, views):
-            map_state = look(
-                map_state,
-                frame,
-                config.max_range,
-                allow_growth=config.allow_growth,
-                drop_edges=config.drop_edges,
-            )
-            grid = add_to_grid(grid, frame, config)
+            map_state, grid = after_frame(map_state, grid, frame, config)
     return map_state, grid
+
+
+def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
+    """The map and the grid after each view of a run, in order; each when it is asked for.
+
+    Raises:
+        RunError: no view, settings that cannot work, or a frame that is missing or broken.
+    """
+    config = config_of(run)
+    map_state, grid = _nothing_known([run])
+    for frame in _frames(run, None):
+        map_state, grid = after_frame(map_state, grid, frame, config)
+        yield map_state, grid
+
+
+def after_frame(
+    map_state: MapState, grid: OccupancyGrid, frame: Frame, config: ExplorationConfig
+) -> tuple[MapState, OccupancyGrid]:
+    """The map and the grid that have seen one frame more, as the loop would have them."""
+    map_state = look(
+        map_state,
+        frame,
+        config.max_range,
+        allow_growth=config.allow_growth,
+        drop_edges=config.drop_edges,
+    )
+    return map_state, add_to_grid(grid, frame, config)
+
+
+def _nothing_known(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
+    """The map and the grid before the first view of runs in one scene."""
+    config = config_of(runs[0])
+    bounds = np.asarray(runs[0].header.bounds, dtype=np.float64)
+    starts = [pose for run in runs for pose in starts_of(run)]
+    try:
+        grid = first_grid(bounds, starts, config)
+    except ValueError as error:
+        raise RunError(runs[0].path / "run.json", str(error)) from None
+    return empty_map(config.capacity, config.voxel_size, config.num_bins), grid
 
 
 def differences(run: Run) -> tuple[int, list[Difference]]:

@@ -18,6 +18,7 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.policy import Decision, Outcome, PlanInfo
 from r3jax.planning.travel import Travel, plan_travel
+from r3jax.scoring.explain import Explanation, explain_view
 from r3jax.scoring.utility import visible_unexplored
 
 ENOUGH_LOOKS = 3
@@ -104,6 +105,36 @@ def follow_way(
     """The memory of a robot that goes a way which its policy did not choose."""
     state, travel, _ = look_round(state, map_state, grid, T_world_camera, config)
     return _with_way(state, travel, waypoints)
+
+
+def explain_way(
+    state: PlannerState,
+    map_state: MapState,
+    grid: OccupancyGrid,
+    T_world_camera: np.ndarray,
+    T_chosen: np.ndarray,
+    waypoints: np.ndarray,
+    config: PlannerConfig,
+) -> tuple[PlannerState, Explanation]:
+    """As `follow_way`, and what the view at the end of the way promises when it is chosen.
+
+    Args:
+        state: the policy's memory.
+        map_state: the map, the view from here included.
+        grid: the grid, the same.
+        T_world_camera: where the latest view was taken.
+        T_chosen: the view that was chosen, by whatever rule.
+        waypoints: the way to it, [K, 3] [m].
+        config: of the policy.
+
+    Returns:
+        The memory with the way counted in, and the utility by cause; of the unexplored cells those
+        count that decisions are scored on (`look_round`).
+    """
+    state, travel, scoring_grid = look_round(state, map_state, grid, T_world_camera, config)
+    pose = jnp.asarray(T_chosen, dtype=jnp.float32)
+    explanation = explain_view(map_state, scoring_grid, state.camera, pose, config.scoring)
+    return _with_way(state, travel, waypoints), explanation
 
 
 def no_decision(

@@ -5,16 +5,16 @@ many as fit in a given memory and evenly spaced, so that any view is a few frame
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import jax
 import numpy as np
 
-from r3jax.exploration.replay import config_of, starts_of
-from r3jax.exploration.step import add_to_grid, first_grid
+from r3jax.exploration.replay import after_frame, config_of, starts_of
+from r3jax.exploration.step import first_grid
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.scoring.sighting import look
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
@@ -83,15 +83,16 @@ class Timeline:
         self._shown = moment
         return moment
 
-    def advance(self) -> bool:
-        """Goes one view farther than ever before; False when the last one was reached.
+    def follow(self) -> Iterator[Moment]:
+        """Every state in order, each when it is asked for; `at` may be called in between.
 
         Raises:
             RunError: as `at`.
         """
-        if self._reached.step < len(self.run.rows) - 1:
-            self._after(self._reached)
-        return self._reached.step < len(self.run.rows) - 1
+        moment = self._start
+        while moment.step < len(self.run.rows) - 1:
+            moment = self._after(moment)
+            yield moment
 
     def _before(self, step: int) -> Moment:
         """The latest known state that is not later than `step`."""
@@ -103,14 +104,7 @@ class Timeline:
     def _after(self, moment: Moment) -> Moment:
         """The state one view later."""
         config, frame = self._config, self.run.frame(moment.step + 1)
-        map_state = look(
-            moment.map_state,
-            frame,
-            config.max_range,
-            allow_growth=config.allow_growth,
-            drop_edges=config.drop_edges,
-        )
-        after = Moment(moment.step + 1, map_state, add_to_grid(moment.grid, frame, config))
+        after = Moment(moment.step + 1, *after_frame(moment.map_state, moment.grid, frame, config))
         if after.step % self.stride == 0:
             self._kept[after.step] = after
         if after.step > self._reached.step:

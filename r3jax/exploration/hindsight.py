@@ -1,0 +1,97 @@
+"""Why each view of a recorded run was worth taking, on what was known before it was taken.
+
+What a planner knew is rebuilt from the frames: the map, the grid, and which unexplored cells it had
+given up. So runs of any policy are explained, those without a utility of their own too: by
+what the view that they chose promised.
+
+Shape symbols: m voxels that a view sees; k cells.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from r3jax.exploration.replay import planner_config_of, states_of
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.decision import explain_way, initial_state
+from r3jax.scoring.explain import Explanation
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run
+
+
+@dataclass(frozen=True)
+class Reason:
+    """What one view promised when it was chosen: an `Explanation`, as small as it can be."""
+
+    totals: np.ndarray
+    """Utility by cause, in the order of `scoring.explain.CAUSES`, [4] float64."""
+
+    rows: np.ndarray
+    """Rows of the map before the view that it was to see, [m]."""
+
+    shares: np.ndarray
+    """1 - R of each of them, by cause: too oblique, inconsistent, too far, [3, m] float32."""
+
+    cells: np.ndarray
+    """Centers of the unexplored cells that it was to see [m], [k, 3] float32."""
+
+    @property
+    def utility(self) -> float:
+        """U = lambda1 U_G + U_R."""
+        return float(self.totals.sum())
+
+
+def reason_of(explanation: Explanation, grid: OccupancyGrid) -> Reason:
+    """What an explanation says of what the view sees.
+
+    Args:
+        explanation: of one view.
+        grid: whose cells it counts.
+    """
+    rows = np.flatnonzero(np.asarray(explanation.visible))
+    cells = np.argwhere(np.asarray(explanation.cells))
+    centers = np.asarray(grid.origin) + (cells + 0.5) * np.asarray(grid.cell_size)
+    return Reason(
+        totals=np.asarray(explanation.totals, dtype=np.float64),
+        rows=rows,
+        shares=np.asarray(explanation.shares)[:, rows],
+        cells=centers.astype(np.float32),
+    )
+
+
+def explain_run(
+    run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
+) -> Iterator[Reason | None]:
+    """Why each view of a run was worth taking, in order; takes as long as mapping took.
+
+    Args:
+        run: not a merged one: each of its runs decided on a map of its own.
+        states: the map and the grid after each view, in order; by default rebuilt from the frames.
+            That after a view is asked for when the reason of the next one is.
+
+    Yields:
+        The reason of each view; None for the first, which nobody chose.
+
+    Raises:
+        RunError: the run was merged, a setting of it is not known, a frame is missing or broken.
+    """
+    if "merged" in (run.header.parent or {}):
+        raise RunError(run.path, "it was merged from runs that decided each for itself")
+    config = planner_config_of(run)
+    after_views = iter(states_of(run) if states is None else states)
+    memory, before = None, None
+    for row in run.rows:
+        if row.choice is None or before is None:
+            yield None
+        else:
+            pose, (map_state, grid) = before
+            memory = memory or initial_state(run.camera, grid)
+            choice = row.choice
+            memory, explanation = explain_way(
+                memory, map_state, grid, pose, choice.pose, choice.waypoints, config
+            )
+            yield reason_of(explanation, grid)
+        if row is not run.rows[-1]:  # nothing was decided on the last map
+            before = np.asarray(row.pose, dtype=np.float64), next(after_views)
