@@ -7,11 +7,11 @@ from r3jax.evaluation import style
 
 COLOR_OF_CAUSE = {
     "fine": "#a7c4a0",
-    "angle": "#2563eb",
+    "angle": style.TOO_OBLIQUE,
     "rare": "#9333ea",
-    "distance": "#f59e0b",
-    "noise": "#dc2626",
-    "unseen": "#111827",
+    "distance": style.TOO_FAR,
+    "noise": style.INCONSISTENT,
+    "unseen": style.NEVER_SEEN,
 }
 """Hexadecimal, by cause."""
 

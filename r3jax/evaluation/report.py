@@ -4,6 +4,7 @@ import html
 import json
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from r3jax.evaluation import figures, style
@@ -16,6 +17,7 @@ from r3jax.evaluation.model_report import (
 )
 from r3jax.evaluation.page import image, page, section
 from r3jax.evaluation.pictures import panorama_picture
+from r3jax.evaluation.reasons import reasons_figure, utility_by_cause
 from r3jax.evaluation.summary import StageTime, stage_times, summary
 from r3jax.files import write_atomic
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -36,6 +38,15 @@ _NOTES = {
         "(the insides of walls and furniture can never be seen, so 100 % is out of reach). The "
         "curve below is the mean renderability of fixed probe views in the free space known at "
         "that time; dots are the recorded views just before each was mapped: low means new.",
+    ),
+    "reasons": (
+        "What the planner was after",
+        "The utility U = λ1 U<sub>G</sub> + Σ (1 − R) that each view promised when it was chosen, "
+        "by cause. Never seen: unexplored cells in view. The rest is what the voxels in view "
+        "lacked, each divided among its terms in proportion to their logarithms: seen from other "
+        "directions only (too oblique), with colours that disagree (inconsistent), from farther "
+        "away only (too far). All of it is worked out again from the frames, whether or not the "
+        "policy decides by U.",
     ),
     "panorama": (
         "Panorama at the last position",
@@ -73,6 +84,7 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     drawn: dict[str, Figure] = {
         "plan": figures.plan_figure(run, map_state, grid),
         "progress": figures.progress_figure(run),
+        **_reasons(run),
         "panorama": figures.panorama_figure(panorama),
         "views": figures.strip_figure(run),
         "cost": figures.cost_figure(run),
@@ -94,6 +106,15 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     path = folder / "report.html"
     write_atomic(path, page("run", title, [f"{run.outcome}."], _cards(run, model), sections))
     return path
+
+
+def _reasons(run: Run) -> dict[str, Figure]:
+    """What the views were chosen for; nothing where that cannot be worked out or none was."""
+    try:
+        utility = utility_by_cause(run)
+    except RunError:  # merged from other runs, or a policy that only its author's program knows
+        return {}
+    return {"reasons": reasons_figure(utility)} if np.isfinite(utility).any() else {}
 
 
 def _model_sections(folder: Path, model: JudgedModel) -> list[str]:

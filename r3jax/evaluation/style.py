@@ -17,6 +17,18 @@ ACCENT = "#0f766e"
 SECOND = "#d97706"
 """The second curve."""
 
+NEVER_SEEN = "#111827"
+"""What no view has shown."""
+
+TOO_OBLIQUE = "#2563eb"
+"""What was seen from other directions only."""
+
+INCONSISTENT = "#dc2626"
+"""What looked different from view to view."""
+
+TOO_FAR = "#f59e0b"
+"""What was seen from farther away only."""
+
 PATH_MAP = "plasma"
 """Colours of acquisition order."""
 

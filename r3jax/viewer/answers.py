@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from r3jax.exploration.hindsight import Reason
 from r3jax.geometry.cameras import Camera
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.views import fitted_size
@@ -19,7 +20,7 @@ from r3jax.viewer.colors import paint, to_bytes
 from r3jax.viewer.controls import PLACES, Controls, Wishes
 from r3jax.viewer.decisions import Offer, offer_segments
 from r3jax.viewer.look import Glance, Look, Photographer, Surroundings, glance_from, look_from
-from r3jax.viewer.panel import glance_html, view_html
+from r3jax.viewer.panel import glance_html, reason_html, view_html
 from r3jax.viewer.pictures import glance_image, look_image, panorama_image
 from r3jax.viewer.shapes import path_segments
 from r3jax.viewer.stage import Color, Stage
@@ -91,7 +92,8 @@ class Answers:
         self._stage, self._controls, self._story = stage, controls, story
         self._config, self._extras, self._ask_again = config, extras, ask_again
         self._surface = Surface(stage, controls, story, config, extras.sources, extras.remark)
-        self._view: tuple[int, int] | None = None
+        self._view: tuple[object, ...] | None = None
+        self._awaited: tuple[int, str] | None = None
         self._candidates: tuple[int, int] | None = None
         self._offers: dict[int, Offer] = {}
         self._deciding: threading.Thread | None = None
@@ -112,34 +114,44 @@ class Answers:
         except RunError as error:
             self._controls.show_note(str(error))
             return False
+        finally:
+            if (
+                self._awaited is not None
+                and self._story.reason(self._awaited[0]) != self._awaited[1]
+            ):
+                self._awaited = None
+                self._ask_again()
 
     def work(self, question: Question) -> Iterator[Show]:
         """The parts of the answer to a question."""
         wishes, pose = question.wishes, question.T_world_camera
         step = min(wishes.step, len(self._story.rows) - 1)
-        yield self._show_view(step)
+        reason = self._story.reason(step)
+        yield self._show_view(step, reason)
         moment = self._story.moment(step)
         around = self._around(moment)
         glance = glance_from(around, pose)
         yield functools.partial(self._show_glance, glance)
         from_free_space = wishes.place == PLACES[0]
         if from_free_space:  # drawn anew for another moment only, and then first
-            yield from self._surface.draw(wishes, pose, moment)
+            yield from self._surface.draw(wishes, pose, moment, reason)
         look = look_from(around, pose, glance)
         yield functools.partial(self._show_look, look, wishes.quantity)
         if not from_free_space:
-            yield from self._surface.draw(wishes, pose, moment)
+            yield from self._surface.draw(wishes, pose, moment, reason)
         yield self._show_candidates(step, wishes.shows_candidates)
 
-    def _show_view(self, step: int) -> Show:
-        """The picture of a view, what the trace says of it, and the way to it."""
+    def _show_view(self, step: int, reason: Reason | str) -> Show:
+        """The picture of a view, what the trace says of it, why it was taken, and the way to it."""
         rows = self._story.rows
-        key = (step, len(rows))
+        key = (step, len(rows), reason if isinstance(reason, str) else "")
+        self._awaited = (step, reason) if isinstance(reason, str) else None
         before = step if self._controls.shows_all_views else 0
         if self._view == key:
             return functools.partial(self._stage.show_views, before)
         pose = np.asarray(rows[step].pose, np.float64)
-        image, facts = self._story.image(step), view_html(rows[step], len(rows))
+        image = self._story.image(step)
+        facts = view_html(rows[step], len(rows)) + reason_html(reason)
         segments, colors = path_segments(rows[: step + 1], len(rows))
 
         def show() -> None:

@@ -9,7 +9,7 @@ import viser
 
 from r3jax.scoring.config import ScoringConfig
 from r3jax.viewer.answers import Answers, Extras, Question
-from r3jax.viewer.blocks import QUANTITIES
+from r3jax.viewer.blocks import CAUSE, QUANTITIES
 from r3jax.viewer.controls import Controls, Menu
 from r3jax.viewer.known import cut_height
 from r3jax.viewer.look import Look
@@ -57,7 +57,7 @@ class App:
         self._lock = threading.Lock()
         self._asked: Question | None = None
         # A running exploration needs the processor: what costs nothing comes first.
-        quantities = ("color", *QUANTITIES[:-1]) if story.is_live else QUANTITIES
+        quantities = ("color", *QUANTITIES[:-1]) if story.is_live else (*QUANTITIES, CAUSE)
         surfaces, heights = extras.sources.names, self._heights(bounds)
         menu = Menu(len(story.rows), quantities, surfaces, heights, story.is_live)
         self.controls = Controls(server, title_html(title, subtitle), menu)

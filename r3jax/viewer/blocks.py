@@ -12,10 +12,14 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from matplotlib.colors import to_rgb
 
+from r3jax.evaluation.reasons import COLORS
+from r3jax.exploration.hindsight import Reason
 from r3jax.geometry.voxels import INDEX_LIMIT, unpack
 from r3jax.mapping.state import MapState
-from r3jax.viewer.colors import paint
+from r3jax.scoring.explain import CAUSES
+from r3jax.viewer.colors import UNSEEN, paint
 from r3jax.viewer.look import TERMS
 from r3jax.viewer.terms import SurfaceTerms
 
@@ -24,6 +28,10 @@ BUDGET = 120_000
 
 QUANTITIES = (*TERMS, "color")
 """What blocks can be colored by: R, its terms, and the mean color that was seen."""
+
+
+CAUSE = "cause"
+"""Colors blocks by why a view was taken; beside `QUANTITIES`, for that depends on the view."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +113,31 @@ def block_values(blocks: Blocks, terms: SurfaceTerms, quantity: str) -> np.ndarr
     rows: dict[str, Array] = dict(zip(TERMS, of_term, strict=True))
     is_seen = (np.asarray(terms.sightings) > 0.0).astype(np.float64)
     return blocks.mean(np.asarray(rows[quantity]), is_seen)
+
+
+def block_causes(blocks: Blocks, capacity: int, reason: Reason) -> np.ndarray:
+    """The cause that took most of what the voxels of each block lacked for a view, [n] int.
+
+    Args:
+        blocks: of the map that the view was chosen on.
+        capacity: rows of that map, N.
+        reason: of the view.
+
+    Returns:
+        An index into `scoring.explain.CAUSES`; 0, which no voxel has, where the view was to see
+        none of the block, or none that lacked anything.
+    """
+    lack = np.zeros((len(CAUSES) - 1, capacity))
+    lack[:, reason.rows] = reason.shares
+    means = np.stack([blocks.mean(of_cause) for of_cause in lack])
+    return np.where(means.max(axis=0, initial=0.0) > 0.0, 1 + np.argmax(means, axis=0), 0)
+
+
+def cause_colors(causes: np.ndarray) -> np.ndarray:
+    """Color per block, [n, 3] uint8, of what `block_causes` found [n]."""
+    rgb = [to_rgb(color) for color in COLORS[1:]]
+    table = np.concatenate([[UNSEEN], np.rint(255.0 * np.asarray(rgb))]).astype(np.uint8)
+    return table[causes]
 
 
 def block_colors(

@@ -4,7 +4,10 @@ import html
 
 import numpy as np
 
+from r3jax.evaluation.reasons import COLORS
+from r3jax.exploration.hindsight import Reason
 from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.scoring.explain import CAUSES
 from r3jax.trace.rows import StepRow
 from r3jax.viewer.colors import paint
 from r3jax.viewer.look import TERMS, Glance, Look
@@ -21,6 +24,12 @@ _BAR = (
     '<span style="display:block;width:{percent:.0f}%;height:7px;border-radius:4px;'
     'background:{color}"></span></span><span style="width:34px;text-align:right;'
     'font-variant-numeric:tabular-nums">{value:.2f}</span></div>'
+)
+_SHARE = (
+    '<div style="display:flex;align-items:baseline;gap:7px"><span style="width:9px;height:9px;'
+    'border-radius:5px;border:1px solid #8888;background:{1}"></span><span style="flex:1">{0}'
+    '</span><span style="opacity:.65">{2}</span><span style="width:44px;text-align:right;'
+    'font-variant-numeric:tabular-nums">{3:.0f} %</span></div>'
 )
 _NUMBER = (
     '<div style="display:flex;align-items:baseline;gap:8px"><b id="r3jax-renderability" '
@@ -74,6 +83,29 @@ def _candidates(row: StepRow) -> str:
         lines.append(f"<tr>{cells}</tr>")
     style = "width:100%;font-size:12px;font-variant-numeric:tabular-nums"
     return f'{head}<table style="{style}">{"".join(lines)}</table>'
+
+
+def reason_html(reason: Reason | str) -> str:
+    """What a view promised when it was chosen, by cause; or why that is not known."""
+    head = '<div style="opacity:.65">its utility when it was chosen</div>'
+    if isinstance(reason, str):
+        return _BOX.format(f'{head}<div id="r3jax-reason">{_e(reason)}</div>')
+    total = reason.utility
+    shares = reason.totals / total if total > 0.0 else np.zeros(len(CAUSES))
+    parts = "".join(
+        f'<span style="width:{100.0 * share:.1f}%;background:{color}"></span>'
+        for share, color in zip(shares, COLORS, strict=True)
+    )
+    counts = [f"{len(reason.cells)} cells"] + [
+        f"{voxels} voxels" for voxels in (reason.shares > 0.0).sum(axis=1)
+    ]
+    table = zip(CAUSES, COLORS, counts, shares, strict=True)
+    lines = "".join(_SHARE.format(*line[:3], 100.0 * line[3]) for line in table)
+    number = f'<b style="font-size:18px">{total:.0f}</b>'
+    return _BOX.format(
+        f'{head}{number}<div style="display:flex;height:9px;border-radius:4px;overflow:hidden;'
+        f'margin:2px 0 4px;background:#8884">{parts}</div><div id="r3jax-reason">{lines}</div>'
+    )
 
 
 def pending_html() -> str:

@@ -154,7 +154,10 @@ class Stage:
             self._server.scene.remove_by_name(name)
 
     def show_points(self, name: str, points: np.ndarray, colors: np.ndarray, edge: float) -> None:
-        """Squares of an edge [m] at points [n, 3] [m] in colors [n, 3] uint8."""
+        """Squares of an edge [m] at points [n, 3] [m] in colors [n, 3] uint8; none: nothing."""
+        if not len(points):
+            self._server.scene.remove_by_name(name)
+            return
         self._server.scene.add_point_cloud(
             name,
             points,

@@ -1,17 +1,19 @@
 """A run as the viewer sees it: recorded, or still going on."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.hindsight import Reason, explain_run
 from r3jax.exploration.step import add_to_grid, first_grid
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.trace.errors import RunError
 from r3jax.trace.images import read_png
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow
@@ -23,6 +25,9 @@ _THUMBNAIL = 256
 
 _OFFERS_KEPT = 200
 """Decisions whose candidates are kept: 100 of them take 7 kB."""
+
+
+_WORKING = "being worked out …"
 
 
 @runtime_checkable
@@ -60,6 +65,10 @@ class Story(Protocol):
         """The candidates that a view was chosen from; None if they are not known."""
         ...
 
+    def reason(self, step: int) -> Reason | str:
+        """What a view promised when it was chosen, or why that is not known."""
+        ...
+
 
 class RecordedStory:
     """A run on disk."""
@@ -73,6 +82,9 @@ class RecordedStory:
             RunError: as `Timeline`.
         """
         self._run, self._timeline = run, Timeline(run)
+        self._reasons: list[Reason | None] = []
+        self._explaining = self._explain()
+        self._problem = ""
 
     @property
     def camera(self) -> Camera:
@@ -97,13 +109,39 @@ class RecordedStory:
         return self._timeline.at(step)
 
     def advance(self) -> bool:
-        """Replays one view more than ever before."""
-        return self._timeline.advance()
+        """Replays one view more than ever before, and finds out why the next one was taken.
+
+        Raises:
+            RunError: a frame is missing or broken, or a setting of the policy is not known.
+        """
+        try:
+            self._reasons.append(next(self._explaining))
+        except StopIteration:
+            return False
+        except RunError as error:
+            self._problem = str(error)
+            raise
+        return True
+
+    def _explain(self) -> Iterator[Reason | None]:
+        """The reasons of all views, in order; of a merged run, nothing but the replay."""
+        moments = self._timeline.follow()
+        if "merged" in (self._run.header.parent or {}):
+            self._problem = "merged from runs that decided each on a map of its own"
+            return (None for _ in moments)
+        return explain_run(self._run, ((m.map_state, m.grid) for m in moments))
 
     def offer(self, step: int) -> Offer | None:
         """The trace does not keep the candidates."""
         del step
         return None
+
+    def reason(self, step: int) -> Reason | str:
+        """What a view promised when it was chosen; known once the views before are replayed."""
+        if self._run.rows[step].choice is None:
+            return "the start: nothing was chosen"
+        reason = self._reasons[step] if step < len(self._reasons) else None
+        return reason or self._problem or _WORKING
 
 
 @dataclass(frozen=True)
@@ -201,6 +239,11 @@ class LiveStory:
     def offer(self, step: int) -> Offer | None:
         """The candidates that a view was chosen from."""
         return self._offers.get(step)
+
+    def reason(self, step: int) -> Reason | str:
+        """The map that a view was chosen on is not kept."""
+        del step
+        return "known when the run is over and opened again: r3jax view"
 
 
 def _recorded_image(run: Run, step: int) -> np.ndarray:

@@ -5,10 +5,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
+from r3jax.evaluation.reasons import COLORS
+from r3jax.exploration.hindsight import Reason
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.scene import GaussianScene
-from r3jax.viewer.blocks import BUDGET, Blocks, block_colors
+from r3jax.viewer.blocks import BUDGET, CAUSE, Blocks, block_causes, block_colors, cause_colors
 from r3jax.viewer.controls import PLACES, Controls, Wishes
 from r3jax.viewer.known import Known, known_at
 from r3jax.viewer.shapes import splat_arrays
@@ -22,6 +25,7 @@ _KNOWN_KEPT = 6
 
 _NODES = {"voxels": "/map", "recorded points": "/points", "splats": "/splats", "mesh": "/mesh"}
 _POINT_EDGE = 0.02
+_CELLS, _CELL_EDGE = "/unexplored", 0.05
 
 Points = tuple[np.ndarray, np.ndarray]
 """Points [n, 3] float32 [m] and their colors [n, 3] uint8."""
@@ -79,22 +83,34 @@ class Surface:
         self._drawn: tuple[object, ...] | None = None
         self._gaussians: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def draw(self, wishes: Wishes, T_world_camera: np.ndarray, moment: Moment) -> Iterator[Show]:
+    def draw(
+        self, wishes: Wishes, T_world_camera: np.ndarray, moment: Moment, reason: Reason | str
+    ) -> Iterator[Show]:
         """What is wished for, unless it is what is drawn already.
 
         Args:
             wishes: of the user.
             T_world_camera: of the dragged camera, [4, 4].
             moment: what was known.
+            reason: why the moment's view was taken, or why that is not known.
         """
+        shows_causes = wishes.surface == "voxels" and wishes.quantity == CAUSE
         key: tuple[object, ...] = (wishes.surface, wishes.cut)
         if wishes.surface == "voxels":
             key += (moment.step, wishes.quantity, wishes.place)
-            if wishes.place != PLACES[0] and wishes.quantity != "color":
+            if shows_causes:
+                key += (reason if isinstance(reason, str) else "",)
+            elif wishes.place != PLACES[0] and wishes.quantity != "color":
                 key += (T_world_camera[:3, 3].tobytes(),)
         if self._drawn == key:
             return
-        if wishes.surface == "voxels":
+        cells = np.zeros((0, 3), np.float32)
+        if shows_causes and isinstance(reason, Reason):
+            cells = reason.cells[reason.cells[:, 2] <= wishes.cut]
+            show = self._causes(wishes.cut, moment.step, reason)
+        elif shows_causes:
+            show = self._no_causes(wishes, moment, reason)
+        elif wishes.surface == "voxels":
             show = self._voxels(wishes, T_world_camera[:3, 3], moment)
         elif wishes.surface == "recorded points":
             show = self._recorded(wishes.cut)
@@ -105,6 +121,7 @@ class Surface:
 
         def show_it() -> None:
             show()
+            self._stage.show_points(_CELLS, cells, _color_of_cells(len(cells)), _CELL_EDGE)
             self._stage.show_only(_NODES[wishes.surface], tuple(_NODES.values()))
             self._drawn = key
 
@@ -115,10 +132,11 @@ class Surface:
 
     def _voxels(self, wishes: Wishes, position: np.ndarray, moment: Moment) -> Show:
         """The map, colored as wished and cut open."""
-        has_score, state = wishes.quantity != "color", moment.map_state
+        has_score = wishes.quantity != "color"
         from_free_space = wishes.place == PLACES[0]
         known = self._known_at(moment, with_terms=has_score and from_free_space)
-        terms = known.terms
+        # The blocks' own map: that of the same view replayed may hold its rows in another order.
+        terms, state = known.terms, known.moment.map_state
         if has_score and not from_free_space:
             terms = surface_terms(state, self._story.camera, position[None], self._config)
         blocks = known.blocks
@@ -129,6 +147,35 @@ class Surface:
         def show() -> None:
             self._stage.show_points("/map", blocks.centers[low], colors[low], blocks.edge)
             self._say(text)
+
+        return show
+
+    def _causes(self, cut: float, step: int, reason: Reason) -> Show:
+        """The map that a view was chosen on, by what the view was after."""
+        before = self._story.moment(step - 1)
+        blocks = self._known_at(before, with_terms=False).blocks
+        colors = cause_colors(block_causes(blocks, before.map_state.capacity, reason))
+        low = blocks.centers[:, 2] <= cut
+        text = (
+            f"{voxel_note(blocks)}, before view {step}; by what it was after; gray: not in its "
+            "view; dark dots: unexplored cells in its view"
+        )
+
+        def show() -> None:
+            self._stage.show_points("/map", blocks.centers[low], colors[low], blocks.edge)
+            self._say(text)
+
+        return show
+
+    def _no_causes(self, wishes: Wishes, moment: Moment, problem: str) -> Show:
+        """The map in gray."""
+        blocks = self._known_at(moment, with_terms=False).blocks
+        low = blocks.centers[:, 2] <= wishes.cut
+        colors = cause_colors(np.zeros(int(low.sum()), np.intp))
+
+        def show() -> None:
+            self._stage.show_points("/map", blocks.centers[low], colors, blocks.edge)
+            self._say(f"what the view was after: {problem}")
 
         return show
 
@@ -185,6 +232,11 @@ class Surface:
             self._say(f"the scene's own mesh, {len(glb) / 1e6:.1f} MB, without its lamps")
 
         return show
+
+
+def _color_of_cells(num: int) -> np.ndarray:
+    """Color of what was never seen, [num, 3] uint8."""
+    return np.tile(np.rint(255.0 * np.asarray(to_rgb(COLORS[0]))).astype(np.uint8), (num, 1))
 
 
 def voxel_note(blocks: Blocks) -> str:

@@ -66,7 +66,7 @@ class Timeline:
         self.stride = math.ceil(len(run.rows) / kept)
         """Views from one kept state to the next."""
         self._kept: dict[int, Moment] = {}
-        self._shown: Moment | None = stored
+        self._stored = self._shown = stored
 
     def at(self, step: int) -> Moment:
         """The state after view `step`.
@@ -96,10 +96,8 @@ class Timeline:
 
     def _before(self, step: int) -> Moment:
         """The latest known state that is not later than `step`."""
-        known = [self._start, self._reached, *self._kept.values()]
-        if self._shown is not None:
-            known.append(self._shown)
-        return max((m for m in known if m.step <= step), key=lambda m: m.step)
+        known = [self._start, self._reached, *self._kept.values(), self._shown, self._stored]
+        return max((m for m in known if m is not None and m.step <= step), key=lambda m: m.step)
 
     def _after(self, moment: Moment) -> Moment:
         """The state one view later."""

@@ -1,8 +1,10 @@
 """The report: it tells the run's own numbers, whole in one file, and its pictures are right."""
 
 import base64
+import dataclasses
 import json
 import re
+import shutil
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,14 +12,17 @@ import numpy as np
 import pytest
 
 from r3jax.evaluation.pictures import floor_picture, panorama_picture
+from r3jax.evaluation.reasons import reasons_figure, shares_of, utility_by_cause
 from r3jax.evaluation.report import write_report
 from r3jax.evaluation.summary import map_row_bytes, stage_times, summary
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.hindsight import explain_run
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
+from r3jax.scoring.explain import CAUSES
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import camera_fields
 from r3jax.trace.reader import read_run
@@ -34,7 +39,8 @@ def reported(tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "run"
     room = BoxRoom()
     scene = {"name": "<box> & room", "hash": "0123abcd"}
-    header = make_header(camera=camera_fields(room.camera), scene=scene)
+    config = dataclasses.asdict(CONFIG)
+    header = make_header(camera=camera_fields(room.camera), scene=scene, config=config)
     with RunWriter(path, header) as recorder:
         result = explore(room, Wander(), budget="views:4", config=CONFIG, recorder=recorder)
     run = read_run(path)
@@ -50,7 +56,7 @@ def test_the_page_stands_alone(reported):
     images = re.findall(r"data:image/png;base64,([A-Za-z0-9+/=]+)", text)
     files = {path.read_bytes() for path in page.parent.glob("*.png")}
     assert {base64.b64decode(image) for image in images} == files
-    assert len(files) == 5
+    assert len(files) == 6
 
 
 def test_the_page_tells_the_runs_own_numbers(reported):
@@ -64,6 +70,47 @@ def test_the_page_tells_the_runs_own_numbers(reported):
     assert "num_candidates 7" in text
     assert "&lt;box&gt; &amp; room" in text  # a name from outside is text, never markup
     assert "<box>" not in text
+
+
+def test_views_are_explained_as_they_were_chosen(reported):
+    """Wander decides by chance: what counts is what the views that it chose promised."""
+    run, _, page = reported
+    utility = utility_by_cause(run)
+    assert utility.shape == (4, 4)
+    assert np.isnan(utility[0]).all()  # nobody chose the start
+    for found, reason in zip(utility[1:], list(explain_run(run))[1:], strict=True):
+        np.testing.assert_array_equal(found, reason.totals)
+    assert (utility[1:, 0] > 0.0).all()
+    assert (utility[1:].sum(axis=1) > utility[1:, 0]).any()
+    assert "What the planner was after" in page.read_text()
+    assert (page.parent / "reasons.png").exists()
+
+
+def test_the_bars_of_a_view_are_its_shares():
+    nan = float("nan")
+    utility = np.array([[nan] * 4, [48.0, 24.0, 8.0, 0.0], [0.0] * 4, [0.0, 1.0, 1.0, 2.0]])
+    expected = np.array([[60.0, 30.0, 10.0, 0.0], [0.0] * 4, [0.0, 25.0, 25.0, 50.0]])
+    np.testing.assert_allclose(shares_of(utility)[1:], expected / 100.0)
+    assert np.isnan(shares_of(utility)[0]).all()
+    upper, lower = reasons_figure(utility).axes
+    for number, bars in enumerate(upper.containers):
+        assert bars.get_label() == CAUSES[number]
+        assert [bar.get_height() for bar in bars] == pytest.approx([0.0, *expected[:, number]])
+        below = expected[:, :number].sum(axis=1)
+        assert [bar.get_y() for bar in bars] == pytest.approx([0.0, *below])
+    np.testing.assert_array_equal(lower.lines[0].get_xdata(), [1, 2, 3, 4])
+    np.testing.assert_array_equal(lower.lines[0].get_ydata(), [nan, 80.0, 0.0, 4.0])
+
+
+def test_a_run_that_cannot_be_explained_has_a_report_all_the_same(reported, tmp_path):
+    run, result, _ = reported
+    shutil.copytree(run.path, tmp_path / "merged")
+    header = dataclasses.replace(run.header, parent={"merged": ["a", "b"], "merged_views": [2, 2]})
+    shutil.rmtree(tmp_path / "merged" / "report")
+    merged = dataclasses.replace(run, path=tmp_path / "merged", header=header)
+    page = write_report(merged, result.state.map_state, result.state.grid)
+    assert "What the planner was after" not in page.read_text()
+    assert not (page.parent / "reasons.png").exists()
 
 
 def test_a_run_without_views_has_no_report(tmp_path):

@@ -121,7 +121,7 @@ def test_settings_are_the_runs_own(run):
     assert float(config.scoring.lambda1) == 3.0
     assert (config.num_candidates, config.num_frontier) == (12, 4)
     header = dataclasses.replace(run.header, policy={"name": "ours", "settings": {"novel": 1}})
-    with pytest.raises(RunError, match="setting of the policy: .*novel"):
+    with pytest.raises(RunError, match=r"setting of the policy: .*novel"):
         planner_config_of(dataclasses.replace(run, header=header))
 
 

@@ -48,16 +48,17 @@ def test_any_way_through_the_views_gives_the_rebuilt_states(run, expected, memor
 def test_with_little_memory_few_states_are_kept(run):
     timeline = Timeline(run, 1)
     assert timeline.stride == 3  # two of five views
-    while timeline.advance():
+    for _ in timeline.follow():
         pass
     assert len(timeline._kept) == 2
 
 
-def test_advancing_ends_at_the_last_view_and_changes_no_state(run, expected):
+def test_following_gives_every_state_in_order_whatever_else_is_asked(run, expected):
     timeline = Timeline(run)
-    assert sum(timeline.advance() for _ in range(VIEWS + 3)) == VIEWS - 1
-    for step in (1, 4):
-        assert_is(timeline.at(step), step, expected)
+    for step, moment in enumerate(timeline.follow()):
+        assert_is(moment, step, expected)
+        assert_is(timeline.at((3 * step) % VIEWS), (3 * step) % VIEWS, expected)
+    assert step == VIEWS - 1
 
 
 def test_the_last_state_comes_from_the_checkpoint_without_reading_a_frame(run, expected, tmp_path):
