@@ -12,14 +12,12 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from matplotlib.colors import to_rgb
 
-from r3jax.evaluation.reasons import COLORS
 from r3jax.exploration.hindsight import Reason
 from r3jax.geometry.voxels import INDEX_LIMIT, unpack
 from r3jax.mapping.state import MapState
 from r3jax.scoring.explain import CAUSES
-from r3jax.viewer.colors import UNSEEN, paint
+from r3jax.viewer.colors import CAUSE_COLORS, UNSEEN, paint
 from r3jax.viewer.look import TERMS
 from r3jax.viewer.terms import SurfaceTerms
 
@@ -135,9 +133,7 @@ def block_causes(blocks: Blocks, capacity: int, reason: Reason) -> np.ndarray:
 
 def cause_colors(causes: np.ndarray) -> np.ndarray:
     """Color per block, [n, 3] uint8, of what `block_causes` found [n]."""
-    rgb = [to_rgb(color) for color in COLORS[1:]]
-    table = np.concatenate([[UNSEEN], np.rint(255.0 * np.asarray(rgb))]).astype(np.uint8)
-    return table[causes]
+    return np.stack([np.asarray(UNSEEN, np.uint8), *CAUSE_COLORS[1:]])[causes]
 
 
 def block_colors(

@@ -7,6 +7,9 @@ import functools
 
 import matplotlib
 import numpy as np
+from matplotlib.colors import to_rgb
+
+from r3jax.evaluation.reasons import COLORS
 
 UNSEEN = (150, 155, 163)
 """Color of what no position sees, and of pixels that show nothing known."""
@@ -19,6 +22,15 @@ ORDER = "plasma"
 
 WORTH = "viridis"
 """Colors of what a candidate or a direction is worth, from the least to the most."""
+
+
+def to_bytes(rgb: np.ndarray) -> np.ndarray:
+    """Colors [..., 3] in [0, 1] as uint8."""
+    return np.rint(np.asarray(rgb, dtype=np.float64).clip(0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+CAUSE_COLORS = tuple(to_bytes(np.asarray(to_rgb(color))) for color in COLORS)
+"""Of the causes of a utility, [3] uint8 each, in the order of `scoring.explain.CAUSES`."""
 
 
 @functools.cache
@@ -54,8 +66,3 @@ def spread(values: np.ndarray) -> np.ndarray:
     low, high = values[finite].min(), values[finite].max()
     scaled = np.where(finite, values - low, 0.0) / (high - low) if high > low else 0.5
     return np.where(finite, scaled, np.nan)
-
-
-def to_bytes(rgb: np.ndarray) -> np.ndarray:
-    """A picture [H, W, 3] in [0, 1] as uint8."""
-    return np.rint(np.asarray(rgb, dtype=np.float64).clip(0.0, 1.0) * 255.0).astype(np.uint8)

@@ -5,13 +5,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.colors import to_rgb
 
-from r3jax.evaluation.reasons import COLORS
 from r3jax.exploration.hindsight import Reason
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.scene import GaussianScene
 from r3jax.viewer.blocks import BUDGET, CAUSE, Blocks, block_causes, block_colors, cause_colors
+from r3jax.viewer.colors import CAUSE_COLORS
 from r3jax.viewer.controls import PLACES, Controls, Wishes
 from r3jax.viewer.known import Known, known_at
 from r3jax.viewer.shapes import splat_arrays
@@ -121,7 +120,9 @@ class Surface:
 
         def show_it() -> None:
             show()
-            self._stage.show_points(_CELLS, cells, _color_of_cells(len(cells)), _CELL_EDGE)
+            self._stage.show_points(
+                _CELLS, cells, np.tile(CAUSE_COLORS[0], (len(cells), 1)), _CELL_EDGE
+            )
             self._stage.show_only(_NODES[wishes.surface], tuple(_NODES.values()))
             self._drawn = key
 
@@ -232,11 +233,6 @@ class Surface:
             self._say(f"the scene's own mesh, {len(glb) / 1e6:.1f} MB, without its lamps")
 
         return show
-
-
-def _color_of_cells(num: int) -> np.ndarray:
-    """Color of what was never seen, [num, 3] uint8."""
-    return np.tile(np.rint(255.0 * np.asarray(to_rgb(COLORS[0]))).astype(np.uint8), (num, 1))
 
 
 def voxel_note(blocks: Blocks) -> str:

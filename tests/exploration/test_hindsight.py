@@ -3,6 +3,8 @@
 import dataclasses
 import shutil
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,24 +13,38 @@ from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.hindsight import explain_run
 from r3jax.exploration.replay import planner_config_of, rebuild, states_of
+from r3jax.frame import Frame
 from r3jax.planning.policy import make_policy
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import camera_fields, plain_settings
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
-from tests.exploration.toys import BoxRoom
+from tests.exploration.toys import UPPER, BoxRoom
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.trace.runs import make_header
 
-VIEWS = 7
+VIEWS = 10
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=1)
 CHAIN = ("r3jax.planning.decision", "r3jax.exploration.hindsight")
+
+
+class GlassRoom(BoxRoom):
+    """One wall is glass: what lies behind stays unexplored, until a planner gives it up."""
+
+    def render(self, T_world_camera: np.ndarray) -> Frame:
+        frame, camera = super().render(T_world_camera), self.camera
+        u = (np.arange(camera.width) + 0.5 - float(camera.cx)) / float(camera.fx)
+        v = (np.arange(camera.height) + 0.5 - float(camera.cy)) / float(camera.fy)
+        along_x, depth = T_world_camera[0], np.asarray(frame.depth, np.float64)
+        slope = along_x[0] * u[None, :] + along_x[1] * v[:, None] + along_x[2]
+        is_glass = along_x[3] + slope * depth > UPPER[0] - 1e-3
+        return eqx.tree_at(lambda f: f.depth, frame, jnp.where(is_glass, 0.0, frame.depth))
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A short run of Ours, whose trace tells U_G and U_R of every view."""
-    path, room = tmp_path_factory.mktemp("hindsight") / "run", BoxRoom()
+    path, room = tmp_path_factory.mktemp("hindsight") / "run", GlassRoom()
     settings = {"num_candidates": 12, "num_frontier": 4}
     policy = make_policy("ours", scoring=r3jax.ScoringConfig(lambda1=3.0), **settings)
     header = make_header(
@@ -126,7 +142,7 @@ def test_settings_are_the_runs_own(run):
 
 
 def test_a_merged_run_is_refused(run):
-    header = dataclasses.replace(run.header, parent={"merged": ["a", "b"], "merged_views": [2, 5]})
+    header = dataclasses.replace(run.header, parent={"merged": ["a", "b"], "merged_views": [2, 8]})
     with pytest.raises(RunError, match="merged from runs"):
         next(explain_run(dataclasses.replace(run, header=header)))
 
