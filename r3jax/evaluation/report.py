@@ -4,7 +4,6 @@ import html
 import json
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from r3jax.evaluation import figures, style
@@ -81,10 +80,10 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     last = run.rows[-1]
     max_range = float(run.header.config.get("max_range", 5.0))
     panorama = panorama_picture(map_state, run.camera, last.pose, max_range)
-    drawn: dict[str, Figure] = {
+    drawn: dict[str, Figure | str] = {
         "plan": figures.plan_figure(run, map_state, grid),
         "progress": figures.progress_figure(run),
-        **_reasons(run),
+        "reasons": _reasons(run),
         "panorama": figures.panorama_figure(panorama),
         "views": figures.strip_figure(run),
         "cost": figures.cost_figure(run),
@@ -93,6 +92,9 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     folder.mkdir(exist_ok=True)
     sections: list[str] = []
     for name, figure in drawn.items():
+        if isinstance(figure, str):
+            sections.append(section(_NOTES[name][0], html.escape(figure), ""))
+            continue
         png = style.to_png(figure)
         write_atomic(folder / f"{name}.png", png)
         table = _stage_table(stage_times(run)) if name == "cost" else ""
@@ -108,13 +110,12 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     return path
 
 
-def _reasons(run: Run) -> dict[str, Figure]:
-    """What the views were chosen for; nothing where that cannot be worked out or none was."""
+def _reasons(run: Run) -> Figure | str:
+    """What the views were chosen for, or why that is not known."""
     try:
-        utility = utility_by_cause(run)
-    except RunError:  # merged from other runs, or a policy that only its author's program knows
-        return {}
-    return {"reasons": reasons_figure(utility)} if np.isfinite(utility).any() else {}
+        return reasons_figure(utility_by_cause(run))
+    except RunError as error:  # merged from other runs, or settings that this version cannot read
+        return f"Not known: {error.reason}."
 
 
 def _model_sections(folder: Path, model: JudgedModel) -> list[str]:

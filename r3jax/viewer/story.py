@@ -83,8 +83,8 @@ class RecordedStory:
         """
         self._run, self._timeline = run, Timeline(run)
         self._reasons: list[Reason | None] = []
-        self._explaining = self._explain()
         self._problem = ""
+        self._explaining = self._explain()
 
     @property
     def camera(self) -> Camera:
