@@ -29,7 +29,7 @@ _SHARE = (
     '<div style="display:flex;align-items:baseline;gap:7px"><span style="width:9px;height:9px;'
     'border-radius:5px;border:1px solid #8888;background:{1}"></span><span style="flex:1">{0}'
     '</span><span style="opacity:.65">{2}</span><span style="width:44px;text-align:right;'
-    'font-variant-numeric:tabular-nums">{3:.0f} %</span></div>'
+    'font-variant-numeric:tabular-nums">{3:.1f} %</span></div>'
 )
 _NUMBER = (
     '<div style="display:flex;align-items:baseline;gap:8px"><b id="r3jax-renderability" '

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import re
 import shutil
 import time
 from pathlib import Path
@@ -23,11 +22,6 @@ from viser import transforms
 
 from r3jax.cli.options import View
 from r3jax.cli.view import open_viewer
-from r3jax.exploration.hindsight import Reason, explain_run
-from r3jax.scoring.explain import CAUSES
-from r3jax.scoring.voxels import voxels_of
-from r3jax.viewer.blocks import CAUSE
-from r3jax.viewer.colors import CAUSE_COLORS, UNSEEN
 from tests.viewer.conftest import VIEWS
 
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
@@ -186,47 +180,6 @@ def test_the_button_turns_the_camera_along_the_suggestion(page, viewer):
         page, lambda: np.allclose(viewer.app.stage.pose[:3, 2], look.best_direction, atol=1e-4)
     )
     settle(page, viewer)
-
-
-def reason_of(run, step) -> Reason:
-    """Why a view was taken, worked out beside the page."""
-    reason = list(explain_run(run))[step]
-    assert reason is not None
-    return reason
-
-
-def test_the_panel_tells_what_the_view_was_chosen_for(page, viewer, run):
-    settle(page, viewer)
-    step = viewer.app.controls.wishes.step
-    wait_until(page, lambda: "%" in page.inner_text("#r3jax-reason"))
-    shown = [int(share) for share in re.findall(r"(\d+) %", page.inner_text("#r3jax-reason"))]
-    reason = reason_of(run, step)
-    np.testing.assert_allclose(shown, 100.0 * reason.totals / reason.utility, atol=0.51)
-    for cause in CAUSES:
-        assert cause in page.inner_text("#r3jax-reason")
-
-
-def test_the_map_is_colored_by_cause(page, viewer, run):
-    """Below the cut every voxel in view has the color of its largest share; the rest is gray."""
-    app = viewer.app
-    step, cut = app.controls.wishes.step, app.controls.wishes.cut
-    app.controls._quantity.value = CAUSE
-    wait_until(page, lambda: f"before view {step}" in page.inner_text("#r3jax-note"))
-    assert app.worker.wait(PATIENCE)
-    scene, reason = app.controls._server.scene, reason_of(run, step)
-    shown = scene.get_handle_by_name("/map").colors
-    height = np.asarray(voxels_of(app.story.moment(step - 1).map_state).center)[2, reason.rows]
-    lacks = (reason.shares.max(axis=0) > 0.0) & (height <= cut + 1e-4)
-    largest = np.argmax(reason.shares[:, lacks], axis=0)
-    for number, color in enumerate(CAUSE_COLORS[1:]):
-        assert (shown == color).all(axis=1).sum() == (largest == number).sum()
-    assert len(np.unique(largest)) > 1
-    assert (shown == UNSEEN).all(axis=1).sum() == len(shown) - lacks.sum()
-    cells = scene.get_handle_by_name("/unexplored").points
-    assert len(cells) == (reason.cells[:, 2] <= cut).sum() > 0
-    app.controls._quantity.value = "renderability"
-    wait_until(page, lambda: "no such place sees them" in page.inner_text("#r3jax-note"))
-    assert scene.get_handle_by_name("/unexplored") is None
 
 
 def test_the_console_has_no_errors(page, complaints):

@@ -81,7 +81,7 @@ def test_the_panel_tells_the_shares():
     numbers = ["3", "3", "2", "2"]
     units = ["cells", "voxels", "voxels", "voxels"]
     assert found == list(zip(CAUSES, numbers, units, strict=True))
-    assert re.findall(r">(\d+) %<", text) == ["60", "30", "10", "0"]
+    assert re.findall(r">([\d.]+) %<", text) == ["60.0", "30.0", "10.0", "0.0"]
     widths = re.findall(r"width:([\d.]+)%;background:(#\w+)", text)
     assert [float(width) for width, _ in widths] == [60.0, 30.0, 10.0, 0.0]
     assert tuple(color for _, color in widths) == COLORS
@@ -89,7 +89,7 @@ def test_the_panel_tells_the_shares():
 
 def test_a_view_that_promised_nothing_has_no_shares():
     nothing = dataclasses.replace(make_reason(), totals=np.zeros(4))
-    assert re.findall(r">(\d+) %<", reason_html(nothing)) == ["0"] * 4
+    assert re.findall(r">([\d.]+) %<", reason_html(nothing)) == ["0.0"] * 4
 
 
 def test_the_panel_tells_why_nothing_is_known_as_text():
