@@ -104,11 +104,10 @@ class Surface:
         if self._drawn == key:
             return
         cells = np.zeros((0, 3), np.float32)
-        if shows_causes and isinstance(reason, Reason):
-            cells = reason.cells[reason.cells[:, 2] <= wishes.cut]
-            show = self._causes(wishes.cut, moment.step, reason)
-        elif shows_causes:
-            show = self._no_causes(wishes, moment, reason)
+        if shows_causes:
+            show = self._causes(wishes.cut, moment, reason)
+            if isinstance(reason, Reason):
+                cells = reason.cells[reason.cells[:, 2] <= wishes.cut]
         elif wishes.surface == "voxels":
             show = self._voxels(wishes, T_world_camera[:3, 3], moment)
         elif wishes.surface == "recorded points":
@@ -142,41 +141,32 @@ class Surface:
             terms = surface_terms(state, self._story.camera, position[None], self._config)
         blocks = known.blocks
         colors = block_colors(blocks, state, terms, wishes.quantity)
-        low = blocks.centers[:, 2] <= wishes.cut
         text = voxel_note(blocks) + ("; gray: no such place sees them" if has_score else "")
+        return self._blocks(blocks, colors, wishes.cut, text)
 
-        def show() -> None:
-            self._stage.show_points("/map", blocks.centers[low], colors[low], blocks.edge)
-            self._say(text)
+    def _causes(self, cut: float, moment: Moment, reason: Reason | str) -> Show:
+        """The map that a view was chosen on, by what the view was after; gray if unknown."""
+        if isinstance(reason, str):
+            blocks = self._known_at(moment, with_terms=False).blocks
+            causes = np.zeros(len(blocks.centers), np.intp)
+            text = f"what the view was after: {reason}"
+        else:
+            before = self._story.moment(moment.step - 1)
+            blocks = self._known_at(before, with_terms=False).blocks
+            causes = block_causes(blocks, before.map_state.capacity, reason)
+            text = (
+                f"{voxel_note(blocks)}, before view {moment.step}; by what it was after; gray: "
+                "not in its view; dark dots: unexplored cells in its view"
+            )
+        return self._blocks(blocks, cause_colors(causes), cut, text)
 
-        return show
-
-    def _causes(self, cut: float, step: int, reason: Reason) -> Show:
-        """The map that a view was chosen on, by what the view was after."""
-        before = self._story.moment(step - 1)
-        blocks = self._known_at(before, with_terms=False).blocks
-        colors = cause_colors(block_causes(blocks, before.map_state.capacity, reason))
+    def _blocks(self, blocks: Blocks, colors: np.ndarray, cut: float, text: str) -> Show:
+        """Blocks in their colors [n, 3], cut open, and what is said of them."""
         low = blocks.centers[:, 2] <= cut
-        text = (
-            f"{voxel_note(blocks)}, before view {step}; by what it was after; gray: not in its "
-            "view; dark dots: unexplored cells in its view"
-        )
 
         def show() -> None:
             self._stage.show_points("/map", blocks.centers[low], colors[low], blocks.edge)
             self._say(text)
-
-        return show
-
-    def _no_causes(self, wishes: Wishes, moment: Moment, problem: str) -> Show:
-        """The map in gray."""
-        blocks = self._known_at(moment, with_terms=False).blocks
-        low = blocks.centers[:, 2] <= wishes.cut
-        colors = cause_colors(np.zeros(int(low.sum()), np.intp))
-
-        def show() -> None:
-            self._stage.show_points("/map", blocks.centers[low], colors, blocks.edge)
-            self._say(f"what the view was after: {problem}")
 
         return show
 
