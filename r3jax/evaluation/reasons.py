@@ -37,7 +37,9 @@ def shares_of(utility: np.ndarray) -> np.ndarray:
 
 
 def reasons_figure(utility: np.ndarray) -> Figure:
-    """Shares of the utility of each chosen view by cause, and the utility itself below.
+    """The utility of each chosen view by cause: shares, and below how much on a logarithmic axis.
+
+    Where much is unexplored, that hides the other causes in the shares.
 
     Args:
         utility: by view and cause, [views, 4]; NaN for views that nobody chose.
@@ -58,10 +60,10 @@ def reasons_figure(utility: np.ndarray) -> Figure:
         *upper.get_legend_handles_labels(), fontsize=9, frameon=False, ncols=4,
         loc="outside lower center",
     )  # fmt: skip
-    style.dress(lower, "What it promised", "views", "utility U")
-    total = utility.sum(axis=1)
-    lower.plot(views, total, color=style.ACCENT, linewidth=2.0, marker="o", markersize=2.5)
-    lower.set_ylim(0.0, 1.1 * max(float(np.nanmax(total, initial=0.0)), 1.0))
+    style.dress(lower, "What it promised", "views", "part of its utility U")
+    lower.set_yscale("log")
+    for color, amount in zip(COLORS, np.where(utility > 0.0, utility, np.nan).T, strict=True):
+        lower.plot(views, amount, color=color, linewidth=1.6, marker="o", markersize=2.5)
     lower.set_xlim(0.4, len(views) + 0.6)
     lower.xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure

@@ -17,7 +17,7 @@ ACCENT = "#0f766e"
 SECOND = "#d97706"
 """The second curve."""
 
-NEVER_SEEN = "#111827"
+NEVER_SEEN = "#334155"
 """What no view has shown."""
 
 TOO_OBLIQUE = "#2563eb"

@@ -13,7 +13,7 @@ import pytest
 
 from r3jax.evaluation import style
 from r3jax.evaluation.pictures import floor_picture, panorama_picture
-from r3jax.evaluation.reasons import reasons_figure, shares_of, utility_by_cause
+from r3jax.evaluation.reasons import COLORS, reasons_figure, shares_of, utility_by_cause
 from r3jax.evaluation.report import write_report
 from r3jax.evaluation.summary import map_row_bytes, stage_times, summary
 from r3jax.exploration import explore
@@ -101,8 +101,12 @@ def test_the_bars_of_a_view_are_its_shares():
         assert [bar.get_height() for bar in bars] == pytest.approx([0.0, *expected[:, number]])
         below = expected[:, :number].sum(axis=1)
         assert [bar.get_y() for bar in bars] == pytest.approx([0.0, *below])
-    np.testing.assert_array_equal(lower.lines[0].get_xdata(), [1, 2, 3, 4])
-    np.testing.assert_array_equal(lower.lines[0].get_ydata(), [nan, 80.0, 0.0, 4.0])
+    # A logarithm shows no 0.
+    amounts = [[nan, 48.0, nan, nan], [nan, 24.0, nan, 1.0], [nan, 8.0, nan, 1.0]]
+    for line, color, amount in zip(lower.lines, COLORS, [*amounts, [nan] * 3 + [2.0]], strict=True):
+        assert line.get_color() == color
+        np.testing.assert_array_equal(line.get_xdata(), [1, 2, 3, 4])
+        np.testing.assert_array_equal(line.get_ydata(), amount)
     style.to_png(reasons_figure(utility[:1]))  # the start alone can be drawn
 
 
