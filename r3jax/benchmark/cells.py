@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from r3jax.benchmark.conditions import Conditions, snapshot_slug
-from r3jax.trace.header import plain_settings
+from r3jax.trace.header import plain_settings, settings_of
 
 IDENTITY_VERSION = 1
 """Raised when results of an older version of this package must not be taken over."""
@@ -85,7 +85,7 @@ def identity(cell: Cell) -> dict[str, Any]:
         "version": IDENTITY_VERSION,
         "scene": cell.scene_hash,
         "policy": cell.policy,
-        "planner": plain_settings(getattr(policy, "config", {})),
+        "planner": settings_of(policy),
         "given": plain_settings(cell.settings),
         "seed": cell.seed,
         "conditions": conditions,

@@ -7,6 +7,7 @@ from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.clock import ClockName
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
+from r3jax.planning.motion import Motion, make_motion, motion_of_record
 from r3jax.planning.policy import Policy, make_policy
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.config import Backend, RasterConfig
@@ -144,7 +145,8 @@ class Conditions:
 
         Args:
             name: one of `planning.policy.policy_names()`.
-            settings: fields of `PlannerConfig`; `scoring.NAME` is a field of `ScoringConfig`.
+            settings: fields of `PlannerConfig`; `scoring.NAME` is a field of `ScoringConfig`,
+                `motion` the name of a motion or its settings.
 
         Raises:
             ValueError: an unknown name, or a value that is impossible.
@@ -162,10 +164,16 @@ class Conditions:
                 f"{', '.join(known)}"
             )
         scoring = {"max_range": self.max_range} | scoring
+        if "motion" in planner:
+            planner["motion"] = _motion(planner["motion"])
         try:
             return make_policy(name, scoring=ScoringConfig(**scoring), **planner)
         except TypeError as error:  # a text where a number belongs
             raise ValueError(f"policy {name!r} with {settings}: {error}") from None
+
+
+def _motion(given: Any) -> Motion:
+    return make_motion(given) if isinstance(given, str) else motion_of_record(given)
 
 
 def _further(given: dict[str, Any], config: type, own: tuple[str, ...]) -> dict[str, Any]:

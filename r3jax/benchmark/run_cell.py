@@ -34,7 +34,7 @@ from r3jax.splatting.ply import write_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import load_views
 from r3jax.trace.errors import RunError
-from r3jax.trace.header import RunHeader, camera_fields, package_versions, plain_settings
+from r3jax.trace.header import RunHeader, camera_fields, package_versions, settings_of
 from r3jax.trace.reader import Run, read_run
 from r3jax.trace.rows import StepRow
 from r3jax.trace.writer import RunWriter
@@ -154,7 +154,7 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
             "max_range": conditions.max_range,
             "start": None,
         },
-        policy={"name": policy.name, "settings": plain_settings(getattr(policy, "config", {}))},
+        policy={"name": policy.name, "settings": settings_of(policy)},
         budget=conditions.budget,
         seed=cell.seed,
         config=dataclasses.asdict(config),

@@ -30,6 +30,8 @@ from r3jax.exploration.loop import Result, explore
 from r3jax.exploration.state import StopReason
 from r3jax.formats.pointcloud import voxel_points, write_points
 from r3jax.formats.transforms import write_transforms
+from r3jax.planning.limits import begin_at
+from r3jax.planning.motion import motion_of
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import package_versions
@@ -156,6 +158,7 @@ def _set_out(options: Explore, console: Console) -> Expedition:
     name = options.name or default_name(options, options.scene, plan.policy.name)
     with console.status(f"opening {options.scene} ..."):
         simulator = simulator_of_options(options)
+    begin_at(motion_of(plan.policy), simulator.start_pose)  # refused before there is a folder
     header = header_of(options, plan, simulator)
     recorder = RunWriter(options.out / name, header, overwrite=options.overwrite)
     return Expedition(plan, simulator, recorder, options.seed)
@@ -190,7 +193,7 @@ def _fork(options: Explore, path: Path, console: Console) -> Expedition:
     plan = plan_of_run(run)
     given = (options.policy, options.candidates, options.lambda1, options.lambda2)
     if any(value is not None for value in given):
-        policy = policy_of_options(options, run.header.scene["max_range"])
+        policy = policy_of_options(options, run.header.scene["max_range"], motion_of(plan.policy))
         plan = dataclasses.replace(plan, policy=policy)
     if options.budget is not None:
         plan = dataclasses.replace(plan, budget=parse_budget(options.budget))

@@ -15,12 +15,13 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.replay import config_of, planner_config_of
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.config import PlannerConfig
+from r3jax.planning.motion import Motion, make_motion
 from r3jax.planning.policy import Policy, make_policy
 from r3jax.scenes.registry import open_scene, scene_hash
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RunError
-from r3jax.trace.header import RunHeader, camera_fields, package_versions, plain_settings
+from r3jax.trace.header import RunHeader, camera_fields, package_versions, settings_of
 from r3jax.trace.reader import Run
 
 DEFAULT_POLICY = "ours-pano"
@@ -55,11 +56,27 @@ def plan_of_options(options: Explore) -> Plan:
         clock=options.clock,
     )
     budget = parse_budget(options.budget or DEFAULT_BUDGET)
-    return Plan(budget, config, policy_of_options(options, options.max_range))
+    policy = policy_of_options(options, options.max_range, motion_of_options(options))
+    return Plan(budget, config, policy)
 
 
-def policy_of_options(options: Explore, max_range: float) -> Policy:
+def motion_of_options(options: Explore) -> Motion:
+    """What carries the camera: a preset, and what the options change of it.
+
+    Raises:
+        ValueError: a setting that cannot work.
+    """
+    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Motion)}
+    return make_motion(options.motion, **{k: v for k, v in given.items() if v is not None})
+
+
+def policy_of_options(options: Explore, max_range: float, motion: Motion) -> Policy:
     """The policy that the options name, with the settings that they give.
+
+    Args:
+        options: of the command line.
+        max_range: of the depth sensor [m].
+        motion: what carries the camera.
 
     Raises:
         ValueError: an unknown policy, a setting that cannot work.
@@ -70,6 +87,7 @@ def policy_of_options(options: Explore, max_range: float) -> Policy:
         scoring = eqx.tree_at(lambda config: config.lambda1, scoring, lambda1)
     settings: dict[str, Any] = {
         "scoring": scoring,
+        "motion": motion,
         "num_candidates": options.candidates,
         "lambda2": options.lambda2,
     }
@@ -162,7 +180,7 @@ def header_of(options: Explore, plan: Plan, simulator: Simulator) -> RunHeader:
 
 def policy_fields(policy: Policy) -> dict[str, Any]:
     """A policy as a header names it."""
-    return {"name": policy.name, "settings": plain_settings(getattr(policy, "config", {}))}
+    return {"name": policy.name, "settings": settings_of(policy)}
 
 
 def default_name(options: Explore, scene: str, policy: str) -> str:
@@ -171,7 +189,8 @@ def default_name(options: Explore, scene: str, policy: str) -> str:
     stem = Path(rest).stem if colon else scene
     if kind == "habitat" and colon:
         stem = f"habitat-{stem.removesuffix('.stage_config')}"
-    return f"{stem}-{policy}-seed{options.seed}"
+    motion = "" if options.motion == "free" else f"-{options.motion}"
+    return f"{stem}-{policy}{motion}-seed{options.seed}"
 
 
 def _start_pose(start: Any) -> np.ndarray | None:

@@ -41,7 +41,7 @@ class ExplorationConfig:
     """The ball round the start that the operator vouches for [m]."""
 
     speed: float = 1.0
-    """Flight speed [m/s]; turning on the spot takes no time."""
+    """Flight speed [m/s] where the policy's motion has none; turning takes no time then."""
 
     clock: ClockName = "wall"
     """`wall`: measured planning and mapping. `model`: fixed costs, the same run every time."""

@@ -87,7 +87,7 @@ def explain_run(
             yield None
         else:
             pose, (map_state, grid) = before
-            memory = memory or initial_state(run.camera, grid)
+            memory = memory or initial_state(run.camera, grid, motion=config.motion)
             choice = row.choice
             memory, explanation = explain_way(
                 memory, map_state, grid, pose, choice.pose, choice.waypoints, config

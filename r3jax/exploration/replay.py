@@ -13,6 +13,7 @@ from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.config import PlannerConfig
+from r3jax.planning.motion import motion_of_record
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.sighting import look
 from r3jax.trace.errors import RunError
@@ -54,7 +55,8 @@ def planner_config_of(run: Run) -> PlannerConfig:
     try:
         settings = dict(run.header.policy["settings"])
         scoring = ScoringConfig(**settings.pop("scoring", {}))
-        return PlannerConfig(scoring=scoring, **settings)
+        motion = motion_of_record(settings.pop("motion", None))
+        return PlannerConfig(scoring=scoring, motion=motion, **settings)
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(run.path / "run.json", f"a setting of the policy: {error}") from None
 

@@ -17,8 +17,11 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
 from r3jax.frame import Frame
+from r3jax.geometry.cameras import angle_between
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import empty_map
+from r3jax.planning.limits import begin_at
+from r3jax.planning.motion import motion_of
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.scoring.sighting import look
 from r3jax.trace.images import frame_hash, stored_form
@@ -32,7 +35,8 @@ def start_state(mission: Mission, init_key: jax.Array) -> LoopState:
     """The state before the first view.
 
     Raises:
-        ValueError: a start pose outside the world's box.
+        ValueError: a start pose outside the world's box, or at a height where what carries the
+            camera cannot be.
     """
     simulator, config = mission.simulator, mission.config
     pose = np.asarray(simulator.start_pose, dtype=np.float64)
@@ -42,6 +46,7 @@ def start_state(mission: Mission, init_key: jax.Array) -> LoopState:
             f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
             f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
         )
+    pose = begin_at(motion_of(mission.policy), pose)
     grid = first_grid(np.stack([lower, upper]), [pose], config)
     map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
     policy_state = mission.policy.init(simulator.camera, grid, key=init_key)
@@ -99,11 +104,18 @@ def step(state: LoopState, mission: Mission) -> tuple[LoopState, View | Stop]:
     if decision is None:
         return state, _no_decision(state, mission, info)
     planning = mission.clock.charge("planning", measured)
-    flight = decision.length / mission.config.speed
+    flight = _flight(decision, mission)
     stop = _spent(state, mission, seconds=planning + flight, metres=decision.length)
     if stop is not None:
         return state, stop
     return _look(state, mission, decision.T_world_camera, (decision, info), stages, planning)
+
+
+def _flight(decision: Decision, mission: Mission) -> float:
+    """Seconds from one view to the next: the policy's own account of its motion, if it has one."""
+    if decision.seconds is not None:
+        return decision.seconds
+    return decision.length / mission.config.speed
 
 
 def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
@@ -152,7 +164,8 @@ def _look(
     state, mapping_stages = _map_frame(state, mission, frame)
     mapping = mission.clock.charge("mapping", sum(mapping_stages.values()))
     length = 0.0 if choice is None else choice[0].length
-    charged = {"planning": planning, "mapping": mapping, "flight": length / mission.config.speed}
+    flight = 0.0 if choice is None else _flight(choice[0], mission)
+    charged = {"planning": planning, "mapping": mapping, "flight": flight}
     state = _arrive(state, frame, length, charged)
     mission.on_stage("measure")
     begin = time.perf_counter()
@@ -216,7 +229,7 @@ def _arrive(state: LoopState, frame: Frame, length: float, charged: dict[str, fl
         T_world_camera=pose,
         seconds=state.seconds + sum(charged.values()),
         metres=state.metres + length,
-        radians=state.radians + _angle_between(state.T_world_camera, pose),
+        radians=state.radians + angle_between(state.T_world_camera, pose),
         still_views=state.still_views + 1 if length < 0.01 else 0,
     )
 
@@ -243,9 +256,3 @@ def _map_frame(
     state = replace(state, map_state=map_state, grid=grid, policy_state=policy_state)
     stages = {"map.voxels": integrating, "map.grid": gridding, "map.policy": observing}
     return state, stages
-
-
-def _angle_between(first: np.ndarray, second: np.ndarray) -> float:
-    """Angle of the rotation between two poses [rad]."""
-    cosine = 0.5 * (np.trace(first[:3, :3].T @ second[:3, :3]) - 1.0)
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -173,6 +173,12 @@ def look_at(
     return pose_along(position, target - position)
 
 
+def angle_between(first: np.ndarray, second: np.ndarray) -> float:
+    """Angle of the rotation between two poses, [4, 4] each [rad]. On the host."""
+    cosine = 0.5 * (np.trace(first[:3, :3].T @ second[:3, :3]) - 1.0)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
 def rigid_error(T: np.ndarray) -> str | None:
     """Says what is wrong with a 4x4 pose, or None if it is rigid and finite. On the host."""
     if T.shape != (4, 4):

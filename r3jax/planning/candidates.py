@@ -51,7 +51,7 @@ def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -
     if len(cells) == 0:
         return np.zeros((0, 3))
     chosen = rng.integers(len(cells), size=num)
-    centers = travel.centers(cells[chosen])
+    centers = travel.stops(cells[chosen])
     positions = _jitter(centers, travel.cell_size, rng)
     is_far = np.linalg.norm(positions - travel.start, axis=1) > radius
     positions[is_far] = centers[is_far]
@@ -86,7 +86,7 @@ def region_of_interest(
     for target, aim in zip(drawn, travel.centers(drawn), strict=True):
         if len(positions) == num:
             break
-        stops = travel.centers(_stops_round(travel, target))
+        stops = travel.stops(_stops_round(travel, target))
         if len(stops) == 0:
             continue
         position = _jitter(stops[rng.integers(len(stops))], travel.cell_size, rng)
@@ -123,7 +123,7 @@ def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.7
         spacing: distance between lattice points along x, y and z [m].
 
     Returns:
-        [n, 3] float64 [m], each at its cell's centre, no cell twice.
+        [n, 3] float64 [m], each where the camera stands in its cell, no cell twice.
     """
     shape = travel.usable.shape
     axes = [
@@ -134,7 +134,7 @@ def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.7
     # The nudge puts points that lie on a border of cells on the same side of it.
     cells = np.unique(np.floor(points / travel.cell_size + 1e-3).astype(np.int64), axis=0)
     cells = cells[np.all(cells < np.array(shape), axis=1)]
-    return travel.centers(cells[travel.goals[tuple(cells.T)]])
+    return travel.stops(cells[travel.goals[tuple(cells.T)]])
 
 
 def spread(places: np.ndarray, num: int) -> np.ndarray:

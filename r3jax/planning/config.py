@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
+from r3jax.planning.motion import Motion
 from r3jax.scoring.config import ScoringConfig
 
 MAX_CANDIDATES = 1_000_000
@@ -36,6 +37,9 @@ class PlannerConfig:
 
     safety_margin: float = 0.3
     """A path keeps its cells' centres this far from anything not known to be free [m]."""
+
+    motion: Motion = field(default_factory=Motion)
+    """What carries the camera: where it may be, how it may look and how fast it goes."""
 
     scoring: ScoringConfig = field(default_factory=ScoringConfig)
     """Settings of the utilities, lambda1 among them."""

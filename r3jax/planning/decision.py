@@ -9,13 +9,15 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
+from r3jax.planning.limits import Limits
+from r3jax.planning.motion import Motion
 from r3jax.planning.policy import Decision, Outcome, PlanInfo
 from r3jax.planning.travel import Travel, plan_travel
 from r3jax.scoring.explain import Explanation, explain_view
@@ -38,6 +40,10 @@ class PlannerState(eqx.Module):
     looks: Int[Array, "X Y Z"] = eqx.field(converter=jnp.asarray)
     """Views that should have shown each cell and left it unexplored."""
 
+    start_height: Float[Array, ""] | None = None
+    """Height of the first view [m], NaN before it; None for a motion whose heights do not count
+    from it."""
+
     memory: Any = None
     """Arrays that one policy keeps beside the map: a pytree of its own."""
 
@@ -57,11 +63,15 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
-def initial_state(camera: Camera, grid: OccupancyGrid, memory: Any = None) -> PlannerState:
+def initial_state(
+    camera: Camera, grid: OccupancyGrid, memory: Any = None, motion: Motion | None = None
+) -> PlannerState:
     """The memory of a robot that has not moved yet."""
     nowhere = jnp.zeros(grid.log_odds.shape, dtype=bool)
     looks = jnp.zeros(grid.log_odds.shape, dtype=jnp.int32)
-    return PlannerState(camera=camera, trail=nowhere, looks=looks, memory=memory)
+    is_relative = motion is not None and motion.is_relative
+    start_height = jnp.asarray(jnp.nan, dtype=jnp.float32) if is_relative else None
+    return PlannerState(camera, nowhere, looks, start_height, memory)
 
 
 def look_round(
@@ -78,7 +88,7 @@ def look_round(
         map_state: the map, the view from here included.
         grid: the grid, the same.
         T_world_camera: where the latest view was taken.
-        config: the safety margin, and how far the camera sees.
+        config: the safety margin, what carries the camera, and how far it sees.
 
     Returns:
         The memory with the view from here counted in, the ways, and the grid for scoring: cells
@@ -86,12 +96,24 @@ def look_round(
         occupied in it (`mask_unexplorable`).
     """
     position = np.asarray(T_world_camera, dtype=np.float64)[:3, 3]
-    travel = plan_travel(grid, position, config.safety_margin, np.asarray(state.trail))
+    state = _with_start(state, position[2])
+    motion, start = config.motion, state.start_height
+    heights = motion.heights_from(0.0 if start is None else float(start))
+    trail = np.asarray(state.trail)
+    travel = plan_travel(grid, position, config.safety_margin, trail, heights, motion.body)
     pose = jnp.asarray(T_world_camera, dtype=jnp.float32)
     visible = visible_unexplored(map_state, grid, state.camera, pose, config.scoring)
     state = eqx.tree_at(lambda s: s.looks, state, state.looks + visible.astype(jnp.int32))
     is_exhausted = np.asarray(state.looks) >= ENOUGH_LOOKS
     return state, travel, mask_unexplorable(grid, travel.reachable, is_exhausted)
+
+
+def _with_start(state: PlannerState, height: float) -> PlannerState:
+    """Notes the height [m] of the first view, if that has not been done."""
+    start = state.start_height
+    if start is None or not np.isnan(start):
+        return state
+    return eqx.tree_at(lambda s: s.start_height, state, jnp.asarray(height, dtype=jnp.float32))
 
 
 def follow_way(
@@ -153,6 +175,7 @@ def settle(
     travel: Travel,
     poses: np.ndarray,
     utilities: dict[str, np.ndarray],
+    limits: Limits,
     stopwatch: Stopwatch,
 ) -> tuple[int, Decision, PlannerState, PlanInfo]:
     """Takes the candidate of the greatest `total` and finds the way to it.
@@ -163,6 +186,7 @@ def settle(
         poses: the candidates, [C, 4, 4], at least one of them reachable.
         utilities: per candidate, [C] each; `total` and `path` among them. A candidate whose
             path is infinite is never taken.
+        limits: what the way and the turn cost.
         stopwatch: what took how long.
 
     Returns:
@@ -172,10 +196,12 @@ def settle(
         is_reachable = np.isfinite(utilities["path"])
         best = int(np.argmax(np.where(is_reachable, utilities["total"], -np.inf)))
         waypoints = travel.path(poses[best, :3, 3])
+    length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
     decision = Decision(
         T_world_camera=poses[best],
         waypoints=waypoints,
-        length=float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum()),
+        length=length,
+        seconds=limits.seconds(length, poses[best]),
         score=float(utilities["total"][best]),
         candidates=poses,
         utilities=utilities,

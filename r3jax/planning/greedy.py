@@ -31,6 +31,7 @@ from r3jax.planning.decision import (
     no_decision,
     settle,
 )
+from r3jax.planning.limits import Limits
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.travel import Travel
 from r3jax.scoring.config import ScoringConfig
@@ -58,6 +59,10 @@ class Situation:
     memory: Any
     """What the policy keeps beside the map."""
 
+    limits: Limits = field(default_factory=Limits)
+    """What the carrier of the camera may do next. Candidates need not lie within them: `decide`
+    sees to that."""
+
     notes: Any = None
     """What `draw` noted of the candidates."""
 
@@ -78,7 +83,11 @@ class Drawn:
 
 @dataclass(frozen=True)
 class GreedyPolicy(ABC):
-    """Draws candidates, scores them, weighs the path, takes the best."""
+    """Draws candidates, scores them, weighs the path, takes the best.
+
+    What a policy draws, and what it turns while scoring, becomes the nearest view that the
+    carrier of the camera may take: no policy has to know the carrier.
+    """
 
     config: PlannerConfig = field(default_factory=PlannerConfig)
 
@@ -116,7 +125,8 @@ class GreedyPolicy(ABC):
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
         """The state before the first frame; nothing in it is random."""
         del key
-        return initial_state(camera, grid, self.first_memory(camera, grid))
+        memory = self.first_memory(camera, grid)
+        return initial_state(camera, grid, memory, self.config.motion)
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
         """The map holds all that most policies need of a frame."""
@@ -132,24 +142,30 @@ class GreedyPolicy(ABC):
         *,
         key: Array,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """The candidate with the greatest total."""
+        """The candidate with the greatest total, of those that the carrier may take."""
         stopwatch = Stopwatch()
         draw_key, score_key = jax.random.split(key)
         with stopwatch.part("travel"):
             state, travel, masked = look_round(state, map_state, grid, T_world_camera, self.config)
+        pose = np.asarray(T_world_camera, dtype=np.float64)
+        limits = Limits(self.config.motion, pose, travel.heights)
         with stopwatch.part("candidates"):
-            situation = Situation(map_state, grid, masked, travel, state.camera, state.memory)
+            situation = Situation(
+                map_state, grid, masked, travel, state.camera, state.memory, limits
+            )
             drawn = self.draw(situation, key=draw_key)
             if len(drawn.poses) == 0:
                 decision, info = no_decision(travel, self.config, stopwatch)
                 return decision, replace(state, memory=drawn.memory), info
             situation = replace(situation, memory=drawn.memory, notes=drawn.notes)
         with stopwatch.part("scoring"):
-            poses, utilities = self.score(situation, drawn.poses, key=score_key)
+            poses, utilities = self.score(situation, limits.obeyed(drawn.poses), key=score_key)
+            poses = limits.obeyed(poses)
         with stopwatch.part("travel"):
-            utilities = utilities | {"path": travel.lengths(poses[:, :3, 3])}
+            lengths = travel.lengths(poses[:, :3, 3])
+            utilities = utilities | {"path": limits.path_costs(lengths, poses)}
         utilities = utilities | {"total": self.weigh(utilities)}
-        best, decision, state, info = settle(state, travel, poses, utilities, stopwatch)
+        best, decision, state, info = settle(state, travel, poses, utilities, limits, stopwatch)
         memory = self.conclude(situation, poses, utilities, best)
         return decision, replace(state, memory=memory), info
 

@@ -48,8 +48,12 @@ class Decision:
     """Every pose that was scored, [C, 4, 4]."""
 
     utilities: dict[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
-    """Per candidate, [C] each: always `path` [m] and `total`; `utility` where views were scored,
-    and its parts `exploration` and `rendering` where they were told apart."""
+    """Per candidate, [C] each: always `total`, and `path` [m], what turning costs included;
+    `utility` where views were scored, and its parts `exploration` and `rendering` where they were
+    told apart."""
+
+    seconds: float | None = None
+    """Time for the path and the turn [s]; None: the length over the loop's speed."""
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import poses_along
+from r3jax.planning.limits import Limits
 from r3jax.planning.travel import Travel
 
 LEAST_GAIN = 0.005
 """Share of the pixels below which a view is not worth taking."""
+
+_UNBOUND = Limits()
 
 _SLACK = 0.5
 """A candidate stands at most this far above or below its level [m]."""
@@ -72,11 +75,15 @@ class Stage:
         stops = (travel.goals & travel.safe)[tuple(columns.T)]
         layer_of_floor = floor_layer(travel.free)
         height = (np.arange(stops.shape[1]) + 0.5 - layer_of_floor) * travel.cell_size
+        lowest, highest = (np.array(travel.heights) - travel.origin[2]) - (
+            layer_of_floor * travel.cell_size
+        )
         borders = [-np.inf, *(0.5 * (a + b) for a, b in pairwise(self.heights)), np.inf]
         layers: list[np.ndarray] = []
         is_there: list[np.ndarray] = []
         for level, (low, high) in zip(self.heights, pairwise(borders), strict=True):
-            gap = np.abs(height - level)
+            # A carrier that never comes up or down to the level has it where it comes nearest.
+            gap = np.abs(height - np.clip(level, lowest, highest))
             may_stand = stops & (height >= low) & (height < high) & (gap <= _SLACK + 1e-6)
             gaps = np.where(may_stand, gap, np.inf)
             layers.append(gaps.argmin(axis=1))
@@ -168,8 +175,13 @@ def dismiss(pool: Pool, draw: Draw, gain: np.ndarray, best: int) -> Pool:
     return replace(pool, gain=remembered, left=left)
 
 
-def draw_candidates(pools: Pools, travel: Travel, num: int) -> tuple[Pools, Draw | None]:
-    """The pools as they are now, and up to `num` candidates of the first stage that has any."""
+def draw_candidates(
+    pools: Pools, travel: Travel, num: int, limits: Limits = _UNBOUND
+) -> tuple[Pools, Draw | None]:
+    """The pools as they are now, and up to `num` candidates of the first stage that has any.
+
+    Those for which the camera cannot turn far enough on the way from here sit out, too.
+    """
     of_stage, num_ended = list(pools.of_stage), int(pools.num_ended)
     found = None
     for k in range(num_ended, len(STAGES)):
@@ -179,6 +191,8 @@ def draw_candidates(pools: Pools, travel: Travel, num: int) -> tuple[Pools, Draw
             num_ended += 1
             continue
         is_open = np.asarray(pool.entered & ~pool.left) & has_place[:, None]
+        lattice = fibonacci_lattice(STAGES[k].num_directions)
+        is_open &= limits.may_turn(travel.stops(cells)[:, None, :], lattice)
         if is_open.any():
             found = _best_remembered(pool, is_open, travel, cells, k, num)
             break
@@ -190,7 +204,7 @@ def _best_remembered(
 ) -> Draw:
     """Up to `num` of the open candidates [P, D]: the greatest gains, then the nearest."""
     place, direction = np.nonzero(is_open)
-    positions = travel.centers(cells[place])
+    positions = travel.stops(cells[place])
     distance = np.linalg.norm(positions - travel.start, axis=1)
     remembered = np.asarray(pool.gain)[place, direction]
     order = np.lexsort((distance, -remembered))[:num]

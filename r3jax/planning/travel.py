@@ -20,10 +20,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning.carrier_cells import cells_over_matter, layers_between
+from r3jax.planning.limits import check_height
+from r3jax.planning.motion import UNLIMITED
 from r3jax.planning.shortest_ways import shortest_ways
 
 _BORDER = 1e-3
 """A segment that passes a corner closer than this counts as touching it [cells]."""
+
+_INSET = 1e-2
+"""A camera at a fixed height that is a border of layers counts as so far inside its own [cells]:
+the next layer is none of its cells."""
 
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * _BORDER
 
@@ -48,7 +55,7 @@ class Travel:
     """Cells known to be free, [X, Y, Z] bool."""
 
     safe: np.ndarray
-    """Cells that keep the margin, [X, Y, Z] bool."""
+    """Cells that keep the margin and are open to what carries the camera, [X, Y, Z] bool."""
 
     usable: np.ndarray
     """Cells that paths may cross: the safe ones, the robot's own, [X, Y, Z] bool."""
@@ -59,6 +66,9 @@ class Travel:
 
     previous: np.ndarray
     """Flat index of the cell before each on that way, [X, Y, Z] int64; -1 at its start."""
+
+    heights: tuple[float, float] = UNLIMITED
+    """Lowest and highest place of the camera [m]: all waypoints lie between them."""
 
     @functools.cached_property
     def reachable(self) -> np.ndarray:
@@ -86,12 +96,18 @@ class Travel:
         """Centres [m] of cells given by index, [n, 3]."""
         return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
 
+    def stops(self, cells: np.ndarray) -> np.ndarray:
+        """Where the camera stands in cells given by index, [n, 3] [m]: at an allowed height."""
+        places = self.centers(cells)
+        places[..., 2] = np.clip(places[..., 2], *self.heights)
+        return places
+
     def distance(self, cell: np.ndarray | tuple[int, int, int]) -> float:
-        """Length of the way from the robot to the centre of a cell [m]; inf if there is none."""
+        """Length of the way from the robot to its stop in a cell [m]; inf if there is none."""
         x, y, z = (int(i) for i in np.asarray(cell))
         if not self.contains((x, y, z)):
             return float("inf")
-        first = self.centers(np.array(self.start_cell))
+        first = self.stops(np.array(self.start_cell))
         return float(np.linalg.norm(first - self.start) + self.cost[x, y, z])
 
     def lengths(self, positions: np.ndarray) -> np.ndarray:
@@ -108,7 +124,7 @@ class Travel:
             return float("inf")
         if segment_is_inside(self.usable, *self._in_cells(self.start, position)):
             return float(np.linalg.norm(position - self.start))
-        last = float(np.linalg.norm(position - self.centers(np.array(cell))))
+        last = float(np.linalg.norm(position - self.stops(np.array(cell))))
         return self.distance(cell) + last
 
     def path(self, position: np.ndarray) -> np.ndarray:
@@ -126,7 +142,7 @@ class Travel:
         while previous[way[-1]] >= 0:
             way.append(int(previous[way[-1]]))
         cells = np.stack(np.unravel_index(way[::-1], self.usable.shape), axis=1)
-        return self._shortcut(np.concatenate([self.start[None], self.centers(cells), goal[None]]))
+        return self._shortcut(np.concatenate([self.start[None], self.stops(cells), goal[None]]))
 
     def cells_along(self, waypoints: np.ndarray) -> np.ndarray:
         """Cells of the grid that the path over waypoints [K, 3] [m] crosses, [X, Y, Z] bool."""
@@ -156,7 +172,16 @@ class Travel:
         return segment_is_inside(self.usable, *self._in_cells(a, b))
 
     def _in_cells(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (a - self.origin) / self.cell_size, (b - self.origin) / self.cell_size
+        return self._scaled(a), self._scaled(b)
+
+    def _scaled(self, position: np.ndarray) -> np.ndarray:
+        """A position in cells, kept off the borders of the layers that are allowed."""
+        scaled = (position - self.origin) / self.cell_size
+        if self.heights != UNLIMITED:
+            num = self.usable.shape[2]
+            first, last = layers_between(self.heights, self.origin[2], self.cell_size, num)
+            scaled[2] = np.clip(scaled[2], first + _INSET, last + 1.0 - _INSET)
+        return scaled
 
 
 def plan_travel(
@@ -164,6 +189,8 @@ def plan_travel(
     position: np.ndarray,
     safety_margin: float = 0.3,
     trail: np.ndarray | None = None,
+    heights: tuple[float, float] = UNLIMITED,
+    body: float = 0.0,
 ) -> Travel:
     """Shortest ways from a position to everywhere that is safe. Once per decision.
 
@@ -174,6 +201,12 @@ def plan_travel(
         trail: cells that the robot has come through, [X, Y, Z] bool. If its present cell is
             not safe (a closer look found something in the margin), it may go back through them
             unless they turned out to be occupied; otherwise they change nothing.
+        heights: lowest and highest place of the camera [m], world.
+        body: what carries the camera reaches so far down from it [m]
+            (`carrier_cells.cells_over_matter`).
+
+    Raises:
+        ValueError: a position that is not finite, or not at an allowed height.
     """
     free = np.asarray(grid.free)
     cell_size = float(grid.cell_size)
@@ -181,7 +214,15 @@ def plan_travel(
     start = np.asarray(position, dtype=np.float64)
     if start.shape != (3,) or not np.all(np.isfinite(start)):
         raise ValueError(f"the position must be three finite numbers [m], got {start}")
+    check_height(float(start[2]), heights)
     safe = safe_cells(free, cell_size, safety_margin)
+    if heights != UNLIMITED:
+        first, last = layers_between(heights, origin[2], cell_size, free.shape[2])
+        safe[:, :, : max(first, 0)] = False
+        safe[:, :, last + 1 :] = False
+    if body > 0.0:
+        occupied = np.asarray(grid.occupied)
+        safe &= ~cells_over_matter(occupied, body, safety_margin, heights, origin[2], cell_size)
     cell = tuple(int(i) for i in np.floor((start - origin) / cell_size))
     is_inside = all(0 <= i < n for i, n in zip(cell, free.shape, strict=True))
     usable = safe
@@ -201,6 +242,7 @@ def plan_travel(
         usable=usable,
         cost=cost * cell_size,
         previous=previous,
+        heights=heights,
     )
 
 

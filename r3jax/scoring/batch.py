@@ -4,10 +4,11 @@ Candidates of a step lie close together, so what none of them can see is left ou
 XLA runs the loops of one score on one core; on a CPU the candidates are therefore dealt out to as
 many threads as the process may use. Where there are several devices, they share the candidates.
 
-Shape symbols: C candidates; n voxels; c cells.
+Shape symbols: C candidates; n voxels; c cells; B bins of the panorama.
 """
 
 import functools
+import operator
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +17,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 from r3jax.geometry.cameras import Camera, is_traced
 from r3jax.mapping.compact import positions_of_set
@@ -56,11 +57,22 @@ def score_positions(
     camera: Camera,
     positions: Float[Array | np.ndarray, "C 3"],
     config: ScoringConfig,
+    allowed: Bool[Array | np.ndarray, "C B"] | None = None,
 ) -> Panorama:
-    """`panorama` of every position; fields of shape [C, ...]. Not to be called under jit."""
+    """`panorama` of every position; fields of shape [C, ...]. Not to be called under jit.
+
+    Args:
+        state: the map.
+        grid: the coarse grid.
+        camera: whose field of view and focal length count.
+        positions: camera centers [m].
+        config: settings.
+        allowed: per position the axes that its best direction is taken from, at least one of
+            the B of the panorama; None: all.
+    """
     positions = jnp.asarray(positions, dtype=jnp.float32)
     voxels, cells, _ = near(state, grid, positions, config)
-    return score_positions_near(voxels, cells, camera, positions, config)
+    return score_positions_near(voxels, cells, camera, positions, config, allowed)
 
 
 def score_views_near(
@@ -80,9 +92,13 @@ def score_positions_near(
     camera: Camera,
     positions: Float[Array, "C 3"],
     config: ScoringConfig,
+    allowed: Bool[Array | np.ndarray, "C B"] | None = None,
 ) -> Panorama:
     """`score_positions` of voxels and cells that `near` gathered."""
-    return deal(functools.partial(_score_positions, voxels, cells, camera, config), positions)
+    if allowed is None:
+        allowed = np.ones((positions.shape[0], config.panorama_bins), dtype=bool)
+    score = functools.partial(_score_positions, voxels, cells, camera, config)
+    return deal(score, (positions, jnp.asarray(allowed)))
 
 
 @jax.jit
@@ -103,10 +119,12 @@ def _score_positions(
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
-    positions: Float[Array, "C 3"],
+    places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
 ) -> Panorama:
-    score = functools.partial(panorama_of, voxels, cells, camera, config=config)
-    return jax.lax.map(score, positions)
+    def score(place: tuple[Float[Array, " 3"], Bool[Array, " B"]]) -> Panorama:
+        return panorama_of(voxels, cells, camera, place[0], config, place[1])
+
+    return jax.lax.map(score, places)
 
 
 def near(
@@ -186,17 +204,17 @@ def _gather_near(
 
 def deal(
     score: "functools.partial[Scores]",
-    candidates: Float[Array, "C ..."],
+    candidates: PyTree[Shaped[Array, "C ..."]],
     devices: Sequence[Any] | None = None,
 ) -> Scores:
     """Scores candidates in equal shares on all devices; a CPU alone: on all of its cores.
 
     Args:
         score: of any number of candidates; a jitted function with all but the last argument.
-        candidates: what to score.
+        candidates: what to score: an array, or a tree of arrays with a row for each.
         devices: of JAX, where to; by default all of this process.
     """
-    num = candidates.shape[0]
+    num = jax.tree.leaves(candidates)[0].shape[0]
     devices = (jax.local_devices() if devices is None else devices)[:num]
     if len(devices) > 1:
         scores = score_on_devices(score.func, score.args, candidates, devices)
@@ -204,7 +222,10 @@ def deal(
     workers = min(len(os.sched_getaffinity(0)), num) if jax.default_backend() == "cpu" else 1
     if workers < 2:
         return score(candidates)
-    shares = jnp.split(padded_to(workers, candidates), workers)
+    padded = padded_to(workers, candidates)
+    size = jax.tree.leaves(padded)[0].shape[0] // workers
+    cuts = [slice(i * size, (i + 1) * size) for i in range(workers)]
+    shares = [jax.tree.map(operator.itemgetter(cut), padded) for cut in cuts]
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda part: jax.block_until_ready(score(part)), shares))
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays)[:num], *parts)

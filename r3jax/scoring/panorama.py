@@ -6,7 +6,7 @@ Shape symbols: B bins of the panorama.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
@@ -31,7 +31,7 @@ class Panorama(eqx.Module):
     """Per camera axis q_k: the sum of the bins inside the camera's field of view."""
 
     best_direction: Float[Array, " 3"]
-    """The axis with the largest score, unit length."""
+    """Of the axes that are allowed, the one with the largest score; unit length."""
 
     best_score: Float[Array, ""]
     """Its score: lambda1 U_G + U_R of that view, to the resolution of the bins."""
@@ -69,8 +69,18 @@ def panorama_of(
     camera: Camera,
     position: Float[Array, " 3"],
     config: ScoringConfig,
+    allowed: Bool[Array, " B"] | None = None,
 ) -> Panorama:
-    """`panorama` of voxels and cells that are already at hand."""
+    """`panorama` of voxels and cells that are already at hand.
+
+    Args:
+        voxels: of the map.
+        cells: of the grid.
+        camera: whose field of view and focal length count.
+        position: camera center [m].
+        config: settings.
+        allowed: axes q_k that the best direction is taken from, at least one; None: all.
+    """
     num_bins = config.panorama_bins
     view = panorama_view(position, config)
     buffer, visible = seen_in(voxels, view, config)
@@ -78,7 +88,7 @@ def panorama_of(
     unexplored = unexplored_by_direction(cells, view, buffer, view.position, num_bins)
     bins = bins + config.lambda1 * unexplored
     directions = bins_in_view(camera, num_bins) @ bins
-    best = jnp.argmax(directions)
+    best = jnp.argmax(directions if allowed is None else jnp.where(allowed, directions, -jnp.inf))
     axis = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)[best]
     return Panorama(bins, directions, axis, directions[best], pose_along(position, axis))
 

@@ -14,22 +14,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float
+from jaxtyping import Array, PyTree, Shaped
 
 _AXIS = "candidates"
 
 
-def padded_to(multiple: int, candidates: Float[Array, "C ..."]) -> Float[Array, "P ..."]:
+def padded_to(
+    multiple: int, candidates: PyTree[Shaped[Array, "C ..."]]
+) -> PyTree[Shaped[Array, "P ..."]]:
     """Candidates, the last one repeated until their number is a multiple."""
-    missing = -candidates.shape[0] % multiple
-    last = jnp.broadcast_to(candidates[-1:], (missing, *candidates.shape[1:]))
-    return jnp.concatenate([candidates, last])
+
+    def pad(rows: Array) -> Array:
+        missing = -rows.shape[0] % multiple
+        return jnp.concatenate([rows, jnp.broadcast_to(rows[-1:], (missing, *rows.shape[1:]))])
+
+    return jax.tree.map(pad, candidates)
 
 
 def score_on_devices(
     score: Callable[..., Any],
     known: tuple[Any, ...],
-    candidates: Float[Array, "C ..."],
+    candidates: PyTree[Shaped[Array, "C ..."]],
     devices: Sequence[Any],
 ) -> Any:
     """`score(*known, candidates)` with the candidates spread over the devices.
@@ -42,7 +47,7 @@ def score_on_devices(
             compiles once; gives fields of shape [C, ...].
         known: the same for all candidates, copied to each device; what is no number or array,
             such as a function, stays as it is.
-        candidates: what to score.
+        candidates: what to score: an array, or a tree of arrays with a row for each.
         devices: of JAX, all of one kind.
 
     Returns:
@@ -62,11 +67,11 @@ def _score(
     score: Callable[..., Any],
     mesh: Mesh,
     known: tuple[Any, ...],
-    candidates: Float[Array, "P ..."],
+    candidates: PyTree[Shaped[Array, "P ..."]],
 ) -> Any:
     arrays, others = eqx.partition(known, eqx.is_array)
 
-    def own(arrays: Any, share: Array) -> Any:
+    def own(arrays: Any, share: Any) -> Any:
         return score(*eqx.combine(arrays, others), share)
 
     split = PartitionSpec(_AXIS)

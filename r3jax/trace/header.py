@@ -18,6 +18,7 @@ from r3jax.foreign.images import MAX_PIXELS
 from r3jax.foreign.json_text import parse_json
 from r3jax.foreign.versions import VersionError, check_version
 from r3jax.geometry.cameras import Camera
+from r3jax.planning.motion import Motion
 from r3jax.trace.errors import RunError
 
 FORMAT = "r3jax-run"
@@ -97,6 +98,17 @@ def plain_settings(settings: Any) -> Any:
     if isinstance(settings, dict):
         return {str(name): plain_settings(value) for name, value in settings.items()}
     return np.asarray(settings).tolist()
+
+
+def settings_of(policy: object) -> dict[str, Any]:
+    """What JSON can hold of a policy's settings.
+
+    A free-flying camera's motion is left out: that is what its absence has always meant.
+    """
+    settings = plain_settings(getattr(policy, "config", {}))
+    if settings.get("motion") == plain_settings(Motion()):
+        del settings["motion"]
+    return settings
 
 
 def package_versions() -> dict[str, str]:

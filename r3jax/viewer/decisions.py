@@ -86,7 +86,7 @@ class WatchedPolicy:
                 compilation, is told twice.
             on_frame: told every frame, and the map that it has joined; on the same terms.
         """
-        self.name = policy.name
+        self.name, self.config = policy.name, getattr(policy, "config", None)
         self._policy, self._on_decision, self._on_frame = policy, on_decision, on_frame
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Any:

@@ -45,9 +45,10 @@ def prefer_high_x(map_state, grid, camera, poses, config):
     return SimpleNamespace(exploration=x * 0 + 1, rendering=(x + 2) ** 2, total=(x + 2) ** 2 + 1)
 
 
-def look_down(map_state, grid, camera, positions, config):
+def look_down(map_state, grid, camera, positions, config, allowed):
     """A stand-in for `score_positions`: straight down is best, high positions above all."""
     assert positions.shape == (NUM, 3)
+    assert allowed.shape == (NUM, 526)
     down = np.tile([0.0, 0.0, -1.0], (NUM, 1))
     return SimpleNamespace(
         T_world_camera=poses_along(positions, down).astype(np.float32),
@@ -177,10 +178,10 @@ def test_the_scorer_never_sees_hopeless_cells(policy_class):
     occupied[13:] = False
     grids = []
 
-    def spy(map_state, grid, camera, views, config):
+    def spy(map_state, grid, camera, views, config, *allowed):
         grids.append(grid)
         stand_in = prefer_high_x if policy_class is Ours else look_down
-        return stand_in(map_state, grid, camera, views, config)
+        return stand_in(map_state, grid, camera, views, config, *allowed)
 
     grid = grid_of(free, occupied)
     assert bool(grid.unexplored[13:].all())

@@ -82,6 +82,32 @@ class Explore:
     start: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Start position in the z-up world [m]; by default the scene's own, or a search."""
 
+    motion: Literal["free", "ground", "gimbal", "handheld"] = "free"
+    """What carries the camera: `free`: a camera that flies; `ground`: a robot whose camera is level
+    and at the height where it starts; `gimbal`: a drone that cannot look up far; `handheld`: a
+    person. The options below change it."""
+
+    heights: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
+    """Lowest and highest place of the camera, above the start [m]."""
+
+    heights_above: Annotated[Literal["start", "world"] | None, tyro.conf.arg()] = None
+    """What --heights count from: `start`, or `world` for z = 0."""
+
+    elevations: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
+    """Lowest and highest angle of the line of sight above the horizon [degrees]."""
+
+    body: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
+    """So far below the camera nothing may be in the way of what carries it [m]."""
+
+    speed: Annotated[float | None, tyro.conf.arg(metavar="SPEED")] = None
+    """Along the way [m/s]."""
+
+    turn_rate: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
+    """How fast the line of sight turns [degrees/s]."""
+
+    turn_per_meter: Annotated[float | None, tyro.conf.arg(metavar="ANGLE")] = None
+    """Largest turn for each meter between a view and the next [degrees/m]."""
+
     voxel_size: float = 0.05
     """Edge of a voxel of the map [m]."""
 

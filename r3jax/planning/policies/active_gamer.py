@@ -72,7 +72,7 @@ class ActiveGamer(GreedyPolicy):
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """The pool's candidates, noted where they stand in it; any nearby view if there is none."""
         num = self.config.num_candidates
-        pools, found = draw_candidates(situation.memory, situation.travel, num)
+        pools, found = draw_candidates(situation.memory, situation.travel, num, situation.limits)
         if found is None:
             return Drawn(free_views(situation, num, self.config.radius, key=key), pools)
         return Drawn(found.poses, pools, notes=found)

@@ -17,6 +17,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier
 from r3jax.planning.candidates import VIEW_DISTANCE, host_generator, in_plain_view, poses_along
 from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_lots, free_views
+from r3jax.planning.limits import Limits
 from r3jax.planning.travel import Travel
 
 _MAX_TARGETS = 300
@@ -29,6 +30,9 @@ _ATTEMPT_COSINE = 0.9
 _ATTEMPT_REACH = 3.0
 """Frontier cells within 26 degrees of the line of sight and 3 m count as looked at too: they lie
 inside the picture of any camera with 52 degrees or more."""
+
+
+_UNBOUND = Limits()
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class Frontier(GreedyPolicy):
         if not np.any(targets & ~np.asarray(attempted)):
             attempted = jnp.zeros_like(attempted)
         fresh = targets & ~np.asarray(attempted)
-        stops, aims = nearest_views(situation.travel, fresh, num, key=target_key)
+        stops, aims = nearest_views(situation.travel, fresh, num, situation.limits, key=target_key)
         if len(stops) == 0:
             anywhere = free_views(situation, num, self.config.radius, key=random_key)
             return Drawn(anywhere, situation.memory, notes=False)
@@ -93,8 +97,19 @@ def _is_looked_at(centers: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray
     return (along >= _ATTEMPT_COSINE * distance) & (distance <= _ATTEMPT_REACH)
 
 
+def _may_look(limits: Limits, place: np.ndarray, aim: np.ndarray) -> bool:
+    """Whether the allowed view from a place that comes nearest to a target counts as one of it."""
+    direction = (aim - place) / np.linalg.norm(aim - place)
+    return bool(limits.nearness(place[None], direction[None])[0] >= _ATTEMPT_COSINE)
+
+
 def nearest_views(
-    travel: Travel, targets: np.ndarray, num: int, *, key: Array
+    travel: Travel,
+    targets: np.ndarray,
+    num: int,
+    limits: Limits = _UNBOUND,
+    *,
+    key: Array,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Up to `num` places from which a target cell is in plain view, nearest by path first.
 
@@ -102,6 +117,7 @@ def nearest_views(
         travel: where the robot may stop, and how far that is.
         targets: free cells to look at, [X, Y, Z] bool.
         num: places wanted.
+        limits: of the carrier; the allowed view nearest to the target must still show it.
         key: draws the targets that are considered, if there are very many.
 
     Returns:
@@ -113,7 +129,7 @@ def nearest_views(
     if len(cells) > _MAX_TARGETS:
         cells = host_generator(key).choice(cells, size=_MAX_TARGETS, replace=False)
     closest, farthest = VIEW_DISTANCE
-    places, aims = travel.centers(stops), travel.centers(cells)
+    places, aims = travel.stops(stops), travel.centers(cells)
     count = min(64, len(stops))
     distance, index = KDTree(places).query(aims, k=count, distance_upper_bound=farthest)
     distance, index = distance.reshape(-1, count), index.reshape(-1, count)
@@ -128,7 +144,7 @@ def nearest_views(
         if not np.isfinite(cost[pair]) or len(found) == num:
             break
         place, aim = places[index[pair]], aims[aim_index[pair]]
-        if in_plain_view(travel, place, aim):
+        if _may_look(limits, place, aim) and in_plain_view(travel, place, aim):
             found.append((place, aim))
     if not found:
         return np.zeros((0, 3)), np.zeros((0, 3))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array
 
+from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
 from r3jax.scoring.batch import score_positions, score_views
 
@@ -59,7 +60,7 @@ class OursPano(GreedyPolicy):
     def score(
         self, situation: Situation, poses: np.ndarray, *, key: Array
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Every position's best direction, and what the panorama promises there."""
+        """Every position's best direction that is allowed, and what the panorama promises there."""
         del key
         positions = poses[:, :3, 3]
         panorama = self.score_all(
@@ -68,6 +69,9 @@ class OursPano(GreedyPolicy):
             situation.camera,
             positions.astype(np.float32),
             self.config.scoring,
+            situation.limits.allowed_axes(
+                positions, fibonacci_lattice(self.config.scoring.panorama_bins)
+            ),
         )
         turned = np.array(panorama.T_world_camera, dtype=np.float64)
         turned[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
