@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera, is_traced
 from r3jax.mapping.compact import positions_of_set
@@ -26,7 +26,7 @@ from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.panorama import Panorama, panorama_of
-from r3jax.scoring.sharding import padded_to, score_on_devices
+from r3jax.scoring.sharding import Candidates, padded_to, score_on_devices
 from r3jax.scoring.utility import ViewUtility, utility_of_view
 from r3jax.scoring.views import Coordinates
 from r3jax.scoring.voxels import Voxels, voxels_of
@@ -204,14 +204,14 @@ def _gather_near(
 
 def deal(
     score: "functools.partial[Scores]",
-    candidates: PyTree[Shaped[Array, "C ..."]],
+    candidates: Candidates,
     devices: Sequence[Any] | None = None,
 ) -> Scores:
     """Scores candidates in equal shares on all devices; a CPU alone: on all of its cores.
 
     Args:
         score: of any number of candidates; a jitted function with all but the last argument.
-        candidates: what to score: an array, or a tree of arrays with a row for each.
+        candidates: what to score.
         devices: of JAX, where to; by default all of this process.
     """
     num = jax.tree.leaves(candidates)[0].shape[0]

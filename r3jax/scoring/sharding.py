@@ -14,14 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, PyTree, Shaped
+from jaxtyping import Array
 
 _AXIS = "candidates"
 
 
-def padded_to(
-    multiple: int, candidates: PyTree[Shaped[Array, "C ..."]]
-) -> PyTree[Shaped[Array, "P ..."]]:
+Candidates = Any
+"""An array with a row for each candidate, [C, ...], or a tree of such arrays."""
+
+
+def padded_to(multiple: int, candidates: Candidates) -> Candidates:
     """Candidates, the last one repeated until their number is a multiple."""
 
     def pad(rows: Array) -> Array:
@@ -34,7 +36,7 @@ def padded_to(
 def score_on_devices(
     score: Callable[..., Any],
     known: tuple[Any, ...],
-    candidates: PyTree[Shaped[Array, "C ..."]],
+    candidates: Candidates,
     devices: Sequence[Any],
 ) -> Any:
     """`score(*known, candidates)` with the candidates spread over the devices.
@@ -47,7 +49,7 @@ def score_on_devices(
             compiles once; gives fields of shape [C, ...].
         known: the same for all candidates, copied to each device; what is no number or array,
             such as a function, stays as it is.
-        candidates: what to score: an array, or a tree of arrays with a row for each.
+        candidates: what to score.
         devices: of JAX, all of one kind.
 
     Returns:
@@ -67,7 +69,7 @@ def _score(
     score: Callable[..., Any],
     mesh: Mesh,
     known: tuple[Any, ...],
-    candidates: PyTree[Shaped[Array, "P ..."]],
+    candidates: Candidates,
 ) -> Any:
     arrays, others = eqx.partition(known, eqx.is_array)
 
