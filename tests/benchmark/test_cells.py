@@ -6,6 +6,7 @@ import pytest
 
 from r3jax.benchmark.cells import Cell, identity, paths_of, snapshots_left
 from r3jax.benchmark.conditions import Conditions
+from r3jax.planning.motion import MOTIONS, Motion
 from r3jax.planning.policy import policy_names
 from tests.benchmark.tiny import CONDITIONS, SETTINGS
 
@@ -152,6 +153,18 @@ def test_cells_from_before_the_edge_filter_could_be_left_out_keep_their_names():
     without = identity(dataclasses.replace(CELL, conditions=kept))
     assert without["exploration"] == identity(CELL)["exploration"] | {"drop_edges": False}
     assert without["conditions"] == identity(CELL)["conditions"]
+
+
+def test_a_motion_is_another_cell_and_a_camera_that_flies_is_not():
+    assert "motion" not in identity(CELL)["planner"]
+    ground = identity(dataclasses.replace(CELL, settings=SETTINGS | {"motion": "ground"}))
+    assert ground["planner"]["motion"]["elevations"] == [0.0, 0.0]
+    slow = MOTIONS["ground"].speed
+    record = {"speed": slow, "heights": [0.0, 0.0]}
+    policy = CONDITIONS.policy("random", {"motion": record})
+    assert policy.config.motion == Motion(speed=slow, heights=(0.0, 0.0))
+    with pytest.raises(ValueError, match="unknown motion 'boat'"):
+        CONDITIONS.policy("random", {"motion": "boat"})
 
 
 def test_without_snapshots_the_budget_is_one():

@@ -138,12 +138,12 @@ def test_a_panorama_serves_every_motion_without_compiling_again(world):
 
 
 def test_the_panorama_takes_the_best_of_the_directions_that_are_allowed(world):
-    positions = np.stack([center(4, 5, 5), center(5, 8, 5)]).astype(np.float32)
+    positions = np.stack([center(4, 3 + 0.5 * k, 5) for k in range(NUM)]).astype(np.float32)
     free = batch.score_positions(*world, CAMERA, positions, SCORING)
     scores = np.asarray(free.direction_scores)
     best = scores.argmax(axis=1)
     allowed = np.random.default_rng(0).random(scores.shape) < 0.2
-    allowed[[0, 1], best] = False
+    allowed[np.arange(NUM), best] = False
     some = batch.score_positions(*world, CAMERA, positions, SCORING, allowed)
     np.testing.assert_array_equal(some.direction_scores, scores)
     rivals = np.where(allowed, scores, -np.inf)
@@ -157,7 +157,7 @@ def test_a_robot_that_fits_nowhere_says_so(world):
     """A body as deep as the flat is high: there is floor in it everywhere but where it stands."""
     motion = replace(MOTIONS["ground"], body=3.0)
     policy = make_policy("random", num_candidates=NUM, num_frontier=4, motion=motion)
-    start = pose_at(center(5, 5, 5))
+    start = pose_at(center(5, 5, 5).astype(np.float32).astype(np.float64))
     state = policy.init(CAMERA, world[1], key=jax.random.key(0))
     decision, _, _ = policy.decide(state, *world, start, key=jax.random.key(1))
     np.testing.assert_array_equal(decision.candidates[:, :3, 3], np.tile(start[:3, 3], (NUM, 1)))

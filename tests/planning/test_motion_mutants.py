@@ -1,0 +1,213 @@
+"""What the planner does for a motion in one place each, and the faults that must be noticed."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.mapping.state import empty_map
+from r3jax.planning import decision, greedy, pool
+from r3jax.planning.candidates import poses_along
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.limits import Limits
+from r3jax.planning.motion import MOTIONS, Motion
+from r3jax.planning.policies import frontier, random, renderability
+from r3jax.planning.travel import plan_travel
+from tests.mutants import Modules, Mutant, assert_caught, each
+from tests.planning.rooms import CELL, center, grid_of, pose_at, two_rooms
+from tests.planning.test_motions_of_policies import CAMERA, CONSTRAINED, assert_obeys, turns
+
+CHAIN = (
+    "r3jax.planning.decision",
+    "r3jax.planning.greedy",
+    "r3jax.planning.pool",
+    "r3jax.planning.policies.renderability",
+    "r3jax.planning.policies.random",
+    "r3jax.planning.policies.frontier",
+)
+REAL: Modules = {
+    "decision": decision,
+    "greedy": greedy,
+    "pool": pool,
+    "renderability": renderability,
+    "random": random,
+    "frontier": frontier,
+}
+NUM = 12
+KEY = jax.random.key(2)
+LATTICE = fibonacci_lattice(526)
+GRID = grid_of(*two_rooms())
+
+
+def config_of(motion_name: str) -> PlannerConfig:
+    return PlannerConfig(num_candidates=NUM, num_frontier=4, motion=MOTIONS[motion_name])
+
+
+def level_start() -> np.ndarray:
+    """Off the middle of its cell, as float32 has it; it looks along x."""
+    pose = poses_along(center(5.1, 6.2, 6.1)[None], np.array([[1.0, 0.0, 0.0]]))[0]
+    return pose.astype(np.float32).astype(np.float64)
+
+
+def decide(policy):
+    state = policy.init(CAMERA, GRID, key=KEY)
+    return policy.decide(state, empty_map(64), GRID, level_start(), key=KEY)[0]
+
+
+def law_what_is_scored_is_what_is_taken(modules: Modules) -> None:
+    """The scorer sees the candidates as the carrier would take them."""
+    for name in CONSTRAINED:
+        seen = []
+
+        def score(map_state, grid, camera, poses, config, seen=seen):
+            seen.append(poses)
+            zeros = np.zeros(len(poses))
+            return SimpleNamespace(exploration=zeros, rendering=zeros, total=zeros + 1.0)
+
+        answer = decide(modules["renderability"].Ours(config_of(name), score))
+        np.testing.assert_allclose(seen[0], answer.candidates, atol=1e-6)
+        assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
+
+
+def law_a_policy_that_turns_is_held(modules: Modules) -> None:
+    """A panorama that answers with a direction off the limits is brought back within them."""
+    for name in CONSTRAINED:
+        allowed_axes = []
+
+        def score(map_state, grid, camera, positions, config, allowed, kept=allowed_axes):
+            kept.append(allowed)
+            axes = LATTICE[allowed.argmax(axis=1)]  # the highest that is allowed
+            poses = poses_along(positions.astype(np.float64), axes).astype(np.float32)
+            return SimpleNamespace(T_world_camera=poses, best_score=np.ones(NUM))
+
+        answer = decide(modules["renderability"].OursPano(config_of(name), score))
+        assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
+        limits = Limits(MOTIONS[name], level_start())
+        expected = limits.allowed_axes(answer.candidates[:, :3, 3], LATTICE)
+        np.testing.assert_array_equal(allowed_axes[0], expected)
+        assert not expected.all()
+
+
+def law_turns_cost(modules: Modules) -> None:
+    """Path and seconds of every candidate by hand: the way is a straight line here."""
+    config = config_of("gimbal")
+    answer = decide(modules["random"].Random(config))
+    poses, motion = answer.candidates, config.motion
+    straight = np.linalg.norm(poses[:, :3, 3] - level_start()[:3, 3], axis=1)
+    meters = motion.speed * turns(level_start(), poses) / motion.turn_rate
+    np.testing.assert_allclose(answer.utilities["path"], straight + meters, atol=0.002)
+    chosen = int(np.argmax(answer.utilities["total"]))
+    assert answer.seconds == pytest.approx((straight + meters)[chosen] / motion.speed, abs=0.002)
+    assert np.ptp(meters) > 0.5
+    free = decide(modules["random"].Random(PlannerConfig(num_candidates=NUM, num_frontier=4)))
+    assert free.seconds is None
+
+
+def law_heights_count_from_the_first_view(modules: Modules) -> None:
+    """Not from the latest one: a hand that has come up does not come up from there again."""
+    config, first = config_of("handheld"), level_start()
+    state = modules["decision"].initial_state(CAMERA, GRID, motion=config.motion)
+    higher = first.copy()
+    higher[2, 3] += 0.1
+    for pose in (first, higher):
+        args = state, empty_map(64), GRID, pose, config
+        state, travel, _ = modules["decision"].look_round(*args)
+        low, high = first[2, 3] - 0.6, first[2, 3] + 0.4
+        np.testing.assert_allclose(travel.heights, (low, high), atol=1e-6)
+    assert modules["decision"].initial_state(CAMERA, GRID).start_height is None
+    walker = modules["random"].Random(config).init(CAMERA, GRID, key=KEY)
+    assert walker.start_height is not None
+
+
+def law_frontier_shows_its_target(modules: Modules) -> None:
+    """A level camera never walks to a target that it would look over."""
+    free, _ = two_rooms()
+    start = level_start()
+    height = (float(start[2, 3]), float(start[2, 3]))
+    travel = plan_travel(GRID, start[:3, 3], heights=height)
+    targets = np.zeros_like(free)
+    targets[8, 3:10, 1:9] = True
+    limits = Limits(Motion(heights=(0.0, 0.0), elevations=(0.0, 0.0)), start, height)
+    places, aims = modules["frontier"].nearest_views(travel, targets, 200, limits, key=KEY)
+    assert len(places) > 10
+    shown = (aims - places) / np.linalg.norm(aims - places, axis=1, keepdims=True)
+    assert np.hypot(shown[:, 0], shown[:, 1]).min() >= 0.9
+    assert np.all(places[:, 2] == start[2, 3])
+    anything, _ = modules["frontier"].nearest_views(travel, targets, 200, key=KEY)
+    assert len(anything) > len(places)
+
+
+def law_pool_waits_for_turns(modules: Modules) -> None:
+    """A hand takes of the pool what it can turn to on the way: its azimuth is never changed."""
+    start, shape = level_start(), (25, 14, 10)
+    travel = plan_travel(GRID, start[:3, 3])
+    limits = Limits(MOTIONS["handheld"], start, travel.heights)
+    pools = modules["pool"].empty_pools(shape, CELL)
+    # Stage 1 needs stage 0 to be over.
+    _, every = modules["pool"].draw_candidates(pools, travel, 500)
+    _, some = modules["pool"].draw_candidates(pools, travel, 500, limits)
+    assert 0 < len(some.poses) < len(every.poses)
+    assert not _is_cut_short(limits, some.poses).any()
+    drawn = lambda draw: {tuple(pose) for pose in np.round(draw.poses.reshape(-1, 16), 5)}
+    left_out = np.array(sorted(drawn(every) - drawn(some))).reshape(-1, 4, 4)
+    assert len(left_out) == len(every.poses) - len(some.poses)
+    assert _is_cut_short(limits, left_out).all()
+
+
+def _is_cut_short(limits: Limits, poses: np.ndarray) -> np.ndarray:
+    """Which poses the carrier cannot turn to, once their elevations are allowed."""
+    tilted = Limits(Motion(elevations=limits.motion.elevations)).obeyed(poses)
+    gap = np.abs(limits.obeyed(poses)[:, :3, :3] - tilted[:, :3, :3])
+    return gap.max(axis=(1, 2)) > 1e-4
+
+
+def law_low_robots_have_candidates(modules: Modules) -> None:
+    """A robot below the levels of the lattice has its candidates at its own height."""
+    start = pose_at(center(5, 6, 2))
+    height = (float(start[2, 3]), float(start[2, 3]))
+    travel = plan_travel(GRID, start[:3, 3], heights=height)
+    _, found = modules["pool"].draw_candidates(
+        modules["pool"].empty_pools((25, 14, 10), CELL), travel, 500
+    )
+    assert found is not None
+    assert np.all(found.poses[:, 2, 3] == start[2, 3])
+
+
+LAWS = [
+    law_what_is_scored_is_what_is_taken,
+    law_a_policy_that_turns_is_held,
+    law_turns_cost,
+    law_heights_count_from_the_first_view,
+    law_frontier_shows_its_target,
+    law_pool_waits_for_turns,
+    law_low_robots_have_candidates,
+]
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
+def test_law(law):
+    law(REAL)
+
+
+MUTANTS = [
+    Mutant("greedy", "limits.obeyed(drawn.poses)", "drawn.poses", LAWS[0]),
+    Mutant("greedy", "            poses = limits.obeyed(poses)\n", "", LAWS[1]),
+    Mutant("greedy", "pose, travel.heights)", "pose)", LAWS[0]),
+    Mutant("greedy", "limits.path_costs(lengths, poses)", "lengths", law_turns_cost),
+    Mutant("greedy", "memory, self.config.motion)", "memory)", LAWS[3]),
+    Mutant("decision", "seconds=limits.seconds(length, poses[best])", "seconds=None", LAWS[2]),
+    Mutant("decision", "is None or not np.isnan(start)", "is None", LAWS[3]),
+    Mutant("decision", "trail, heights, motion.body)", "trail)", LAWS[3]),
+    Mutant("frontier", "_may_look(limits, place, aim) and ", "", law_frontier_shows_its_target),
+    Mutant("frontier", "travel.stops(stops)", "travel.centers(stops)", LAWS[4]),
+    Mutant("pool", "is_open &= limits.may_turn(", "_ = limits.may_turn(", law_pool_waits_for_turns),
+    Mutant("pool", "np.clip(level, lowest, highest)", "level", law_low_robots_have_candidates),
+    Mutant("pool", "travel.stops(cells[place])", "travel.centers(cells[place])", LAWS[6]),
+]
+
+
+@each(MUTANTS)
+def test_a_fault_is_noticed(mutant):
+    assert_caught(CHAIN, mutant)
