@@ -190,9 +190,9 @@ def draw_candidates(
         if k == num_ended and pool.is_spent:
             num_ended += 1
             continue
-        is_open = np.asarray(pool.entered & ~pool.left) & has_place[:, None]
         lattice = fibonacci_lattice(STAGES[k].num_directions)
-        is_open &= limits.may_turn(travel.stops(cells)[:, None, :], lattice)
+        can_turn = limits.may_turn(travel.stops(cells)[:, None, :], lattice)
+        is_open = np.asarray(pool.entered & ~pool.left) & has_place[:, None] & can_turn
         if is_open.any():
             found = _best_remembered(pool, is_open, travel, cells, k, num)
             break

@@ -202,7 +202,7 @@ MUTANTS = [
     Mutant("decision", "trail, heights, motion.body)", "trail)", LAWS[3]),
     Mutant("frontier", "_may_look(limits, place, aim) and ", "", law_frontier_shows_its_target),
     Mutant("frontier", "travel.stops(stops)", "travel.centers(stops)", LAWS[4]),
-    Mutant("pool", "is_open &= limits.may_turn(", "_ = limits.may_turn(", law_pool_waits_for_turns),
+    Mutant("pool", "has_place[:, None] & can_turn", "has_place[:, None]", law_pool_waits_for_turns),
     Mutant("pool", "np.clip(level, lowest, highest)", "level", law_low_robots_have_candidates),
     Mutant("pool", "travel.stops(cells[place])", "travel.centers(cells[place])", LAWS[6]),
 ]
