@@ -28,7 +28,8 @@ def padded_to(multiple: int, candidates: Candidates) -> Candidates:
 
     def pad(rows: Array) -> Array:
         missing = -rows.shape[0] % multiple
-        return jnp.concatenate([rows, jnp.broadcast_to(rows[-1:], (missing, *rows.shape[1:]))])
+        last = jnp.broadcast_to(rows[-1:], (missing, *rows.shape[1:]))
+        return jnp.concatenate([rows, last])
 
     return jax.tree.map(pad, candidates)
 

@@ -111,7 +111,7 @@ MUTANTS = [
     Mutant("batch", "x[:num], jax", "x, jax", law_each_device_scores_its_share_only),
     Mutant("batch", "devices is None else devices)[:num]", "devices is None else devices)[:2]",
            law_each_device_scores_its_share_only),
-    Mutant("sharding", "jnp.concatenate([candidates, last])", "jnp.concatenate([last, candidates])",
+    Mutant("sharding", "jnp.concatenate([rows, last])", "jnp.concatenate([last, rows])",
            law_each_device_scores_its_share_only),
     Mutant("sharding", "(PartitionSpec(), split), out_specs=split",
            "(PartitionSpec(), PartitionSpec()), out_specs=PartitionSpec()",
