@@ -57,7 +57,7 @@ class PlannerConfig:
     """Places that `ours-ahead` tries for the next view of each path."""
 
     view_seconds: float = 1.0
-    """What `ours-ahead` counts for a view, beside the way to it at 1 m/s [s]."""
+    """What `ours-ahead` counts for a view, beside the way to it [s]."""
 
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""

@@ -3,7 +3,10 @@
 A path is worth what its views add (`scoring.foresight`) over what it costs, in seconds:
 
     rate = sum of the utility of each view after those before it
-           / sum over its views of (seconds of a view + length of the way / 1 m/s)
+           / sum over its views of (seconds of a view + of the way and the turn)
+
+The carrier's motion says how long ways and turns take and which views there are; a camera that
+flies goes 1 m/s and turns in no time.
 
 The beam holds the paths of the greatest rate. From each, some places are tried whose panorama was
 worth most when nothing else had been seen, which bounds what it can be worth now, and the last
@@ -14,15 +17,17 @@ Shape symbols: C places.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import shortest_path
 
-from r3jax.geometry.cameras import Camera
+from r3jax.geometry.cameras import Camera, angle_between
+from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.config import PlannerConfig
+from r3jax.planning.limits import Limits
 from r3jax.planning.travel import Travel, segment_is_inside
 from r3jax.scoring.batch import score_positions_near
 from r3jax.scoring.cells import Cells
@@ -34,6 +39,9 @@ _NEIGHBORS = 8
 
 _APART = 0.7
 """Views from places this far apart are two choices [m]."""
+
+_SPEED = 1.0
+"""Of a carrier whose motion does not say [m/s]."""
 
 _TURNED = 0.5
 """Cosine between the axes of two views from one place, below which they are two choices."""
@@ -86,6 +94,14 @@ class Outlook:
     camera: Camera
     config: PlannerConfig
 
+    limits: Limits = field(default_factory=Limits)
+    """Of the carrier, where it is."""
+
+    @property
+    def speed(self) -> float:
+        """Of the carrier [m/s]."""
+        return self.limits.motion.speed or _SPEED
+
 
 def search(outlook: Outlook, voxels: Voxels, cells: Cells) -> list[Path]:
     """The paths of the greatest rate, best first; none if no place can be reached.
@@ -96,7 +112,8 @@ def search(outlook: Outlook, voxels: Voxels, cells: Cells) -> list[Path]:
         cells: unexplored space, the same.
     """
     config = outlook.config
-    cost = config.view_seconds + outlook.lengths
+    ways = outlook.limits.path_costs(outlook.lengths, outlook.poses)
+    cost = config.view_seconds + ways / outlook.speed
     reachable = np.flatnonzero(np.isfinite(cost))
     rate = outlook.utility[reachable] / np.maximum(cost[reachable], 1e-9)
     ranked = reachable[np.argsort(-rate, kind="stable")]
@@ -118,7 +135,7 @@ def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
     """
     num = len(positions)
     gap = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    scaled = (positions - travel.origin) / travel.cell_size
+    scaled = travel.scaled(positions)
     direct = np.zeros((num, num))
     nearest = np.argsort(gap, axis=1, kind="stable")[:, 1 : _NEIGHBORS + 1]
     for i in range(num):
@@ -135,7 +152,8 @@ def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
 def _expanded(path: Path, outlook: Outlook) -> list[Path]:
     """The path with one more view, once for each place that is tried."""
     config, last = outlook.config, path.places[-1]
-    cost = config.view_seconds + outlook.between[last]
+    limits = replace(outlook.limits, T_world_camera=path.poses[-1])
+    cost = config.view_seconds + outlook.between[last] / outlook.speed
     bound = (sum(path.gains) + outlook.utility) / np.maximum(path.seconds + cost, 1e-9)
     bound[~np.isfinite(outlook.lengths) | ~np.isfinite(cost)] = -np.inf
     ranked = [int(i) for i in np.argsort(-bound, kind="stable") if bound[i] > -np.inf]
@@ -143,17 +161,21 @@ def _expanded(path: Path, outlook: Outlook) -> list[Path]:
     padded = [tried[i % len(tried)] for i in range(config.branching)]  # compiles once
     T = jnp.asarray(path.poses[-1], dtype=jnp.float32)
     voxels, cells = foresee_near(path.voxels, path.cells, outlook.camera, T, config.scoring)
-    places = jnp.asarray(outlook.poses[padded, :3, 3], dtype=jnp.float32)
-    scores = score_positions_near(voxels, cells, outlook.camera, places, config.scoring)
+    positions = outlook.poses[padded, :3, 3]
+    places = jnp.asarray(positions, dtype=jnp.float32)
+    allowed = limits.allowed_axes(positions, fibonacci_lattice(config.scoring.panorama_bins))
+    scores = score_positions_near(voxels, cells, outlook.camera, places, config.scoring, allowed)
     poses = np.array(scores.T_world_camera, dtype=np.float64)
-    poses[:, :3, 3] = outlook.poses[padded, :3, 3]
+    poses[:, :3, 3] = positions
+    poses = limits.obeyed(poses)
+    turning = [limits.motion.turning(angle_between(path.poses[-1], pose)) for pose in poses]
     gains = np.asarray(scores.best_score, dtype=np.float64)
     return [
         Path(
             places=(*path.places, i),
             poses=(*path.poses, poses[k]),
             gains=(*path.gains, float(gains[k])),
-            seconds=path.seconds + float(cost[i]),
+            seconds=path.seconds + float(cost[i]) + turning[k],
             voxels=voxels,
             cells=cells,
         )

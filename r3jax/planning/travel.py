@@ -172,15 +172,15 @@ class Travel:
         return segment_is_inside(self.usable, *self._in_cells(a, b))
 
     def _in_cells(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._scaled(a), self._scaled(b)
+        return self.scaled(a), self.scaled(b)
 
-    def _scaled(self, position: np.ndarray) -> np.ndarray:
-        """A position in cells, kept off the borders of the layers that are allowed."""
-        scaled = (position - self.origin) / self.cell_size
+    def scaled(self, positions: np.ndarray) -> np.ndarray:
+        """Positions [..., 3] in cells, kept off the borders of the layers that are allowed."""
+        scaled = (positions - self.origin) / self.cell_size
         if self.heights != UNLIMITED:
             num = self.usable.shape[2]
             first, last = layers_between(self.heights, self.origin[2], self.cell_size, num)
-            scaled[2] = np.clip(scaled[2], first + _INSET, last + 1.0 - _INSET)
+            scaled[..., 2] = np.clip(scaled[..., 2], first + _INSET, last + 1.0 - _INSET)
         return scaled
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import poses_along, spread
 from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_positions
 from r3jax.planning.lookahead import Outlook, lengths_between, search
@@ -37,10 +38,10 @@ class OursAhead(GreedyPolicy):
             self.config, num_candidates=num_own, num_frontier=min(self.config.num_frontier, num_own)
         )
         positions, _ = draw_positions(travel, situation.scoring_grid, own, key=key)
-        centers = travel.centers(np.argwhere(travel.goals))
-        if len(positions) == 0 or len(centers) == 0:
+        stops = travel.stops(np.argwhere(travel.goals))
+        if len(positions) == 0 or len(stops) == 0:
             return Drawn(np.zeros((0, 4, 4)), situation.memory)
-        wide = centers[spread(centers, num_spread)] if num_spread else centers[:0]
+        wide = stops[spread(stops, num_spread)] if num_spread else stops[:0]
         positions = np.concatenate([positions, wide])
         positions = positions[np.arange(num) % len(positions)]  # few places: repeat, one shape
         return Drawn(poses_along(positions, np.tile([1.0, 0.0, 0.0], (num, 1))), situation.memory)
@@ -57,17 +58,19 @@ class OursAhead(GreedyPolicy):
         positions = poses[:, :3, 3]
         places = jnp.asarray(positions, dtype=jnp.float32)
         voxels, cells, _ = near(situation.map_state, situation.scoring_grid, places, scoring)
-        panorama = score_positions_near(voxels, cells, situation.camera, places, scoring)
+        allowed = situation.limits.allowed_axes(positions, fibonacci_lattice(scoring.panorama_bins))
+        panorama = score_positions_near(voxels, cells, situation.camera, places, scoring, allowed)
         turned = np.array(panorama.T_world_camera, dtype=np.float64)
         turned[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
         utility = np.asarray(panorama.best_score, dtype=np.float64)
         outlook = Outlook(
-            turned,
+            situation.limits.obeyed(turned),
             utility,
             travel.lengths(positions),
             lengths_between(travel, positions),
             situation.camera,
             self.config,
+            situation.limits,
         )
         rate = np.full(len(positions), -np.inf)
         for path in search(outlook, voxels, cells):
