@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from r3jax.planning import lookahead as real
+from r3jax.planning.candidates import poses_along
 from r3jax.planning.config import PlannerConfig
+from r3jax.planning.limits import Limits
+from r3jax.planning.motion import Motion
 from r3jax.planning.travel import plan_travel
 from r3jax.scoring.batch import near, score_positions
 from r3jax.scoring.panorama import panorama
@@ -101,6 +105,30 @@ def test_a_horizon_of_one_is_the_next_best_view():
     law_one_view({"lookahead": real})
 
 
+def law_motion(modules: Modules) -> None:
+    """A slow level camera: the seconds of every path by hand, and no view that it cannot take."""
+    motion = Motion(elevations=(0.0, 0.0), speed=0.2, turn_rate=45.0)
+    start = poses_along(PLACES[:1], np.array([[0.0, 1.0, 0.0]]))[0]
+    limits = Limits(motion, start)
+    flying = outlook_of(dataclasses.replace(WIDE, horizon=2), view_seconds=0.3)
+    outlook = dataclasses.replace(flying, poses=limits.obeyed(flying.poses), limits=limits)
+    found = modules["lookahead"].search(outlook, *at_hand())
+    assert len(found) > 10
+    for path in found:
+        seconds, here, place = 0.0, start, None
+        for number, pose in zip(path.places, path.poses, strict=True):
+            way = flying.lengths[number] if place is None else flying.between[place, number]
+            turn = Rotation.from_matrix(here[:3, :3].T @ pose[:3, :3]).magnitude()
+            seconds += 0.3 + way / 0.2 + np.degrees(turn) / 45.0
+            assert abs(pose[2, 2]) < 1e-6
+            here, place = pose, number
+        assert path.seconds == pytest.approx(seconds, abs=0.01)
+
+
+def test_a_carrier_takes_its_time():
+    law_motion({"lookahead": real})
+
+
 def law_apart(modules: Modules) -> None:
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[1, 0, 3] = 0.1  # as good as the first
@@ -154,13 +182,16 @@ def test_ways_between_rooms_lead_through_the_door():
 CHAIN = ("r3jax.scoring.foresight", "r3jax.planning.lookahead")
 _TAKEN = "T = jnp.asarray(path.poses[-1]"
 _SECONDS = "seconds=path.seconds + float(cost[i])"
-_FIRST = "cost = config.view_seconds + outlook.lengths"
+_FIRST = "cost = config.view_seconds + ways"
 MUTANTS = [
     Mutant("lookahead", _TAKEN, "T = jnp.asarray(path.poses[0]", law_paths),
     Mutant("lookahead", "outlook.between[last]", "outlook.lengths", law_paths),
     Mutant("lookahead", _SECONDS, "seconds=float(cost[i])", law_paths),
     Mutant("lookahead", "return sum(self.gains) /", "return self.gains[-1] /", law_paths),
-    Mutant("lookahead", _FIRST, "cost = outlook.lengths", law_one_view),
+    Mutant("lookahead", _FIRST, "cost = ways", law_one_view),
+    Mutant("lookahead", " + turning[k]", "", law_motion),
+    Mutant("lookahead", "poses = limits.obeyed(poses)", "pass", law_motion),
+    Mutant("lookahead", "ways / outlook.speed", "ways", law_motion),
     Mutant("lookahead", "< _TURNED", "> _TURNED", law_apart),
     Mutant("lookahead", "others = list(taken)", "others = []", law_apart),
 ]
@@ -168,7 +199,7 @@ MUTANTS = [
 
 def test_laws_hold_without_a_fault():
     modules = load(CHAIN)
-    for law in (law_paths, law_one_view, law_apart):
+    for law in (law_paths, law_one_view, law_motion, law_apart):
         law(modules)
 
 
