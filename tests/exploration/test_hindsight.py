@@ -81,8 +81,8 @@ def test_reasons_are_the_utilities_of_the_trace(run, states):
 
 
 MUTANTS = [
-    Mutant("hindsight", "memory = memory or initial_state(run.camera, grid)",
-           "memory = initial_state(run.camera, grid)", law_of_the_trace),
+    Mutant("hindsight", "memory = memory or initial_state(",
+           "memory = initial_state(", law_of_the_trace),
     Mutant("decision", "explain_view(map_state, scoring_grid,", "explain_view(map_state, grid,",
            law_of_the_trace),
     Mutant("hindsight", "map_state, grid, pose, choice.pose", "map_state, grid, pose, pose",

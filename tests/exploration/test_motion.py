@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from r3jax.cli.main import main
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.hindsight import explain_run
 from r3jax.exploration.loop import explore
 from r3jax.exploration.state import StopReason
 from r3jax.geometry.cameras import pose_along
@@ -89,6 +90,12 @@ def test_a_ground_robot_stays_level_at_its_height(ground_run):
         assert row.charged["flight"] == pytest.approx(seconds, abs=0.01)
     assert rows[-1].metres > 0.5
     assert rows[-1].radians > 1.0
+
+
+def test_its_views_can_be_explained_in_hindsight(ground_run):
+    reasons = list(explain_run(read_run(ground_run)))
+    assert reasons[0] is None
+    assert all(reason.totals.sum() > 0.0 for reason in reasons[1:])
 
 
 def test_resume_and_fork_keep_the_motion(ground_run):
