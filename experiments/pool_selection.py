@@ -7,9 +7,9 @@ cost. A policy scores the whole pool, the best pose is taken, its frame joins th
 Vanilla 3DGS is then trained from scratch on each choice and judged on the scene's test views.
 
 The pool comes from the ground truth, the same for all; pictures come only from poses that were
-chosen. What is left out has no score of a pose: `frontier`, and `ours-pano` and `ours-ahead`, which
-turn poses and so would have another pool. `active-gamer` is its gain, the empty pixels, without its
-lattice.
+chosen. What is left out has no score of a pose: `frontier`, and `ours-pano`, `ours-demand` and
+`ours-ahead`, which turn poses and so would have another pool. `active-gamer` is its gain, the empty
+pixels, without its lattice.
 """
 
 import dataclasses

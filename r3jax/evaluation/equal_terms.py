@@ -15,7 +15,8 @@ Cell = Mapping[str, Any]
 
 POLICIES = (
     "random", "uniform", "frontier", "unseen", "unseen-depth", "cover", "active-gamer",
-    "active-gs-no-depth", "active-gs", "ours", "ours-pano", "ours-ahead",
+    "active-gs-no-depth", "active-gs", "ours", "ours-pano", "ours-demand",
+    "ours-ahead",
 )  # fmt: skip
 """Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""
 

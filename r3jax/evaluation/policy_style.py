@@ -43,6 +43,7 @@ class Look:
 
 _POLICIES = {
     "ours-pano": ("#D55E00", "o", "-"),
+    "ours-demand": ("#D55E00", "H", "--"),
     "ours": ("#E69F00", "s", "-"),
     "ours-ahead": ("#8f2d00", ">", "-"),
     "active-gs": ("#0072B2", "^", "-"),

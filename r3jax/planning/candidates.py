@@ -6,16 +6,22 @@ most a quarter of a cell from its centre.
 Shape symbols: X Y Z cells along the axes; n candidates; c places to choose from; p places chosen.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from scipy.spatial import KDTree
 
 from r3jax.geometry.cameras import pose_along
 from r3jax.planning.travel import Travel, segment_is_inside
 
 _JITTER = 0.25
 """Positions lie at most this far from their cell's centre, along each axis [cells]."""
+
+_MOST_PLACES = 4096
+"""Standpoints are chosen from so many cells at most: a house has ten times as many."""
 
 _NEIGHBORS = 256
 """A region of interest is looked at from one of this many nearest cells."""
@@ -137,6 +143,32 @@ def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.7
     return travel.stops(cells[travel.goals[tuple(cells.T)]])
 
 
+def standpoints(
+    travel: Travel, num: int, candidates: np.ndarray, reach: float, *, key: Array
+) -> np.ndarray:
+    """`num` positions where the robot may stop, spread out: from where surfaces will be looked at.
+
+    Args:
+        travel: where the robot may stop.
+        num: positions wanted.
+        candidates: places that matter, [n, 3] [m], n >= 1.
+        reach: positions lie at most this far from the nearest of them, as far as a cell goes [m].
+        key: source of randomness.
+
+    Returns:
+        [num, 3] float64 [m]; with fewer cells they repeat. The candidates, repeated, if there is
+        no such cell.
+    """
+    rng = host_generator(key)
+    cells = travel.stops(rng.permutation(np.argwhere(travel.goals)))
+    if len(cells):
+        distance, _ = KDTree(candidates).query(cells)
+        cells = cells[np.asarray(distance) <= reach][:_MOST_PLACES]
+    places = candidates if len(cells) == 0 else cells[spread(cells, num)]
+    places = places[np.arange(num) % len(places)]
+    return places if len(cells) == 0 else _jitter(places, travel.cell_size, rng)
+
+
 def spread(places: np.ndarray, num: int) -> np.ndarray:
     """Indices of up to `num` places, each the farthest from those before (Gonzalez 1985).
 
@@ -183,6 +215,21 @@ def poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
     exact = np.array(poses, dtype=np.float64)
     exact[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
     return exact
+
+
+def best_views(positions: np.ndarray, panorama: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The views that look along the best directions of panoramas, and their scores.
+
+    Args:
+        positions: [n, 3] [m].
+        panorama: their `scoring.panorama.Panorama`, fields of shape [n, ...].
+
+    Returns:
+        Poses [n, 4, 4] and scores [n], float64.
+    """
+    poses = np.array(panorama.T_world_camera, dtype=np.float64)
+    poses[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
+    return poses, np.asarray(panorama.best_score, dtype=np.float64)
 
 
 def _jitter(centers: np.ndarray, cell_size: float, rng: np.random.Generator) -> np.ndarray:

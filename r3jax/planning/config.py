@@ -9,6 +9,9 @@ from r3jax.scoring.config import ScoringConfig
 MAX_CANDIDATES = 1_000_000
 """More are no longer a choice within seconds, and their scores no longer fit into memory."""
 
+MAX_STANDPOINTS = 256
+"""A row of answers for every voxel, and a piece of compiled code, is kept for each."""
+
 
 @dataclass(frozen=True)
 class PlannerConfig:
@@ -34,6 +37,10 @@ class PlannerConfig:
 
     lambda2: float = 0.5
     """Weight of a candidate's share of the path lengths against its share of the utility."""
+
+    num_standpoints: int = 16
+    """Places in reachable free space from which `ours-demand` has surfaces looked at. Each takes
+    two thirds of a candidate's time, and some of every candidate's."""
 
     safety_margin: float = 0.3
     """A path keeps its cells' centres this far from anything not known to be free [m]."""
@@ -69,6 +76,11 @@ class PlannerConfig:
             raise ValueError(
                 f"num_frontier must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.num_frontier}"
+            )
+        if not 1 <= self.num_standpoints <= MAX_STANDPOINTS:
+            raise ValueError(
+                f"num_standpoints must lie between 1 and {MAX_STANDPOINTS}, "
+                f"got {self.num_standpoints}"
             )
         for name, least in (("horizon", 1), ("num_spread", 0), ("beam", 1), ("branching", 1)):
             if getattr(self, name) < least:

@@ -26,6 +26,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.planning.candidates import best_views
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.limits import Limits
 from r3jax.planning.travel import Travel, segment_is_inside
@@ -164,12 +165,10 @@ def _expanded(path: Path, outlook: Outlook) -> list[Path]:
     positions = outlook.poses[padded, :3, 3]
     places = jnp.asarray(positions, dtype=jnp.float32)
     allowed = limits.allowed_axes(positions, fibonacci_lattice(config.scoring.panorama_bins))
-    scores = score_positions_near(voxels, cells, outlook.camera, places, config.scoring, allowed)
-    poses = np.array(scores.T_world_camera, dtype=np.float64)
-    poses[:, :3, 3] = positions
+    panorama = score_positions_near(voxels, cells, outlook.camera, places, config.scoring, allowed)
+    poses, gains = best_views(positions, panorama)
     poses = limits.obeyed(poses)
     turning = [limits.motion.turning(angle_between(path.poses[-1], pose)) for pose in poses]
-    gains = np.asarray(scores.best_score, dtype=np.float64)
     return [
         Path(
             places=(*path.places, i),

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.candidates import spread
+from r3jax.planning.candidates import best_views, spread
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.travel import safe_cells
@@ -131,10 +131,8 @@ def _score_as_given(poses: np.ndarray, camera: Camera, config: PlannerConfig) ->
 def _score_turned(positions: np.ndarray, camera: Camera, config: PlannerConfig) -> Ask:
     def ask(voxels: Voxels, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         places = jnp.asarray(positions[ids], dtype=jnp.float32)
-        scores = score_positions_near(voxels, cells, camera, places, config.scoring)
-        poses = np.array(scores.T_world_camera, dtype=np.float64)
-        poses[:, :3, 3] = positions[ids]
-        return poses, np.asarray(scores.best_score, dtype=np.float64)
+        panorama = score_positions_near(voxels, cells, camera, places, config.scoring)
+        return best_views(positions[ids], panorama)
 
     return ask
 

@@ -119,6 +119,7 @@ def _registry() -> dict[str, Any]:
     from r3jax.planning.policies.active_gs import ActiveGS, ActiveGSNoDepth
     from r3jax.planning.policies.ahead import OursAhead
     from r3jax.planning.policies.cover import Cover
+    from r3jax.planning.policies.demand import OursDemand
     from r3jax.planning.policies.frontier import Frontier
     from r3jax.planning.policies.random import Random
     from r3jax.planning.policies.renderability import Ours, OursPano
@@ -128,6 +129,7 @@ def _registry() -> dict[str, Any]:
     known = (
         Ours,
         OursPano,
+        OursDemand,
         OursAhead,
         ActiveGS,
         ActiveGSNoDepth,

@@ -4,7 +4,7 @@ Candidates of a step lie close together, so what none of them can see is left ou
 XLA runs the loops of one score on one core; on a CPU the candidates are therefore dealt out to as
 many threads as the process may use. Where there are several devices, they share the candidates.
 
-Shape symbols: C candidates; n voxels; c cells; B bins of the panorama.
+Shape symbols: C candidates; S standpoints; n voxels; c cells; B bins of the panorama.
 """
 
 import functools
@@ -25,6 +25,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.demand import Demand, asked_from, joined
 from r3jax.scoring.panorama import Panorama, panorama_of
 from r3jax.scoring.sharding import Candidates, padded_to, score_on_devices
 from r3jax.scoring.utility import ViewUtility, utility_of_view
@@ -58,21 +59,25 @@ def score_positions(
     positions: Float[Array | np.ndarray, "C 3"],
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
+    standpoints: Float[Array | np.ndarray, "S 3"] | None = None,
 ) -> Panorama:
     """`panorama` of every position; fields of shape [C, ...]. Not to be called under jit.
 
     Args:
         state: the map.
-        grid: the coarse grid.
+        grid: whose unexplored cells count.
         camera: whose field of view and focal length count.
         positions: camera centers [m].
         config: settings.
         allowed: per position the axes that its best direction is taken from, at least one of
             the B of the panorama; None: all.
+        standpoints: if given, voxels count by what seeing them would add for whoever looks from
+            there [m] (`scoring.demand`), not by what they lack.
     """
     positions = jnp.asarray(positions, dtype=jnp.float32)
     voxels, cells, _ = near(state, grid, positions, config)
-    return score_positions_near(voxels, cells, camera, positions, config, allowed)
+    demand = None if standpoints is None else demand_from(voxels, camera, standpoints, config)
+    return score_positions_near(voxels, cells, camera, positions, config, allowed, demand)
 
 
 def score_views_near(
@@ -93,12 +98,25 @@ def score_positions_near(
     positions: Float[Array, "C 3"],
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
+    demand: Demand | None = None,
 ) -> Panorama:
     """`score_positions` of voxels and cells that `near` gathered."""
     if allowed is None:
         allowed = np.ones((positions.shape[0], config.panorama_bins), dtype=bool)
-    score = functools.partial(_score_positions, voxels, cells, camera, config)
+    score = functools.partial(_score_positions, voxels, cells, camera, config, demand)
     return deal(score, (positions, jnp.asarray(allowed)))
+
+
+def demand_from(
+    voxels: Voxels,
+    camera: Camera,
+    standpoints: Float[Array | np.ndarray, "S 3"],
+    config: ScoringConfig,
+) -> Demand:
+    """`demand_of` with the standpoints [m] dealt out. Not to be called under jit."""
+    places = jnp.asarray(standpoints, dtype=jnp.float32)
+    cover, size = deal(functools.partial(_ask, voxels, camera.focal, config), places)
+    return _joined(places, cover, size, camera.focal)
 
 
 @jax.jit
@@ -119,12 +137,26 @@ def _score_positions(
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
+    demand: Demand | None,
     places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
 ) -> Panorama:
     def score(place: tuple[Float[Array, " 3"], Bool[Array, " B"]]) -> Panorama:
-        return panorama_of(voxels, cells, camera, place[0], config, place[1])
+        return panorama_of(voxels, cells, camera, place[0], config, place[1], demand)
 
     return jax.lax.map(score, places)
+
+
+@jax.jit
+def _ask(
+    voxels: Voxels,
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    standpoints: Float[Array, "S 3"],
+) -> tuple[Float[Array, "S n"], Float[Array, " S"]]:
+    return jax.lax.map(functools.partial(asked_from, voxels, focal, config), standpoints)
+
+
+_joined = jax.jit(joined)
 
 
 def near(

@@ -70,6 +70,25 @@ def _seen_directions_jvp(
     return (cosine, inside), (jnp.where(is_free, moved, 0.0), jnp.zeros_like(inside))
 
 
+def nearest_seen(
+    visited: UInt32[Array, "W ..."], direction: Float[Array, "3 ..."], num_bins: int
+) -> Float[Array, "..."]:
+    """The cosine alone: max_k <q_k, r> over the visited bins, in [-1, 1]; -1 where there is none.
+
+    Args:
+        visited: as in `seen_directions`.
+        direction: unit vectors from the voxels to the camera.
+        num_bins: number of bins B.
+    """
+    x, y, z = direction
+    best = jnp.full_like(x, -1.0)
+    for k, (q_x, q_y, q_z) in enumerate(fibonacci_lattice(num_bins).astype("float32").tolist()):
+        is_visited = (visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
+        cosine = q_x * x + q_y * y + q_z * z
+        best = jnp.maximum(best, jnp.where(is_visited, cosine, -1.0))
+    return best
+
+
 def _scan(
     visited: UInt32[Array, "W n"],
     direction: Float[Array, "3 n"],

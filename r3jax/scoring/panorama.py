@@ -14,6 +14,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.demand import Demand, gain_by_direction
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.views import panorama_view
 from r3jax.scoring.visibility import seen_in
@@ -24,8 +25,8 @@ class Panorama(eqx.Module):
     """Scores of all directions from one position."""
 
     bin_scores: Float[Array, " B"]
-    """Per bin: the sum of lambda1 over its visible unexplored cells and of (1 - R) over its
-    visible voxels."""
+    """Per bin: the sum of lambda1 over its visible unexplored cells and of (1 - R), or of the
+    gain for a demand, over its visible voxels."""
 
     direction_scores: Float[Array, " B"]
     """Per camera axis q_k: the sum of the bins inside the camera's field of view."""
@@ -34,7 +35,7 @@ class Panorama(eqx.Module):
     """Of the axes that are allowed, the one with the largest score; unit length."""
 
     best_score: Float[Array, ""]
-    """Its score: lambda1 U_G + U_R of that view, to the resolution of the bins."""
+    """Its score: lambda1 U_G + U_R (or the gain) of that view, to the resolution of the bins."""
 
     T_world_camera: Float[Array, "4 4"]
     """The roll-free pose at the position that looks along the best direction."""
@@ -70,6 +71,7 @@ def panorama_of(
     position: Float[Array, " 3"],
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
+    demand: Demand | None = None,
 ) -> Panorama:
     """`panorama` of voxels and cells that are already at hand.
 
@@ -80,11 +82,16 @@ def panorama_of(
         position: camera center [m].
         config: settings.
         allowed: axes q_k that the best direction is taken from, at least one; None: all.
+        demand: for these voxels; if given, a voxel counts by what seeing it would add
+            (`scoring.demand`), not by what it lacks.
     """
-    num_bins = config.panorama_bins
+    num_bins, focal = config.panorama_bins, camera.focal
     view = panorama_view(position, config)
     buffer, visible = seen_in(voxels, view, config)
-    bins = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, num_bins)
+    if demand is None:
+        bins = lack_by_direction(voxels, visible, position, focal, config.kappa, num_bins)
+    else:
+        bins = gain_by_direction(voxels, visible, demand, position, focal, num_bins)
     unexplored = unexplored_by_direction(cells, view, buffer, view.position, num_bins)
     bins = bins + config.lambda1 * unexplored
     directions = bins_in_view(camera, num_bins) @ bins

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 import r3jax
 from r3jax.planning.policy import make_policy
@@ -59,9 +60,10 @@ def test_100_panoramas(benchmark, explored, scoring):
     assert benchmark(score).best_score.shape == (100,)
 
 
-def test_planning_step(benchmark, explored):
+@pytest.mark.parametrize("name", ["ours-pano", "ours-demand"])
+def test_planning_step(benchmark, explored, name):
     """Target: 400 ms for a whole decision of `ours-pano` among 100 candidates."""
-    policy = make_policy("ours-pano")
+    policy = make_policy(name)
     state = policy.init(explored.camera, explored.grid, key=jax.random.key(0))
     for frame in explored.frames:
         state = policy.observe(state, explored.map, frame)

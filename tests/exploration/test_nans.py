@@ -19,7 +19,7 @@ class HoleyRoom(BoxRoom):
         return type(frame)(frame.rgb, depth, frame.T_world_camera, frame.camera)
 
 
-SCORERS = ("ours", "ours-pano", "active-gs", "cover")
+SCORERS = ("ours", "ours-pano", "ours-demand", "active-gs", "cover")
 """One of each way to score; the others score like one of these, and run outside the gate."""
 
 

@@ -16,6 +16,7 @@ from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decision import ENOUGH_LOOKS, initial_state, look_round, net_utility
+from r3jax.planning.policies.demand import OursDemand
 from r3jax.planning.policies.frontier import Frontier
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policies.renderability import Ours, OursPano
@@ -27,7 +28,8 @@ from tests.planning.test_travel import assert_inside
 KEY = jax.random.key(3)
 CAMERA = Camera.from_fov(64, 64)
 NUM = 40
-CONFIG = PlannerConfig(num_candidates=NUM, num_frontier=12)
+NUM_STANDPOINTS = 9
+CONFIG = PlannerConfig(num_candidates=NUM, num_frontier=12, num_standpoints=NUM_STANDPOINTS)
 
 
 def flat():
@@ -45,10 +47,11 @@ def prefer_high_x(map_state, grid, camera, poses, config):
     return SimpleNamespace(exploration=x * 0 + 1, rendering=(x + 2) ** 2, total=(x + 2) ** 2 + 1)
 
 
-def look_down(map_state, grid, camera, positions, config, allowed):
+def look_down(map_state, grid, camera, positions, config, allowed, standpoints=None):
     """A stand-in for `score_positions`: straight down is best, high positions above all."""
     assert positions.shape == (NUM, 3)
     assert allowed.shape == (NUM, 526)
+    assert standpoints is None or standpoints.shape == (NUM_STANDPOINTS, 3)
     down = np.tile([0.0, 0.0, -1.0], (NUM, 1))
     return SimpleNamespace(
         T_world_camera=poses_along(positions, down).astype(np.float32),
@@ -60,6 +63,7 @@ def policies() -> list:
     return [
         Ours(CONFIG, prefer_high_x),
         OursPano(CONFIG, look_down),
+        OursDemand(CONFIG, look_down),
         Frontier(CONFIG),
         Random(CONFIG),
     ]
@@ -161,15 +165,32 @@ def test_ours_mixes_local_views_with_views_of_the_frontier(world):
     assert np.linalg.norm(offset, axis=1).max() <= 0.5
 
 
-def test_pano_takes_the_direction_from_the_panorama(world):
-    decision, _, _ = decide(OursPano(CONFIG, look_down), world, center(6, 6, 4))
+@pytest.mark.parametrize("policy_class", [OursPano, OursDemand])
+def test_pano_takes_the_direction_from_the_panorama(policy_class, world):
+    decision, _, _ = decide(policy_class(CONFIG, look_down), world, center(6, 6, 4))
     np.testing.assert_allclose(decision.T_world_camera[:3, 2], [0, 0, -1], atol=1e-6)
     np.testing.assert_allclose(
         decision.utilities["utility"], decision.candidates[:, 2, 3] ** 2, rtol=1e-5
     )
 
 
-@pytest.mark.parametrize("policy_class", [Ours, OursPano])
+def test_those_who_ask_stand_all_over_where_the_robot_can_go(world):
+    asked = []
+
+    def spy(map_state, grid, camera, positions, config, standpoints):
+        asked.append(standpoints)
+        return look_down(map_state, grid, camera, positions, config, standpoints)
+
+    start = center(6, 6, 4)
+    for key in range(2):
+        decide(OursDemand(CONFIG, spy), world, start, key=jax.random.key(key))
+    travel = plan_travel(world[1], start)
+    assert np.isfinite(travel.lengths(asked[0])).all()
+    assert np.ptp(asked[0][:, 0]) > 2.0
+    assert not np.array_equal(*asked)
+
+
+@pytest.mark.parametrize("policy_class", [Ours, OursPano, OursDemand])
 def test_the_scorer_never_sees_hopeless_cells(policy_class):
     free, occupied = two_rooms()
     occupied[12] = True  # the door is shut: the second room cannot be entered
@@ -178,10 +199,10 @@ def test_the_scorer_never_sees_hopeless_cells(policy_class):
     occupied[13:] = False
     grids = []
 
-    def spy(map_state, grid, camera, views, config, *allowed):
+    def spy(map_state, grid, camera, views, config, *more):
         grids.append(grid)
         stand_in = prefer_high_x if policy_class is Ours else look_down
-        return stand_in(map_state, grid, camera, views, config, *allowed)
+        return stand_in(map_state, grid, camera, views, config, *more)
 
     grid = grid_of(free, occupied)
     assert bool(grid.unexplored[13:].all())
@@ -238,7 +259,16 @@ def test_the_trail_follows_the_robot(world):
 
 
 def test_the_registry_makes_what_it_names():
-    known = {"ours", "ours-pano", "cover", "unseen", "unseen-depth", "frontier", "uniform"}
+    known = {
+        "ours",
+        "ours-pano",
+        "ours-demand",
+        "cover",
+        "unseen",
+        "unseen-depth",
+        "frontier",
+        "uniform",
+    }
     assert known | {"random"} <= set(policy_names())
     for name in policy_names():
         policy = make_policy(name, num_candidates=7, num_frontier=2)
@@ -262,6 +292,8 @@ def test_an_unknown_name_lists_the_known_ones():
         ("num_candidates", 0),
         ("num_frontier", -1),
         ("num_frontier", 101),
+        ("num_standpoints", 0),
+        ("num_standpoints", 257),
         ("radius", np.inf),
         ("lambda2", -0.5),
         ("safety_margin", np.nan),

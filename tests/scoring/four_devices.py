@@ -142,12 +142,14 @@ def test_scores_compile_once_for_all_maps_and_settings():
     assert traces == [{"name": center}]
 
 
-@pytest.mark.parametrize("name", ["ours", "ours-pano", "active-gs"])
+@pytest.mark.parametrize("name", ["ours", "ours-pano", "ours-demand", "active-gs"])
 def test_a_decision_is_that_of_one_device(name, one_device, monkeypatch):
     used = []
     kept = batch.score_on_devices
     monkeypatch.setattr(batch, "score_on_devices", lambda *a: used.append(a[3]) or kept(*a))
-    policy = make_policy(name, num_candidates=NUM, num_frontier=3, scoring=CONFIG)
+    policy = make_policy(
+        name, num_candidates=NUM, num_frontier=3, num_standpoints=5, scoring=CONFIG
+    )
     state, grid = flat()
 
     def decide():
@@ -156,10 +158,12 @@ def test_a_decision_is_that_of_one_device(name, one_device, monkeypatch):
         return policy.decide(planner, state, grid, start, key=jax.random.key(1))[0]
 
     several = decide()
-    assert used == [jax.local_devices()]
+    # Standpoints are dealt out too, before the candidates.
+    times = 2 if name == "ours-demand" else 1
+    assert used == times * [jax.local_devices()]
     one_device()
     one = decide()
-    assert len(used) == 1
+    assert len(used) == times
     np.testing.assert_array_equal(several.T_world_camera, one.T_world_camera)
     np.testing.assert_array_equal(several.candidates, one.candidates)
     assert several.utilities.keys() == one.utilities.keys()

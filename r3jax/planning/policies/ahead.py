@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.planning.candidates import poses_along, spread
+from r3jax.planning.candidates import best_views, poses_along, spread
 from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_positions
 from r3jax.planning.lookahead import Outlook, lengths_between, search
 from r3jax.scoring.batch import near, score_positions_near
@@ -60,9 +60,7 @@ class OursAhead(GreedyPolicy):
         voxels, cells, _ = near(situation.map_state, situation.scoring_grid, places, scoring)
         allowed = situation.limits.allowed_axes(positions, fibonacci_lattice(scoring.panorama_bins))
         panorama = score_positions_near(voxels, cells, situation.camera, places, scoring, allowed)
-        turned = np.array(panorama.T_world_camera, dtype=np.float64)
-        turned[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
-        utility = np.asarray(panorama.best_score, dtype=np.float64)
+        turned, utility = best_views(positions, panorama)
         outlook = Outlook(
             situation.limits.obeyed(turned),
             utility,

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
-from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.greedy import GreedyPolicy, Situation, score_by_pixels
+from r3jax.scoring.directions import nearest_seen
 from r3jax.scoring.pixels import PixelView
 
 UNSEEN_WEIGHT = 1000.0
@@ -50,13 +50,8 @@ def coverage_of_pixels(
         hit: 1 for covered pixels, else 0.
     """
     length = jnp.sqrt(jnp.sum(offset * offset, axis=0))
-    x, y, z = offset / jnp.maximum(length, 1e-6)[None]
-    nearest = jnp.full_like(x, -1.0)
-    lattice = fibonacci_lattice(seen.num_bins).astype("float32").tolist()
-    for k, (q_x, q_y, q_z) in enumerate(lattice):
-        is_seen = (seen.visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
-        cosine = q_x * x + q_y * y + q_z * z
-        nearest = jnp.maximum(nearest, jnp.where(is_seen, cosine, -1.0))
+    direction = offset / jnp.maximum(length, 1e-6)[None]
+    nearest = nearest_seen(seen.visited, direction, seen.num_bins)
     total, num = jnp.sum(hit * 0.5 * (1.0 + nearest)), jnp.sum(hit)
     return jnp.where(num > 0.0, jnp.clip(total / jnp.maximum(num, 1.0), 0.0, 1.0), 1.0)
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.planning.candidates import best_views
 from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
 from r3jax.scoring.batch import score_positions, score_views
 
@@ -73,6 +74,5 @@ class OursPano(GreedyPolicy):
                 positions, fibonacci_lattice(self.config.scoring.panorama_bins)
             ),
         )
-        turned = np.array(panorama.T_world_camera, dtype=np.float64)
-        turned[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
-        return turned, {"utility": np.asarray(panorama.best_score, dtype=np.float64)}
+        turned, utility = best_views(positions, panorama)
+        return turned, {"utility": utility}

@@ -1,0 +1,58 @@
+"""Ours-Demand: go where a view repairs most, not where most is broken.
+
+    U_view = U / sum U - lambda2 L / sum L,    U = lambda1 U_G + gain,  L the path length
+
+Renderability's U_R asks how badly a view would render now. A surface that no view can mend draws it
+again and again, and one behind the sofa counts like one that everybody looks at. Here standpoints,
+spread over the space that the robot can reach, stand for everybody; the gain of a view is the
+renderability that it would add to what they see (`scoring.demand`). Positions and their best
+directions are as in Ours-Pano.
+
+Shape symbols: C candidates, always `config.num_candidates`, so that scoring compiles once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Array
+
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.planning.candidates import best_views, standpoints
+from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
+from r3jax.scoring.batch import score_positions
+
+
+@dataclass(frozen=True)
+class OursDemand(GreedyPolicy):
+    """Ours-Pano by gain instead of lack: what a view would add to what all free space can see."""
+
+    score_all: ScoreViews = score_positions
+    """Scores positions [C, 3] for standpoints."""
+
+    name = "ours-demand"
+    source = "ours, after facility location, Nemhauser et al. 1978"
+
+    def score(
+        self, situation: Situation, poses: np.ndarray, *, key: Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Every position's best direction, and what the panorama promises there."""
+        positions = poses[:, :3, 3]
+        scoring = self.config.scoring
+        places = standpoints(
+            situation.travel,
+            self.config.num_standpoints,
+            positions,
+            float(scoring.max_range),
+            key=key,
+        )
+        panorama = self.score_all(
+            situation.map_state,
+            situation.scoring_grid,
+            situation.camera,
+            positions.astype(np.float32),
+            scoring,
+            situation.limits.allowed_axes(positions, fibonacci_lattice(scoring.panorama_bins)),
+            places,
+        )
+        turned, utility = best_views(positions, panorama)
+        return turned, {"utility": utility}
