@@ -177,9 +177,9 @@ def test_pano_takes_the_direction_from_the_panorama(policy_class, world):
 def test_those_who_ask_stand_all_over_where_the_robot_can_go(world):
     asked = []
 
-    def spy(map_state, grid, camera, positions, config, standpoints):
+    def spy(map_state, grid, camera, positions, config, allowed, standpoints):
         asked.append(standpoints)
-        return look_down(map_state, grid, camera, positions, config, standpoints)
+        return look_down(map_state, grid, camera, positions, config, allowed, standpoints)
 
     start = center(6, 6, 4)
     for key in range(2):
