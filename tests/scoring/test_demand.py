@@ -254,7 +254,9 @@ def test_panoramas_sum_gains_by_direction_and_cells_as_before():
 
     def bins(weight, standpoints):
         config = eqx.tree_at(lambda c: c.lambda1, CONFIG, jnp.float32(weight))
-        found = batch.score_positions(state, grid, CAMERA, positions, config, standpoints=standpoints)
+        found = batch.score_positions(
+            state, grid, CAMERA, positions, config, standpoints=standpoints
+        )
         return np.asarray(found.bin_scores, np.float64)
 
     gains, cells = bins(0.0, places), bins(3.0, None) - bins(0.0, None)
