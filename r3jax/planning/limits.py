@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from r3jax.geometry.cameras import angle_between
+from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.motion import MOTIONS, UNLIMITED, Motion
 
 _SAME = 1e-6
@@ -60,14 +61,14 @@ class Limits:
         nearest = _directions(*self._turned(positions, *_angles_along(directions)))
         return np.clip(np.sum(nearest * directions, axis=-1), -1.0, 1.0)
 
-    def allowed_axes(self, positions: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-        """Directions of a lattice [B, 3] whose bins reach into what is allowed, [C, B] bool.
+    def allowed_axes(self, positions: np.ndarray, num_bins: int) -> np.ndarray:
+        """Axes of a panorama of B bins that a view at positions [C, 3] may have, [C, B] bool.
 
-        A bin is a cap of 1 / B of the sphere. At least one direction is allowed everywhere, so
-        that a tilt between the lattice's directions has its nearest one.
+        Those whose bins, caps of 1 / B of the sphere, reach into what is allowed. At least one is
+        allowed everywhere, so that a tilt between the lattice's directions has its nearest one.
         """
-        nearness = self.nearness(positions[:, None, :], lattice)
-        cap = 1.0 - 2.0 / len(lattice)
+        nearness = self.nearness(positions[:, None, :], fibonacci_lattice(num_bins))
+        cap = 1.0 - 2.0 / num_bins
         return nearness >= np.minimum(cap, nearness.max(axis=1, keepdims=True))
 
     def may_turn(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -25,7 +25,6 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import shortest_path
 
 from r3jax.geometry.cameras import Camera, angle_between
-from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import best_views
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.limits import Limits
@@ -164,7 +163,7 @@ def _expanded(path: Path, outlook: Outlook) -> list[Path]:
     voxels, cells = foresee_near(path.voxels, path.cells, outlook.camera, T, config.scoring)
     positions = outlook.poses[padded, :3, 3]
     places = jnp.asarray(positions, dtype=jnp.float32)
-    allowed = limits.allowed_axes(positions, fibonacci_lattice(config.scoring.panorama_bins))
+    allowed = limits.allowed_axes(positions, config.scoring.panorama_bins)
     panorama = score_positions_near(voxels, cells, outlook.camera, places, config.scoring, allowed)
     poses, gains = best_views(positions, panorama)
     poses = limits.obeyed(poses)

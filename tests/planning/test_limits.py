@@ -115,7 +115,7 @@ def law_axes(modules: Modules, seed: int = 0) -> None:
     for motion in MOTIONS_TRIED:
         limits = limited(modules["limits"], motion, seed)
         positions[:, 2] = np.clip(positions[:, 2], *limits.heights)
-        axes = limits.allowed_axes(positions, LATTICE)
+        axes = limits.allowed_axes(positions, len(LATTICE))
         assert axes.shape == (NUM, 526)
         assert axes.any(axis=1).all()
         for position, allowed in zip(positions[:6], axes[:6], strict=True):
@@ -137,7 +137,7 @@ def law_axes(modules: Modules, seed: int = 0) -> None:
     gap = anywhere[np.argmin((anywhere @ LATTICE.T).max(axis=1))]
     now = poses_along(np.zeros((1, 3)), gap[None])[0]
     still = modules["limits"].Limits(Motion(turn_per_meter=90.0), now)
-    (axes,) = still.allowed_axes(np.zeros((1, 3)), LATTICE)
+    (axes,) = still.allowed_axes(np.zeros((1, 3)), len(LATTICE))
     np.testing.assert_array_equal(np.flatnonzero(axes), [np.argmax(LATTICE @ gap)])
 
 
@@ -223,7 +223,7 @@ MUTANTS = [
     Mutant("limits", " * np.cos(0.5 * by[1])", "", law_obeyed),
     Mutant("limits", "_wrapped(azimuth - azimuth_now)", "azimuth - azimuth_now", law_nearest),
     Mutant("limits", "np.minimum(cap, nearness", "np.maximum(cap, 0.0 * nearness", law_axes),
-    Mutant("limits", "cap = 1.0 - 2.0 / len(lattice)", "cap = 1.0 - 1e-9", law_axes),
+    Mutant("limits", "cap = 1.0 - 2.0 / num_bins", "cap = 1.0 - 1e-9", law_axes),
     Mutant(
         "limits",
         "self._clipped(*_angles_along(directions))",

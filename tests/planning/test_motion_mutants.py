@@ -85,7 +85,7 @@ def law_a_policy_that_turns_is_held(modules: Modules) -> None:
         answer = decide(modules["renderability"].OursPano(config_of(name), score))
         assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
         limits = Limits(MOTIONS[name], level_start())
-        expected = limits.allowed_axes(answer.candidates[:, :3, 3], LATTICE)
+        expected = limits.allowed_axes(answer.candidates[:, :3, 3], len(LATTICE))
         np.testing.assert_array_equal(allowed_axes[0], expected)
         assert not expected.all()
 

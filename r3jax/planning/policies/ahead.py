@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import best_views, poses_along, spread
 from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_positions
 from r3jax.planning.lookahead import Outlook, lengths_between, search
@@ -58,7 +57,7 @@ class OursAhead(GreedyPolicy):
         positions = poses[:, :3, 3]
         places = jnp.asarray(positions, dtype=jnp.float32)
         voxels, cells, _ = near(situation.map_state, situation.scoring_grid, places, scoring)
-        allowed = situation.limits.allowed_axes(positions, fibonacci_lattice(scoring.panorama_bins))
+        allowed = situation.limits.allowed_axes(positions, scoring.panorama_bins)
         panorama = score_positions_near(voxels, cells, situation.camera, places, scoring, allowed)
         turned, utility = best_views(positions, panorama)
         outlook = Outlook(

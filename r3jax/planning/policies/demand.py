@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import best_views, standpoints
 from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
 from r3jax.scoring.batch import score_positions
@@ -51,7 +50,7 @@ class OursDemand(GreedyPolicy):
             situation.camera,
             positions.astype(np.float32),
             scoring,
-            situation.limits.allowed_axes(positions, fibonacci_lattice(scoring.panorama_bins)),
+            situation.limits.allowed_axes(positions, scoring.panorama_bins),
             places,
         )
         turned, utility = best_views(positions, panorama)

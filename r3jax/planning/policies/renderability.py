@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import best_views
 from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
 from r3jax.scoring.batch import score_positions, score_views
@@ -70,9 +69,7 @@ class OursPano(GreedyPolicy):
             situation.camera,
             positions.astype(np.float32),
             self.config.scoring,
-            situation.limits.allowed_axes(
-                positions, fibonacci_lattice(self.config.scoring.panorama_bins)
-            ),
+            situation.limits.allowed_axes(positions, self.config.scoring.panorama_bins),
         )
         turned, utility = best_views(positions, panorama)
         return turned, {"utility": utility}
