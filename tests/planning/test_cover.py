@@ -57,11 +57,15 @@ def law_by_hand(modules: Modules) -> None:
     assert coverage(module, bins, np.array(offset), [0] * NUM) == 1.0
 
 
+CHAIN = ("r3jax.scoring.directions", "r3jax.planning.policies.cover")
+_IS_VISITED = """(visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
+        cosine = q_x"""
+_NEAREST = "jnp.maximum(best, jnp.where(is_visited, cosine, -1.0))"
 MUTANTS = [
     Mutant("cover", "0.5 * (1.0 + nearest)", "nearest", law_by_hand),
-    Mutant("cover", "jnp.maximum(nearest, jnp.where", "jnp.add(nearest, jnp.where", law_by_hand),
-    Mutant("cover", "where(is_seen, cosine, -1.0)", "where(is_seen, cosine, 0.0)", law_by_hand),
-    Mutant("cover", "seen.visited[k // 32] &", "seen.visited[0] &", law_by_hand),
+    Mutant("directions", _NEAREST, _NEAREST.replace("maximum", "add"), law_by_hand),
+    Mutant("directions", _NEAREST, _NEAREST.replace("-1.0", "0.0"), law_by_hand),
+    Mutant("directions", _IS_VISITED, _IS_VISITED.replace("k // 32", "0"), law_by_hand),
     Mutant("cover", "jnp.maximum(length, 1e-6)", "jnp.ones_like(length)", law_by_hand),
     Mutant("cover", "jnp.sum(hit * 0.5", "jnp.sum(0.5", law_by_hand),
     Mutant("cover", "jnp.sum(hit)\n", "jnp.float32(hit.size)\n", law_by_hand),
@@ -75,7 +79,7 @@ def test_the_term_by_hand():
 
 @each(MUTANTS)
 def test_faults_are_noticed(mutant):
-    assert_caught(("r3jax.planning.policies.cover",), mutant)
+    assert_caught(CHAIN, mutant)
 
 
 BINS = st.lists(st.lists(st.integers(0, 63), max_size=5), min_size=NUM, max_size=NUM)
