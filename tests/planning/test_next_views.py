@@ -1,6 +1,7 @@
 """Several views at once: against scoring everything again on the whole map after every view."""
 
 import functools
+from unittest import mock
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 import r3jax
 from r3jax.geometry.cameras import look_at
 from r3jax.planning import next_views as real
-from r3jax.scoring.batch import score_positions, score_views
+from r3jax.scoring.batch import score_positions, score_views, score_views_near
 from r3jax.scoring.foresight import foresee
 from r3jax.scoring.utility import view_utility
 from tests.mutants import Modules, Mutant, assert_caught, each, load
@@ -67,6 +68,24 @@ def law_each_once(modules: Modules) -> None:
     views = modules["next_views"].next_views(state, grid, CAMERA, NUM, poses=poses, config=CONFIG)
     order = [np.flatnonzero((poses == T).all(axis=(1, 2)))[0] for T in views.T_world_camera]
     assert sorted(order) == list(range(NUM))
+
+
+def law_lazy(modules: Modules) -> None:
+    """Hopeless poses are scored once."""
+    module, scored = modules["next_views"], []
+
+    def count(voxels, cells, camera, poses, config):
+        scored.append(len(poses))
+        return score_views_near(voxels, cells, camera, poses, config)
+
+    with mock.patch.object(module, "score_views_near", count):
+        module.next_views(*known(), CAMERA, 3, poses=poses_of(2), config=CONFIG)
+    assert scored[0] == NUM
+    assert sum(scored[1:]) < 2 * NUM
+
+
+def test_only_what_may_win_is_scored_again():
+    law_lazy({"next_views": real})
 
 
 def test_no_pose_is_taken_twice():
@@ -141,7 +160,7 @@ CHAIN = ("r3jax.scoring.foresight", "r3jax.planning.next_views")
 MUTANTS = [
     Mutant("next_views", "is_new[:] = False", "is_new[:] = True", law_greedy),
     Mutant("next_views", "left[best] -= 1", "left[best] -= 0", law_each_once),
-    Mutant("next_views", "np.argsort(-bound[stale]", "np.argsort(bound[stale]", law_greedy),
+    Mutant("next_views", "np.argsort(-bound[stale]", "np.argsort(bound[stale]", law_lazy),
     Mutant("foresight", "& ~visible_mask", "| visible_mask", law_greedy),
     Mutant("foresight", "visited[:, index] | words", "visited[:, index]", law_greedy),
 ]
