@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from r3jax.audit.diagnosis import CAUSES, FINE, Diagnosis
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
 from r3jax.scoring.voxels import voxels_of
 
@@ -118,7 +118,7 @@ def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST_UNSE
         most: regions at most.
     """
     cell = float(grid.cell_size)
-    points = np.asarray(grid.origin, np.float64) + (np.argwhere(edges) + 0.5) * cell
+    points = centers_on_host(grid, np.argwhere(edges))
     flat = np.flatnonzero(edges)
     left = np.ones(len(points), dtype=bool)
     found: list[Region] = []

@@ -12,7 +12,7 @@ from scipy import ndimage
 from scipy.spatial import Delaunay, KDTree
 
 from r3jax.audit.survey import MARGIN
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.planning.travel import safe_cells
 
 _HEIGHTS = (5.0, 95.0)
@@ -31,14 +31,14 @@ def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray
         grid: free and occupied space.
         cameras: where the camera was, [n, 3] [audit units].
     """
-    cell, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
+    cell = float(grid.cell_size)
     safe = safe_cells(np.asarray(grid.free), cell, MARGIN)
     labels = np.zeros(safe.shape, dtype=np.int32)
     ndimage.label(safe, output=labels)
     cells = np.argwhere(safe)
     if not len(cells):
         return np.zeros((0, 3))
-    centers = origin + (cells + 0.5) * cell
+    centers = centers_on_host(grid, cells)
     # A camera near a wall stands in a cell that is not safe: the nearest safe one is meant.
     distance, nearest = KDTree(centers).query(cameras)
     close = cells[np.asarray(nearest)[np.asarray(distance) <= 2.0 * MARGIN + cell]]

@@ -167,7 +167,7 @@ def _set_out(options: Explore, console: Console) -> Expedition:
 def _resume(options: Explore, path: Path, console: Console) -> Expedition:
     _refuse_others(options, "--resume", _WITH_RESUME)
     run = read_run(path)
-    if run.header.parent is not None and "merged" in run.header.parent:
+    if run.header.is_merged:
         raise ValueError(f"{path} was merged from other runs: fork it with --fork and --at")
     _refuse_half_a_fork(run)
     plan = plan_of_run(run)

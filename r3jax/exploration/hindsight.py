@@ -12,12 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.exploration.replay import planner_config_of, states_of
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.exploration.replay import check_decided_alone, planner_config_of, states_of
+from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
 from r3jax.planning.decision import explain_way, initial_state
 from r3jax.scoring.explain import Explanation
-from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
 
@@ -51,8 +50,7 @@ def reason_of(explanation: Explanation, grid: OccupancyGrid) -> Reason:
         grid: whose cells it counts.
     """
     rows = np.flatnonzero(np.asarray(explanation.visible))
-    cells = np.argwhere(np.asarray(explanation.cells))
-    centers = np.asarray(grid.origin) + (cells + 0.5) * np.asarray(grid.cell_size)
+    centers = centers_on_host(grid, np.argwhere(np.asarray(explanation.cells)))
     return Reason(
         totals=np.asarray(explanation.totals, dtype=np.float64),
         rows=rows,
@@ -77,8 +75,7 @@ def explain_run(
     Raises:
         RunError: the run was merged, a setting of it is not known, a frame is missing or broken.
     """
-    if "merged" in (run.header.parent or {}):
-        raise RunError(run.path, "it was merged from runs that decided each for itself")
+    check_decided_alone(run)
     config = planner_config_of(run)
     after_views = iter(states_of(run) if states is None else states)
     memory, before = None, None

@@ -108,16 +108,33 @@ def after_frame(
     return map_state, add_to_grid(grid, frame, config)
 
 
-def _nothing_known(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    """The map and the grid before the first view of runs in one scene."""
-    config = config_of(runs[0])
+def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
+    """The grid before the first view of runs in one scene.
+
+    Raises:
+        RunError: a run without a view, or settings that cannot work.
+    """
     bounds = np.asarray(runs[0].header.bounds, dtype=np.float64)
     starts = [pose for run in runs for pose in starts_of(run)]
     try:
-        grid = first_grid(bounds, starts, config)
+        return first_grid(bounds, starts, config_of(runs[0]))
     except ValueError as error:
         raise RunError(runs[0].path / "run.json", str(error)) from None
-    return empty_map(config.capacity, config.voxel_size, config.num_bins), grid
+
+
+def check_decided_alone(run: Run) -> None:
+    """Refuses a merged run where it matters on which map its views were decided.
+
+    Raises:
+        RunError: it was merged.
+    """
+    if run.header.is_merged:
+        raise RunError(run.path, "it was merged from runs that decided each for itself")
+
+
+def _nothing_known(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
+    config = config_of(runs[0])
+    return empty_map(config.capacity, config.voxel_size, config.num_bins), grid_before(runs)
 
 
 def differences(run: Run) -> tuple[int, list[Difference]]:

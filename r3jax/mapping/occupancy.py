@@ -138,6 +138,11 @@ def cell_centers(grid: OccupancyGrid, cells: Int[Array, "*n 3"]) -> Float[Array,
     return origin + (cells.astype(jnp.float32) + 0.5) * grid.cell_size
 
 
+def centers_on_host(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
+    """`cell_centers` of any number of cells [n, 3] in NumPy, float64: nothing compiles."""
+    return np.asarray(grid.origin, np.float64) + (cells + 0.5) * float(grid.cell_size)
+
+
 def log_odds_at(
     grid: OccupancyGrid, points_world: Float[Array, "*n 3"], outside: float = 0.0
 ) -> Float[Array, "*n"]:

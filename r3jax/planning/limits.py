@@ -119,6 +119,10 @@ class Limits:
         return azimuth, np.clip(elevation, *np.radians(self.motion.elevations))
 
 
+UNBOUND = Limits()
+"""Of a carrier that may do anything."""
+
+
 def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
     """The pose where a mission begins, [4, 4]: its elevation becomes one that is allowed.
 

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from r3jax.geometry.cameras import Camera, rigid_error
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import best_views, spread
 from r3jax.planning.config import PlannerConfig
@@ -103,7 +103,7 @@ def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) 
             "the grid knows no free cell that keeps the safety margin of "
             f"{config.safety_margin} m: integrate a frame with depth, or give poses"
         )
-    centers = np.asarray(grid.origin, np.float64) + (cells + 0.5) * float(grid.cell_size)
+    centers = centers_on_host(grid, cells)
     return centers[spread(centers, config.num_candidates)]
 
 

@@ -23,13 +23,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import poses_along
-from r3jax.planning.limits import Limits
+from r3jax.planning.limits import UNBOUND, Limits
 from r3jax.planning.travel import Travel
 
 LEAST_GAIN = 0.005
 """Share of the pixels below which a view is not worth taking."""
-
-_UNBOUND = Limits()
 
 _SLACK = 0.5
 """A candidate stands at most this far above or below its level [m]."""
@@ -176,7 +174,7 @@ def dismiss(pool: Pool, draw: Draw, gain: np.ndarray, best: int) -> Pool:
 
 
 def draw_candidates(
-    pools: Pools, travel: Travel, num: int, limits: Limits = _UNBOUND
+    pools: Pools, travel: Travel, num: int, limits: Limits = UNBOUND
 ) -> tuple[Pools, Draw | None]:
     """The pools as they are now, and up to `num` candidates of the first stage that has any.
 

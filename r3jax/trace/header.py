@@ -77,6 +77,11 @@ class RunHeader:
     the run's own policy from view `decided_from` on; or `merged` runs with `merged_views` each."""
 
     @property
+    def is_merged(self) -> bool:
+        """True if the views come from several runs, each of which decided on a map of its own."""
+        return self.parent is not None and "merged" in self.parent
+
+    @property
     def intrinsics(self) -> Camera:
         """The camera of every frame."""
         size = {name: int(self.camera[name]) for name in ("width", "height")}

@@ -17,6 +17,7 @@ from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
+from r3jax.exploration.replay import check_decided_alone
 from r3jax.exploration.state import Mission
 from r3jax.exploration.step import relive, start_state
 from r3jax.frame import Frame
@@ -165,10 +166,8 @@ def decide_again(
     Raises:
         RunError: the policy decides otherwise today, a frame is missing, or the run was merged.
     """
-    parent = run.header.parent or {}
-    if "merged" in parent:
-        raise RunError(run.path, "it was merged from runs that decided each for itself")
-    decided_from = int(parent.get("decided_from", 0))
+    check_decided_alone(run)
+    decided_from = int((run.header.parent or {}).get("decided_from", 0))
     decisions: list[Decision] = []
     init_key, key = jax.random.split(jax.random.key(run.header.seed))
     mission = Mission(

@@ -126,7 +126,7 @@ class RecordedStory:
     def _explain(self) -> Iterator[Reason | None]:
         """The reasons of all views, in order; of a merged run, nothing but the replay."""
         moments = self._timeline.follow()
-        if "merged" in (self._run.header.parent or {}):
+        if self._run.header.is_merged:
             self._problem = "merged from runs that decided each on a map of its own"
             return (None for _ in moments)
         return explain_run(self._run, ((m.map_state, m.grid) for m in moments))

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from r3jax.exploration.replay import after_frame, config_of, starts_of
-from r3jax.exploration.step import first_grid
+from r3jax.exploration.replay import after_frame, config_of, grid_before
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.trace.errors import RunError
@@ -52,11 +51,7 @@ class Timeline:
             RunError: settings that cannot work, or a run without a view.
         """
         self.run, self._config = run, config_of(run)
-        bounds = np.asarray(run.header.bounds, dtype=np.float64)
-        try:
-            grid = first_grid(bounds, starts_of(run), self._config)
-        except ValueError as error:
-            raise RunError(run.path / "run.json", str(error)) from None
+        grid = grid_before([run])
         stored = _stored(run, grid)
         # Rows enough for the last state from the start on: what works on maps compiles once.
         capacity = self._config.capacity if stored is None else stored.map_state.capacity

@@ -58,8 +58,8 @@ class Watch:
 
 def _give_back() -> None:
     """Has glibc return free memory to the system; other C libraries do as they like."""
-    if hasattr(ctypes.CDLL(None), "malloc_trim"):
-        ctypes.CDLL(None).malloc_trim(0)
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        trim(0)
 
 
 def long_run(

@@ -199,10 +199,10 @@ def test_the_scorer_never_sees_hopeless_cells(policy_class):
     occupied[13:] = False
     grids = []
 
-    def spy(map_state, grid, camera, views, config, *more):
+    def spy(map_state, grid, camera, views, config, *more, **asked):
         grids.append(grid)
         stand_in = prefer_high_x if policy_class is Ours else look_down
-        return stand_in(map_state, grid, camera, views, config, *more)
+        return stand_in(map_state, grid, camera, views, config, *more, **asked)
 
     grid = grid_of(free, occupied)
     assert bool(grid.unexplored[13:].all())

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.planning.candidates import best_views, standpoints
+from r3jax.planning.candidates import standpoints
 from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
+from r3jax.planning.policies.renderability import turned_views
 from r3jax.scoring.batch import score_positions
 
 
@@ -44,14 +45,4 @@ class OursDemand(GreedyPolicy):
             float(scoring.max_range),
             key=key,
         )
-        panorama = self.score_all(
-            situation.map_state,
-            situation.scoring_grid,
-            situation.camera,
-            positions.astype(np.float32),
-            scoring,
-            situation.limits.allowed_axes(positions, scoring.panorama_bins),
-            places,
-        )
-        turned, utility = best_views(positions, panorama)
-        return turned, {"utility": utility}
+        return turned_views(self.score_all, situation, positions, scoring, standpoints=places)

@@ -17,7 +17,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier
 from r3jax.planning.candidates import VIEW_DISTANCE, host_generator, in_plain_view, poses_along
 from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_lots, free_views
-from r3jax.planning.limits import Limits
+from r3jax.planning.limits import UNBOUND, Limits
 from r3jax.planning.travel import Travel
 
 _MAX_TARGETS = 300
@@ -30,9 +30,6 @@ _ATTEMPT_COSINE = 0.9
 _ATTEMPT_REACH = 3.0
 """Frontier cells within 26 degrees of the line of sight and 3 m count as looked at too: they lie
 inside the picture of any camera with 52 degrees or more."""
-
-
-_UNBOUND = Limits()
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,7 @@ def nearest_views(
     travel: Travel,
     targets: np.ndarray,
     num: int,
-    limits: Limits = _UNBOUND,
+    limits: Limits = UNBOUND,
     *,
     key: Array,
 ) -> tuple[np.ndarray, np.ndarray]:

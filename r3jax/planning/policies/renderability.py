@@ -9,6 +9,7 @@ Shape symbols: C candidates, always `config.num_candidates`, so that scoring com
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array
@@ -16,6 +17,7 @@ from jaxtyping import Array
 from r3jax.planning.candidates import best_views
 from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
 from r3jax.scoring.batch import score_positions, score_views
+from r3jax.scoring.config import ScoringConfig
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,33 @@ class OursPano(GreedyPolicy):
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Every position's best direction that is allowed, and what the panorama promises there."""
         del key
-        positions = poses[:, :3, 3]
-        panorama = self.score_all(
-            situation.map_state,
-            situation.scoring_grid,
-            situation.camera,
-            positions.astype(np.float32),
-            self.config.scoring,
-            situation.limits.allowed_axes(positions, self.config.scoring.panorama_bins),
-        )
-        turned, utility = best_views(positions, panorama)
-        return turned, {"utility": utility}
+        return turned_views(self.score_all, situation, poses[:, :3, 3], self.config.scoring)
+
+
+def turned_views(
+    score_all: ScoreViews,
+    situation: Situation,
+    positions: np.ndarray,
+    scoring: ScoringConfig,
+    **asked: Any,
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """What `GreedyPolicy.score` answers for positions that look where it is worth most.
+
+    Args:
+        score_all: `score_positions`, or a stand-in for it.
+        situation: what is known.
+        positions: [C, 3] [m].
+        scoring: settings of the utilities.
+        **asked: further arguments of `score_positions`.
+    """
+    panorama = score_all(
+        situation.map_state,
+        situation.scoring_grid,
+        situation.camera,
+        positions.astype(np.float32),
+        scoring,
+        situation.limits.allowed_axes(positions, scoring.panorama_bins),
+        **asked,
+    )
+    turned, utility = best_views(positions, panorama)
+    return turned, {"utility": utility}
