@@ -44,6 +44,7 @@ OnStage = Callable[[str], None]
 
 _COMPLETE = {
     StopReason.BUDGET.value,
+    StopReason.FORECAST.value,
     StopReason.NO_CANDIDATE.value,
     StopReason.NO_REACHABLE_CANDIDATE.value,
     StopReason.STUCK.value,

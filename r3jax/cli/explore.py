@@ -41,9 +41,9 @@ from r3jax.trace.writer import RunWriter
 
 _EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
 
-_WITH_RESUME = ("resume", "budget", "live", "port")
+_WITH_RESUME = ("resume", "budget", "until", "live", "port")
 _WITH_FORK = (
-    "fork", "at", "policy", "budget", "name", "out", "overwrite", "candidates", "lambda1",
+    "fork", "at", "policy", "budget", "until", "name", "out", "overwrite", "candidates", "lambda1",
     "lambda2", "live", "port",
 )  # fmt: skip
 """Options that make sense beside these; all others are fixed by the recorded run."""
@@ -171,11 +171,12 @@ def _resume(options: Explore, path: Path, console: Console) -> Expedition:
         raise ValueError(f"{path} was merged from other runs: fork it with --fork and --at")
     _refuse_half_a_fork(run)
     plan = plan_of_run(run)
+    plan = _with_limits(plan, options)
     header = None
-    if options.budget is not None:
-        budget = parse_budget(options.budget)
-        plan = dataclasses.replace(plan, budget=budget)
-        header = dataclasses.replace(run.header, budget=str(budget))
+    if (options.budget, options.until) != (None, None):
+        header = dataclasses.replace(
+            run.header, budget=str(plan.budget), config=dataclasses.asdict(plan.config)
+        )
     _warn_of_versions(console, run)
     with console.status(f"opening {run.header.scene['name']} ..."):
         simulator = simulator_of_run(run)
@@ -195,8 +196,7 @@ def _fork(options: Explore, path: Path, console: Console) -> Expedition:
     if any(value is not None for value in given):
         policy = policy_of_options(options, run.header.scene["max_range"], motion_of(plan.policy))
         plan = dataclasses.replace(plan, policy=policy)
-    if options.budget is not None:
-        plan = dataclasses.replace(plan, budget=parse_budget(options.budget))
+    plan = _with_limits(plan, options)
     with console.status(f"opening {run.header.scene['name']} ..."):
         simulator = simulator_of_run(run)
     fields = policy_fields(plan.policy)
@@ -206,6 +206,7 @@ def _fork(options: Explore, path: Path, console: Console) -> Expedition:
         run.header,
         policy=fields,
         budget=str(plan.budget),
+        config=dataclasses.asdict(plan.config),
         packages=package_versions(),
         parent={"forked": str(path), "views": at, "decided_from": decided_from},
     )
@@ -220,6 +221,16 @@ def _fork(options: Explore, path: Path, console: Console) -> Expedition:
     except BaseException:
         recorder.close()
         raise
+
+
+def _with_limits(plan: Plan, options: Explore) -> Plan:
+    """The plan of a recorded run, with another budget or goal if one is given."""
+    if options.budget is not None:
+        plan = dataclasses.replace(plan, budget=parse_budget(options.budget))
+    if options.until is not None:
+        config = dataclasses.replace(plan.config, until=options.until)
+        plan = dataclasses.replace(plan, config=config)
+    return plan
 
 
 def _refuse_half_a_fork(run: Run) -> None:

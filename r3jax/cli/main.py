@@ -15,6 +15,7 @@ from r3jax.cli.options import (
     Evaluate,
     Explore,
     Export,
+    Forecast,
     Info,
     Merge,
     Policies,
@@ -32,6 +33,7 @@ _COMMANDS = {
     "replay": Replay,
     "merge": Merge,
     "export": Export,
+    "forecast": Forecast,
     "audit": Audit,
     "view": View,
     "policies": Policies,
@@ -93,6 +95,7 @@ def _run(
     | Replay
     | Merge
     | Export
+    | Forecast
     | Audit
     | View
     | Policies
@@ -131,6 +134,10 @@ def _run(
         from r3jax.cli.export import run_export
 
         return run_export(command)
+    if isinstance(command, Forecast):
+        from r3jax.cli.forecast import run_forecast
+
+        return run_forecast(command)
     if isinstance(command, Audit):
         from r3jax.cli.audit import run_audit
 

@@ -16,6 +16,7 @@ from r3jax.exploration.budget import Budget
 from r3jax.trace.rows import StepRow
 
 _STAGES = {
+    "forecast": "forecasting the quality",
     "plan": "planning",
     "render": "rendering",
     "map": "mapping",

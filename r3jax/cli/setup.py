@@ -54,6 +54,7 @@ def plan_of_options(options: Explore) -> Plan:
         capacity=options.capacity,
         allow_growth=not options.fixed_capacity,
         clock=options.clock,
+        until=options.until,
     )
     budget = parse_budget(options.budget or DEFAULT_BUDGET)
     policy = policy_of_options(options, options.max_range, motion_of_options(options))

@@ -1,11 +1,15 @@
 """What a planner was after, view by view: the utility of its decisions, divided among causes."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from r3jax.evaluation import style
 from r3jax.exploration.hindsight import explain_run
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
 from r3jax.scoring.explain import CAUSES
 from r3jax.trace.reader import Run
 
@@ -16,8 +20,14 @@ _MANY = 60
 """From so many views on their bars touch: gaps would be narrower than a pixel."""
 
 
-def utility_by_cause(run: Run) -> np.ndarray:
+def utility_by_cause(
+    run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
+) -> np.ndarray:
     """What each view of a run promised when it was chosen, by cause.
+
+    Args:
+        run: the run.
+        states: as `explain_run` takes them.
 
     Returns:
         [views, 4] float64, in the order of `CAUSES`; NaN for views that nobody chose.
@@ -26,7 +36,7 @@ def utility_by_cause(run: Run) -> np.ndarray:
         RunError: as `explain_run`.
     """
     unknown = np.full(len(CAUSES), np.nan)
-    rows = [unknown if reason is None else reason.totals for reason in explain_run(run)]
+    rows = [unknown if reason is None else reason.totals for reason in explain_run(run, states)]
     return np.stack(rows) if rows else np.zeros((0, len(CAUSES)))
 
 

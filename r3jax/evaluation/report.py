@@ -14,10 +14,13 @@ from r3jax.evaluation.model_report import (
     read_judged_model,
     training_figure,
 )
+from r3jax.evaluation.outlook import outlook_figure, outlook_lines
 from r3jax.evaluation.page import image, page, section
 from r3jax.evaluation.pictures import panorama_picture
 from r3jax.evaluation.reasons import reasons_figure, utility_by_cause
 from r3jax.evaluation.summary import StageTime, stage_times, summary
+from r3jax.exploration.outlook import Outlook
+from r3jax.exploration.replay import states_of
 from r3jax.files import write_atomic
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
@@ -46,6 +49,12 @@ _NOTES = {
         "directions only (too oblique), with colours that disagree (inconsistent), from farther "
         "away only (too far). All of it is worked out again from the frames, whether or not the "
         "policy decides by U.",
+    ),
+    "forecast": (
+        "Is it enough?",
+        "The PSNR that a splat model trained on the views so far would have all over the free "
+        "space, forecast from the map alone. The bands hold four of five errors of such forecasts "
+        "in scenes that their calibration had not seen.",
     ),
     "panorama": (
         "Panorama at the last position",
@@ -80,10 +89,12 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     last = run.rows[-1]
     max_range = float(run.header.config.get("max_range", 5.0))
     panorama = panorama_picture(map_state, run.camera, last.pose, max_range)
+    outlook = Outlook(run)
     drawn: dict[str, Figure | str] = {
         "plan": figures.plan_figure(run, map_state, grid),
         "progress": figures.progress_figure(run),
-        "reasons": _reasons(run),
+        "reasons": _reasons(run, outlook),
+        "forecast": _forecast(outlook, map_state, grid),
         "panorama": figures.panorama_figure(panorama),
         "views": figures.strip_figure(run),
         "cost": figures.cost_figure(run),
@@ -97,7 +108,7 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
             continue
         png = style.to_png(figure)
         write_atomic(folder / f"{name}.png", png)
-        table = _stage_table(stage_times(run)) if name == "cost" else ""
+        table = _beside(name, run, outlook)
         sections.append(_figure_section(name, png, table))
     model = read_judged_model(run)
     if model is not None:
@@ -110,12 +121,28 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     return path
 
 
-def _reasons(run: Run) -> Figure | str:
-    """What the views were chosen for, or why that is not known."""
+def _reasons(run: Run, outlook: Outlook) -> Figure | str:
+    """What the views were chosen for, or why that is not known; the outlook sees the maps too."""
     try:
-        return reasons_figure(utility_by_cause(run))
+        return reasons_figure(utility_by_cause(run, outlook.watch(states_of(run))))
     except RunError as error:  # merged from other runs, or settings that this version cannot read
         return f"Not known: {error.reason}."
+
+
+def _forecast(outlook: Outlook, map_state: MapState, grid: OccupancyGrid) -> Figure | str:
+    outlook.add(len(outlook.run.rows), map_state, grid)
+    if not outlook.forecasts[-1].mixture.size:
+        return " ".join(outlook_lines(outlook))
+    return outlook_figure(outlook)
+
+
+def _beside(name: str, run: Run, outlook: Outlook) -> str:
+    """What stands below a figure."""
+    if name == "cost":
+        return _stage_table(stage_times(run))
+    if name == "forecast":
+        return "".join(f"<p>{html.escape(line)}</p>" for line in outlook_lines(outlook))
+    return ""
 
 
 def _model_sections(folder: Path, model: JudgedModel) -> list[str]:

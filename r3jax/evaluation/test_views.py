@@ -29,7 +29,8 @@ from r3jax.foreign.files import read_bytes
 from r3jax.foreign.json_text import parse_json
 from r3jax.foreign.versions import VersionError, check_version
 from r3jax.frame import Frame
-from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.geometry.axis_views import LOOKS, poses_at
+from r3jax.geometry.cameras import Camera
 
 SPACING = (1.0, 1.0, 0.75)
 """Replica-Dense's lattice [m]."""
@@ -50,7 +51,6 @@ _MAX_BYTES = 64 << 20
 _FARTHEST = 1e6
 """From the origin [m]; beyond that tenths of millimetres are no whole 64-bit numbers."""
 
-_LOOKS = ("+x", "-x", "+y", "-y", "+z", "-z")
 _LEAST_SEEN = 0.5
 """A view with less surface than this share of the picture is left out."""
 
@@ -146,14 +146,14 @@ def compute_view_set(
     Raises:
         ValueError: settings out of range, fewer than six views asked for, or none found.
     """
-    if max_views is not None and max_views < len(_LOOKS):
+    if max_views is not None and max_views < len(LOOKS):
         raise ValueError(
-            f"max_views must be at least {len(_LOOKS)}, the views of one position; got {max_views}"
+            f"max_views must be at least {len(LOOKS)}, the views of one position; got {max_views}"
         )
     positions = truth.free_positions(spacing, margin)
     if max_views is not None:
-        positions = positions[_evenly(positions, spacing, max_views // len(_LOOKS))]
-    centers, looks = np.repeat(positions, len(_LOOKS), axis=0), np.tile(_LOOKS, len(positions))
+        positions = positions[_evenly(positions, spacing, max_views // len(LOOKS))]
+    centers, looks = np.repeat(positions, len(LOOKS), axis=0), np.tile(LOOKS, len(positions))
     shows_something = np.zeros(0, dtype=bool)
     if len(looks):
         shows_something = truth.seen_share(poses_at(centers, looks)) >= _LEAST_SEEN
@@ -256,19 +256,6 @@ def read_view_set(path: str | Path) -> ViewSet:
 _AGAIN = "delete the file and it is computed again"
 
 
-def poses_at(positions: np.ndarray, looks: Sequence[str] | np.ndarray) -> np.ndarray:
-    """Poses without roll, [V, 4, 4] float64, at positions [V, 3] [m] along "+x", "-x", ..."""
-    axes: dict[str, np.ndarray] = {}
-    for look in _LOOKS:
-        direction = np.zeros(3, np.float32)
-        direction["xyz".index(look[1])] = 1.0 if look[0] == "+" else -1.0
-        # Entries are 0 or 1 up to rounding; adding 0 turns -0.0 into 0.0.
-        axes[look] = np.rint(pose_along(np.zeros(3, np.float32), direction)) + 0.0
-    poses = np.stack([axes[str(look)] for look in looks]).astype(np.float64)
-    poses[:, :3, 3] = positions
-    return poses
-
-
 def _evenly(positions: np.ndarray, spacing: Sequence[float | int], count: int) -> np.ndarray:
     """Indices of `count` of the positions [P, 3], in order: evenly spaced along a Morton curve.
 
@@ -328,10 +315,10 @@ def _from_record(record: dict[str, Any]) -> ViewSet:
     x, y, z = (float(side) for side in record["spacing"])
     views = record["views"]
     positions = np.array([view["position"] for view in views], dtype=np.float64).reshape(-1, 3)
-    odd = sorted({str(view["look"]) for view in views} - set(_LOOKS))
+    odd = sorted({str(view["look"]) for view in views} - set(LOOKS))
     if odd or not views or not np.abs(positions).max() <= _FARTHEST:
         raise ForeignFileError(
-            f"expected views along {', '.join(_LOOKS)}, within {_FARTHEST:g} m, got "
+            f"expected views along {', '.join(LOOKS)}, within {_FARTHEST:g} m, got "
             f"{len(views)}, some along {odd[:1] or 'them, but farther away'}"
         )
     return ViewSet(

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from r3jax.exploration.clock import ClockName
+from r3jax.forecast.goal import parse_goal
 
 MAX_CAPACITY = 1 << 27
 """Rows of a map: 5 GB."""
@@ -55,8 +56,17 @@ class ExplorationConfig:
     max_still_views: int = 100
     """So many views in a row without moving end the run: the policy is stuck."""
 
+    until: str | None = None
+    """The run ends when the forecast says so: `psnr:25` for the mean of all views of the free
+    space, `psnr:20@p10` for all but the worst tenth; None: the budget alone ends it."""
+
+    until_every: int = 5
+    """Views from one look at the forecast to the next; it takes most of a second."""
+
     def __post_init__(self) -> None:
         """Refuses what cannot work."""
+        if self.until is not None:
+            parse_goal(self.until)
         for name in ("voxel_size", "cell_size", "max_range", "speed"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -65,7 +75,9 @@ class ExplorationConfig:
                 raise ValueError(
                     f"{name} must lie between 0.001 and 1000 m, got {getattr(self, name)}"
                 )
-        for name in ("num_bins", "num_probes", "checkpoint_every", "max_still_views"):
+        for name in (
+            "num_bins", "num_probes", "checkpoint_every", "max_still_views", "until_every"
+        ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.capacity < 2 or self.capacity & (self.capacity - 1):

@@ -25,6 +25,9 @@ class StopReason(enum.Enum):
     BUDGET = "budget"
     """The next view would exceed the budget."""
 
+    FORECAST = "forecast"
+    """The views are enough: the forecast has reached the goal."""
+
     NO_CANDIDATE = "no-candidate"
     """The policy found no place to look from."""
 
@@ -105,4 +108,4 @@ class Mission:
     config: ExplorationConfig
     clock: Clock
     on_stage: Callable[[str], None] = lambda stage: None
-    """Told what happens next: `plan`, `render`, `map`, `measure`, `record`."""
+    """Told what happens next: `forecast`, `plan`, `render`, `map`, `measure`, `record`."""

@@ -16,6 +16,8 @@ from r3jax.exploration.clock import timed
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
+from r3jax.forecast.forecast import forecast_map
+from r3jax.forecast.goal import parse_goal
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import angle_between
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
@@ -86,6 +88,8 @@ def step(state: LoopState, mission: Mission) -> tuple[LoopState, View | Stop]:
     if state.views == 0:
         return _look(state, mission, state.T_world_camera, None, {}, 0.0)
     stop = _spent(state, mission, seconds=0.0, metres=0.0)
+    if stop is None:
+        stop = _good_enough(state, mission)
     if stop is not None:
         return state, stop
     mission.on_stage("plan")
@@ -140,6 +144,25 @@ def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float)
             StopReason.STUCK, f"{spent}: the last {state.still_views} views were taken on one spot"
         )
     return None
+
+
+def _good_enough(state: LoopState, mission: Mission) -> Stop | None:
+    """Why no further view is needed; asked beside the mission, not on its clock."""
+    config = mission.config
+    if config.until is None or state.views % config.until_every:
+        return None
+    mission.on_stage("forecast")
+    goal, camera = parse_goal(config.until), mission.simulator.camera
+    forecast = forecast_map(state.map_state, state.grid, camera, max_range=config.max_range)
+    if not goal.reached(forecast):
+        return None
+    low, high = forecast.interval(goal.statistic)
+    return Stop(
+        StopReason.FORECAST,
+        f"{state.views} views: the forecast of the PSNR of free-space views "
+        f"({goal.statistic}) is {forecast.value(goal.statistic):.1f} dB, "
+        f"{low:.1f} to {high:.1f} in four of five places; {goal} was asked for",
+    )
 
 
 def _look(

@@ -3,7 +3,7 @@
 from r3jax.cli.options.audit import Audit
 from r3jax.cli.options.benchmark import Benchmark
 from r3jax.cli.options.explore import Demo, Explore
-from r3jax.cli.options.runs import Export, Info, Merge, Policies, Replay, View
+from r3jax.cli.options.runs import Export, Forecast, Info, Merge, Policies, Replay, View
 from r3jax.cli.options.splats import Evaluate, Train
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Evaluate",
     "Explore",
     "Export",
+    "Forecast",
     "Info",
     "Merge",
     "Policies",

@@ -40,6 +40,11 @@ class Explore:
     budget: Annotated[str | None, tyro.conf.arg(metavar="BUDGET")] = None
     """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `metres:M`."""
 
+    until: Annotated[str | None, tyro.conf.arg(metavar="GOAL")] = None
+    """Stop before the budget is spent, when the forecast of the image quality says that the views
+    are enough: `psnr:25` for the mean of all free-space views, `psnr:20@p10` for all but the worst
+    tenth."""
+
     resume: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """Go on with a run that was cut off; all settings are its own. Another --budget extends it."""
 

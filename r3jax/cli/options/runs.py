@@ -50,6 +50,20 @@ class Merge:
 
 
 @dataclass(frozen=True)
+class Forecast:
+    """Forecast the PSNR that a model of a run's views would have all over the place."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+
+    calibration: Annotated[Path | None, tyro.conf.arg(metavar="JSON")] = None
+    """A calibration of your own (`python -m experiments.forecast`); by default the package's."""
+
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None
+    """PNG for the forecast along the run."""
+
+
+@dataclass(frozen=True)
 class Export:
     """Export a run for other programs: nerfstudio's transforms.json, or a COLMAP model."""
 

@@ -1,0 +1,51 @@
+"""`r3jax forecast`: what a model trained on a run would be like, from the map alone."""
+
+from collections import deque
+
+from rich.console import Console
+
+from r3jax.cli.console import PLAIN
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import Forecast
+from r3jax.evaluation.outlook import LEVEL, outlook_figure, outlook_lines
+from r3jax.evaluation.style import to_png
+from r3jax.exploration.outlook import Outlook
+from r3jax.exploration.replay import states_of
+from r3jax.files import write_atomic
+from r3jax.forecast.calibration import default_calibration, read_calibration
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import read_run
+
+
+def run_forecast(options: Forecast) -> int:
+    """Prints the forecast along the run, and what one more decibel would take.
+
+    Raises:
+        UserError: not a run, a frame that is missing, or a file that is no calibration.
+    """
+    console = Console(stderr=True)
+    try:
+        chosen = options.calibration
+        calibration = default_calibration() if chosen is None else read_calibration(chosen)
+        outlook = Outlook(read_run(options.path), calibration=calibration)
+        with console.status("rebuilding the map from the frames ..."):
+            deque(outlook.watch(states_of(outlook.run)), maxlen=0)
+        if options.plot is not None:
+            write_atomic(options.plot, to_png(outlook_figure(outlook)))
+    except (RunError, ValueError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    out = Console()
+    out.print(
+        f"PSNR of free-space views [dB], calibrated on {calibration.source}; intervals hold "
+        f"{100 * LEVEL:.0f} % of its errors in scenes that it had not seen",
+        **PLAIN,
+    )
+    out.print("views   mean   p10   p50", style="bold", markup=False)
+    for views, forecast in zip(outlook.views, outlook.forecasts, strict=True):
+        mean, low, middle = (forecast.value(name) for name in ("mean", "p10", "p50"))
+        out.print(f"{views:5d}  {mean:5.1f} {low:5.1f} {middle:5.1f}", **PLAIN)
+    for line in outlook_lines(outlook):
+        out.print(line, **PLAIN)
+    if options.plot is not None:
+        out.print(f"plot  {options.plot}", **PLAIN)
+    return 0

@@ -1,0 +1,1 @@
+"""How well models of the views collected so far would come out, from the map alone."""
