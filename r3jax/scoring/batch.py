@@ -33,8 +33,11 @@ from r3jax.scoring.views import Coordinates
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 SMALLEST = 1 << 14
-"""Voxels and cells at hand are padded to this or twice, four times, ... as many: a run compiles
-once for each size that it meets."""
+"""Voxels and cells at hand are padded to this or so many times as many: a run compiles once for
+each pair of sizes that it meets, which takes seconds and keeps some 40 MB."""
+
+VOXEL_STEP, CELL_STEP = 2, 8
+"""From one size to the next. Cells are few, and absent ones cost little."""
 
 Scores = TypeVar("Scores")
 
@@ -172,14 +175,17 @@ def near(
     low, high = positions.min(axis=0), positions.max(axis=0)
     counts = np.asarray(_count_near(state, grid, low, high, config))
     sizes = (
-        _padded(int(counts[0]), state.capacity),
-        _padded(int(counts[1]), grid.log_odds.size),
+        _padded(int(counts[0]), state.capacity, VOXEL_STEP),
+        _padded(int(counts[1]), grid.log_odds.size, CELL_STEP),
     )
     return _gather_near(state, grid, low, high, config, sizes)
 
 
-def _padded(count: int, most: int) -> int:
-    return min(max(SMALLEST, 1 << max(count - 1, 0).bit_length()), most)
+def _padded(count: int, most: int, step: int) -> int:
+    size = SMALLEST
+    while size < count:
+        size *= step
+    return min(size, most)
 
 
 def _masks(
