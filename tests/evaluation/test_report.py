@@ -19,6 +19,7 @@ from r3jax.evaluation.summary import map_row_bytes, stage_times, summary
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.hindsight import explain_run
+from r3jax.forecast.forecast import forecast_map
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
@@ -59,7 +60,7 @@ def test_the_page_stands_alone(reported):
     images = re.findall(r"data:image/png;base64,([A-Za-z0-9+/=]+)", text)
     files = {path.read_bytes() for path in page.parent.glob("*.png")}
     assert {base64.b64decode(image) for image in images} == files
-    assert len(files) == 6
+    assert len(files) == 7
 
 
 def test_the_page_tells_the_runs_own_numbers(reported):
@@ -73,6 +74,15 @@ def test_the_page_tells_the_runs_own_numbers(reported):
     assert "num_candidates 7" in text
     assert "&lt;box&gt; &amp; room" in text  # a name from outside is text, never markup
     assert "<box>" not in text
+
+
+def test_the_page_forecasts_what_a_model_would_be_worth(reported):
+    """The last of the curve's points is a forecast of the map that the run ended with."""
+    run, result, page = reported
+    forecast = forecast_map(result.state.map_state, result.state.grid, run.camera)
+    low, high = forecast.interval("p10")
+    said = f"(p10): {forecast.value('p10'):.1f} dB ({low:.1f} to {high:.1f})"
+    assert said in page.read_text()
 
 
 def test_views_are_explained_as_they_were_chosen(reported):
