@@ -4,7 +4,6 @@ A run that is interrupted, or whose disk is full, ends like any other: with the 
 everything recorded before complete. It goes on from there as if nothing had happened.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,8 +13,9 @@ from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.resume import continued, state_tables
-from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
+from r3jax.exploration.recording import record_end, record_view
+from r3jax.exploration.resume import continued
+from r3jax.exploration.state import LoopState, Mission, Stop, StopReason
 from r3jax.exploration.step import start_state, step
 from r3jax.planning.policy import Policy
 from r3jax.simulators.base import Simulator
@@ -111,7 +111,7 @@ def _go(
                 continue
             if recorder is not None:
                 mission.on_stage("record")
-                _record(recorder, output, after, mission.config)
+                record_view(recorder, output, after, mission.config)
             state = after
             rows.append(output.row)
             on_step(output.row)
@@ -121,28 +121,6 @@ def _go(
         stop = Stop(StopReason.RECORDING_STOPPED, str(error))
     except Exception as error:
         if recorder is not None:
-            _finish(recorder, state, Stop(StopReason.FAILED, f"{type(error).__name__}: {error}"))
+            record_end(recorder, state, Stop(StopReason.FAILED, f"{type(error).__name__}: {error}"))
         raise
-    return state, stop if recorder is None else _finish(recorder, state, stop)
-
-
-def _record(recorder: RunWriter, view: View, state: LoopState, config: ExplorationConfig) -> None:
-    """Writes one view, and begins to write the state after it."""
-    begin = time.perf_counter()
-    recorder.add(view.row, view.frame)
-    if state.views % config.checkpoint_every == 0:
-        recorder.checkpoint(view.row.step, state_tables(state))
-    seconds = time.perf_counter() - begin
-    recorder.add_timings(view.row.step, view.stages | {"record": seconds})
-
-
-def _finish(recorder: RunWriter, state: LoopState, stop: Stop) -> Stop:
-    """Writes the last map and how the run ended; a full disk may refuse even that."""
-    try:
-        if state.views > 0:
-            recorder.checkpoint(state.views - 1, state_tables(state), wait=True)
-        recorder.finish(stop.reason.value, stop.message)
-    except RecordingStopped as error:
-        unsaid = f"{stop.message}; the end could not be recorded ({error.reason})"
-        return Stop(stop.reason, unsaid)
-    return stop
+    return state, stop if recorder is None else record_end(recorder, state, stop)

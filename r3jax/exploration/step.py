@@ -33,8 +33,15 @@ _integrate_depth = jax.jit(integrate_depth)
 _mark_free_ball = jax.jit(mark_free_ball)
 
 
-def start_state(mission: Mission, init_key: jax.Array) -> LoopState:
+def start_state(
+    mission: Mission, init_key: jax.Array, other_starts: Iterable[np.ndarray] = ()
+) -> LoopState:
     """The state before the first view.
+
+    Args:
+        mission: what the run is asked for.
+        init_key: of the policy's first state.
+        other_starts: poses [4, 4] where others start at the same time: space that is free, too.
 
     Raises:
         ValueError: a start pose outside the world's box, or at a height where what carries the
@@ -49,7 +56,7 @@ def start_state(mission: Mission, init_key: jax.Array) -> LoopState:
             f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
         )
     pose = begin_at(motion_of(mission.policy), pose)
-    grid = first_grid(np.stack([lower, upper]), [pose], config)
+    grid = first_grid(np.stack([lower, upper]), [pose, *other_starts], config)
     map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
     policy_state = mission.policy.init(simulator.camera, grid, key=init_key)
     return LoopState(0, map_state, grid, policy_state, pose)
@@ -78,16 +85,26 @@ def add_to_grid(grid: OccupancyGrid, frame: Frame, config: ExplorationConfig) ->
     return _mark_free_ball(grid, frame.position, config.body_radius)
 
 
-def step(state: LoopState, mission: Mission) -> tuple[LoopState, View | Stop]:
+def step(
+    state: LoopState, mission: Mission, *, exchange: float = 0.0
+) -> tuple[LoopState, View | Stop]:
     """One view: decide where to go (the first view is taken at the start), fly, look, map.
+
+    Args:
+        state: before the view.
+        mission: what the run is asked for.
+        exchange: seconds on the mission clock that went into hearing from others since the last
+            view.
 
     Returns:
         The state after the view and what to record; or, if the run ends here, the state as it
         was and the reason.
     """
+    charged = {"exchange": exchange} if exchange else {}
     if state.views == 0:
-        return _look(state, mission, state.T_world_camera, None, {}, 0.0)
-    stop = _spent(state, mission, seconds=0.0, metres=0.0)
+        before = {"planning": 0.0} | charged
+        return _look(state, mission, state.T_world_camera, None, {}, before)
+    stop = _spent(state, mission, seconds=exchange, metres=0.0)
     if stop is None:
         stop = _good_enough(state, mission)
     if stop is not None:
@@ -109,10 +126,12 @@ def step(state: LoopState, mission: Mission) -> tuple[LoopState, View | Stop]:
         return state, _no_decision(state, mission, info)
     planning = mission.clock.charge("planning", measured)
     flight = _flight(decision, mission)
-    stop = _spent(state, mission, seconds=planning + flight, metres=decision.length)
+    seconds = exchange + planning + flight
+    stop = _spent(state, mission, seconds=seconds, metres=decision.length)
     if stop is not None:
         return state, stop
-    return _look(state, mission, decision.T_world_camera, (decision, info), stages, planning)
+    before = {"planning": planning} | charged
+    return _look(state, mission, decision.T_world_camera, (decision, info), stages, before)
 
 
 def _flight(decision: Decision, mission: Mission) -> float:
@@ -171,9 +190,12 @@ def _look(
     T_world_camera: np.ndarray,
     choice: tuple[Decision, PlanInfo] | None,
     stages: dict[str, float],
-    planning: float,
+    before: dict[str, float],
 ) -> tuple[LoopState, View]:
-    """Takes the view at a pose, integrates it and measures what is known now."""
+    """Takes the view at a pose, integrates it and measures what is known now.
+
+    `before` holds what is charged for the time until the camera begins to fly [s].
+    """
     mission.on_stage("render")
     begin = time.perf_counter()
     pose = np.asarray(T_world_camera, dtype=np.float64)
@@ -188,7 +210,7 @@ def _look(
     mapping = mission.clock.charge("mapping", sum(mapping_stages.values()))
     length = 0.0 if choice is None else choice[0].length
     flight = 0.0 if choice is None else _flight(choice[0], mission)
-    charged = {"planning": planning, "mapping": mapping, "flight": flight}
+    charged = before | {"mapping": mapping, "flight": flight}
     state = _arrive(state, frame, length, charged)
     mission.on_stage("measure")
     begin = time.perf_counter()

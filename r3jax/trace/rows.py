@@ -100,7 +100,8 @@ class StepRow:
     """Angle turned so far, along the shortest rotations [rad]."""
 
     charged: dict[str, float]
-    """What this view added to the mission clock: `planning`, `mapping`, `flight` [s]."""
+    """What this view added to the mission clock: `planning`, `mapping`, `flight`, and
+    `exchange` where others told what they had seen [s]."""
 
     coverage: Coverage
 
