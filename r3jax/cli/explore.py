@@ -10,7 +10,7 @@ from rich.console import Console
 
 from r3jax.cli.console import PLAIN
 from r3jax.cli.errors import UserError, check_folder_name, one_line
-from r3jax.cli.options import Explore
+from r3jax.cli.options import Explore, Team
 from r3jax.cli.pages import check_viser
 from r3jax.cli.progress import RunProgress
 from r3jax.cli.setup import (
@@ -39,7 +39,8 @@ from r3jax.trace.reader import Run, read_run
 from r3jax.trace.rows import StepRow
 from r3jax.trace.writer import RunWriter
 
-_EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
+EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
+"""Of a run that can be gone on with; 0 for all others."""
 
 _WITH_RESUME = ("resume", "budget", "until", "live", "port")
 _WITH_FORK = (
@@ -104,7 +105,7 @@ def run_explore(options: Explore) -> int:
         except RunError as error:
             raise UserError(one_line(error)) from error
     _conclude(console, recorder.path, result)
-    return _EXIT_CODES.get(result.reason, 0)
+    return EXIT_CODES.get(result.reason, 0)
 
 
 def _open_page(options: Explore, stack: contextlib.ExitStack) -> Callable[[Expedition], Any]:
@@ -165,10 +166,15 @@ def _set_out(options: Explore, console: Console) -> Expedition:
 
 
 def _resume(options: Explore, path: Path, console: Console) -> Expedition:
-    _refuse_others(options, "--resume", _WITH_RESUME)
+    refuse_others(options, "--resume", _WITH_RESUME)
     run = read_run(path)
     if run.header.is_merged:
         raise ValueError(f"{path} was merged from other runs: fork it with --fork and --at")
+    if run.header.is_of_team:
+        raise ValueError(
+            f"{path} flew in a team: go on with `r3jax team --resume {path.parent}`, or fork it "
+            "with --fork and --at"
+        )
     _refuse_half_a_fork(run)
     plan = plan_of_run(run)
     plan = _with_limits(plan, options)
@@ -177,7 +183,7 @@ def _resume(options: Explore, path: Path, console: Console) -> Expedition:
         header = dataclasses.replace(
             run.header, budget=str(plan.budget), config=dataclasses.asdict(plan.config)
         )
-    _warn_of_versions(console, run)
+    warn_of_versions(console, run)
     with console.status(f"opening {run.header.scene['name']} ..."):
         simulator = simulator_of_run(run)
     recorder, run = RunWriter.resume(path, header)
@@ -186,7 +192,7 @@ def _resume(options: Explore, path: Path, console: Console) -> Expedition:
 
 
 def _fork(options: Explore, path: Path, console: Console) -> Expedition:
-    _refuse_others(options, "--fork", _WITH_FORK)
+    refuse_others(options, "--fork", _WITH_FORK)
     run, at = read_run(path), options.at
     assert at is not None
     if not 1 <= at <= len(run.rows):
@@ -200,7 +206,8 @@ def _fork(options: Explore, path: Path, console: Console) -> Expedition:
     with console.status(f"opening {run.header.scene['name']} ..."):
         simulator = simulator_of_run(run)
     fields = policy_fields(plan.policy)
-    is_same = fields == run.header.policy
+    # What a team's policy decided on is not known from the run's own frames.
+    is_same = fields == run.header.policy and not run.header.is_of_team
     decided_from = _decided_from(run) if is_same else at
     header = dataclasses.replace(
         run.header,
@@ -249,8 +256,12 @@ def _decided_from(run: Run) -> int:
     return int((run.header.parent or {}).get("decided_from", 0))
 
 
-def _refuse_others(options: Explore, flag: str, allowed: tuple[str, ...]) -> None:
-    """A setting that would be ignored is a mistake."""
+def refuse_others(options: Explore | Team, flag: str, allowed: tuple[str, ...]) -> None:
+    """A setting that would be ignored is a mistake.
+
+    Raises:
+        ValueError: one was given beside `flag`; names it.
+    """
     fields = [field for field in dataclasses.fields(options) if field.name not in allowed]
     given = [field.name for field in fields if getattr(options, field.name) != field.default]
     if given:
@@ -258,7 +269,8 @@ def _refuse_others(options: Explore, flag: str, allowed: tuple[str, ...]) -> Non
         raise ValueError(f"{flag} takes these from the recorded run, leave them out: {names}")
 
 
-def _warn_of_versions(console: Console, run: Run) -> None:
+def warn_of_versions(console: Console, run: Run) -> None:
+    """Says which packages are not those that a run was begun with."""
     now, then = package_versions(), run.header.packages
     changed = [f"{k} {then.get(k)} -> {v}" for k, v in now.items() if then.get(k) != v]
     if changed:
@@ -274,7 +286,7 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
     console.print(f"{result.reason.value}: {result.message}", **PLAIN)
     if result.state.views == 0:
         return
-    if result.reason in _EXIT_CODES:
+    if result.reason in EXIT_CODES:
         console.print(f"go on     r3jax explore --resume {path}", **PLAIN)
     try:
         with console.status("writing the data set and the report ..."):

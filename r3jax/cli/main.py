@@ -20,6 +20,7 @@ from r3jax.cli.options import (
     Merge,
     Policies,
     Replay,
+    Team,
     Train,
     View,
 )
@@ -27,6 +28,7 @@ from r3jax.cli.options import (
 _COMMANDS = {
     "demo": Demo,
     "explore": Explore,
+    "team": Team,
     "train": Train,
     "evaluate": Evaluate,
     "benchmark": Benchmark,
@@ -89,6 +91,7 @@ def _main(args: Sequence[str] | None) -> int:
 def _run(
     command: Demo
     | Explore
+    | Team
     | Train
     | Evaluate
     | Benchmark
@@ -110,6 +113,10 @@ def _run(
         from r3jax.cli.explore import run_explore
 
         return run_explore(command)
+    if isinstance(command, Team):
+        from r3jax.cli.team import run_team
+
+        return run_team(command)
     if isinstance(command, Train):
         from r3jax.cli.train import run_train
 

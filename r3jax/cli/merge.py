@@ -60,6 +60,12 @@ def merge_runs(runs: list[Run], out: Path, *, overwrite: bool = False) -> MapSta
     """
     for run in runs[1:]:
         check_alike(runs[0], run)
+        if run.header.camera != runs[0].header.camera:
+            raise RunError(
+                run.path,
+                f"its camera is not that of {runs[0].path}, and a run has one: {run.header.camera} "
+                f"instead of {runs[0].header.camera}",
+            )
     map_state, grid = rebuild(runs)
     with RunWriter(out, _header(runs), overwrite=overwrite) as writer:
         last: StepRow | None = None

@@ -17,7 +17,7 @@ from r3jax.planning.motion import motion_of_record
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.sighting import look
 from r3jax.trace.errors import RunError
-from r3jax.trace.reader import Run
+from r3jax.trace.reader import Run, read_run
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,42 @@ def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, Oc
     return map_state, grid
 
 
+def team_of(run: Run) -> list[Run]:
+    """The runs of all members of the team that a run flew in, in order.
+
+    Raises:
+        RunError: it flew in none; one is missing, or was cut off before the last meeting.
+    """
+    names = (run.header.parent or {}).get("team")
+    if not names:
+        raise RunError(run.path, "it flew in no team")
+    team = [read_run(run.path.parent / name) for name in names]
+    for member in team:
+        if member.end is None:
+            raise RunError(
+                member.path,
+                "the team was cut off before its last meeting: go on with `r3jax team --resume "
+                f"{run.path.parent}`",
+            )
+    return team
+
+
+def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
+    """The map and the grid of a team after its last meeting: all frames, in the clock's order.
+
+    Raises:
+        RunError: the runs do not fit together, or a frame is missing or broken.
+    """
+    for run in runs[1:]:
+        check_alike(runs[0], run)
+    config = config_of(runs[0])
+    map_state, grid = _nothing_known(runs)
+    steps = [(row.seconds, n, row.step) for n, run in enumerate(runs) for row in run.rows]
+    for _, number, step in sorted(steps):
+        map_state, grid = after_frame(map_state, grid, runs[number].frame(step), config)
+    return map_state, grid
+
+
 def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
     """The map and the grid after each view of a run, in order; each when it is asked for.
 
@@ -123,13 +159,15 @@ def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
 
 
 def check_decided_alone(run: Run) -> None:
-    """Refuses a merged run where it matters on which map its views were decided.
+    """Refuses a run whose own frames do not tell on which map its views were decided.
 
     Raises:
-        RunError: it was merged.
+        RunError: it was merged, or flew in a team.
     """
     if run.header.is_merged:
         raise RunError(run.path, "it was merged from runs that decided each for itself")
+    if run.header.is_of_team:
+        raise RunError(run.path, "it flew in a team, and decided on what others had seen, too")
 
 
 def _nothing_known(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
@@ -140,20 +178,28 @@ def _nothing_known(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
 def differences(run: Run) -> tuple[int, list[Difference]]:
     """Where the newest stored map and grid are not those that the frames rebuild.
 
+    Those of a run that flew in a team are rebuilt from the frames of all its members.
+
     Returns:
         The views that were compared, and every array that differs.
 
     Raises:
-        RunError: no checkpoint, or one or a frame that cannot be read.
+        RunError: no checkpoint, or one or a frame that cannot be read; a team that was cut off.
     """
     step, stored_map, stored_grid = run.checkpoint()
-    map_state, grid = rebuild([run], step + 1)
+    team = [run]
+    if run.header.is_of_team:
+        team = team_of(run)
+        map_state, grid = rebuild_team(team)
+    else:
+        map_state, grid = rebuild([run], step + 1)
     found: list[Difference | None] = []
     for table, stored, rebuilt in (("map", stored_map, map_state), ("grid", stored_grid, grid)):
         for name, array in vars(stored).items():
             if isinstance(array, jax.Array):
                 found.append(_compare(f"{table}.{name}", array, getattr(rebuilt, name)))
-    return step + 1, [difference for difference in found if difference is not None]
+    views = step + 1 if team == [run] else sum(len(member.rows) for member in team)
+    return views, [difference for difference in found if difference is not None]
 
 
 def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | None:

@@ -73,13 +73,19 @@ class RunHeader:
     """Versions of the packages that shape the result, of Python, and the device."""
 
     parent: dict[str, Any] | None = None
-    """Where the first views come from if not from this run: `forked` from a run, `views` of it,
-    the run's own policy from view `decided_from` on; or `merged` runs with `merged_views` each."""
+    """What else a run rests on: `forked` from a run, `views` of it, the run's own policy from view
+    `decided_from` on; or `merged` runs with `merged_views` each; or the `team` of runs, folders
+    side by side, in which this is number `member`, and that met every `meet_every` seconds."""
 
     @property
     def is_merged(self) -> bool:
         """True if the views come from several runs, each of which decided on a map of its own."""
         return self.parent is not None and "merged" in self.parent
+
+    @property
+    def is_of_team(self) -> bool:
+        """True if others told this camera what they saw while it flew."""
+        return self.parent is not None and "team" in self.parent
 
     @property
     def intrinsics(self) -> Camera:

@@ -124,10 +124,13 @@ class RecordedStory:
         return True
 
     def _explain(self) -> Iterator[Reason | None]:
-        """The reasons of all views, in order; of a merged run, nothing but the replay."""
+        """The reasons of all views, in order; nothing but the replay where others had a say."""
         moments = self._timeline.follow()
         if self._run.header.is_merged:
             self._problem = "merged from runs that decided each on a map of its own"
+            return (None for _ in moments)
+        if self._run.header.is_of_team:
+            self._problem = "decided on what the others of a team had seen, too"
             return (None for _ in moments)
         return explain_run(self._run, ((m.map_state, m.grid) for m in moments))
 

@@ -5,6 +5,7 @@ from r3jax.cli.options.benchmark import Benchmark
 from r3jax.cli.options.explore import Demo, Explore
 from r3jax.cli.options.runs import Export, Forecast, Info, Merge, Policies, Replay, View
 from r3jax.cli.options.splats import Evaluate, Train
+from r3jax.cli.options.team import Team
 
 __all__ = [
     "Audit",
@@ -18,6 +19,7 @@ __all__ = [
     "Merge",
     "Policies",
     "Replay",
+    "Team",
     "Train",
     "View",
 ]
