@@ -302,6 +302,11 @@ def _inside(grid: OccupancyGrid, index: Int[Array, "*n 3"]) -> Bool[Array, "*n"]
 
 def _distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X Y Z"]:
     """Distance from a point to every cell's centre [m]."""
+    return jnp.sqrt(squared_distance(grid, point))
+
+
+def squared_distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X Y Z"]:
+    """Squared distance from a point to every cell's centre [m^2]."""
     x, y, z = (
         jnp.square(
             grid.origin[axis]
@@ -310,7 +315,7 @@ def _distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X
         )
         for axis, n in enumerate(grid.log_odds.shape)
     )
-    return jnp.sqrt(x[:, None, None] + y[None, :, None] + z[None, None, :])
+    return x[:, None, None] + y[None, :, None] + z[None, None, :]
 
 
 def _has_face_neighbor(mask: Bool[Array, "X Y Z"]) -> Bool[Array, "X Y Z"]:

@@ -6,6 +6,7 @@ unexplored cells in it are no longer worth a look. That holds for one decision: 
 the grid that is kept learns of it.
 """
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,12 @@ from jaxtyping import Array, Float
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid
+from r3jax.mapping.occupancy import (
+    LOG_ODDS_LIMIT,
+    OccupancyGrid,
+    frontier_unexplored,
+    squared_distance,
+)
 from r3jax.mapping.state import MapState
 from r3jax.planning.policy import Decision, PlanInfo, Policy
 from r3jax.scoring.config import ScoringConfig
@@ -72,6 +78,9 @@ class Considerate:
         for view in self.promised:
             pose = jnp.asarray(view.T_world_camera, dtype=jnp.float32)
             map_state, grid = after_promise(map_state, grid, view.camera, pose, self.scoring)
+        others = jnp.asarray([view.T_world_camera[:3, 3] for view in self.promised], jnp.float32)
+        here = jnp.asarray(T_world_camera[:3, 3], dtype=jnp.float32)
+        grid = without_yielded(grid, here, others)
         return self.policy.decide(state, map_state, grid, T_world_camera, key=key)
 
     def follow(
@@ -110,3 +119,25 @@ def after_promise(
     log_odds = jnp.where(shown, LOG_ODDS_LIMIT, grid.log_odds)
     after, _ = foresee(map_state, camera, T_world_camera, scoring)
     return after, eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+
+
+@jax.jit
+def without_yielded(
+    grid: OccupancyGrid, here: Float[Array, " 3"], others: Float[Array, "K 3"]
+) -> OccupancyGrid:
+    """The grid for a decision that leaves to others what lies nearer to them.
+
+    Unexplored cells that are nearer to one of the others than to here are marked as occupied; none
+    is if that would leave nothing to explore.
+
+    Args:
+        grid: the coarse grid.
+        here: where the camera is [m].
+        others: where the others go [m].
+    """
+    nearest = functools.reduce(jnp.minimum, [squared_distance(grid, other) for other in others])
+    is_yielded = grid.unexplored & (nearest < squared_distance(grid, here))
+    log_odds = jnp.where(is_yielded, LOG_ODDS_LIMIT, grid.log_odds)
+    own = eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+    is_left = jnp.any(frontier_unexplored(own))
+    return eqx.tree_at(lambda g: g.log_odds, grid, jnp.where(is_left, log_odds, grid.log_odds))
