@@ -3,12 +3,10 @@
 import contextlib
 import dataclasses
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from r3jax.cli.console import PLAIN
@@ -33,15 +31,13 @@ from r3jax.formats.transforms import write_team_transforms, write_transforms
 from r3jax.planning.limits import begin_at
 from r3jax.planning.motion import motion_of
 from r3jax.simulators.base import Simulator
+from r3jax.simulators.start import APART, places_beside
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import RunHeader
 from r3jax.trace.reader import Run, read_run
 from r3jax.trace.writer import RunWriter
 
 DEFAULT_BUDGET = "seconds:120"
-
-APART = 0.6
-"""Starts lie this far from each other [m]: two body radii."""
 
 _WITH_RESUME = ("resume", "budget")
 
@@ -213,15 +209,6 @@ def _with_starts(singles: list[Explore]) -> tuple[list[Explore], list[Simulator]
                 f"{simulators[0].start_pose[:3, 3].round(2).tolist()}: give a roomier --start"
             )
     return placed, simulators
-
-
-def places_beside(start: np.ndarray) -> Iterator[np.ndarray]:
-    """Places [3] [m] at the height of a start, `APART` from it and from each other: a ring of six.
-
-    A wall that leaves both of two such places 0.3 m of room cannot lie between them.
-    """
-    for angle in np.arange(6) * np.pi / 3.0:
-        yield start + APART * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def _check_leftovers(folder: Path, cameras: int) -> None:

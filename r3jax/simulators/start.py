@@ -17,6 +17,9 @@ MIN_CLEARANCE = 0.3
 PROMISED_CLEARANCE = 0.5
 """What `Simulator.start_pose` promises; starts that we choose ourselves keep it [m]."""
 
+APART = 0.6
+"""Cameras that start together lie this far from each other [m]: two body radii."""
+
 _EYE_HEIGHT = 1.4
 _CANDIDATES = 3000
 _PROBES = 96
@@ -33,6 +36,16 @@ def level_pose(position: np.ndarray, yaw: float) -> np.ndarray:
     pose[:3, 2] = cos, sin, 0.0
     pose[:3, 3] = position
     return pose
+
+
+def places_beside(start: np.ndarray) -> np.ndarray:
+    """Six places [6, 3] [m] at the height of a start [3], `APART` from it and from each other.
+
+    A wall cannot lie between two such places where both have `MIN_CLEARANCE` around them.
+    """
+    angle = np.arange(6) * np.pi / 3.0
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(6)], axis=1)
+    return start + APART * ring
 
 
 def start_problem(

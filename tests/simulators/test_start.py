@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.start import APART, places_beside
 from tests.simulators.rooms import SMALL, box_quads, box_room, facing_x, world_of
 
 PILLAR = ((4, 1, 0), (5.5, 3, 3))
@@ -109,3 +110,12 @@ def test_a_bad_start_of_the_world_is_refused():
 def test_a_start_that_is_no_pose_is_refused():
     with pytest.raises(ValueError, match="start_pose: the pose is not rigid"):
         RaycastSimulator(box_room(), start_pose=2.0 * facing_x(2, 2, 1))
+
+
+def test_places_beside_a_start_keep_apart():
+    start = np.array([1.0, -2.0, 1.4])
+    places = np.concatenate([start[None], places_beside(start)])
+    between = np.linalg.norm(places[:, None] - places[None], axis=2)
+    assert between[~np.eye(7, dtype=bool)].min() > APART - 1e-9
+    np.testing.assert_allclose(between[0, 1:], APART)
+    np.testing.assert_array_equal(places[:, 2], start[2])
