@@ -73,9 +73,9 @@ class Size:
 
 SIZES: dict[SizeName, Size] = {
     "smoke": Size("flat", (0,), 30.0),
-    "small": Size("apartment", (0, 1, 2), 90.0),
+    "small": Size("apartment", (0, 1, 2), 60.0),
 }
-"""Some minutes on two cores; an hour."""
+"""Some minutes on two cores; half an hour."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,12 @@
 
 Two cameras that know the same would want the same view. Whoever decides second takes the first
 one's view as taken: what it will show of the map is foreseen (`scoring.foresight`), and the
-unexplored cells in it are no longer worth a look. That holds for one decision: neither the map nor
-the grid that is kept learns of it.
+unexplored cells in it are no longer worth a look. Nor are those that lie nearer to where the
+other goes, unless nothing else is left: two cameras that see a door go through it one after the
+other for nothing. All that holds for one decision: neither the map nor the grid that is kept
+learns of it.
+
+Shape symbols: X Y Z cells along the axes; K other cameras.
 """
 
 import functools

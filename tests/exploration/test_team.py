@@ -25,7 +25,7 @@ from r3jax.exploration.team import Member, explore_team
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.state import empty_map
 from r3jax.planning.policy import Decision, Outcome, PlanInfo
-from r3jax.planning.promised import after_promise
+from r3jax.planning.promised import after_promise, without_yielded
 from r3jax.scoring.batch import score_views
 from r3jax.scoring.config import ScoringConfig
 from r3jax.trace.images import stored_form
@@ -188,7 +188,9 @@ def law_nobody_knows_more_or_less(meet_every: float, seed: int = 1, team=real_te
             if under_way is not None and (begins[under_way[:2]], under_way[1]) < (now, number):
                 frame = under_way[2]
                 scoring = ScoringConfig(max_range=jnp.asarray(CONFIG.max_range, jnp.float32))
-                expected = after_promise(*expected, frame.camera, frame.T_world_camera, scoring)
+                after, dark = after_promise(*expected, frame.camera, frame.T_world_camera, scoring)
+                here = np.asarray(rows[k - 1].pose)[:3, 3]
+                expected = after, without_yielded(dark, jnp.asarray(here), frame.position[None])
             assert_equal((map_state, grid), expected)
             # Everything told since the last time, and one's own on top of it once more.
             news = [item for item in common if item[0] > heard]
