@@ -16,6 +16,7 @@ from r3jax.foreign.fields import build, check_type
 from r3jax.foreign.files import read_bytes
 from r3jax.foreign.images import MAX_PIXELS
 from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.names import check_relative
 from r3jax.foreign.versions import VersionError, check_version
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.motion import Motion
@@ -180,6 +181,8 @@ def _check(header: RunHeader) -> None:
         check_type(f"camera.{name}", header.camera.get(name), kind)
     check_type("scene.name", header.scene.get("name"), str)
     check_type("policy.name", header.policy.get("name"), str)
+    if header.is_of_team:
+        _check_team(header.parent or {})
     camera = header.intrinsics
     if camera.width * camera.height > MAX_PIXELS:
         raise ForeignFileError(f"images of {camera.width} x {camera.height} pixels are not read")
@@ -188,3 +191,17 @@ def _check(header: RunHeader) -> None:
     lower, upper = header.bounds
     if any(low > high for low, high in zip(lower, upper, strict=True)):
         raise ForeignFileError(f"`bounds` are upside down: {lower} to {upper}")
+
+
+def _check_team(parent: dict[str, Any]) -> None:
+    """Refuses what no team has.
+
+    Raises:
+        ValueError: says which setting makes no sense.
+    """
+    check_type("parent.team", parent["team"], list[str])
+    check_type("parent.meet_every", parent.get("meet_every"), float)
+    if not parent["team"] or parent["meet_every"] < 0.0:
+        raise ForeignFileError("`parent` names a team without members, or that met before it began")
+    for name in parent["team"]:
+        check_relative(name)

@@ -1,5 +1,6 @@
 """What a team leaves on disk: runs that replay, and a team that goes on as if never cut off."""
 
+import json
 import shutil
 
 import pytest
@@ -132,3 +133,22 @@ def test_decisions_of_a_team_are_not_explained_from_one_run(whole):
     folder, _ = whole("wander")
     with pytest.raises(RunError, match="flew in a team"):
         check_decided_alone(read_run(folder / "0"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"team": [3]}, "`parent.team` must be"),
+        ({"team": []}, "without members"),
+        ({"team": ["../elsewhere"]}, "leads out of the folder"),
+        ({"meet_every": "often"}, "`parent.meet_every` must be float"),
+        ({"meet_every": -1.0}, "met before it began"),
+    ],
+)
+def test_a_header_that_names_no_team_is_refused(tmp_path, whole, change, message):
+    source, _ = whole("wander")
+    header = json.loads((source / "0" / "run.json").read_text())
+    header["parent"] |= change
+    (tmp_path / "run.json").write_text(json.dumps(header))
+    with pytest.raises(RunError, match=message):
+        read_run(tmp_path)
