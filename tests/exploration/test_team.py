@@ -212,6 +212,16 @@ def test_nobody_knows_more_or_less_than_was_told(meet_every):
     law_nobody_knows_more_or_less(meet_every)
 
 
+def law_everyone_draws_for_itself(team=real_team) -> None:
+    result = team.explore_team(wanderers((None, None)), budget="views:2", config=CONFIG)
+    first, second = (member.rows[1].choice.score for member in result.members)
+    assert first != second
+
+
+def test_everyone_draws_for_itself():
+    law_everyone_draws_for_itself()
+
+
 @dataclass
 class Turning:
     """Stays where it is and takes the most useful of eight level views."""
@@ -321,6 +331,10 @@ def informed(modules: Modules) -> None:
     law_nobody_knows_more_or_less(0.9, team=modules["team"])
 
 
+def own_lots(modules: Modules) -> None:
+    law_everyone_draws_for_itself(modules["team"])
+
+
 MUTANTS = [
     Mutant("sharing", 'attrgetter("seconds", "member")', 'attrgetter("member", "seconds")', merged),
     Mutant("sharing", "if sight.seconds > until:", "if sight.seconds >= until:", merged_in_touch),
@@ -343,8 +357,8 @@ MUTANTS = [
         merged,
     ),
     Mutant("team", "me = min((me", "me = max((me", informed),
-    Mutant("team", "if i != number]", "if False]", merged),
-    Mutant("team", "jax.random.fold_in(key, number) if number else key", "key", informed),
+    Mutant("team", "if i != number]", "if False]", informed),
+    Mutant("team", "jax.random.fold_in(key, number) if number else key", "key", own_lots),
 ]
 
 
@@ -352,6 +366,7 @@ def test_the_laws_hold_on_a_fresh_copy():
     modules = load(CHAIN)
     merged(modules)
     informed(modules)
+    own_lots(modules)
 
 
 @each(MUTANTS)
