@@ -23,9 +23,9 @@ from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import host_generator, poses_along, random_directions
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
-from r3jax.planning.greedy import Situation
 from r3jax.planning.policies.active_gamer import ActiveGamer, empty_share
 from r3jax.planning.policy import make_policy
+from r3jax.planning.situation import Situation
 from r3jax.planning.travel import plan_travel
 from r3jax.scoring.pixels import score_pixels
 from r3jax.scoring.sighting import look

@@ -45,7 +45,7 @@ EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
 _WITH_RESUME = ("resume", "budget", "until", "live", "port")
 _WITH_FORK = (
     "fork", "at", "policy", "budget", "until", "name", "out", "overwrite", "candidates", "lambda1",
-    "lambda2", "live", "port",
+    "lambda2", "refine", "live", "port",
 )  # fmt: skip
 """Options that make sense beside these; all others are fixed by the recorded run."""
 
@@ -198,7 +198,9 @@ def _fork(options: Explore, path: Path, console: Console) -> Expedition:
     if not 1 <= at <= len(run.rows):
         raise ValueError(f"--at must lie between 1 and the run's {len(run.rows)} views, got {at}")
     plan = plan_of_run(run)
-    given = (options.policy, options.candidates, options.lambda1, options.lambda2)
+    given = (
+        options.policy, options.candidates, options.lambda1, options.lambda2, options.refine
+    )  # fmt: skip
     if any(value is not None for value in given):
         policy = policy_of_options(options, run.header.scene["max_range"], motion_of(plan.policy))
         plan = dataclasses.replace(plan, policy=policy)

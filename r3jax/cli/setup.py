@@ -91,6 +91,7 @@ def policy_of_options(options: Explore, max_range: float, motion: Motion) -> Pol
         "motion": motion,
         "num_candidates": options.candidates,
         "lambda2": options.lambda2,
+        "refine": options.refine,
     }
     if options.candidates is not None:
         # Keeps the share that is aimed at the frontier, whatever the number.

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from r3jax.geometry.cameras import pose_along
 from r3jax.planning.travel import Travel, segment_is_inside
 
-_JITTER = 0.25
+JITTER = 0.25
 """Positions lie at most this far from their cell's centre, along each axis [cells]."""
 
 _MOST_PLACES = 4096
@@ -233,4 +233,4 @@ def best_views(positions: np.ndarray, panorama: Any) -> tuple[np.ndarray, np.nda
 
 
 def _jitter(centers: np.ndarray, cell_size: float, rng: np.random.Generator) -> np.ndarray:
-    return centers + rng.uniform(-_JITTER, _JITTER, size=centers.shape) * cell_size
+    return centers + rng.uniform(-JITTER, JITTER, size=centers.shape) * cell_size

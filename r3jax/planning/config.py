@@ -45,6 +45,13 @@ class PlannerConfig:
     safety_margin: float = 0.3
     """A path keeps its cells' centres this far from anything not known to be free [m]."""
 
+    refine: int = 0
+    """So many of the best candidates of `ours`, `ours-pano`, `ours-demand` and `ours-ahead` climb
+    the utility by its gradient (`planning.refine`); 0: none."""
+
+    refine_radius: float = 0.4
+    """A climb ends at this distance along each axis [m]; 0: it turns the view and no more."""
+
     motion: Motion = field(default_factory=Motion)
     """What carries the camera: where it may be, how it may look and how fast it goes."""
 
@@ -77,6 +84,11 @@ class PlannerConfig:
                 f"num_frontier must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.num_frontier}"
             )
+        if not 0 <= self.refine <= self.num_candidates:
+            raise ValueError(
+                f"refine must lie between 0 and num_candidates ({self.num_candidates}), "
+                f"got {self.refine}"
+            )
         if not 1 <= self.num_standpoints <= MAX_STANDPOINTS:
             raise ValueError(
                 f"num_standpoints must lie between 1 and {MAX_STANDPOINTS}, "
@@ -85,7 +97,7 @@ class PlannerConfig:
         for name, least in (("horizon", 1), ("num_spread", 0), ("beam", 1), ("branching", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        for name in ("radius", "lambda2", "safety_margin", "view_seconds"):
+        for name in ("radius", "refine_radius", "lambda2", "safety_margin", "view_seconds"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} must be a finite number >= 0, got {value}")

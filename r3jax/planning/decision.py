@@ -215,15 +215,28 @@ def _with_way(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> Pla
     return eqx.tree_at(lambda s: s.trail, state, trail)
 
 
-def net_utility(utility: np.ndarray, path: np.ndarray, lambda2: float) -> np.ndarray:
+def net_utility(
+    utility: np.ndarray,
+    path: np.ndarray,
+    lambda2: float,
+    among: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
     """U_view of each candidate, from its utility and path length [C].
 
     U_view = utility / sum(utility) - lambda2 * path / sum(path), both sums over the reachable
     candidates (as in Active-GS); a sum of 0 leaves its term out. Unreachable: -inf.
+
+    Args:
+        utility: of each candidate.
+        path: length of the way to it, or what it costs; inf: unreachable.
+        lambda2: weight of the path.
+        among: utilities and paths of the candidates that the sums are over; None: these.
     """
-    is_reachable = np.isfinite(path)
+    wholes = (utility, path) if among is None else among
+    counts, is_reachable = np.isfinite(wholes[1]), np.isfinite(path)
     shares: list[np.ndarray] = []
-    for values in (utility, path):
+    for values, whole in zip((utility, path), wholes, strict=True):
         values = np.where(is_reachable, np.asarray(values, dtype=np.float64), 0.0)
-        shares.append(values / (values.sum() or 1.0))
+        total = np.where(counts, np.asarray(whole, dtype=np.float64), 0.0).sum()
+        shares.append(values / (total or 1.0))
     return np.where(is_reachable, shares[0] - lambda2 * shares[1], -np.inf)

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -33,38 +34,11 @@ from r3jax.planning.decision import (
 )
 from r3jax.planning.limits import Limits
 from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.planning.refine import refine_best
+from r3jax.planning.situation import Situation
 from r3jax.planning.travel import Travel
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.pixels import Value, score_pixels
-
-
-@dataclass(frozen=True)
-class Situation:
-    """All that a decision may depend on: what is known, where the robot is and can go."""
-
-    map_state: MapState
-
-    grid: OccupancyGrid
-    """As it is; for travel."""
-
-    scoring_grid: OccupancyGrid
-    """Without unexplored cells that are not worth a look (`look_round`); for utilities."""
-
-    travel: Travel
-    """Where the robot can go from here."""
-
-    camera: Camera
-    """Of every frame to come."""
-
-    memory: Any
-    """What the policy keeps beside the map."""
-
-    limits: Limits = field(default_factory=Limits)
-    """What the carrier of the camera may do next. Candidates need not lie within them: `decide`
-    sees to that."""
-
-    notes: Any = None
-    """What `draw` noted of the candidates."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +71,10 @@ class GreedyPolicy(ABC):
     source: ClassVar[str]
     """Where the rule comes from."""
 
+    climbs: ClassVar[bool] = False
+    """True where `utility` is that of `scoring.utility`, and `total` the net of it: `decide` then
+    refines the best candidates if the settings ask for it."""
+
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
         """What the policy keeps beside the map, before the first frame: nothing."""
         del camera, grid
@@ -110,6 +88,12 @@ class GreedyPolicy(ABC):
         self, situation: Situation, poses: np.ndarray, *, key: Array
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """The candidates, turned if the policy turns them, and `utility` [C] among others."""
+
+    def standpoints(
+        self, situation: Situation, positions: np.ndarray, *, key: Array
+    ) -> np.ndarray | None:
+        """From where the utility asks for surfaces [S, 3] [m] (`scoring.demand`); None: it is U."""
+        del situation, positions, key
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """`total` of each candidate, from `utility` and `path` [C]: U_view."""
@@ -164,6 +148,14 @@ class GreedyPolicy(ABC):
         with stopwatch.part("travel"):
             lengths = travel.lengths(poses[:, :3, 3])
             utilities = utilities | {"path": limits.path_costs(lengths, poses)}
+        if self.climbs and self.config.refine:
+            with stopwatch.part("refining"):
+                asked = self.standpoints(situation, poses[:, :3, 3], key=score_key)
+                first = (utilities["utility"], utilities["path"])
+                weigh = partial(net_utility, lambda2=self.config.lambda2, among=first)
+                poses, utilities = refine_best(
+                    situation, poses, utilities, self.config, weigh, asked
+                )
         utilities = utilities | {"total": self.weigh(utilities)}
         best, decision, state, info = settle(state, travel, poses, utilities, limits, stopwatch)
         memory = self.conclude(situation, poses, utilities, best)

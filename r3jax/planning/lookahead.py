@@ -40,7 +40,7 @@ _NEIGHBORS = 8
 _APART = 0.7
 """Views from places this far apart are two choices [m]."""
 
-_SPEED = 1.0
+SPEED = 1.0
 """Of a carrier whose motion does not say [m/s]."""
 
 _TURNED = 0.5
@@ -100,7 +100,7 @@ class Outlook:
     @property
     def speed(self) -> float:
         """Of the carrier [m/s]."""
-        return self.limits.motion.speed or _SPEED
+        return self.limits.motion.speed or SPEED
 
 
 def search(outlook: Outlook, voxels: Voxels, cells: Cells) -> list[Path]:

@@ -89,9 +89,10 @@ def score_views_near(
     camera: Camera,
     poses: Float[Array, "C 4 4"],
     config: ScoringConfig,
+    demand: Demand | None = None,
 ) -> ViewUtility:
-    """`score_views` of voxels and cells that `near` gathered."""
-    return deal(functools.partial(_score_views, voxels, cells, camera, config), poses)
+    """`score_views` of voxels and cells that `near` gathered, and of a demand for them if given."""
+    return deal(functools.partial(_score_views, voxels, cells, camera, config, demand), poses)
 
 
 def score_positions_near(
@@ -128,9 +129,10 @@ def _score_views(
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
+    demand: Demand | None,
     poses: Float[Array, "C 4 4"],
 ) -> ViewUtility:
-    score = functools.partial(utility_of_view, voxels, cells, camera, config=config)
+    score = functools.partial(utility_of_view, voxels, cells, camera, config=config, demand=demand)
     return jax.lax.map(score, poses)
 
 

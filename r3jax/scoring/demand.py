@@ -143,14 +143,24 @@ def gain_by_direction(
         index: Int[Array, " K"], valid: Bool[Array, " K"], total: Float[Array, " B"]
     ) -> Float[Array, " B"]:
         part = voxels.take(index, valid)
-        cover = demand.cover[:, index]
-        gain = jnp.zeros(index.shape)
-        for s, (offer, worth) in enumerate(_offers(part, demand, position, focal)):
-            gain = gain + worth * jnp.maximum(offer - cover[s], 0.0)
-        gain = jnp.where(valid, gain, 0.0)
+        gain = jnp.where(valid, gain_of_voxels(part, demand, index, position, focal), 0.0)
         return total + sum_by_direction(part.center, gain, position, num_bins)
 
     return for_selected(visible, add, jnp.zeros(num_bins, dtype=jnp.float32))
+
+
+def gain_of_voxels(
+    part: Voxels,
+    demand: Demand,
+    index: Int[Array, " K"],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+) -> Float[Array, " K"]:
+    """What seeing each of the voxels at `index`, which are `part`, from a position would add."""
+    cover, gain = demand.cover[:, index], jnp.zeros(index.shape)
+    for s, (offer, worth) in enumerate(_offers(part, demand, position, focal)):
+        gain = gain + worth * jnp.maximum(offer - cover[s], 0.0)
+    return gain
 
 
 def gain_of(

@@ -9,6 +9,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_mask
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.demand import Demand, gain_by_direction
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.views import pinhole_view
 from r3jax.scoring.visibility import candidates_of, depth_buffer, seen_in
@@ -52,12 +53,20 @@ def utility_of_view(
     camera: Camera,
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
+    demand: Demand | None = None,
 ) -> ViewUtility:
-    """`view_utility` of voxels and cells that are already at hand."""
+    """`view_utility` of voxels and cells that are already at hand.
+
+    With a demand for these voxels, `rendering` is what seeing them would add (`scoring.demand`).
+    """
     view = pinhole_view(camera, T_world_camera, config)
     buffer, visible = seen_in(voxels, view, config)
     position = T_world_camera[:3, 3]
-    rendering = lack_by_direction(voxels, visible, position, camera.focal, config.kappa, 1)[0]
+    focal = camera.focal
+    if demand is None:
+        rendering = lack_by_direction(voxels, visible, position, focal, config.kappa, 1)[0]
+    else:
+        rendering = gain_by_direction(voxels, visible, demand, position, focal, 1)[0]
     exploration = unexplored_by_direction(cells, view, buffer, position, 1)[0]
     return ViewUtility(exploration, rendering, config.lambda1 * exploration + rendering)
 

@@ -82,7 +82,8 @@ def visible_voxels(
 
     def test(index: Int[Array, " K"]) -> Bool[Array, " K"]:
         place = view.place(voxels.center_of(index))
-        return _shows_a_corner(view, place, voxels.size, buffer.limit)
+        margin = corner_margin(view, place, voxels.size, buffer.limit)
+        return _is_in_view(view, place) & (margin >= 0.0)
 
     return narrow(candidates, test)
 
@@ -115,14 +116,18 @@ def is_visible(view: View, place: Placement, limit: Float[Array, "h w"]) -> Bool
         place: where the points fall in it.
         limit: `DepthBuffer.distance` for points in empty space, which nothing may hide.
     """
-    nearest = _at_pixel(limit, place.column, place.row, wraps=view.wraps)
-    return _is_in_view(view, place) & (place.distance <= nearest)
+    return _is_in_view(view, place) & (depth_margin(view, place, limit) >= 0.0)
 
 
-def _shows_a_corner(
+def depth_margin(view: View, place: Placement, limit: Float[Array, "h w"]) -> Float[Array, " n"]:
+    """How far before `limit` points lie at their pixel [m]; negative: something hides them."""
+    return _at_pixel(limit, place.column, place.row, wraps=view.wraps) - place.distance
+
+
+def corner_margin(
     view: View, place: Placement, voxel_size: Float[Array, ""], limit: Float[Array, "h w"]
-) -> Bool[Array, " n"]:
-    """True for voxels with a corner, as they appear in the view, that nothing hides.
+) -> Float[Array, " n"]:
+    """The same for voxels, at that of their corners, as they appear in the view, that shows most.
 
     Half of the voxels that a cluttered room hides in part show something beside the edge that
     hides their middle.
@@ -137,14 +142,18 @@ def _shows_a_corner(
     reach = jnp.maximum(
         jnp.maximum(farthest[0], farthest[1]), jnp.maximum(farthest[2], farthest[3])
     )
-    return _is_in_view(view, place) & (place.distance <= reach)
+    return reach - place.distance
+
+
+def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
+    """True for points that fall into the image, at whatever distance."""
+    height, width = view.shape
+    is_in = (place.column >= 0.0) & (place.column < width) & place.ahead
+    return is_in & (place.row >= 0.0) & (place.row < height)
 
 
 def _is_in_view(view: View, place: Placement) -> Bool[Array, " n"]:
-    height, width = view.shape
-    is_in = (place.column >= 0.0) & (place.column < width) & place.ahead
-    is_in &= (place.row >= 0.0) & (place.row < height)
-    return is_in & (place.distance <= view.max_range)
+    return is_in_image(view, place) & (place.distance <= view.max_range)
 
 
 def _at_pixel(

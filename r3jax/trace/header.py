@@ -115,11 +115,14 @@ def plain_settings(settings: Any) -> Any:
 def settings_of(policy: object) -> dict[str, Any]:
     """What JSON can hold of a policy's settings.
 
-    A free-flying camera's motion is left out: that is what its absence has always meant.
+    A free-flying camera's motion is left out, and so is refinement where there is none: that is
+    what their absence has always meant.
     """
     settings = plain_settings(getattr(policy, "config", {}))
     if settings.get("motion") == plain_settings(Motion()):
         del settings["motion"]
+    if settings.get("refine") == 0:
+        del settings["refine"], settings["refine_radius"]
     return settings
 
 

@@ -14,10 +14,10 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.join import grow
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.greedy import Situation
 from r3jax.planning.policies.active_gs import ActiveGS, ActiveGSNoDepth, policy, regions
 from r3jax.planning.policies.active_gs.confidence import no_sightings
 from r3jax.planning.policy import Outcome
+from r3jax.planning.situation import Situation
 from r3jax.planning.travel import plan_travel
 from r3jax.scoring.pixels import PixelView
 from tests.mutants import Modules, Mutant, assert_caught, each

@@ -9,7 +9,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
-from r3jax.planning.greedy import Situation
+from r3jax.planning.situation import Situation
 from r3jax.planning.travel import plan_travel
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import view_utility

@@ -134,6 +134,9 @@ class Explore:
     lambda2: Annotated[float | None, tyro.conf.arg(metavar="WEIGHT")] = None
     """Weight of the path length against the utility (policy's default: 0.5)."""
 
+    refine: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """The best N candidates of `ours` and its kin climb the utility by its gradient (0: none)."""
+
     live: bool = False
     """Show the exploration in the browser while it runs, on this machine only (extra `viewer`)."""
 

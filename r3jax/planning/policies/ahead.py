@@ -15,8 +15,10 @@ import numpy as np
 from jaxtyping import Array
 
 from r3jax.planning.candidates import best_views, poses_along, spread
-from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_positions
-from r3jax.planning.lookahead import Outlook, lengths_between, search
+from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_positions
+from r3jax.planning.lookahead import SPEED, Outlook, lengths_between, search
+from r3jax.planning.refine import refine_best
+from r3jax.planning.situation import Situation
 from r3jax.scoring.batch import near, score_positions_near
 
 
@@ -60,8 +62,12 @@ class OursAhead(GreedyPolicy):
         allowed = situation.limits.allowed_axes(positions, scoring.panorama_bins)
         panorama = score_positions_near(voxels, cells, situation.camera, places, scoring, allowed)
         turned, utility = best_views(positions, panorama)
+        turned = situation.limits.obeyed(turned)
+        if self.config.refine:
+            turned, utility = self._refined(situation, turned, utility)
+            positions = turned[:, :3, 3]
         outlook = Outlook(
-            situation.limits.obeyed(turned),
+            turned,
             utility,
             travel.lengths(positions),
             lengths_between(travel, positions),
@@ -73,6 +79,21 @@ class OursAhead(GreedyPolicy):
         for path in search(outlook, voxels, cells):
             rate[path.places[0]] = max(rate[path.places[0]], path.rate)
         return turned, {"utility": utility, "ahead": rate}
+
+    def _refined(
+        self, situation: Situation, poses: np.ndarray, utility: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Views of the greatest rate, climbed before paths are searched: all of them gain by it."""
+        limits, travel = situation.limits, situation.travel
+        speed = limits.motion.speed or SPEED
+        ways = limits.path_costs(travel.lengths(poses[:, :3, 3]), poses)
+
+        def weigh(utility: np.ndarray, path: np.ndarray) -> np.ndarray:
+            return utility / np.maximum(self.config.view_seconds + path / speed, 1e-9)
+
+        known = {"utility": utility, "path": ways}
+        poses, found = refine_best(situation, poses, known, self.config, weigh)
+        return poses, found["utility"]
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """The rate of the best path: the way is in it."""

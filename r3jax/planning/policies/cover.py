@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
-from r3jax.planning.greedy import GreedyPolicy, Situation, score_by_pixels
+from r3jax.planning.greedy import GreedyPolicy, score_by_pixels
+from r3jax.planning.situation import Situation
 from r3jax.scoring.directions import nearest_seen
 from r3jax.scoring.pixels import PixelView
 

@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Array
 
 from r3jax.planning.candidates import standpoints
-from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
+from r3jax.planning.greedy import GreedyPolicy, ScoreViews
 from r3jax.planning.policies.renderability import turned_views
+from r3jax.planning.situation import Situation
 from r3jax.scoring.batch import score_positions
 
 
@@ -31,18 +32,19 @@ class OursDemand(GreedyPolicy):
 
     name = "ours-demand"
     source = "ours, after facility location, Nemhauser et al. 1978"
+    climbs = True
 
     def score(
         self, situation: Situation, poses: np.ndarray, *, key: Array
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Every position's best direction, and what the panorama promises there."""
         positions = poses[:, :3, 3]
+        places = self.standpoints(situation, positions, key=key)
         scoring = self.config.scoring
-        places = standpoints(
-            situation.travel,
-            self.config.num_standpoints,
-            positions,
-            float(scoring.max_range),
-            key=key,
-        )
         return turned_views(self.score_all, situation, positions, scoring, standpoints=places)
+
+    def standpoints(self, situation: Situation, positions: np.ndarray, *, key: Array) -> np.ndarray:
+        """Spread over the space that the robot can reach, in sight of the candidates."""
+        reach = float(self.config.scoring.max_range)
+        num = self.config.num_standpoints
+        return standpoints(situation.travel, num, positions, reach, key=key)

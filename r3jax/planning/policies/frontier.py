@@ -16,8 +16,9 @@ from scipy.spatial import KDTree
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier
 from r3jax.planning.candidates import VIEW_DISTANCE, host_generator, in_plain_view, poses_along
-from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_lots, free_views
+from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_lots, free_views
 from r3jax.planning.limits import UNBOUND, Limits
+from r3jax.planning.situation import Situation
 from r3jax.planning.travel import Travel
 
 _MAX_TARGETS = 300

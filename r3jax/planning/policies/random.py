@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, draw_lots, free_views
+from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_lots, free_views
+from r3jax.planning.situation import Situation
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array
 
 from r3jax.planning.candidates import best_views
-from r3jax.planning.greedy import GreedyPolicy, ScoreViews, Situation
+from r3jax.planning.greedy import GreedyPolicy, ScoreViews
+from r3jax.planning.situation import Situation
 from r3jax.scoring.batch import score_positions, score_views
 from r3jax.scoring.config import ScoringConfig
 
@@ -29,6 +30,7 @@ class Ours(GreedyPolicy):
 
     name = "ours"
     source = "Ours, arXiv 2601.07484"
+    climbs = True
 
     def score(
         self, situation: Situation, poses: np.ndarray, *, key: Array
@@ -58,6 +60,7 @@ class OursPano(GreedyPolicy):
 
     name = "ours-pano"
     source = "Ours-Pano, arXiv 2601.07484"
+    climbs = True
 
     def score(
         self, situation: Situation, poses: np.ndarray, *, key: Array

@@ -22,7 +22,8 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.decision import PlannerState
-from r3jax.planning.greedy import Drawn, GreedyPolicy, Situation, free_views
+from r3jax.planning.greedy import Drawn, GreedyPolicy, free_views
+from r3jax.planning.situation import Situation
 
 METRES_PER_RADIAN = 2.0 / np.pi
 """A quarter turn counts as much as a metre."""

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.greedy import GreedyPolicy, Situation, draw_lots, score_by_pixels
+from r3jax.planning.greedy import GreedyPolicy, draw_lots, score_by_pixels
+from r3jax.planning.situation import Situation
 from r3jax.scoring.pixels import PixelView
 
 

@@ -1,0 +1,263 @@
+"""A smooth stand-in for the utility of a view, round one place: what gradients can climb.
+
+The utility counts what is in the image and not hidden. It is piecewise constant but for R, and its
+gradient says nothing of what comes into sight a step aside. Here
+
+    soft(c, R) = sum over points p of  w_p(c) F_p(c, R)
+
+with c the position of the camera, in a box, and R its axes.
+
+- w_p, what p adds where it is in the image: (1 - R) of a voxel, or the gain for a demand, or
+  lambda1 for an unexplored cell, times a soft depth test and a soft test of the range, both
+  sigmoids of a distance [m]. It is worked out in full, with a depth buffer of its own, at nodes:
+  the middle of the box and the middles of its six sides. In between w_p is a parabola along each
+  axis, cut off at the least and the greatest of the nodes: so surfaces come out from behind
+  others, and direction bins and kappa's box take effect gradually.
+- F_p, the soft frustum: the product of a sigmoid of the angle to each side of the image.
+
+The buffers look along the start's axis with a margin all round: a surrogate for turns up to it.
+Where there are more points in sight than room, an even sample of them counts for all.
+
+Shape symbols: n voxels; c cells; m points; k nodes, 7, or 1 where the position stays; h w size of
+the depth buffers.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.geometry.cameras import Camera
+from r3jax.geometry.numerics import safe_norm
+from r3jax.mapping.compact import positions_of_set
+from r3jax.scoring.cells import Cells
+from r3jax.scoring.chunks import Selection, narrow, select
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.demand import Demand, gain_of_voxels
+from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.views import Coordinates, PinholeView, pinhole_view
+from r3jax.scoring.visibility import (
+    corner_margin,
+    depth_buffer,
+    depth_margin,
+    is_in_image,
+    is_visible,
+    visible_voxels,
+)
+from r3jax.scoring.voxels import Voxels
+
+MOST_VOXELS, MOST_CELLS = 1 << 12, 1 << 10
+"""Points of each kind that a climb looks at."""
+
+MARGIN = math.radians(25.0)
+"""The buffers reach so far beyond the image on each side [rad]."""
+
+_WIDEST = math.radians(75.0)
+"""Half a buffer's field of view at most [rad]: a plane cannot show 90."""
+
+
+class Softness(eqx.Module):
+    """Where sigmoids are at 73 %. The smaller, the nearer to the exact utility, and the rougher."""
+
+    angle: Float[Array, ""] = eqx.field(default=0.04, converter=jnp.asarray)
+    """Inside the image [rad]."""
+
+    depth: Float[Array, ""] = eqx.field(default=0.5, converter=jnp.asarray)
+    """Before what hides, and within range [voxels]."""
+
+
+class Surroundings(eqx.Module):
+    """What may be seen from a box of positions, and what it is worth from its nodes."""
+
+    x: Float[Array, " m"]
+    """Of the points: voxels, then cells [m]."""
+
+    y: Float[Array, " m"]
+    """[m]."""
+
+    z: Float[Array, " m"]
+    """[m]."""
+
+    worth: Float[Array, "k m"]
+    """w at the nodes: the middle, then the lower and the upper side along x, y and z."""
+
+    middle: Float[Array, " 3"]
+    """Of the box [m]."""
+
+    half: Float[Array, " 3"]
+    """From the middle to the sides [m]."""
+
+
+def soft_utility(
+    around: Surroundings,
+    camera: Camera,
+    position: Float[Array, " 3"],
+    R: Float[Array, "3 3"],
+    softness: Softness,
+) -> Float[Array, ""]:
+    """The stand-in for the utility of a view.
+
+    Args:
+        around: what may be seen.
+        camera: of the view.
+        position: of its center, in the box [m].
+        R: its axes in the world, as columns: right, down, forward.
+        softness: of the image's border.
+    """
+    offset = [p - position[i] for i, p in enumerate((around.x, around.y, around.z))]
+    x, y, z = (sum(R[i, j] * offset[i] for i in range(3)) for j in range(3))
+    inverse = 1.0 / jnp.sqrt(x * x + y * y + z * z + 1e-6)
+    inside = jnp.ones_like(x)
+    for along, focal, center, size in (
+        (x, camera.fx, camera.cx, camera.width),
+        (y, camera.fy, camera.cy, camera.height),
+    ):
+        for side, k in ((1.0, -center / focal), (-1.0, (size - center) / focal)):
+            sine = side * (along - k * z) * inverse / jnp.sqrt(1.0 + k * k)
+            inside = inside * jax.nn.sigmoid(sine / softness.angle)
+    return jnp.sum(inside * _worth_at(around, position))
+
+
+def surroundings_of(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    low: Float[Array, " 3"],
+    high: Float[Array, " 3"],
+    config: ScoringConfig,
+    softness: Softness,
+    demand: Demand | None = None,
+    *,
+    moves: bool = True,
+) -> Surroundings:
+    """Looks about from the nodes of a box.
+
+    Args:
+        voxels: what is known.
+        cells: unexplored space.
+        camera: of the view.
+        T_world_camera: where it begins; its axis decides what is looked at.
+        low: corner of the box [m].
+        high: opposite corner [m].
+        config: settings of the utility.
+        softness: of depth and range.
+        demand: as in `panorama_of`.
+        moves: False: the camera stays in the middle of the box.
+    """
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    nodes = middle[None, :]
+    if moves:
+        sides = np.stack([sign * np.eye(3)[axis] for axis in range(3) for sign in (-1.0, 1.0)])
+        offsets = half[None, :] * jnp.asarray(sides, dtype=jnp.float32)
+        nodes = jnp.concatenate([nodes, middle[None, :] + offsets])
+    wide = _widened(camera)
+
+    def view_from(position: Float[Array, " 3"]) -> PinholeView:
+        return pinhole_view(wide, T_world_camera.at[:3, 3].set(position), config)
+
+    def look(
+        position: Float[Array, " 3"],
+    ) -> tuple[Float[Array, "h w"], Float[Array, "h w"], Bool[Array, " n"], Bool[Array, " c"]]:
+        view = view_from(position)
+        buffer = depth_buffer(voxels, near_voxels, view, config)
+        seen = visible_voxels(voxels, near_voxels, view, buffer)
+        empty = _visible_cells(cells, near_cells, view, buffer.distance)
+        return buffer.limit, buffer.distance, seen.mask, empty.mask
+
+    reach = safe_norm(half)
+    near_voxels = select(
+        voxels.present & view_from(middle).may_see(voxels.center, voxels.size + reach)
+    )
+    near_cells = select(
+        cells.unexplored & view_from(middle).may_see((cells.x, cells.y, cells.z), reach)
+    )
+    limit, distance, seen, empty = jax.lax.map(look, nodes)
+    row, is_row, each = _sample(jnp.any(seen, axis=0), MOST_VOXELS)
+    part, center = voxels.take(row, is_row), voxels.center_of(row)
+    cell, is_cell, each_cell = _sample(jnp.any(empty, axis=0), MOST_CELLS)
+    points = jnp.stack([cells.x[cell], cells.y[cell], cells.z[cell]])
+    soft = softness.depth * voxels.size
+
+    def worth(node: tuple[Array, Array, Array]) -> Float[Array, " m"]:
+        position, limit, distance = node
+        view = view_from(position)
+        if demand is None:
+            lack = 1.0 - score_voxels(part, position, camera.focal, config.kappa).value
+        else:
+            lack = gain_of_voxels(part, demand, row, position, camera.focal)
+        place = view.place(center)
+        margin = corner_margin(view, place, voxels.size, limit)
+        margin = jnp.minimum(margin, view.max_range - place.distance)
+        shown = jnp.where(is_row & is_in_image(view, place), jax.nn.sigmoid(margin / soft), 0.0)
+        place = view.place(points)
+        margin = depth_margin(view, place, distance)
+        margin = jnp.minimum(margin, view.max_range - place.distance)
+        open_ = jnp.where(is_cell & is_in_image(view, place), jax.nn.sigmoid(margin / soft), 0.0)
+        return jnp.concatenate([each * lack * shown, each_cell * config.lambda1 * open_])
+
+    x, y, z = (jnp.concatenate([center[i], points[i]]) for i in range(3))
+    return Surroundings(x, y, z, jax.lax.map(worth, (nodes, limit, distance)), middle, half)
+
+
+def _worth_at(around: Surroundings, position: Float[Array, " 3"]) -> Float[Array, " m"]:
+    """W at a position: a parabola along each axis, within what the nodes have."""
+    worth = around.worth
+    middle = worth[0]
+    if worth.shape[0] == 1:
+        return middle
+    share = (position - around.middle) / jnp.maximum(around.half, 1e-6)
+    total = middle
+    for axis in range(3):
+        before, after = worth[2 * axis + 1], worth[2 * axis + 2]
+        t = share[axis]
+        total = total + 0.5 * t * (after - before) + t * t * (0.5 * (before + after) - middle)
+    return jnp.clip(total, worth.min(axis=0), worth.max(axis=0))
+
+
+def _widened(camera: Camera) -> Camera:
+    """A camera of as many pixels that sees `MARGIN` more on each side."""
+
+    def tangent(k: Float[Array, ""]) -> Float[Array, ""]:
+        return jnp.tan(jnp.minimum(jnp.arctan(k) + MARGIN, _WIDEST))
+
+    def lens(
+        focal: Float[Array, ""], center: Float[Array, ""], size: int
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        before, after = tangent(center / focal), tangent((size - center) / focal)
+        wide = size / (before + after)
+        return wide, wide * before
+
+    fx, cx = lens(camera.fx, camera.cx, camera.width)
+    fy, cy = lens(camera.fy, camera.cy, camera.height)
+    return Camera(camera.width, camera.height, fx, fy, cx, cy)
+
+
+def _visible_cells(
+    cells: Cells, near: Selection, view: PinholeView, distance: Float[Array, "h w"]
+) -> Selection:
+    def test(index: Int[Array, " K"]) -> Bool[Array, " K"]:
+        points: Coordinates = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
+        return is_visible(view, view.place(points), distance)
+
+    return narrow(near, test)
+
+
+def _sample(
+    chosen: Bool[Array, " n"], most: int
+) -> tuple[Int[Array, " m"], Bool[Array, " m"], Float[Array, ""]]:
+    """At most so many of the chosen, every so-manieth; which are real, and for how many each is.
+
+    Voxels lie in the order of a hash table: a sample by number is one by chance.
+    """
+    num = chosen.shape[0]
+    order = positions_of_set(chosen, num)
+    count = jnp.sum(chosen, dtype=jnp.float32)
+    each = jnp.maximum(count / most, 1.0)
+    number = jnp.arange(min(most, num), dtype=jnp.float32)
+    index = order[jnp.minimum((number * each).astype(jnp.int32), num - 1)]
+    is_real = (number * each < count) & (index < num)
+    return jnp.minimum(index, num - 1), is_real, each
