@@ -39,18 +39,18 @@ _UNIT = (0.3, 0.3, 0.3, 0.3, 0.3)
 
 
 class Starts(eqx.Module):
-    """Where climbs begin, and their bounds; [C, ...] for many."""
+    """Where climbs begin, and their bounds: of one, or of C."""
 
-    T_world_camera: Float[Array, "4 4"]
+    T_world_camera: Float[Array, "*C 4 4"]
     """The view, without roll."""
 
-    low: Float[Array, " 3"]
+    low: Float[Array, "*C 3"]
     """Corner of the box of positions [m]."""
 
-    high: Float[Array, " 3"]
+    high: Float[Array, "*C 3"]
     """Opposite corner [m]."""
 
-    elevations: Float[Array, " 2"]
+    elevations: Float[Array, "*C 2"]
     """Lowest and highest angle of the line of sight above the horizon [rad]."""
 
 

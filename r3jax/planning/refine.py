@@ -100,7 +100,7 @@ def _best(poses: np.ndarray, total: np.ndarray, num: int) -> np.ndarray:
     """
     ranked = np.argsort(-total, kind="stable")
     ranked = ranked[np.isfinite(total[ranked])]
-    views = poses[ranked].reshape(len(ranked), -1)
+    views = poses[ranked].reshape(-1, 16)
     _, first = np.unique(views, axis=0, return_index=True)
     distinct = ranked[np.sort(first)][:num]
     return distinct[np.arange(num) % len(distinct)] if len(distinct) else distinct

@@ -1,9 +1,13 @@
 """Small known worlds for the planning tests."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 
+import r3jax
 from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
 
 CELL = 0.2
 ORIGIN = np.array([-1.0, 2.0, 0.5])
@@ -43,3 +47,20 @@ def two_rooms() -> tuple[np.ndarray, np.ndarray]:
     free[13:24, 1:13, 1:9] = True
     free[12, 4:9, 1:8] = True
     return free, ~free
+
+
+@functools.cache
+def known_flat() -> tuple[MapState, OccupancyGrid]:
+    """Two rooms, the far half of the second unknown, with voxels on the walls that are known."""
+    free, walls = two_rooms()
+    known = (np.arange(25) < 18)[:, None, None]
+    free, walls = free & known, walls & known
+    free[8:10, 1:9, 3], walls[8:10, 1:9, 3] = False, True  # a table
+    points = (np.argwhere(walls) + 0.5) * CELL + ORIGIN
+    state = r3jax.integrate_points(
+        r3jax.empty_map(1 << 12, 0.1),
+        points.astype(np.float32),
+        np.full(points.shape, 0.5, np.float32),
+        center(6, 6, 4).astype(np.float32),
+    )
+    return state, grid_of(free, walls)

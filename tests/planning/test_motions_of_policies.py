@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-import r3jax
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import poses_along
@@ -20,7 +19,7 @@ from r3jax.planning.motion import MOTIONS, Motion
 from r3jax.planning.policy import Outcome, make_policy, policy_names
 from r3jax.scoring import batch
 from r3jax.scoring.config import ScoringConfig
-from tests.planning.rooms import CELL, ORIGIN, center, grid_of, pose_at, two_rooms
+from tests.planning.rooms import CELL, ORIGIN, center, grid_of, known_flat, pose_at
 from tests.planning.test_travel import assert_inside
 
 CAMERA = Camera.from_fov(16, 16, 60.0)
@@ -33,19 +32,7 @@ ROUNDING = 0.1
 
 @pytest.fixture(scope="module")
 def world():
-    """Two rooms, the far half of the second unknown, with voxels on the walls that are known."""
-    free, walls = two_rooms()
-    known = (np.arange(25) < 18)[:, None, None]
-    free, walls = free & known, walls & known
-    free[8:10, 1:9, 3], walls[8:10, 1:9, 3] = False, True  # a table
-    points = (np.argwhere(walls) + 0.5) * CELL + ORIGIN
-    state = r3jax.integrate_points(
-        r3jax.empty_map(1 << 12, 0.1),
-        points.astype(np.float32),
-        np.full(points.shape, 0.5, np.float32),
-        center(6, 6, 4).astype(np.float32),
-    )
-    return state, grid_of(free, walls)
+    return known_flat()
 
 
 def policy_of(name: str, motion: Motion):

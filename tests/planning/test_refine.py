@@ -1,0 +1,287 @@
+"""Candidates that climb: never worse, never colliding, within limits, and near the best there is.
+
+The flat is half known; the utility is worked out anew on the whole map.
+"""
+
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import r3jax
+from r3jax.geometry.cameras import Camera, rigid_error
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning import climb
+from r3jax.planning import refine as real
+from r3jax.planning.candidates import poses_along
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.decision import net_utility
+from r3jax.planning.explorable import mask_unexplorable
+from r3jax.planning.limits import Limits
+from r3jax.planning.motion import MOTIONS, Motion
+from r3jax.planning.policy import make_policy
+from r3jax.planning.situation import Situation
+from r3jax.planning.travel import plan_travel
+from r3jax.scoring.batch import demand_from, near, score_views, score_views_near
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.demand import gain_of
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.planning.rooms import center, known_flat
+from tests.planning.walls import SEEN_FROM, VOXEL, box, wall
+
+NUM, REFINED = 12, 3  # one shape: one compile
+CAMERA = Camera.from_fov(48, 48, 60.0)
+SCORING = ScoringConfig(max_range=4.0, zbuffer_size=48, panorama_size=64)
+EYE = center(6, 6, 4)
+"""Where the robot is [m]."""
+
+CONFIG = PlannerConfig(
+    num_candidates=NUM, num_frontier=0, refine=REFINED, refine_radius=0.3, scoring=SCORING
+)
+seeds = st.integers(0, 10_000)
+
+
+def situation_of(motion: Motion) -> Situation:
+    """A robot in the first room that looks along x."""
+    state, grid = known_flat()
+    start = poses_along(EYE[None], np.array([[1.0, 0.0, 0.0]]))[0]
+    heights = motion.heights_from(float(EYE[2]))
+    travel = plan_travel(grid, EYE, heights=heights)
+    limits = Limits(motion, start, heights)
+    masked = mask_unexplorable(grid, travel.reachable)
+    return Situation(state, grid, masked, travel, CAMERA, None, limits)
+
+
+def candidates(where: Situation, seed: int) -> np.ndarray:
+    """From stops, to anywhere, as far as the carrier may."""
+    rng = np.random.default_rng(seed)
+    stops = where.travel.stops(np.argwhere(where.travel.safe & where.travel.reachable))
+    places = stops[rng.integers(len(stops), size=NUM)]
+    places[:, :2] += rng.uniform(-0.05, 0.05, (NUM, 2))
+    return where.limits.obeyed(poses_along(places, rng.normal(size=(NUM, 3))))
+
+
+def utility_of(where: Situation, poses: np.ndarray) -> np.ndarray:
+    views = score_views(where.map_state, where.scoring_grid, CAMERA, poses, SCORING)
+    return np.asarray(views.total, np.float64)
+
+
+def paths_of(where: Situation, poses: np.ndarray) -> np.ndarray:
+    return where.limits.path_costs(where.travel.lengths(poses[:, :3, 3]), poses)
+
+
+def refined(modules: Modules, where: Situation, poses: np.ndarray, config: PlannerConfig = CONFIG):
+    """Before and after: utilities, paths and totals, the latter by the same sums."""
+    utility, path = utility_of(where, poses), paths_of(where, poses)
+    weigh = functools.partial(net_utility, lambda2=config.lambda2, among=(utility, path))
+    known_of = {"utility": utility, "path": path}
+    after, found = modules["refine"].refine_best(where, poses, known_of, config, weigh)
+    return weigh(utility, path), after, found, weigh
+
+
+def law_never_worse(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
+    where = situation_of(motion)
+    poses = candidates(where, seed)
+    before = utility_of(where, poses)
+    total, after, found, weigh = refined(modules, where, poses)
+    is_new = np.any(after != poses, axis=(1, 2))
+    assert is_new.sum() <= REFINED
+    exact = utility_of(where, after)
+    np.testing.assert_allclose(found["utility"], exact, rtol=1e-5)
+    np.testing.assert_allclose(found["path"], paths_of(where, after), atol=1e-9)
+    np.testing.assert_array_equal(found["utility"][~is_new], before[~is_new])
+    assert np.all(exact[is_new] > before[is_new])
+    assert np.all(weigh(exact, found["path"])[is_new] > total[is_new])
+    best = np.argsort(-total)[:REFINED]
+    assert set(np.flatnonzero(is_new)) <= set(best)
+
+
+def law_safe(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
+    """Every view that is new stands in a stop, within reach of its start, and is allowed."""
+    where = situation_of(motion)
+    poses = candidates(where, seed)
+    _, after, found, _ = refined(modules, where, poses)
+    stops = where.travel.safe & where.travel.reachable
+    for start, pose in zip(poses, after, strict=True):
+        assert stops[where.travel.cell_of(pose[:3, 3])]
+        assert np.abs(pose[:3, 3] - start[:3, 3]).max() <= CONFIG.refine_radius + 1e-9
+        assert rigid_error(pose) is None
+        assert abs(pose[2, 0]) < 1e-6  # no roll
+    assert np.all(np.isfinite(found["path"]))
+    np.testing.assert_allclose(where.limits.obeyed(after), after, atol=1e-6)
+
+
+@given(seeds, st.sampled_from(list(MOTIONS)))
+@settings(max_examples=12)
+def test_no_view_gets_worse_or_collides(seed, motion_name):
+    law_never_worse({"refine": real}, seed, MOTIONS[motion_name])
+    law_safe({"refine": real}, seed, MOTIONS[motion_name])
+
+
+def law_gains(modules: Modules) -> None:
+    """Random directions leave much to gain: half of the best of these, a tenth or more."""
+    where, gains = situation_of(MOTIONS["free"]), []
+    for seed in range(4):
+        poses = candidates(where, seed)
+        before = utility_of(where, poses)
+        total, _, found, _ = refined(modules, where, poses)
+        best = np.argsort(-total)[:REFINED]
+        gains += list(found["utility"][best] / before[best] - 1.0)
+    assert np.median(gains) > 0.1
+
+
+def test_climbing_gains():
+    law_gains({"refine": real})
+
+
+def test_turning_alone_gains_and_stays():
+    where = situation_of(MOTIONS["free"])
+    config = dataclasses.replace(CONFIG, refine_radius=0.0)
+    poses = candidates(where, 1)
+    before = utility_of(where, poses)
+    _, after, found, _ = refined({"refine": real}, where, poses, config)
+    np.testing.assert_array_equal(after[:, :3, 3], poses[:, :3, 3])
+    assert (found["utility"] / before).max() > 1.05
+
+
+def test_climbs_compile_once():
+    where = situation_of(MOTIONS["free"])
+    refined({"refine": real}, where, candidates(where, 0))
+    before = climb._move._cache_size()
+    for seed, motion in enumerate(("free", "gimbal", "handheld", "ground")):
+        where = situation_of(MOTIONS[motion])
+        refined({"refine": real}, where, candidates(where, seed))
+    assert climb._move._cache_size() == before
+
+
+def badly_seen() -> tuple[r3jax.MapState, OccupancyGrid]:
+    """A wall seen well from in front; a patch of it only along the wall. Nothing is unexplored."""
+    state = wall()
+    keys = np.stack([[20, y, z] for y in range(6, 11) for z in range(14, 19)])
+    points = np.resize((keys + 0.5) * VOXEL, (625, 3)).astype(np.float32)
+    eye = np.array([1.9, -3.0, 1.6], np.float32)
+    for _ in range(2):
+        state = r3jax.integrate_points(state, points, np.full_like(points, 0.2), eye)
+    return state, box(9.0)
+
+
+def test_a_climb_comes_near_the_best_of_a_dense_grid():
+    """Positions and directions all over the box and round the start, one by one."""
+    scoring = ScoringConfig(max_range=4.0, zbuffer_size=32)
+    state, grid = badly_seen()
+    travel = plan_travel(grid, SEEN_FROM)
+    where = Situation(state, grid, grid, travel, CAMERA, None)
+    start = poses_along(SEEN_FROM[None], np.array([[1.0, 0.0, 0.0]]))
+    config = dataclasses.replace(CONFIG, refine=1, refine_radius=0.4, scoring=scoring)
+    utility = np.asarray(score_views(state, grid, CAMERA, start, scoring).total, np.float64)
+    known_of = {"utility": utility, "path": np.zeros(1)}
+    _, found = real.refine_best(where, start, known_of, config, lambda utility, path: utility)
+    offsets = itertools.product((-0.4, 0.0, 0.4), repeat=3)
+    angles = itertools.product(np.radians(np.arange(-30, 31, 6)), np.radians(np.arange(-24, 25, 6)))
+    rows = [(*SEEN_FROM + o, *a) for o, a in itertools.product(offsets, angles)]
+    rows = np.array(rows)
+    ways = np.stack(
+        [np.cos(rows[:, 4]) * np.cos(rows[:, 3]), np.cos(rows[:, 4]) * np.sin(rows[:, 3]),
+         np.sin(rows[:, 4])], axis=1,
+    )  # fmt: skip
+    dense = score_views(state, grid, CAMERA, poses_along(rows[:, :3], ways), scoring)
+    best = float(np.asarray(dense.total).max())
+    assert best > 1.2 * utility[0]
+    assert found["utility"][0] > 0.95 * best
+
+
+@pytest.mark.parametrize("name", ["ours", "ours-pano", "ours-demand", "ours-ahead"])
+def test_decisions_with_refinement(name):
+    """The choice is one of the candidates, and what it was worth before is no more than after."""
+    state, grid = known_flat()
+    pose = poses_along(EYE[None], np.array([[1.0, 0.0, 0.0]]))[0]
+    chosen = {}
+    for num in (0, REFINED):
+        settings = dict(num_candidates=NUM, num_frontier=0, num_standpoints=3, scoring=SCORING)
+        ahead = dict(horizon=2, beam=2, branching=2, num_spread=4)
+        policy = make_policy(name, refine=num, **settings, **ahead)
+        memory = policy.init(CAMERA, grid, key=jax.random.key(0))
+        decision, _, info = policy.decide(memory, state, grid, pose, key=jax.random.key(4))
+        assert ("refining" in info.stage_seconds) == (num > 0 and name != "ours-ahead")
+        gaps = np.abs(decision.candidates - decision.T_world_camera).max(axis=(1, 2))
+        assert gaps.min() == 0.0
+        chosen[num] = decision
+    plain, better = chosen[0], chosen[REFINED]
+    is_new = np.any(plain.candidates != better.candidates, axis=(1, 2))
+    assert 0 < is_new.sum() <= REFINED
+    assert np.all(better.utilities["utility"] >= plain.utilities["utility"])
+    assert np.all((better.utilities["utility"] > plain.utilities["utility"]) == is_new)
+    if name == "ours":
+        parts = better.utilities["exploration"] * float(SCORING.lambda1)
+        np.testing.assert_allclose(
+            parts + better.utilities["rendering"], better.utilities["utility"], rtol=1e-5
+        )
+
+
+def test_views_are_scored_for_a_demand():
+    """U of a demand: lambda1 times the cells, and the gain."""
+    where = situation_of(MOTIONS["free"])
+    poses = jnp.asarray(candidates(where, 0), jnp.float32)
+    places = jnp.asarray(EYE + np.array([[0.0, 0.0, 0.0], [0.6, 0.4, 0.0]]), jnp.float32)
+    voxels, cells, _ = near(where.map_state, where.scoring_grid, poses[:, :3, 3], SCORING)
+    demand = demand_from(voxels, CAMERA, places, SCORING)
+    views = score_views_near(voxels, cells, CAMERA, poses, SCORING, demand)
+    plain = score_views_near(voxels, cells, CAMERA, poses, SCORING)
+    gain = jax.jit(jax.vmap(lambda pose: gain_of(voxels, demand, CAMERA, pose, SCORING)))(poses)
+    np.testing.assert_allclose(views.rendering, gain, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(views.exploration, plain.exploration)
+
+
+def test_nothing_to_climb_is_no_error():
+    where = situation_of(MOTIONS["free"])
+    poses = candidates(where, 0)
+    known_of = {"utility": np.ones(NUM), "path": np.full(NUM, np.inf)}
+    nothing = lambda utility, path: np.full(len(utility), -np.inf)
+    after, found = real.refine_best(where, poses, known_of, CONFIG, nothing)
+    np.testing.assert_array_equal(after, poses)
+    assert found is known_of
+
+
+CHAIN = ("r3jax.planning.refine",)
+
+
+def over_motions(law):
+    return lambda modules: [
+        law(modules, seed, MOTIONS[name])
+        for seed, name in enumerate(("free", "gimbal", "handheld"))
+    ]
+
+
+MUTANTS = [
+    Mutant("refine", "gains[\"utility\"] > 0.0", "gains[\"utility\"] > -np.inf",
+           over_motions(law_never_worse)),
+    Mutant("refine", "is_better &= weigh", "weigh", over_motions(law_never_worse)),
+    Mutant("refine", "limits.obeyed(poses_along(positions, ", "(poses_along(positions, ",
+           over_motions(law_safe)),
+    Mutant("refine", "np.clip(numbers[:, :3], low, high)", "numbers[:, :3] + 0.3",
+           over_motions(law_safe)),
+    Mutant("refine", "found[name][taken] += gains", "found[name][taken] -= gains",
+           over_motions(law_never_worse)),
+    Mutant("refine", "found[\"path\"][taken] = path[is_better]", "pass",
+           over_motions(law_never_worse)),
+    Mutant("refine", "np.argsort(-total,", "np.argsort(total,", over_motions(law_never_worse)),
+    Mutant("refine", "_directions(*numbers[:, 3:].T)", "_directions(*numbers[:, :2].T)",
+           law_gains),
+]  # fmt: skip
+
+
+def test_laws_hold_without_a_fault():
+    modules = load(CHAIN)
+    for law in (over_motions(law_never_worse), over_motions(law_safe), law_gains):
+        law(modules)
+
+
+@each(MUTANTS, in_gate=2)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
