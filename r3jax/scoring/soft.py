@@ -259,5 +259,5 @@ def _sample(
     each = jnp.maximum(count / most, 1.0)
     number = jnp.arange(min(most, num), dtype=jnp.float32)
     index = order[jnp.minimum((number * each).astype(jnp.int32), num - 1)]
-    is_real = (number * each < count) & (index < num)
+    is_real = (number < count) & (index < num)
     return jnp.minimum(index, num - 1), is_real, each

@@ -77,6 +77,13 @@ def test_a_record_reads_back_as_it_was(name):
     assert motion_of_record(settings.get("motion")) == MOTIONS[name]
 
 
+def test_a_record_without_refinement_reads_as_it_always_did():
+    plain, refined = (settings_of(make_policy("ours", refine=num)) for num in (0, 4))
+    assert not {"refine", "refine_radius"} & set(plain)
+    assert refined["refine"] == 4
+    assert PlannerConfig(refine_radius=refined["refine_radius"]).refine == 0
+
+
 def test_a_damaged_record_is_refused():
     with pytest.raises(ValueError, match="a motion has no setting legs"):
         motion_of_record({"legs": 2})

@@ -24,7 +24,7 @@ from tests.mutants import Modules, Mutant, assert_caught, each
 
 VOXEL, CAPACITY = 0.1, 1 << 11  # one shape: one compile
 CAMERA = Camera(96, 72, 90.0, 84.0, 45.0, 37.5)
-SCORING = ScoringConfig(max_range=3.0, zbuffer_size=96, lambda1=4.0)
+SCORING = ScoringConfig(max_range=2.4, zbuffer_size=96, lambda1=4.0)
 MIDDLE = np.array([0.0, 0.0, 1.25])
 BOX = np.array([0.3, 0.35, 0.2])
 """Half of the box of positions [m]."""
@@ -63,7 +63,7 @@ WALL = surface(2.0, (-1.2, 1.2), (0.1, 2.5))
 PLATE = surface(1.0, (0.1, 0.6), (0.9, 1.6))
 BARE = voxels_with(WALL)
 HIDDEN = voxels_with(WALL, PLATE)
-CELLS = cells_where(lambda x, y, z: (y > 0.9) & (x < 1.8))
+CELLS = cells_where(lambda x, y, z: (y < -0.9) & (x < 1.8))
 STANDPOINTS = jnp.asarray([[0.5, -0.8, 1.0], [0.3, 0.9, 1.6]], jnp.float32)
 DEMAND = demand_of(BARE, STANDPOINTS, CAMERA.focal, SCORING)
 
@@ -198,7 +198,8 @@ def test_without_softness_it_is_the_utility(seed):
 def law_nodes(modules: Modules) -> None:
     """Behind a plate, from the middle and from every side: what the plate hides there is left out.
 
-    The wider buffers are coarser, so that edges differ by a voxel.
+    It hides a third of what is in view. The buffers are wider and so coarser: along the plate's
+    edges they differ by a voxel.
     """
     stand = STAND if modules["soft"] is real else Stand(modules["soft"])
     around = stand.around(HIDDEN, CELLS, CRISP, None, HALF)
@@ -209,12 +210,9 @@ def law_nodes(modules: Modules) -> None:
         found.append(float(stand.value(around, jnp.asarray(numbers, jnp.float32), CRISP)))
         view = exact(HIDDEN, CELLS, CAMERA, pose_of(numbers), SCORING)
         wanted.append(float(view.total))
-    np.testing.assert_allclose(found, wanted, rtol=0.06)
-    differ = np.subtract(wanted, wanted[0])
-    assert np.abs(differ).max() > 0.1 * wanted[0]
-    np.testing.assert_allclose(
-        np.subtract(found, found[0]), differ, atol=0.35 * np.abs(differ).max()
-    )
+    np.testing.assert_allclose(found, wanted, rtol=0.15)
+    assert np.ptp(wanted) > 0.5 * wanted[0]
+    assert np.corrcoef(found, wanted)[0, 1] > 0.93
 
 
 def test_at_the_nodes_it_is_the_utility():
@@ -273,13 +271,12 @@ MUTANTS = [
     Mutant("soft", "row, position, camera.focal)", "row * 0, position, camera.focal)",
            several(law_exact)),
     Mutant("soft", "config.lambda1 * open_", "open_", several(law_exact)),
-    Mutant("soft", "margin = jnp.minimum(margin, view.max_range - place.distance)\n        open_",
-           "open_", several(law_exact)),
+    Mutant("soft", "margin = jnp.minimum(margin, view.max_range - place.distance)\n        shown",
+           "shown", several(law_exact)),
     Mutant("soft", "set(position), config)", "set(middle), config)", law_nodes),
     Mutant("soft", "margin = corner_margin(view, place, voxels.size, limit)",
            "margin = jnp.full_like(place.distance, jnp.inf)", law_nodes),
     Mutant("soft", "jnp.any(seen, axis=0)", "seen[0]", law_nodes),
-    Mutant("soft", "number * each < count", "number < count", several(law_sample)),
     Mutant("soft", "jnp.maximum(count / most, 1.0)", "1.0 + 0.0 * count", several(law_sample)),
 ]  # fmt: skip
 
