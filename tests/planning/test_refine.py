@@ -6,6 +6,7 @@ The flat is half known; the utility is worked out anew on the whole map.
 import dataclasses
 import functools
 import itertools
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -58,13 +59,15 @@ def situation_of(motion: Motion) -> Situation:
     return Situation(state, grid, masked, travel, CAMERA, None, limits)
 
 
-def candidates(where: Situation, seed: int) -> np.ndarray:
-    """From stops, to anywhere, as far as the carrier may."""
+def candidates(where: Situation, seed: int, *, poor: bool = False) -> np.ndarray:
+    """From stops, to anywhere, or poorly to the floor, as far as the carrier may."""
     rng = np.random.default_rng(seed)
     stops = where.travel.stops(np.argwhere(where.travel.safe & where.travel.reachable))
     places = stops[rng.integers(len(stops), size=NUM)]
     places[:, :2] += rng.uniform(-0.05, 0.05, (NUM, 2))
-    return where.limits.obeyed(poses_along(places, rng.normal(size=(NUM, 3))))
+    directions = rng.normal(size=(NUM, 3))
+    directions = 0.1 * directions - np.array([0.0, 0.0, 1.0]) if poor else directions
+    return where.limits.obeyed(poses_along(places, directions))
 
 
 def utility_of(where: Situation, poses: np.ndarray) -> np.ndarray:
@@ -85,11 +88,18 @@ def refined(modules: Modules, where: Situation, poses: np.ndarray, config: Plann
     return weigh(utility, path), after, found, weigh
 
 
-def law_never_worse(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
+def law_never_worse(
+    modules: Modules,
+    seed: int = 0,
+    motion: Motion = MOTIONS["free"],
+    *,
+    config: PlannerConfig = CONFIG,
+    poor: bool = False,
+) -> None:
     where = situation_of(motion)
-    poses = candidates(where, seed)
+    poses = candidates(where, seed, poor=poor)
     before = utility_of(where, poses)
-    total, after, found, weigh = refined(modules, where, poses)
+    total, after, found, weigh = refined(modules, where, poses, config)
     is_new = np.any(after != poses, axis=(1, 2))
     assert is_new.sum() <= REFINED
     exact = utility_of(where, after)
@@ -102,10 +112,12 @@ def law_never_worse(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["f
     assert set(np.flatnonzero(is_new)) <= set(best)
 
 
-def law_safe(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
+def law_safe(
+    modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"], *, poor: bool = False
+) -> None:
     """Every view that is new stands in a stop, within reach of its start, and is allowed."""
     where = situation_of(motion)
-    poses = candidates(where, seed)
+    poses = candidates(where, seed, poor=poor)
     _, after, found, _ = refined(modules, where, poses)
     stops = where.travel.safe & where.travel.reachable
     for start, pose in zip(poses, after, strict=True):
@@ -122,6 +134,30 @@ def law_safe(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) 
 def test_no_view_gets_worse_or_collides(seed, motion_name):
     law_never_worse({"refine": real}, seed, MOTIONS[motion_name])
     law_safe({"refine": real}, seed, MOTIONS[motion_name])
+
+
+def law_whatever_climbs(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
+    """The same where a climb ends anywhere, and the way counts for more than the view."""
+
+    def stray(*args, moves: bool) -> np.ndarray:
+        rng, starts = np.random.default_rng(seed), args[5]
+        assert isinstance(starts, climb.Starts)
+        positions = np.asarray(starts.T_world_camera)[:, :3, 3]
+        positions = positions + rng.uniform(-0.5, 0.5, positions.shape)
+        angles = rng.uniform((-np.pi, -1.5), (np.pi, 1.5), (REFINED, 2))
+        return np.concatenate([positions, angles], axis=1)
+
+    with mock.patch.object(modules["refine"], "climb", stray):
+        for lambda2 in (0.5, 5.0):
+            config = dataclasses.replace(CONFIG, lambda2=lambda2)
+            law_never_worse(modules, seed, motion, config=config, poor=True)
+        law_safe(modules, seed, motion, poor=True)
+
+
+@given(seeds, st.sampled_from(list(MOTIONS)))
+@settings(max_examples=12)
+def test_where_a_climb_ends_is_checked(seed, motion_name):
+    law_whatever_climbs({"refine": real}, seed, MOTIONS[motion_name])
 
 
 def law_gains(modules: Modules) -> None:
@@ -260,12 +296,12 @@ def over_motions(law):
 
 MUTANTS = [
     Mutant("refine", "gains[\"utility\"] > 0.0", "gains[\"utility\"] > -np.inf",
-           over_motions(law_never_worse)),
-    Mutant("refine", "is_better &= weigh", "weigh", over_motions(law_never_worse)),
+           over_motions(law_whatever_climbs)),
     Mutant("refine", "limits.obeyed(poses_along(positions, ", "(poses_along(positions, ",
-           over_motions(law_safe)),
-    Mutant("refine", "np.clip(numbers[:, :3], low, high)", "numbers[:, :3] + 0.3",
-           over_motions(law_safe)),
+           over_motions(law_whatever_climbs)),
+    Mutant("refine", "is_better &= weigh", "weigh", over_motions(law_whatever_climbs)),
+    Mutant("refine", "np.clip(numbers[:, :3], low, high)", "numbers[:, :3]",
+           over_motions(law_whatever_climbs)),
     Mutant("refine", "found[name][taken] += gains", "found[name][taken] -= gains",
            over_motions(law_never_worse)),
     Mutant("refine", "found[\"path\"][taken] = path[is_better]", "pass",
@@ -278,7 +314,7 @@ MUTANTS = [
 
 def test_laws_hold_without_a_fault():
     modules = load(CHAIN)
-    for law in (over_motions(law_never_worse), over_motions(law_safe), law_gains):
+    for law in (over_motions(law_never_worse), over_motions(law_whatever_climbs), law_gains):
         law(modules)
 
 
