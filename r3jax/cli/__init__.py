@@ -1,4 +1,4 @@
-"""The command line: `r3jax demo | explore | info`."""
+"""The command line: `r3jax COMMAND`; the commands are listed in `main`."""
 
 from r3jax.cli.main import main
 
