@@ -44,8 +44,11 @@ _OF_CONDITIONS = {
 }
 """Settings for which `Conditions` has fields, by name."""
 
-_OF_MISSION = ("speed", "num_probes", "max_still_views")
+_OF_MISSION = ("speed", "num_probes", "max_still_views", "until", "until_every")
 """Fields of `ExplorationConfig` that concern neither the map nor the grid."""
+
+_WORDS = ("until",)
+"""Optional fields that are no whole numbers."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +134,9 @@ def _defaults(config: type, leave_out: tuple[str, ...] = ()) -> dict[str, Any]:
 
 
 def _setting(name: str, config: type, part: Part, field: str, default: Value) -> Setting:
-    # Only optional whole numbers have no default that the kind could be taken from.
-    kind = int if default is None else type(default)
+    # Of what is optional there is no default that the kind could be taken from: it is a whole
+    # number, but for the goal.
+    kind = type(default) if default is not None else str if field in _WORDS else int
     sentence = sentences_of(config).get(field.removeprefix("scoring."), "")
     return Setting(name, default, kind, sentence, part, field)
 

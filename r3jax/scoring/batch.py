@@ -33,11 +33,9 @@ from r3jax.scoring.views import Coordinates
 from r3jax.scoring.voxels import Voxels, voxels_of
 
 SMALLEST = 1 << 14
-"""Voxels and cells at hand are padded to this or so many times as many: a run compiles once for
-each pair of sizes that it meets, which takes seconds and keeps some 40 MB."""
-
-VOXEL_STEP, CELL_STEP = 2, 8
-"""From one size to the next. Cells are few, and absent ones cost little."""
+"""Voxels at hand are padded to this or 4, 16, ... times as many: a run compiles once for each pair
+of sizes, of voxels and of cells, that it meets, which takes seconds and keeps some 40 MB for good.
+Absent ones cost little."""
 
 Scores = TypeVar("Scores")
 
@@ -176,18 +174,19 @@ def near(
         raise TypeError("score_views and score_positions choose sizes: call them outside jit")
     low, high = positions.min(axis=0), positions.max(axis=0)
     counts = np.asarray(_count_near(state, grid, low, high, config))
-    sizes = (
-        _padded(int(counts[0]), state.capacity, VOXEL_STEP),
-        _padded(int(counts[1]), grid.log_odds.size, CELL_STEP),
-    )
+    sizes = _sizes(int(counts[0]), int(counts[1]), state.capacity, grid.log_odds.size)
     return _gather_near(state, grid, low, high, config, sizes)
 
 
-def _padded(count: int, most: int, step: int) -> int:
-    size = SMALLEST
-    while size < count:
-        size *= step
-    return min(size, most)
+def _sizes(voxels: int, cells: int, capacity: int, num_cells: int) -> tuple[int, int]:
+    """Room for so many voxels and cells, in few different pairs.
+
+    The cells get as much as the voxels, or all that there are.
+    """
+    room = SMALLEST
+    while room < min(voxels, capacity):
+        room *= 4
+    return min(room, capacity), num_cells if cells > room else min(room, num_cells)
 
 
 def _masks(
