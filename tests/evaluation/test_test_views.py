@@ -267,8 +267,8 @@ MUTANTS = [
         ("return [view_set.scene_hash, ", "return [", LAWS[0]),
         ("digest.update(np.rint(self.poses", "(np.rint(self.poses", LAWS[0]),
         ("[ranks])", "[: len(ranks)])", LAWS[1]),
-        ("max_views // len(_LOOKS))]", "max_views)]", LAWS[1]),
-        ("np.repeat(positions, len(_LOOKS), axis=0)", "np.tile(positions, (6, 1))", LAWS[1]),
+        ("max_views // len(LOOKS))]", "max_views)]", LAWS[1]),
+        ("np.repeat(positions, len(LOOKS), axis=0)", "np.tile(positions, (6, 1))", LAWS[1]),
     ]
 ]
 

@@ -79,7 +79,7 @@ def test_each_device_holds_a_share_and_the_whole_map(monkeypatch):
     monkeypatch.setattr(sharding, "_score", lambda *a: given.append(a) or kept(*a))
     candidates, devices = jnp.asarray(poses()), jax.local_devices()
     voxels, cells, _ = batch.near(*flat(), candidates[:, :3, 3], CONFIG)
-    known = (voxels, cells, CAMERA, CONFIG)
+    known = (voxels, cells, CAMERA, CONFIG, None)  # no demand
     scores = sharding.score_on_devices(batch._score_views, known, candidates, devices)
     ((_, _, spread, shares),) = given
     for shared in (shares, *jax.tree.leaves(scores)):
