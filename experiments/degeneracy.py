@@ -22,7 +22,7 @@ from experiments.artefacts import (
     write_markdown,
 )
 from experiments.suite import Options, Records, origin, run_suite
-from r3jax.evaluation.equal_terms import methods_of, snapshots_of, with_short_names
+from r3jax.evaluation.equal_terms import method_name, methods_of, snapshots_of, with_short_names
 from r3jax.evaluation.positions_figure import positions_figure
 from r3jax.trace.reader import read_run
 
@@ -80,7 +80,7 @@ def write_page(folder: Path, root: Path, records: Records, source: Origin) -> No
     boxes = {}
     for mission in found:
         record = mission["record"]
-        by_scene[record["scene"]].setdefault(record["policy"], mission["poses"][:, :3, 3])
+        by_scene[record["scene"]].setdefault(method_name(record), mission["poses"][:, :3, 3])
         boxes[record["scene"]] = tuple(mission["box"])
     pictures = []
     for scene, positions in by_scene.items():
@@ -94,8 +94,9 @@ def write_page(folder: Path, root: Path, records: Records, source: Origin) -> No
 def table_rows(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """One row per cell, numbers only."""
     return [
-        {key: mission["record"][key] for key in ("scene", "policy", "seed")}
+        {"scene": mission["record"]["scene"], "policy": method_name(mission["record"])}
         | {
+            "seed": mission["record"]["seed"],
             "views": len(mission["poses"]),
             "revisit_rate": revisit_rate(mission["poses"]),
             "known_share": mission["record"]["exploration"]["known_share"],

@@ -1,6 +1,5 @@
 """`r3jax benchmark`: plans the cells, has them run, and shows what came out."""
 
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
 from r3jax.benchmark.cells import Cell
-from r3jax.benchmark.conditions import Conditions
+from r3jax.benchmark.conditions import Conditions, parse_settings
 from r3jax.benchmark.engines.events import Event, Report
 from r3jax.benchmark.engines.local import run_here, run_in_processes, visible_gpus
 from r3jax.benchmark.engines.slurm import run_on_cluster
@@ -95,17 +94,10 @@ def _request(options: Benchmark) -> Request:
 
 
 def _settings(option: str, words: Sequence[str]) -> dict[str, Any]:
-    """`NAME=VALUE` words; a value that is no number, true or false is a text."""
-    settings: dict[str, Any] = {}
-    for word in words:
-        name, separator, text = word.partition("=")
-        if not (name and separator):
-            raise ValueError(f"--{option} takes NAME=VALUE, got {word!r}")
-        try:
-            settings[name] = json.loads(text)
-        except ValueError:
-            settings[name] = text
-    return settings
+    try:
+        return parse_settings(words)
+    except ValueError as error:
+        raise ValueError(f"--{option} takes {error}") from None
 
 
 def _run(
