@@ -40,6 +40,9 @@ class Options:
     policies: tuple[str, ...] = ()
     """Policies other than the size's."""
 
+    seeds: tuple[int, ...] = ()
+    """Seeds other than the size's."""
+
     engine: Literal["local", "slurm"] = "local"
     """Processes on this machine, or an array job."""
 
@@ -116,7 +119,7 @@ def request_of(options: Options, unit: Literal["views", "seconds"]) -> Request:
     return Request(
         scenes=options.scenes or size.scenes,
         policies=options.policies or size.policies,
-        seeds=size.seeds,
+        seeds=options.seeds or size.seeds,
         max_test_views=size.max_test_views,
         conditions=replace(size.conditions, budget=snapshots[-1], snapshots=snapshots, clock=clock),
     )

@@ -79,7 +79,7 @@ def climb(
     """Where climbs end: positions [m], azimuths and elevations [rad]. Not to be called under jit.
 
     Args:
-        voxels: what is known; `scoring.batch.near` gathers it.
+        voxels: what is known; `scoring.near.near` gathers it.
         cells: unexplored space, the same.
         camera: of the views.
         config: settings of the utility.

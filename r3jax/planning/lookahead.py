@@ -29,9 +29,10 @@ from r3jax.planning.candidates import best_views
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.limits import Limits
 from r3jax.planning.travel import Travel, segment_is_inside
-from r3jax.scoring.batch import score_positions_near
+from r3jax.scoring.batch import score_kept_near
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.foresight import foresee_near
+from r3jax.scoring.kept import Kept
 from r3jax.scoring.voxels import Voxels
 
 _NEIGHBORS = 8
@@ -91,6 +92,12 @@ class Outlook:
     between: np.ndarray
     """Of the ways between them, [C, C] [m]."""
 
+    kept: Kept
+    """The panorama of each."""
+
+    start: tuple[Voxels, Cells]
+    """What is known: surfaces and unexplored space at hand (`scoring.near.near`)."""
+
     camera: Camera
     config: PlannerConfig
 
@@ -103,14 +110,8 @@ class Outlook:
         return self.limits.motion.speed or SPEED
 
 
-def search(outlook: Outlook, voxels: Voxels, cells: Cells) -> list[Path]:
-    """The paths of the greatest rate, best first; none if no place can be reached.
-
-    Args:
-        outlook: the places.
-        voxels: what is known of surfaces; `scoring.batch.near` gathers it.
-        cells: unexplored space, the same.
-    """
+def search(outlook: Outlook) -> list[Path]:
+    """The paths of the greatest rate, best first; none if no place can be reached."""
     config = outlook.config
     ways = outlook.limits.path_costs(outlook.lengths, outlook.poses)
     cost = config.view_seconds + ways / outlook.speed
@@ -118,7 +119,9 @@ def search(outlook: Outlook, voxels: Voxels, cells: Cells) -> list[Path]:
     rate = outlook.utility[reachable] / np.maximum(cost[reachable], 1e-9)
     ranked = reachable[np.argsort(-rate, kind="stable")]
     beam = [
-        Path((i,), (outlook.poses[i],), (float(outlook.utility[i]),), float(cost[i]), voxels, cells)
+        Path(
+            (i,), (outlook.poses[i],), (float(outlook.utility[i]),), float(cost[i]), *outlook.start
+        )
         for i in _apart(ranked.tolist(), outlook.poses, (), config.beam)
     ]
     for _ in range(config.horizon - 1):
@@ -164,7 +167,10 @@ def _expanded(path: Path, outlook: Outlook) -> list[Path]:
     positions = outlook.poses[padded, :3, 3]
     places = jnp.asarray(positions, dtype=jnp.float32)
     allowed = limits.allowed_axes(positions, config.scoring.panorama_bins)
-    panorama = score_positions_near(voxels, cells, outlook.camera, places, config.scoring, allowed)
+    kept, now = outlook.kept.at(jnp.asarray(padded)), (voxels, cells)
+    panorama = score_kept_near(
+        kept, outlook.start, now, outlook.camera, places, config.scoring, allowed
+    )
     poses, gains = best_views(positions, panorama)
     poses = limits.obeyed(poses)
     turning = [limits.motion.turning(angle_between(path.poses[-1], pose)) for pose in poses]

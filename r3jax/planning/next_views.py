@@ -24,9 +24,10 @@ from r3jax.planning.candidates import best_views, spread
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.travel import safe_cells
-from r3jax.scoring.batch import near, score_positions_near, score_views_near
+from r3jax.scoring.batch import keep_positions_near, score_kept_near, score_views_near
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.foresight import foresee_near
+from r3jax.scoring.near import near
 from r3jax.scoring.voxels import Voxels
 
 _AT_ONCE = 8
@@ -81,18 +82,18 @@ def next_views(
     safe = safe_cells(free, float(grid.cell_size), config.safety_margin)
     if k < 1:
         raise ValueError(f"k must be at least 1, got {k}")
-    if poses is None:
-        positions = _positions_in(grid, safe, config)
-        ask, most = _score_turned(positions, camera, config), k
-    else:
-        checked = _checked(poses, k)
-        positions = checked[:, :3, 3]
-        ask, most = _score_as_given(checked, camera, config), 1
+    checked = None if poses is None else _checked(poses, k)
+    positions = _positions_in(grid, safe, config) if checked is None else checked[:, :3, 3]
     known_grid = mask_unexplorable(grid, safe) if safe.any() else grid
     places = jnp.asarray(positions, dtype=jnp.float32)
     voxels, cells, _ = near(state, known_grid, places, config.scoring)
-    left = np.full(len(positions), most)
-    return _lazy_greedy(ask, voxels, cells, camera, left, k, config)
+    if checked is None:
+        ask, first = _score_turned(voxels, cells, positions, camera, config)
+    else:
+        ask = _score_as_given(checked, camera, config)
+        first = ask(voxels, cells, np.arange(len(checked)))
+    left = np.full(len(positions), k if checked is None else 1)
+    return _lazy_greedy(ask, first, voxels, cells, camera, left, k, config)
 
 
 def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) -> np.ndarray:
@@ -128,17 +129,24 @@ def _score_as_given(poses: np.ndarray, camera: Camera, config: PlannerConfig) ->
     return ask
 
 
-def _score_turned(positions: np.ndarray, camera: Camera, config: PlannerConfig) -> Ask:
-    def ask(voxels: Voxels, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        places = jnp.asarray(positions[ids], dtype=jnp.float32)
-        panorama = score_positions_near(voxels, cells, camera, places, config.scoring)
-        return best_views(positions[ids], panorama)
+def _score_turned(
+    voxels: Voxels, cells: Cells, positions: np.ndarray, camera: Camera, config: PlannerConfig
+) -> tuple[Ask, tuple[np.ndarray, np.ndarray]]:
+    start, scoring = (voxels, cells), config.scoring
+    places = jnp.asarray(positions, dtype=jnp.float32)
+    panorama, kept = keep_positions_near(*start, camera, places, scoring)
 
-    return ask
+    def ask(voxels: Voxels, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        some, after = jnp.asarray(ids), (voxels, cells)
+        again = score_kept_near(kept.at(some), start, after, camera, places[some], scoring)
+        return best_views(positions[ids], again)
+
+    return ask, best_views(positions, panorama)
 
 
 def _lazy_greedy(
     ask: Ask,
+    first: tuple[np.ndarray, np.ndarray],
     voxels: Voxels,
     cells: Cells,
     camera: Camera,
@@ -147,7 +155,7 @@ def _lazy_greedy(
     config: PlannerConfig,
 ) -> NextViews:
     """K times the candidate of the greatest utility; each may be taken `left` [C] times."""
-    poses, bound = ask(voxels, cells, np.arange(len(left)))
+    poses, bound = first
     is_new = np.ones(len(left), dtype=bool)
     taken: list[np.ndarray] = []
     worth: list[float] = []

@@ -19,7 +19,8 @@ from r3jax.planning.climb import Starts, climb
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.free_box import free_box
 from r3jax.planning.situation import Situation
-from r3jax.scoring.batch import demand_from, near, score_views_near
+from r3jax.scoring.batch import demand_from, score_views_near
+from r3jax.scoring.near import near
 
 Weigh = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """From utilities and paths [K] what views are worth net of the way, by a measure that other

@@ -1,6 +1,5 @@
 """Scores of many candidates against one map: the inner loop of planning.
 
-Candidates of a step lie close together, so what none of them can see is left out once for all.
 XLA runs the loops of one score on one core; on a CPU the candidates are therefore dealt out to as
 many threads as the process may use. Where there are several devices, they share the candidates.
 
@@ -17,25 +16,26 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from r3jax.geometry.cameras import Camera, is_traced
-from r3jax.mapping.compact import positions_of_set
+from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, cells_of
+from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.demand import Demand, asked_from, joined
+from r3jax.scoring.kept import (
+    Changes,
+    Kept,
+    changes_between,
+    keep_panorama,
+    panorama_again,
+)
+from r3jax.scoring.near import near
 from r3jax.scoring.panorama import Panorama, panorama_of
 from r3jax.scoring.sharding import Candidates, padded_to, score_on_devices
 from r3jax.scoring.utility import ViewUtility, utility_of_view
-from r3jax.scoring.views import Coordinates
-from r3jax.scoring.voxels import Voxels, voxels_of
-
-SMALLEST = 1 << 14
-"""Voxels at hand are padded to this or 4, 16, ... times as many: a run compiles once for each pair
-of sizes, of voxels and of cells, that it meets, which takes seconds and keeps some 40 MB for good.
-Absent ones cost little."""
+from r3jax.scoring.voxels import Voxels
 
 Scores = TypeVar("Scores")
 
@@ -103,10 +103,47 @@ def score_positions_near(
     demand: Demand | None = None,
 ) -> Panorama:
     """`score_positions` of voxels and cells that `near` gathered."""
+    score = functools.partial(_score_positions, voxels, cells, camera, config, demand)
+    return deal(score, (positions, _all_if_none(allowed, positions, config)))
+
+
+def keep_positions_near(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    positions: Float[Array, "C 3"],
+    config: ScoringConfig,
+    allowed: Bool[Array | np.ndarray, "C B"] | None = None,
+) -> tuple[Panorama, Kept]:
+    """`score_positions_near`, and what `score_kept_near` needs to do it again."""
+    score = functools.partial(_keep_positions, voxels, cells, camera, config)
+    return deal(score, (positions, _all_if_none(allowed, positions, config)))
+
+
+def score_kept_near(
+    kept: Kept,
+    before: tuple[Voxels, Cells],
+    after: tuple[Voxels, Cells],
+    camera: Camera,
+    positions: Float[Array, "C 3"],
+    config: ScoringConfig,
+    allowed: Bool[Array | np.ndarray, "C B"] | None = None,
+) -> Panorama:
+    """`score_positions_near` after imagined views, from what was kept before them."""
+    changes = _changes_between(before, after)
+    score = functools.partial(_score_kept, changes, camera, config)
+    return deal(score, (kept, positions, _all_if_none(allowed, positions, config)))
+
+
+def _all_if_none(
+    allowed: Bool[Array | np.ndarray, "C B"] | None,
+    positions: Float[Array, "C 3"],
+    config: ScoringConfig,
+) -> Bool[Array, "C B"]:
+    """The axes that are allowed, or all."""
     if allowed is None:
         allowed = np.ones((positions.shape[0], config.panorama_bins), dtype=bool)
-    score = functools.partial(_score_positions, voxels, cells, camera, config, demand)
-    return deal(score, (positions, jnp.asarray(allowed)))
+    return jnp.asarray(allowed)
 
 
 def demand_from(
@@ -149,6 +186,34 @@ def _score_positions(
     return jax.lax.map(score, places)
 
 
+_changes_between = jax.jit(changes_between)
+
+
+@jax.jit
+def _keep_positions(
+    voxels: Voxels,
+    cells: Cells,
+    camera: Camera,
+    config: ScoringConfig,
+    places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
+) -> tuple[Panorama, Kept]:
+    return jax.lax.map(
+        lambda at: keep_panorama(voxels, cells, camera, at[0], config, at[1]), places
+    )
+
+
+@jax.jit
+def _score_kept(
+    changes: Changes,
+    camera: Camera,
+    config: ScoringConfig,
+    places: tuple[Kept, Float[Array, "C 3"], Bool[Array, "C B"]],
+) -> Panorama:
+    return jax.lax.map(
+        lambda at: panorama_again(at[0], changes, camera, at[1], config, at[2]), places
+    )
+
+
 @jax.jit
 def _ask(
     voxels: Voxels,
@@ -160,85 +225,6 @@ def _ask(
 
 
 _joined = jax.jit(joined)
-
-
-def near(
-    state: MapState, grid: OccupancyGrid, positions: Float[Array, "C 3"], config: ScoringConfig
-) -> tuple[Voxels, Cells, Int[Array, " n"]]:
-    """The voxels and unexplored cells that at least one of the positions may see.
-
-    Returns:
-        Voxels and cells, padded with absent ones, and each voxel's row in the map (N: padding).
-    """
-    if is_traced(state.key, positions):
-        raise TypeError("score_views and score_positions choose sizes: call them outside jit")
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    counts = np.asarray(_count_near(state, grid, low, high, config))
-    sizes = _sizes(int(counts[0]), int(counts[1]), state.capacity, grid.log_odds.size)
-    return _gather_near(state, grid, low, high, config, sizes)
-
-
-def _sizes(voxels: int, cells: int, capacity: int, num_cells: int) -> tuple[int, int]:
-    """Room for so many voxels and cells, in few different pairs.
-
-    The cells get as much as the voxels, or all that there are.
-    """
-    room = SMALLEST
-    while room < min(voxels, capacity):
-        room *= 4
-    return min(room, capacity), num_cells if cells > room else min(room, num_cells)
-
-
-def _masks(
-    voxels: Voxels,
-    cells: Cells,
-    low: Float[Array, " 3"],
-    high: Float[Array, " 3"],
-    config: ScoringConfig,
-) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:
-    """Voxels and unexplored cells within range of a box."""
-
-    def is_near(points: Coordinates, margin: Float[Array, ""] | float) -> Bool[Array, " k"]:
-        gap = [
-            jnp.maximum(jnp.maximum(low[i] - points[i], points[i] - high[i]), 0.0) for i in range(3)
-        ]
-        reach = config.max_range + margin
-        return gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] <= reach * reach
-
-    near_voxels = voxels.present & is_near(voxels.center, voxels.size)
-    near_cells = cells.unexplored & is_near((cells.x, cells.y, cells.z), 0.0)
-    return near_voxels, near_cells
-
-
-@jax.jit
-def _count_near(
-    state: MapState,
-    grid: OccupancyGrid,
-    low: Float[Array, " 3"],
-    high: Float[Array, " 3"],
-    config: ScoringConfig,
-) -> Int[Array, " 2"]:
-    masks = _masks(voxels_of(state, config.delta), cells_of(grid), low, high, config)
-    return jnp.stack([jnp.sum(mask, dtype=jnp.int32) for mask in masks])
-
-
-@functools.partial(jax.jit, static_argnames="sizes")
-def _gather_near(
-    state: MapState,
-    grid: OccupancyGrid,
-    low: Float[Array, " 3"],
-    high: Float[Array, " 3"],
-    config: ScoringConfig,
-    sizes: tuple[int, int],
-) -> tuple[Voxels, Cells, Int[Array, " n"]]:
-    voxels, cells = voxels_of(state, config.delta), cells_of(grid)
-    gathered, indices = [], []
-    masks = _masks(voxels, cells, low, high, config)
-    for items, mask, size in zip((voxels, cells), masks, sizes, strict=True):
-        index = positions_of_set(mask, size)
-        gathered.append(items.take(jnp.minimum(index, mask.shape[0] - 1), index < mask.shape[0]))
-        indices.append(index)
-    return *gathered, indices[0]
 
 
 def deal(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.scoring.chunks import Carry, for_selected, select
+from r3jax.scoring.chunks import Carry, Selection, for_selected, narrow, select
 from r3jax.scoring.lack import sum_by_direction
 from r3jax.scoring.views import Placement, View
 from r3jax.scoring.visibility import DepthBuffer, is_visible
@@ -54,33 +54,36 @@ def cells_of(grid: OccupancyGrid) -> Cells:
 
 
 def unexplored_by_direction(
-    cells: Cells,
-    view: View,
-    buffer: DepthBuffer,
-    position: Float[Array, " 3"],
-    num_bins: int,
+    cells: Cells, visible: Selection, position: Float[Array, " 3"], num_bins: int
 ) -> Float[Array, " B"]:
-    """U_G: number of unexplored cells whose center the view sees, per direction bin.
+    """U_G: number of visible cells that are still unexplored, per direction bin.
 
     Args:
         cells: of the coarse grid.
-        view: where from.
-        buffer: what hides.
+        visible: which of them are seen (`visible_cells`), now or before some were explored.
         position: of the camera [m].
         num_bins: bins of the Fibonacci lattice; 1 counts over all directions.
     """
 
     def count(
-        points: Float[Array, "3 n"],
-        place: Placement,
-        is_seen: Bool[Array, " n"],
-        total: Float[Array, " B"],
+        index: Int[Array, " n"], valid: Bool[Array, " n"], total: Float[Array, " B"]
     ) -> Float[Array, " B"]:
-        del place
-        weight = is_seen.astype(jnp.float32)
+        points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
+        weight = (valid & cells.unexplored[index]).astype(jnp.float32)
         return total + sum_by_direction(points, weight, position, num_bins)
 
-    return over_visible(cells, view, buffer, count, jnp.zeros(num_bins, dtype=jnp.float32))
+    return for_selected(visible, count, jnp.zeros(num_bins, dtype=jnp.float32))
+
+
+def visible_cells(cells: Cells, view: View, buffer: DepthBuffer) -> Selection:
+    """The unexplored cells whose center the view sees."""
+
+    def test(index: Int[Array, " n"]) -> Bool[Array, " n"]:
+        points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
+        return is_visible(view, view.place(points), buffer.distance)
+
+    in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
+    return narrow(select(cells.unexplored & in_view), test)
 
 
 def over_visible(
@@ -108,10 +111,3 @@ def over_visible(
 
     in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
     return for_selected(select(cells.unexplored & in_view), of_chunk, start)
-
-
-def visible_mask(cells: Cells, view: View, buffer: DepthBuffer) -> Bool[Array, " c"]:
-    """The unexplored cells whose center the view sees: those that `over_visible` adds up."""
-    points = jnp.stack([cells.x, cells.y, cells.z])
-    in_view = view.may_see(points, jnp.zeros(()))
-    return cells.unexplored & in_view & is_visible(view, view.place(points), buffer.distance)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import cells_of, visible_mask
+from r3jax.scoring.cells import cells_of, visible_cells
 from r3jax.scoring.chunks import Selection, for_selected
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import score_voxels
@@ -77,7 +77,7 @@ def explain_view(
     voxels, cells = voxels_of(state, config.delta), cells_of(grid)
     view = pinhole_view(camera, T_world_camera, config)
     buffer, visible = seen_in(voxels, view, config)
-    unseen = visible_mask(cells, view, buffer)
+    unseen = visible_cells(cells, view, buffer).mask
     position = T_world_camera[:3, 3]
     shares, rendering = _divide_visible(voxels, visible, position, camera.focal, config.kappa)
     exploration = config.lambda1 * jnp.sum(unseen, dtype=jnp.float32)

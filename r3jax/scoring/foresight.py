@@ -24,7 +24,7 @@ from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
 from r3jax.mapping.join import bin_words
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, visible_mask
+from r3jax.scoring.cells import Cells, visible_cells
 from r3jax.scoring.chunks import Selection, for_selected
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.views import pinhole_view
@@ -74,7 +74,7 @@ def foresee_near(
     The unexplored cells that the view shows are no longer unexplored.
 
     Args:
-        voxels: those that hide or are seen; `scoring.batch.near` gathers them.
+        voxels: those that hide or are seen; `scoring.near.near` gathers them.
         cells: of the coarse grid.
         camera: of the view.
         T_world_camera: pose of the view.
@@ -83,7 +83,7 @@ def foresee_near(
     view = pinhole_view(camera, T_world_camera, config)
     buffer, visible = seen_in(voxels, view, config)
     after = observed(voxels, visible, T_world_camera[:3, 3], camera.focal)
-    left = cells.unexplored & ~visible_mask(cells, view, buffer)
+    left = cells.unexplored & ~visible_cells(cells, view, buffer).mask
     return after, eqx.tree_at(lambda c: c.unexplored, cells, left)
 
 

@@ -12,7 +12,8 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction
+from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_cells
+from r3jax.scoring.chunks import Selection
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.demand import Demand, gain_by_direction
 from r3jax.scoring.lack import lack_by_direction
@@ -85,15 +86,41 @@ def panorama_of(
         demand: for these voxels; if given, a voxel counts by what seeing it would add
             (`scoring.demand`), not by what it lacks.
     """
-    num_bins, focal = config.panorama_bins, camera.focal
     view = panorama_view(position, config)
     buffer, visible = seen_in(voxels, view, config)
+    seen = visible_cells(cells, view, buffer)
+    bins = bins_of_seen(voxels, visible, cells, seen, position, camera.focal, config, demand)
+    return panorama_of_bins(bins, camera, position, config, allowed)
+
+
+def bins_of_seen(
+    voxels: Voxels,
+    visible: Selection,
+    cells: Cells,
+    seen: Selection,
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    demand: Demand | None = None,
+) -> Float[Array, " B"]:
+    """`Panorama.bin_scores` of the `visible` voxels and the cells that are `seen`."""
+    num_bins = config.panorama_bins
     if demand is None:
         bins = lack_by_direction(voxels, visible, position, focal, config.kappa, num_bins)
     else:
         bins = gain_by_direction(voxels, visible, demand, position, focal, num_bins)
-    unexplored = unexplored_by_direction(cells, view, buffer, view.position, num_bins)
-    bins = bins + config.lambda1 * unexplored
+    return bins + config.lambda1 * unexplored_by_direction(cells, seen, position, num_bins)
+
+
+def panorama_of_bins(
+    bins: Float[Array, " B"],
+    camera: Camera,
+    position: Float[Array, " 3"],
+    config: ScoringConfig,
+    allowed: Bool[Array, " B"] | None = None,
+) -> Panorama:
+    """The panorama whose bins have these scores."""
+    num_bins = config.panorama_bins
     directions = bins_in_view(camera, num_bins) @ bins
     best = jnp.argmax(directions if allowed is None else jnp.where(allowed, directions, -jnp.inf))
     axis = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)[best]

@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Float
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.batch import deal, near
+from r3jax.scoring.batch import deal
 from r3jax.scoring.cells import Cells, over_visible
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.near import near
 from r3jax.scoring.views import PinholeView, Placement, pinhole_view
 from r3jax.scoring.visibility import DepthBuffer, candidates_of, depth_buffer
 from r3jax.scoring.voxels import Voxels

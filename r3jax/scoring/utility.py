@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_mask
+from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.demand import Demand, gain_by_direction
 from r3jax.scoring.lack import lack_by_direction
@@ -67,7 +67,8 @@ def utility_of_view(
         rendering = lack_by_direction(voxels, visible, position, focal, config.kappa, 1)[0]
     else:
         rendering = gain_by_direction(voxels, visible, demand, position, focal, 1)[0]
-    exploration = unexplored_by_direction(cells, view, buffer, position, 1)[0]
+    seen = visible_cells(cells, view, buffer)
+    exploration = unexplored_by_direction(cells, seen, position, 1)[0]
     return ViewUtility(exploration, rendering, config.lambda1 * exploration + rendering)
 
 
@@ -83,4 +84,4 @@ def visible_unexplored(
     voxels, cells = voxels_of(state, config.delta), cells_of(grid)
     view = pinhole_view(camera, T_world_camera, config)
     buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
-    return visible_mask(cells, view, buffer).reshape(grid.log_odds.shape)
+    return visible_cells(cells, view, buffer).mask.reshape(grid.log_odds.shape)

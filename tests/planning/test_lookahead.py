@@ -16,7 +16,8 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.limits import Limits
 from r3jax.planning.motion import Motion
 from r3jax.planning.travel import plan_travel
-from r3jax.scoring.batch import near, score_positions
+from r3jax.scoring.batch import keep_positions_near, score_positions
+from r3jax.scoring.near import near
 from r3jax.scoring.panorama import panorama
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.known_hall import CAMERA, CONFIG, SCORING, after_view, for_scoring
@@ -37,7 +38,9 @@ def outlook_of(config: PlannerConfig, view_seconds: float = 1.0) -> real.Outlook
     gap = np.linalg.norm(PLACES[:, None] - PLACES, axis=2)
     config = dataclasses.replace(config, view_seconds=view_seconds)
     utility = np.asarray(panoramas.best_score, np.float64)
-    return real.Outlook(poses, utility, gap[0], gap, CAMERA, config)
+    start, places = at_hand(), jnp.asarray(PLACES, jnp.float32)
+    _, kept = keep_positions_near(*start, CAMERA, places, SCORING)
+    return real.Outlook(poses, utility, gap[0], gap, kept, start, CAMERA, config)
 
 
 def at_hand():
@@ -66,7 +69,7 @@ def all_paths(outlook: real.Outlook, horizon: int) -> dict[tuple[int, ...], floa
 def law_paths(modules: Modules) -> None:
     """With room for all of them, the search finds the best path of three views."""
     outlook = outlook_of(WIDE)
-    found = modules["lookahead"].search(outlook, *at_hand())
+    found = modules["lookahead"].search(outlook)
     rates = all_paths(outlook, 3)
     best = max(rates, key=lambda path: rates[path])
     assert found[0].places == best
@@ -84,7 +87,7 @@ def test_a_narrow_beam_keeps_its_promise():
     """Not the best path, perhaps, but its rate is true, and views never add less than nothing."""
     outlook = outlook_of(dataclasses.replace(CONFIG, horizon=3, beam=2, branching=5))
     rates = all_paths(outlook, 3)
-    found = real.search(outlook, *at_hand())
+    found = real.search(outlook)
     assert len(found) == 2
     for path in found:
         assert path.rate == pytest.approx(rates[path.places], rel=1e-4)
@@ -95,7 +98,7 @@ def test_a_narrow_beam_keeps_its_promise():
 def law_one_view(modules: Modules) -> None:
     """A horizon of one is the next-best view, by gain over time."""
     outlook = outlook_of(dataclasses.replace(WIDE, horizon=1), view_seconds=0.3)
-    found = modules["lookahead"].search(outlook, *at_hand())
+    found = modules["lookahead"].search(outlook)
     rate = outlook.utility / (0.3 + outlook.lengths)
     assert found[0].places == (int(np.argmax(rate)),)
     assert found[0].rate == pytest.approx(rate.max())
@@ -112,7 +115,7 @@ def law_motion(modules: Modules) -> None:
     limits = Limits(motion, start)
     flying = outlook_of(dataclasses.replace(WIDE, horizon=2), view_seconds=0.3)
     outlook = dataclasses.replace(flying, poses=limits.obeyed(flying.poses), limits=limits)
-    found = modules["lookahead"].search(outlook, *at_hand())
+    found = modules["lookahead"].search(outlook)
     assert len(found) > 10
     for path in found:
         seconds, here, place = 0.0, start, None
@@ -147,7 +150,7 @@ def test_choices_lie_apart():
 
 def test_no_way_no_path():
     outlook = dataclasses.replace(outlook_of(WIDE), lengths=np.full(len(PLACES), np.inf))
-    assert real.search(outlook, *at_hand()) == []
+    assert real.search(outlook) == []
 
 
 @given(st.integers(0, 1000))

@@ -161,7 +161,7 @@ MUTANTS = [
     Mutant("next_views", "is_new[:] = False", "is_new[:] = True", law_greedy),
     Mutant("next_views", "left[best] -= 1", "left[best] -= 0", law_each_once),
     Mutant("next_views", "np.argsort(-bound[stale]", "np.argsort(bound[stale]", law_lazy),
-    Mutant("foresight", "& ~visible_mask", "| visible_mask", law_greedy),
+    Mutant("foresight", "& ~visible_cells", "| visible_cells", law_greedy),
     Mutant("foresight", "visited[:, index] | words", "visited[:, index]", law_greedy),
 ]
 

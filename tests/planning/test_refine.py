@@ -30,9 +30,10 @@ from r3jax.planning.motion import MOTIONS, Motion
 from r3jax.planning.policy import make_policy
 from r3jax.planning.situation import Situation
 from r3jax.planning.travel import plan_travel
-from r3jax.scoring.batch import demand_from, near, score_views, score_views_near
+from r3jax.scoring.batch import demand_from, score_views, score_views_near
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.demand import gain_of
+from r3jax.scoring.near import near
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import center, known_flat
 from tests.planning.walls import SEEN_FROM, VOXEL, box, wall

@@ -17,6 +17,7 @@ from r3jax.planning.candidates import poses_along
 from r3jax.planning.policy import make_policy
 from r3jax.scoring import batch, sharding
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.near import near
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, pose_at, two_rooms
 
@@ -78,7 +79,7 @@ def test_each_device_holds_a_share_and_the_whole_map(monkeypatch):
     kept = sharding._score
     monkeypatch.setattr(sharding, "_score", lambda *a: given.append(a) or kept(*a))
     candidates, devices = jnp.asarray(poses()), jax.local_devices()
-    voxels, cells, _ = batch.near(*flat(), candidates[:, :3, 3], CONFIG)
+    voxels, cells, _ = near(*flat(), candidates[:, :3, 3], CONFIG)
     known = (voxels, cells, CAMERA, CONFIG, None)  # no demand
     scores = sharding.score_on_devices(batch._score_views, known, candidates, devices)
     ((_, _, spread, shares),) = given

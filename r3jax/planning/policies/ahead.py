@@ -14,12 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from r3jax.geometry.cameras import Camera
 from r3jax.planning.candidates import best_views, poses_along, spread
 from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_positions
 from r3jax.planning.lookahead import SPEED, Outlook, lengths_between, search
 from r3jax.planning.refine import refine_best
 from r3jax.planning.situation import Situation
-from r3jax.scoring.batch import near, score_positions_near
+from r3jax.scoring.batch import keep_positions_near
+from r3jax.scoring.cells import Cells
+from r3jax.scoring.kept import Kept
+from r3jax.scoring.near import near
+from r3jax.scoring.voxels import Voxels
 
 
 @dataclass(frozen=True)
@@ -60,23 +65,27 @@ class OursAhead(GreedyPolicy):
         places = jnp.asarray(positions, dtype=jnp.float32)
         voxels, cells, _ = near(situation.map_state, situation.scoring_grid, places, scoring)
         allowed = situation.limits.allowed_axes(positions, scoring.panorama_bins)
-        panorama = score_positions_near(voxels, cells, situation.camera, places, scoring, allowed)
+        start = (voxels, cells)
+        panorama, kept = keep_positions_near(*start, situation.camera, places, scoring, allowed)
         turned, utility = best_views(positions, panorama)
         turned = situation.limits.obeyed(turned)
         if self.config.refine:
             turned, utility = self._refined(situation, turned, utility)
+            kept = self._kept_again(kept, start, situation.camera, positions, turned[:, :3, 3])
             positions = turned[:, :3, 3]
         outlook = Outlook(
             turned,
             utility,
             travel.lengths(positions),
             lengths_between(travel, positions),
+            kept,
+            start,
             situation.camera,
             self.config,
             situation.limits,
         )
         rate = np.full(len(positions), -np.inf)
-        for path in search(outlook, voxels, cells):
+        for path in search(outlook):
             rate[path.places[0]] = max(rate[path.places[0]], path.rate)
         return turned, {"utility": utility, "ahead": rate}
 
@@ -94,6 +103,24 @@ class OursAhead(GreedyPolicy):
         known = {"utility": utility, "path": ways}
         poses, found = refine_best(situation, poses, known, self.config, weigh)
         return poses, found["utility"]
+
+    def _kept_again(
+        self,
+        kept: Kept,
+        start: tuple[Voxels, Cells],
+        camera: Camera,
+        before: np.ndarray,
+        after: np.ndarray,
+    ) -> Kept:
+        """The same panoramas, but for the few positions [C, 3] that have moved."""
+        moved = np.flatnonzero((before != after).any(axis=1))
+        if len(moved) == 0:
+            return kept
+        room = -(-len(moved) // self.config.refine) * self.config.refine  # compiles once
+        padded = jnp.asarray(moved[np.arange(room) % len(moved)])
+        places = jnp.asarray(after, dtype=jnp.float32)[padded]
+        _, others = keep_positions_near(*start, camera, places, self.config.scoring)
+        return kept.replaced(padded, others)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """The rate of the best path: the way is in it."""

@@ -6,15 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.scoring import batch as real
+from r3jax.scoring import near as real
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
-CHAIN = ("r3jax.scoring.batch",)
+CHAIN = ("r3jax.scoring.near",)
 CAPACITY, CELLS = 1 << 23, 2_918_208  # a hall of 60 x 60 x 6 m
 
 
 def law_of_room(modules: Modules, voxels: int = 70_000, cells: int = 300_000) -> None:
-    sizes_of = modules["batch"]._sizes
+    sizes_of = modules["near"]._sizes
     room, cell_room = sizes_of(voxels, cells, CAPACITY, CELLS)
     assert voxels <= room <= max(real.SMALLEST, 4 * voxels)
     assert cells <= cell_room <= CELLS
@@ -24,24 +24,24 @@ def law_of_room(modules: Modules, voxels: int = 70_000, cells: int = 300_000) ->
 
 @given(st.integers(0, CAPACITY), st.integers(0, CELLS))
 def test_there_is_room(voxels, cells):
-    law_of_room({"batch": real}, voxels, cells)
+    law_of_room({"near": real}, voxels, cells)
 
 
 def law_of_few(modules: Modules) -> None:
     """However maps and views vary: six sizes of voxels, two of cells with each at most."""
     counts = [0, *(round(1.3**k) for k in range(64))]
     sizes = {
-        modules["batch"]._sizes(min(voxels, CAPACITY), min(cells, CELLS), CAPACITY, CELLS)
+        modules["near"]._sizes(min(voxels, CAPACITY), min(cells, CELLS), CAPACITY, CELLS)
         for voxels, cells in itertools.product(counts, counts)
     }
     assert 6 <= len(sizes) <= 11
 
 
 MUTANTS = [
-    Mutant("batch", "room *= 4", "room += 4096", law_of_few),
-    Mutant("batch", "min(voxels, capacity):", "min(voxels, capacity) // 2:", law_of_room),
-    Mutant("batch", "num_cells if cells > room else", "", law_of_room),
-    Mutant("batch", "else min(room, num_cells)", "else cells", law_of_few),
+    Mutant("near", "room *= 4", "room += 4096", law_of_few),
+    Mutant("near", "min(voxels, capacity):", "min(voxels, capacity) // 2:", law_of_room),
+    Mutant("near", "num_cells if cells > room else", "", law_of_room),
+    Mutant("near", "else min(room, num_cells)", "else cells", law_of_few),
 ]  # fmt: skip
 
 
