@@ -75,15 +75,19 @@ def unexplored_by_direction(
     return for_selected(visible, count, jnp.zeros(num_bins, dtype=jnp.float32))
 
 
-def visible_cells(cells: Cells, view: View, buffer: DepthBuffer) -> Selection:
-    """The unexplored cells whose center the view sees."""
+def visible_cells(
+    cells: Cells, view: View, buffer: DepthBuffer, among: Selection | None = None
+) -> Selection:
+    """The unexplored cells whose center the view sees; `among`: which it may see, if known."""
 
     def test(index: Int[Array, " n"]) -> Bool[Array, " n"]:
         points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
         return is_visible(view, view.place(points), buffer.distance)
 
-    in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
-    return narrow(select(cells.unexplored & in_view), test)
+    if among is None:
+        in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
+        among = select(cells.unexplored & in_view)
+    return narrow(among, test)
 
 
 def over_visible(

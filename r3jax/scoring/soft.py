@@ -33,18 +33,17 @@ from jaxtyping import Array, Bool, Float, Int
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.numerics import safe_norm
 from r3jax.mapping.compact import positions_of_set
-from r3jax.scoring.cells import Cells
-from r3jax.scoring.chunks import Selection, narrow, select
+from r3jax.scoring.cells import Cells, visible_cells
+from r3jax.scoring.chunks import select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.demand import Demand, gain_of_voxels
 from r3jax.scoring.renderability import score_voxels
-from r3jax.scoring.views import Coordinates, PinholeView, pinhole_view
+from r3jax.scoring.views import PinholeView, pinhole_view
 from r3jax.scoring.visibility import (
     corner_margin,
     depth_buffer,
     depth_margin,
     is_in_image,
-    is_visible,
     visible_voxels,
 )
 from r3jax.scoring.voxels import Voxels
@@ -165,7 +164,7 @@ def surroundings_of(
         view = view_from(position)
         buffer = depth_buffer(voxels, near_voxels, view, config)
         seen = visible_voxels(voxels, near_voxels, view, buffer)
-        empty = _visible_cells(cells, near_cells, view, buffer.distance)
+        empty = visible_cells(cells, view, buffer, near_cells)
         return buffer.limit, buffer.distance, seen.mask, empty.mask
 
     reach = safe_norm(half)
@@ -234,16 +233,6 @@ def _widened(camera: Camera) -> Camera:
     fx, cx = lens(camera.fx, camera.cx, camera.width)
     fy, cy = lens(camera.fy, camera.cy, camera.height)
     return Camera(camera.width, camera.height, fx, fy, cx, cy)
-
-
-def _visible_cells(
-    cells: Cells, near: Selection, view: PinholeView, distance: Float[Array, "h w"]
-) -> Selection:
-    def test(index: Int[Array, " K"]) -> Bool[Array, " K"]:
-        points: Coordinates = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
-        return is_visible(view, view.place(points), distance)
-
-    return narrow(near, test)
 
 
 def _sample(
