@@ -88,7 +88,9 @@ def climb(
         moves: False: turns only, whatever the boxes and elevations are.
     """
     run = _move if moves else _turn
-    return deal(functools.partial(run, voxels, cells, camera, config, demand), starts)
+    # One thread: of two, one was seen once to wait for the other without end, inside of XLA.
+    score = functools.partial(run, voxels, cells, camera, config, demand)
+    return deal(score, starts, most_threads=1)
 
 
 @jax.jit
