@@ -88,9 +88,7 @@ def climb(
         moves: False: turns only, whatever the boxes and elevations are.
     """
     run = _move if moves else _turn
-    # One thread: of two, one was seen once to wait for the other without end, inside of XLA.
-    score = functools.partial(run, voxels, cells, camera, config, demand)
-    return deal(score, starts, most_threads=1)
+    return deal(functools.partial(run, voxels, cells, camera, config, demand), starts)
 
 
 @jax.jit
@@ -103,7 +101,8 @@ def _move(
     starts: Starts,
 ) -> Float[Array, "C 5"]:
     look = functools.partial(_hill_of, voxels, cells, camera, config, demand, moves=True)
-    return jax.vmap(_climb_in_box)(jax.lax.map(look, starts), starts)
+    # One after the other: for some starts in an office, XLA's code for all at once never ended.
+    return jax.lax.map(lambda start: _climb_in_box(look(start), start), starts)
 
 
 @jax.jit
@@ -116,7 +115,7 @@ def _turn(
     starts: Starts,
 ) -> Float[Array, "C 5"]:
     look = functools.partial(_hill_of, voxels, cells, camera, config, demand, moves=False)
-    return jax.vmap(_climb_by_turning)(jax.lax.map(look, starts))
+    return jax.lax.map(lambda start: _climb_by_turning(look(start)), starts)
 
 
 def _hill_of(

@@ -231,7 +231,6 @@ def deal(
     score: "functools.partial[Scores]",
     candidates: Candidates,
     devices: Sequence[Any] | None = None,
-    most_threads: int | None = None,
 ) -> Scores:
     """Scores candidates in equal shares on all devices; a CPU alone: on all of its cores.
 
@@ -239,15 +238,13 @@ def deal(
         score: of any number of candidates; a jitted function with all but the last argument.
         candidates: what to score.
         devices: of JAX, where to; by default all of this process.
-        most_threads: of a CPU; None: one for each of its cores.
     """
     num = jax.tree.leaves(candidates)[0].shape[0]
     devices = (jax.local_devices() if devices is None else devices)[:num]
     if len(devices) > 1:
         scores = score_on_devices(score.func, score.args, candidates, devices)
         return jax.tree.map(lambda x: x[:num], jax.device_put(scores, devices[0]))
-    cores = len(os.sched_getaffinity(0)) if jax.default_backend() == "cpu" else 1
-    workers = min(cores, num, most_threads or num)
+    workers = min(len(os.sched_getaffinity(0)), num) if jax.default_backend() == "cpu" else 1
     if workers < 2:
         return score(candidates)
     padded = padded_to(workers, candidates)
