@@ -1,5 +1,6 @@
 """Reads the command line and turns errors into messages and exit codes."""
 
+import importlib
 import os
 import sys
 from collections.abc import Sequence
@@ -88,78 +89,13 @@ def _main(args: Sequence[str] | None) -> int:
         return INTERRUPTED
 
 
-def _run(
-    command: Demo
-    | Explore
-    | Team
-    | Train
-    | Evaluate
-    | Benchmark
-    | Replay
-    | Merge
-    | Export
-    | Forecast
-    | Audit
-    | View
-    | Policies
-    | Info,
-) -> int:
-    """Imports what the command needs and nothing else, so that --help does not wait for JAX."""
-    if isinstance(command, Demo):
-        from r3jax.cli.demo import run_demo
+def _run(command: object) -> int:
+    """Calls `run_NAME` of `r3jax.cli.NAME` for the command NAME.
 
-        return run_demo(command)
-    if isinstance(command, Explore):
-        from r3jax.cli.explore import run_explore
-
-        return run_explore(command)
-    if isinstance(command, Team):
-        from r3jax.cli.team import run_team
-
-        return run_team(command)
-    if isinstance(command, Train):
-        from r3jax.cli.train import run_train
-
-        return run_train(command)
-    if isinstance(command, Evaluate):
-        from r3jax.cli.evaluate import run_evaluate
-
-        return run_evaluate(command)
-    if isinstance(command, Benchmark):
-        from r3jax.cli.benchmark import run_benchmark
-
-        return run_benchmark(command)
-    if isinstance(command, Replay):
-        from r3jax.cli.replay import run_replay
-
-        return run_replay(command)
-    if isinstance(command, Merge):
-        from r3jax.cli.merge import run_merge
-
-        return run_merge(command)
-    if isinstance(command, Export):
-        from r3jax.cli.export import run_export
-
-        return run_export(command)
-    if isinstance(command, Forecast):
-        from r3jax.cli.forecast import run_forecast
-
-        return run_forecast(command)
-    if isinstance(command, Audit):
-        from r3jax.cli.audit import run_audit
-
-        return run_audit(command)
-    if isinstance(command, View):
-        from r3jax.cli.view import run_view
-
-        return run_view(command)
-    if isinstance(command, Policies):
-        from r3jax.cli.policies import run_policies
-
-        return run_policies(command)
-    from r3jax.cli.info import run_info
-
-    return run_info(command)
+    Imports what the command needs and nothing else, so that --help does not wait for JAX.
+    """
+    (name,) = (name for name, kind in _COMMANDS.items() if kind is type(command))
+    return getattr(importlib.import_module(f"r3jax.cli.{name}"), f"run_{name}")(command)
 
 
 def _keep_compilations() -> None:

@@ -23,6 +23,8 @@ the depth buffers.
 """
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -38,7 +40,7 @@ from r3jax.scoring.chunks import select
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.demand import Demand, gain_of_voxels
 from r3jax.scoring.renderability import score_voxels
-from r3jax.scoring.views import PinholeView, pinhole_view
+from r3jax.scoring.views import PinholeView, Placement, pinhole_view
 from r3jax.scoring.visibility import (
     corner_margin,
     depth_buffer,
@@ -148,36 +150,16 @@ def surroundings_of(
         moves: False: the camera stays in the middle of the box.
     """
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    nodes = middle[None, :]
-    if moves:
-        sides = np.stack([sign * np.eye(3)[axis] for axis in range(3) for sign in (-1.0, 1.0)])
-        offsets = half[None, :] * jnp.asarray(sides, dtype=jnp.float32)
-        nodes = jnp.concatenate([nodes, middle[None, :] + offsets])
+    nodes = _nodes_of(middle, half) if moves else middle[None, :]
     wide = _widened(camera)
 
     def view_from(position: Float[Array, " 3"]) -> PinholeView:
         return pinhole_view(wide, T_world_camera.at[:3, 3].set(position), config)
 
-    def look(
-        position: Float[Array, " 3"],
-    ) -> tuple[Float[Array, "h w"], Float[Array, "h w"], Bool[Array, " n"], Bool[Array, " c"]]:
-        view = view_from(position)
-        buffer = depth_buffer(voxels, near_voxels, view, config)
-        seen = visible_voxels(voxels, near_voxels, view, buffer)
-        empty = visible_cells(cells, view, buffer, near_cells)
-        return buffer.limit, buffer.distance, seen.mask, empty.mask
-
-    reach = safe_norm(half)
-    near_voxels = select(
-        voxels.present & view_from(middle).may_see(voxels.center, voxels.size + reach)
-    )
-    near_cells = select(
-        cells.unexplored & view_from(middle).may_see((cells.x, cells.y, cells.z), reach)
-    )
-    limit, distance, seen, empty = jax.lax.map(look, nodes)
-    row, is_row, each = _sample(jnp.any(seen, axis=0), MOST_VOXELS)
+    sight = _look_about(voxels, cells, nodes, safe_norm(half), view_from, config)
+    row, is_row, each = _sample(jnp.any(sight.seen, axis=0), MOST_VOXELS)
     part, center = voxels.take(row, is_row), voxels.center_of(row)
-    cell, is_cell, each_cell = _sample(jnp.any(empty, axis=0), MOST_CELLS)
+    cell, is_cell, each_cell = _sample(jnp.any(sight.empty, axis=0), MOST_CELLS)
     points = jnp.stack([cells.x[cell], cells.y[cell], cells.z[cell]])
     soft = softness.depth * voxels.size
 
@@ -190,16 +172,65 @@ def surroundings_of(
             lack = gain_of_voxels(part, demand, row, position, camera.focal)
         place = view.place(center)
         margin = corner_margin(view, place, voxels.size, limit)
-        margin = jnp.minimum(margin, view.max_range - place.distance)
-        shown = jnp.where(is_row & is_in_image(view, place), jax.nn.sigmoid(margin / soft), 0.0)
+        shown = _softly_seen(view, place, margin, is_row, soft)
         place = view.place(points)
-        margin = depth_margin(view, place, distance)
-        margin = jnp.minimum(margin, view.max_range - place.distance)
-        open_ = jnp.where(is_cell & is_in_image(view, place), jax.nn.sigmoid(margin / soft), 0.0)
+        open_ = _softly_seen(view, place, depth_margin(view, place, distance), is_cell, soft)
         return jnp.concatenate([each * lack * shown, each_cell * config.lambda1 * open_])
 
     x, y, z = (jnp.concatenate([center[i], points[i]]) for i in range(3))
-    return Surroundings(x, y, z, jax.lax.map(worth, (nodes, limit, distance)), middle, half)
+    worths = jax.lax.map(worth, (nodes, sight.limit, sight.distance))
+    return Surroundings(x, y, z, worths, middle, half)
+
+
+def _nodes_of(middle: Float[Array, " 3"], half: Float[Array, " 3"]) -> Float[Array, "k 3"]:
+    """The middle of a box, then of its lower and upper side along x, y and z."""
+    sides = np.stack([sign * np.eye(3)[axis] for axis in range(3) for sign in (-1.0, 1.0)])
+    offsets = half[None, :] * jnp.asarray(sides, dtype=jnp.float32)
+    return jnp.concatenate([middle[None, :], middle[None, :] + offsets])
+
+
+class _Sight(NamedTuple):
+    """What is seen from each node, and the depth buffer there."""
+
+    limit: Float[Array, "k h w"]
+    distance: Float[Array, "k h w"]
+    seen: Bool[Array, "k n"]
+    empty: Bool[Array, "k c"]
+
+
+def _look_about(
+    voxels: Voxels,
+    cells: Cells,
+    nodes: Float[Array, "k 3"],
+    reach: Float[Array, ""],
+    view_from: Callable[[Float[Array, " 3"]], PinholeView],
+    config: ScoringConfig,
+) -> _Sight:
+    """Looks from every node, at what can be seen from within `reach` [m] of the first."""
+    middle = view_from(nodes[0])
+    near_voxels = select(voxels.present & middle.may_see(voxels.center, voxels.size + reach))
+    near_cells = select(cells.unexplored & middle.may_see((cells.x, cells.y, cells.z), reach))
+
+    def look(position: Float[Array, " 3"]) -> _Sight:
+        view = view_from(position)
+        buffer = depth_buffer(voxels, near_voxels, view, config)
+        seen = visible_voxels(voxels, near_voxels, view, buffer)
+        empty = visible_cells(cells, view, buffer, near_cells)
+        return _Sight(buffer.limit, buffer.distance, seen.mask, empty.mask)
+
+    return jax.lax.map(look, nodes)
+
+
+def _softly_seen(
+    view: PinholeView,
+    place: Placement,
+    margin: Float[Array, " m"],
+    is_real: Bool[Array, " m"],
+    soft: Float[Array, ""],
+) -> Float[Array, " m"]:
+    """How surely points in the image are in sight, by how far they are from being hidden [m]."""
+    margin = jnp.minimum(margin, view.max_range - place.distance)
+    return jnp.where(is_real & is_in_image(view, place), jax.nn.sigmoid(margin / soft), 0.0)
 
 
 def _worth_at(around: Surroundings, position: Float[Array, " 3"]) -> Float[Array, " m"]:

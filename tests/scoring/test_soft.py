@@ -271,12 +271,12 @@ MUTANTS = [
     Mutant("soft", "row, position, camera.focal)", "row * 0, position, camera.focal)",
            several(law_exact)),
     Mutant("soft", "config.lambda1 * open_", "open_", several(law_exact)),
-    Mutant("soft", "margin = jnp.minimum(margin, view.max_range - place.distance)\n        shown",
-           "shown", several(law_exact)),
+    Mutant("soft", "margin = jnp.minimum(margin, view.max_range - place.distance)\n    return",
+           "return", several(law_exact)),
     Mutant("soft", "set(position), config)", "set(middle), config)", law_nodes),
     Mutant("soft", "margin = corner_margin(view, place, voxels.size, limit)",
            "margin = jnp.full_like(place.distance, jnp.inf)", law_nodes),
-    Mutant("soft", "jnp.any(seen, axis=0)", "seen[0]", law_nodes),
+    Mutant("soft", "jnp.any(sight.seen, axis=0)", "sight.seen[0]", law_nodes),
     Mutant("soft", "jnp.maximum(count / most, 1.0)", "1.0 + 0.0 * count", several(law_sample)),
 ]  # fmt: skip
 
