@@ -70,8 +70,9 @@ class PlannerConfig:
     branching: int = 6
     """Places that `ours-ahead` tries for the next view of each path."""
 
-    view_seconds: float = 1.0
-    """What `ours-ahead` counts for a view, beside the way to it [s]."""
+    view_seconds: float = 4.0
+    """What `ours-ahead` counts for a view, beside the way to it [s]. With 1 it saves metres, looks
+    at what is near once more, and 60 views of an office come out 1 dB worse."""
 
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""
