@@ -67,6 +67,8 @@ class Limits:
         Those whose bins, caps of 1 / B of the sphere, reach into what is allowed. At least one is
         allowed everywhere, so that a tilt between the lattice's directions has its nearest one.
         """
+        if self.motion.looks_anywhere:  # a search of paths asks often: 3 ms for six positions
+            return np.ones((len(positions), num_bins), dtype=bool)
         nearness = self.nearness(positions[:, None, :], fibonacci_lattice(num_bins))
         cap = 1.0 - 2.0 / num_bins
         return nearness >= np.minimum(cap, nearness.max(axis=1, keepdims=True))

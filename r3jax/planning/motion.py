@@ -89,6 +89,11 @@ class Motion:
             raise ValueError("turn_rate weighs turns against ways: give the speed [m/s] too")
 
     @property
+    def looks_anywhere(self) -> bool:
+        """True if the line of sight may have any direction, whatever it was before."""
+        return self.elevations == (-_LEVEL, _LEVEL) and self.turn_per_meter is None
+
+    @property
     def is_relative(self) -> bool:
         """True if the allowed heights depend on where the camera started."""
         return self.heights is not None and self.heights_above == "start"

@@ -224,6 +224,8 @@ MUTANTS = [
     Mutant("limits", "_wrapped(azimuth - azimuth_now)", "azimuth - azimuth_now", law_nearest),
     Mutant("limits", "np.minimum(cap, nearness", "np.maximum(cap, 0.0 * nearness", law_axes),
     Mutant("limits", "cap = 1.0 - 2.0 / num_bins", "cap = 1.0 - 1e-9", law_axes),
+    Mutant("limits", "motion.looks_anywhere", "motion.turn_per_meter is None", law_axes),
+    Mutant("limits", "motion.looks_anywhere", "motion.elevations == (-90.0, 90.0)", law_axes),
     Mutant(
         "limits",
         "self._clipped(*_angles_along(directions))",
