@@ -18,15 +18,11 @@ from experiments.artefacts import Origin, markdown_table, write_csv, write_markd
 from experiments.degeneracy import missions, revisit_rate
 from experiments.replica_dense import REFERENCE, tables_of
 from experiments.suite import Options as SuiteOptions
-from experiments.suite import Records, origin, request_of, run_cells
-from r3jax.benchmark.cells import Cell
+from experiments.suite import Records, by_method_and_scene, origin, request_of, run_requests
 from r3jax.benchmark.conditions import parse_settings
-from r3jax.benchmark.plan import Request, make_plan
-from r3jax.benchmark.record import read_records
+from r3jax.benchmark.plan import Request
 from r3jax.evaluation.equal_terms import (
-    method_name,
     methods_of,
-    scenes_of,
     scores_by_method,
     snapshots_of,
     with_short_names,
@@ -47,20 +43,11 @@ class Options(SuiteOptions):
 
 def main(options: Options) -> Path:
     """Runs what is left of the cells, writes the page, and returns the folder of the results."""
-    root = options.work / f"{options.size}-views"
-    root.mkdir(parents=True, exist_ok=True)
-    cells = plan(options, root)
-    run_cells(cells, root, engine=options.engine, jobs=options.jobs)
-    records = read_records(root, cells)
+    root, _, records = run_requests(options, "views", requests_of(options))
     folder = options.out / NAME / options.size
     write_page(folder, root, records, origin(f"experiments.{NAME}", records))
     print(f"results  {folder}")
     return folder
-
-
-def plan(options: Options, root: Path) -> list[Cell]:
-    """The cells of all variants; their test views are rendered where they are not yet."""
-    return [cell for request in requests_of(options) for cell in make_plan(request, root)]
 
 
 def requests_of(options: Options) -> list[Request]:
@@ -116,25 +103,19 @@ def ways_rows(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """A line per method and scene: what it went and saw, means over the seeds."""
     records = [mission["record"] for mission in found]
     rows: list[dict[str, Any]] = []
-    for method in methods_of(records):
-        for scene in scenes_of(records):
-            mine = [
-                mission
-                for mission in found
-                if (method_name(mission["record"]), mission["record"]["scene"]) == (method, scene)
-            ]
-            done = [mission["record"]["exploration"] for mission in mine]
-            rows.append(
-                {
-                    "method": method,
-                    "scene": scene,
-                    "revisit rate": float(np.mean([revisit_rate(m["poses"]) for m in mine])),
-                    "path [m]": float(np.mean([d["metres"] for d in done])),
-                    "turns [rad]": float(np.mean([d["radians"] for d in done])),
-                    "share of the box explored": float(np.mean([d["known_share"] for d in done])),
-                    "mean R": float(np.mean([d["mean_renderability"] for d in done])),
-                }
-            )
+    for method, scene, mine in by_method_and_scene(records, found):
+        done = [mission["record"]["exploration"] for mission in mine]
+        rows.append(
+            {
+                "method": method,
+                "scene": scene,
+                "revisit rate": float(np.mean([revisit_rate(m["poses"]) for m in mine])),
+                "path [m]": float(np.mean([d["metres"] for d in done])),
+                "turns [rad]": float(np.mean([d["radians"] for d in done])),
+                "share of the box explored": float(np.mean([d["known_share"] for d in done])),
+                "mean R": float(np.mean([d["mean_renderability"] for d in done])),
+            }
+        )
     return rows
 
 

@@ -15,16 +15,9 @@ import numpy as np
 import tyro
 
 from experiments.artefacts import Origin, markdown_table, write_csv, write_markdown
-from experiments.beyond import Options, plan
-from experiments.suite import Records, origin, run_cells
-from r3jax.benchmark.record import read_records
-from r3jax.evaluation.equal_terms import (
-    method_name,
-    methods_of,
-    scenes_of,
-    snapshots_of,
-    with_short_names,
-)
+from experiments.beyond import Options, requests_of
+from experiments.suite import Records, by_method_and_scene, origin, run_requests
+from r3jax.evaluation.equal_terms import snapshots_of, with_short_names
 from r3jax.exploration.hindsight import explain_run
 from r3jax.scoring.explain import CAUSES
 from r3jax.trace.reader import read_run
@@ -37,11 +30,7 @@ PARTS = 3
 
 def main(options: Options) -> Path:
     """Explains every run, writes the page, and returns its folder."""
-    root = options.work / f"{options.size}-views"
-    root.mkdir(parents=True, exist_ok=True)
-    cells = plan(options, root)
-    run_cells(cells, root, engine=options.engine, jobs=options.jobs)
-    records = read_records(root, cells)
+    root, _, records = run_requests(options, "views", requests_of(options))
     last = snapshots_of(records)[-1]
     records = with_short_names([record for record in records if record["snapshot"] == last])
     totals = [totals_of(root / record["run"]) for record in records]
@@ -64,25 +53,17 @@ def table_rows(records: Records, totals: Sequence[np.ndarray]) -> list[dict[str,
         totals: of `totals_of`, for the same runs.
     """
     rows: list[dict[str, Any]] = []
-    for method in methods_of(records):
-        for scene in scenes_of(records):
-            mine = [
-                np.array_split(found, PARTS)
-                for record, found in zip(records, totals, strict=True)
-                if (method_name(record), record["scene"]) == (method, scene)
-            ]
-            for part in range(PARTS):
-                mean = np.concatenate([parts[part] for parts in mine]).mean(axis=0)
-                lack = float(mean[1:].sum())
-                rows.append(
-                    {"method": method, "scene": scene, "part": f"{part + 1} of {PARTS}"}
-                    | dict(zip(CAUSES, mean.tolist(), strict=True))
-                    | {
-                        "inconsistent, share of U_R [%]": 100.0 * float(mean[2]) / lack
-                        if lack
-                        else None
-                    }
-                )
+    for method, scene, runs in by_method_and_scene(records, totals):
+        parts = zip(*(np.array_split(run, PARTS) for run in runs), strict=True)
+        for number, part in enumerate(parts, start=1):
+            mean = np.concatenate(part).mean(axis=0)
+            lack = float(mean[1:].sum())
+            share = 100.0 * float(mean[2]) / lack if lack else None
+            rows.append(
+                {"method": method, "scene": scene, "part": f"{number} of {PARTS}"}
+                | dict(zip(CAUSES, mean.tolist(), strict=True))
+                | {"inconsistent, share of U_R [%]": share}
+            )
     return rows
 
 

@@ -12,7 +12,6 @@ The cells are those of `experiments.beyond`. What was trained once is kept.
 """
 
 import json
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,11 +24,10 @@ import tyro
 
 from experiments.artefacts import Origin, joint_origin, markdown_table, write_csv, write_markdown
 from experiments.replica_dense import REFERENCE
-from experiments.suite import Options, Records, request_of, run_cells
+from experiments.suite import Options, Records, request_of, run_requests
 from r3jax.benchmark.cells import Cell, paths_of
 from r3jax.benchmark.judging import load_judging_views
-from r3jax.benchmark.plan import make_plan
-from r3jax.benchmark.record import machine, read_records, source_commit
+from r3jax.benchmark.record import machine, source_commit
 from r3jax.evaluation.equal_terms import (
     scenes_of,
     scores_by_method,
@@ -37,7 +35,7 @@ from r3jax.evaluation.equal_terms import (
     with_short_names,
 )
 from r3jax.evaluation.judge import judge
-from r3jax.evaluation.statistics import Scores, mean_over_scenes, paired_difference
+from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
 from r3jax.exploration.replay import rebuild
 from r3jax.files import write_atomic
 from r3jax.geometry.cameras import Camera
@@ -62,11 +60,8 @@ EVERY_SECOND, IN_HINDSIGHT = "every second", "in hindsight"
 
 def main(options: Options) -> Path:
     """Trains on half of the views of every run, writes the page, and returns its folder."""
-    root = options.work / f"{options.size}-views"
-    root.mkdir(parents=True, exist_ok=True)
-    cells = make_plan(replace(request_of(options, "views"), policies=(REFERENCE,)), root)
-    run_cells(cells, root, engine=options.engine, jobs=options.jobs)
-    records = read_records(root, cells)
+    request = replace(request_of(options, "views"), policies=(REFERENCE,))
+    root, cells, records = run_requests(options, "views", [request])
     halves = [half for cell in cells for half in halves_of(cell, root)]
     made = [*records, *halves]
     source = joint_origin(
@@ -79,7 +74,10 @@ def main(options: Options) -> Path:
 
 
 def halves_of(cell: Cell, root: Path) -> list[dict[str, Any]]:
-    """What models of half of a cell's views are worth; kept where it was found before."""
+    """What models of half of a cell's views are worth; kept where it was found before.
+
+    In the form of the referee's records, with the choice in the policy's place.
+    """
     path = root / NAME / f"{cell.name}.json"
     if path.exists():
         return json.loads(path.read_text())
@@ -102,16 +100,18 @@ def halves_of(cell: Cell, root: Path) -> list[dict[str, Any]]:
         rows = judge(train.fit(views, config).scene, judging.views, config.raster).rows
         found.append(
             {
-                "choice": choice,
-                "scene": cell.scene_name,
+                "policy": choice,
+                "settings": {},
+                "scene": cell.scene,
                 "seed": cell.seed,
                 "steps": steps,
-                "psnr": [row.psnr for row in rows],
+                "views": {"psnr": [row.psnr for row in rows]},
                 "machine": machine(),
                 "commit": source_commit(),
             }
         )
-        print(f"{cell.name}: {choice} {np.mean(found[-1]['psnr']):.2f} dB", flush=True)
+        mean = np.mean([row.psnr for row in rows])
+        print(f"{cell.name}: {choice} {mean:.2f} dB", flush=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, json.dumps(found).encode())
     return found
@@ -157,9 +157,7 @@ def chosen_in_hindsight(
     return chosen
 
 
-def write_page(
-    folder: Path, records: Records, halves: Sequence[Mapping[str, Any]], source: Origin
-) -> None:
+def write_page(folder: Path, records: Records, halves: Records, source: Origin) -> None:
     """Writes the table.
 
     Args:
@@ -181,26 +179,16 @@ def write_page(
     write_markdown(folder / f"{NAME}.md", page, source)
 
 
-def table_rows(records: Records, halves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def table_rows(records: Records, halves: Records) -> list[dict[str, Any]]:
     """A line per choice: the mean PSNR of every scene, and the difference to all views."""
-    records = with_short_names(records)
+    named = with_short_names([*records, *halves])
+    records, halves = named[: len(records)], named[len(records) :]
     snapshots = snapshots_of(records)
-    scores: dict[str, Scores] = {
+    scores = {
         name: scores_by_method([r for r in records if r["snapshot"] == snapshot], "psnr")[REFERENCE]
         for name, snapshot in (("all", snapshots[-1]), (f"first, {snapshots[0]}", snapshots[0]))
-    }
+    } | scores_by_method(halves, "psnr")
     scenes = scenes_of(records)
-    for choice in (EVERY_SECOND, IN_HINDSIGHT):
-        scores[choice] = {
-            scene: np.array(
-                [
-                    half["psnr"]
-                    for half in sorted(halves, key=lambda half: half["seed"])
-                    if (half["choice"], half["scene"]) == (choice, scene)
-                ]
-            )
-            for scene in scenes
-        }
     rows: list[dict[str, Any]] = []
     for name, by_scene in scores.items():
         lacks = paired_difference(by_scene, scores["all"])

@@ -1,9 +1,9 @@
 """The comparison that several tables and figures share: cells of the benchmark in three sizes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from experiments.artefacts import Origin, joint_origin
 from r3jax.benchmark.cells import Cell
@@ -13,8 +13,11 @@ from r3jax.benchmark.engines.local import run_in_processes
 from r3jax.benchmark.engines.slurm import run_on_cluster
 from r3jax.benchmark.plan import Request, cells_left, make_plan
 from r3jax.benchmark.record import collect, read_records
+from r3jax.evaluation.equal_terms import method_name, methods_of, scenes_of
 from r3jax.planning.policy import policy_names
 from r3jax.scenes.registry import scene_names
+
+T = TypeVar("T")
 
 HOUSE = "mesh:../shared/scenes/aws_small_house/aws_small_house.glb"
 
@@ -134,11 +137,38 @@ def run_suite(options: Options, unit: Literal["views", "seconds"]) -> tuple[Path
     Raises:
         SystemExit: a cell failed; the others are done, and the same command tries it again.
     """
+    root, _, records = run_requests(options, unit, [request_of(options, unit)])
+    return root, records
+
+
+def run_requests(
+    options: Options, unit: Literal["views", "seconds"], requests: Sequence[Request]
+) -> tuple[Path, list[Cell], Records]:
+    """Runs what is left of the cells of all requests, in the folder of the suite's.
+
+    Returns:
+        The folder of the cells, the cells, and their records.
+
+    Raises:
+        SystemExit: a cell failed; the others are done, and the same command tries it again.
+    """
     root = options.work / f"{options.size}-{unit}"
     root.mkdir(parents=True, exist_ok=True)
-    cells = make_plan(request_of(options, unit), root)
+    cells = [cell for request in requests for cell in make_plan(request, root)]
     run_cells(cells, root, engine=options.engine, jobs=options.jobs)
-    return root, read_records(root, cells)
+    return root, cells, read_records(root, cells)
+
+
+def by_method_and_scene(records: Records, items: Sequence[T]) -> Iterator[tuple[str, str, list[T]]]:
+    """What belongs to the records of each method in each scene, one item per record."""
+    for method in methods_of(records):
+        for scene in scenes_of(records):
+            mine = [
+                item
+                for record, item in zip(records, items, strict=True)
+                if (method_name(record), record["scene"]) == (method, scene)
+            ]
+            yield method, scene, mine
 
 
 def run_cells(cells: Sequence[Cell], root: Path, *, engine: str = "local", jobs: int = 1) -> None:

@@ -60,7 +60,13 @@ def test_the_table_compares_every_choice_with_all_views(tmp_path):
         for views, name in ((30, "first"), (60, "all"))
     ]
     halves = [
-        {"choice": choice, "scene": scene, "seed": seed, "psnr": (PSNR[choice] + seed + hard)}
+        {
+            "policy": choice,
+            "settings": {},
+            "scene": scene,
+            "seed": seed,
+            "views": {"psnr": PSNR[choice] + seed + hard},
+        }
         for choice in (half.EVERY_SECOND, half.IN_HINDSIGHT)
         for scene, seed in reversed(cases)
     ]
