@@ -190,12 +190,12 @@ def _nodes_of(middle: Float[Array, " 3"], half: Float[Array, " 3"]) -> Float[Arr
 
 
 class _Sight(NamedTuple):
-    """What is seen from each node, and the depth buffer there."""
+    """What is seen from a node, and the depth buffer there: of one, or of k."""
 
-    limit: Float[Array, "k h w"]
-    distance: Float[Array, "k h w"]
-    seen: Bool[Array, "k n"]
-    empty: Bool[Array, "k c"]
+    limit: Float[Array, "*k h w"]
+    distance: Float[Array, "*k h w"]
+    seen: Bool[Array, "*k n"]
+    empty: Bool[Array, "*k c"]
 
 
 def _look_about(
