@@ -1,5 +1,6 @@
 """The command line, as a user meets it: help, mistakes, a run, an interrupt, a recording."""
 
+import importlib
 import json
 import os
 import subprocess
@@ -8,7 +9,7 @@ import sys
 import pytest
 import trimesh
 
-from r3jax.cli.main import main
+from r3jax.cli.main import _COMMANDS, main
 from r3jax.exploration.budget import parse_budget
 from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.trace.reader import read_run
@@ -29,6 +30,11 @@ def run_folder(room, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs")
     assert explore(room, out) == 0
     return out / "box"
+
+
+@pytest.mark.parametrize("name", _COMMANDS)
+def test_every_command_has_what_runs_it(name):
+    assert callable(getattr(importlib.import_module(f"r3jax.cli.{name}"), f"run_{name}"))
 
 
 def test_a_run_leaves_data_set_and_report(run_folder):
