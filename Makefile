@@ -1,11 +1,16 @@
-# Two commands for a new machine: `make demo` and `make test`. Both set up .venv from nothing.
+# For a new machine: `make demo` shows what it does, `make test` checks it. Both set up .venv.
+#
+#   make test       formulas, laws, one run end to end: minutes
+#   make test-all   also browsers, notebooks, fuzzing, whole runs of every policy
+#   make mutants    plants every listed fault and asks whether a law notices
+#   make stress     kill loops, thousands of damaged files, long runs: hours
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 
-.PHONY: setup demo test lint docs benchmark clean
+.PHONY: setup demo test test-all test-added mutants stress lint docs benchmark clean
 
 setup: $(STAMP)
 
@@ -18,8 +23,22 @@ demo: setup
 	$(BIN)/r3jax demo
 
 # Two processes: compiling, most of the time, runs on one core each.
+PYTEST := $(BIN)/pytest -n 2 --dist worksteal
+
 test: setup
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(PYTEST)
+
+test-all: test test-added
+
+# What `test-all` adds to `test`.
+test-added: setup
+	$(PYTEST) -m "full and not (mutant or slow)"
+
+mutants: setup
+	$(PYTEST) -m mutant
+
+stress: setup
+	$(PYTEST) -m slow
 
 lint: setup
 	$(BIN)/ruff check .

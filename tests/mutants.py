@@ -2,8 +2,12 @@
 
 A mutant is a snippet of a module's source and what to write in its place. The module and those
 that build on it are then loaded a second time, beside the real ones, and a law is run on them.
+
+Every plant compiles anew, so mutants run on demand (`make mutants`). That each snippet is still in
+the source is checked whenever the tests are collected.
 """
 
+import functools
 import importlib.util
 import sys
 from collections.abc import Callable
@@ -14,7 +18,7 @@ from unittest import mock
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "r3jax"
+ROOT = Path(__file__).resolve().parents[1]
 
 Modules = dict[str, ModuleType]
 """Loaded modules by the last part of their names."""
@@ -80,12 +84,21 @@ def _replaced(source: str, mutant: Mutant, path: Path) -> str:
 
 
 def _require_snippet(mutant: Mutant) -> None:
-    """A list that runs seldom must not fall behind the code unnoticed."""
-    paths = [p for p in PACKAGE.rglob(f"{mutant.module}.py") if mutant.original in p.read_text()]
-    if len(paths) != 1:
+    """A list that runs on demand must not fall behind the code unnoticed."""
+    counts = [text.count(mutant.original) for text in _sources().get(mutant.module, ())]
+    if sum(counts) != 1:
         raise LookupError(
-            f"{len(paths)} files {mutant.module}.py hold {mutant.original!r}, not one"
+            f"{sum(counts)} places in files {mutant.module}.py hold {mutant.original!r}, not one"
         )
+
+
+@functools.cache
+def _sources() -> dict[str, list[str]]:
+    """Source of every module that a fault may be planted in, by the last part of its name."""
+    sources: dict[str, list[str]] = {}
+    for path in (p for folder in ("r3jax", "experiments") for p in (ROOT / folder).rglob("*.py")):
+        sources.setdefault(path.stem, []).append(path.read_text(encoding="utf-8"))
+    return sources
 
 
 def assert_caught(chain: tuple[str, ...], mutant: Mutant) -> None:
@@ -95,19 +108,16 @@ def assert_caught(chain: tuple[str, ...], mutant: Mutant) -> None:
         mutant.law(modules)
 
 
-def each(mutants: list[Mutant], in_gate: int | None = None) -> pytest.MarkDecorator:
-    """Runs a test for each mutant, named by the module and the fault.
-
-    Args:
-        mutants: the list.
-        in_gate: so many of them run every time, the others with `pytest -m slow`: where each
-            compiles for seconds, and the laws change seldom. None: all.
-    """
-    cases: list[Any] = []
-    for number, mutant in enumerate(mutants):
-        name = f"{mutant.module}: {' '.join(mutant.mutated.split())}"
-        is_rare = in_gate is not None and number >= in_gate
-        if is_rare:
-            _require_snippet(mutant)
-        cases.append(pytest.param(mutant, id=name, marks=[pytest.mark.slow] if is_rare else []))
+def each(mutants: list[Mutant]) -> pytest.MarkDecorator:
+    """Runs a test for each mutant with `make mutants`, named by the module and the fault."""
+    for mutant in mutants:
+        _require_snippet(mutant)
+    cases: list[Any] = [
+        pytest.param(
+            mutant,
+            id=f"{mutant.module}: {' '.join(mutant.mutated.split())}",
+            marks=pytest.mark.mutant,
+        )
+        for mutant in mutants
+    ]
     return pytest.mark.parametrize("mutant", cases)

@@ -10,6 +10,8 @@ import pytest
 
 import r3jax
 
+pytestmark = pytest.mark.full
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

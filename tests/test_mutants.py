@@ -52,7 +52,9 @@ def test_a_stale_mutant_is_named(original, module, words):
         load(CHAIN, mutant(original, "", module))
 
 
-def test_a_seldom_run_mutant_that_the_code_has_left_behind_is_named_at_once():
+def test_a_mutant_that_the_code_has_left_behind_is_named_when_tests_are_collected():
     mutant = Mutant("join", "a line that is not there", "another", lambda modules: None)
-    with pytest.raises(LookupError, match=r"0 files join\.py hold 'a line that is not there'"):
-        each([mutant], in_gate=0)
+    with pytest.raises(
+        LookupError, match=r"0 places in files join\.py hold 'a line that is not there'"
+    ):
+        each([mutant])

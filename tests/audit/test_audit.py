@@ -30,6 +30,8 @@ from tests.audit.room import (
     write_recording,
 )
 
+pytestmark = pytest.mark.full
+
 VOXEL = 0.15
 WISHES = Wishes(voxel_size=VOXEL, num_views=3, folds=4, num_places=16, num_standpoints=8)
 FEW_VIEWS = dataclasses.replace(WISHES, voxel_size=None, num_views=2)

@@ -160,6 +160,6 @@ def test_laws_hold_without_a_fault():
     law_marks(modules)
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)

@@ -20,6 +20,7 @@ from tests.slurm import cluster
 
 ABSENT = ", ".join(cluster.missing())
 pytestmark = [
+    pytest.mark.full,
     pytest.mark.slurm,
     pytest.mark.skipif(bool(ABSENT), reason=f"needs {ABSENT} (apt-get install slurm-wlm munge)"),
 ]

@@ -40,6 +40,7 @@ def read(out):
     return [json.loads(line) for line in (out / CELLS).read_text().splitlines()]
 
 
+@pytest.mark.full
 def test_every_cell_and_snapshot_has_its_line(finished):
     records = read(finished)
     assert sorted((r["policy"], r["snapshot"]) for r in records) == [
@@ -76,6 +77,7 @@ def test_another_setting_makes_another_cell_beside_the_first(room, finished, cap
     assert "frontier (" not in captured.out  # the table is of what was asked for
 
 
+@pytest.mark.full
 def test_a_cell_that_fails_is_named_and_the_exit_code_says_so(room, tmp_path, capsys, monkeypatch):
     judge = running.judge
 

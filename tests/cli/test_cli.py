@@ -59,6 +59,7 @@ def test_an_existing_run_is_kept(room, run_folder, capsys):
     assert (run_folder / "trace.jsonl").read_bytes() == before
 
 
+@pytest.mark.full
 def test_the_model_clock_makes_a_run_repeatable(room, run_folder, tmp_path):
     assert explore(room, tmp_path) == 0
     again = (tmp_path / "box" / "trace.jsonl").read_bytes()
@@ -80,6 +81,7 @@ def test_info_lists_what_there_is(capsys):
         assert name in text
 
 
+@pytest.mark.full
 def test_info_follows_a_recording(shared, tmp_path, capsys):
     plot = tmp_path / "plot.png"
     folder = shared("recordings", "hololens_lounge")
@@ -144,6 +146,7 @@ def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monke
     assert "interrupted" in (tmp_path / "box" / "report" / "report.html").read_text()
 
 
+@pytest.mark.full
 def test_the_demo_overwrites_its_own_folder_only(tmp_path):
     for name in ("demo", "other"):
         with RunWriter(tmp_path / name, make_header()) as writer:

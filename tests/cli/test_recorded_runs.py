@@ -14,6 +14,8 @@ from r3jax.trace.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore
 
+pytestmark = pytest.mark.full
+
 VIEWS = 5
 
 

@@ -190,6 +190,7 @@ def frames_round(count: int) -> list[Frame]:
     return [Frame(rgb, jnp.full((24, 24), 2.0), T, camera) for T in look]
 
 
+@pytest.mark.full
 def test_a_map_knows_what_it_was_shown_and_no_more():
     frames = frames_round(4)
     state = map_of(frames[:2], voxel_size=0.2)
@@ -201,6 +202,7 @@ def test_a_map_knows_what_it_was_shown_and_no_more():
     assert map_of(frames[:1], voxel_size=0.2, num_bins=96).num_bins == 96
 
 
+@pytest.mark.full
 def test_a_map_grows_instead_of_dropping(monkeypatch):
     from r3jax.evaluation import maps
 

@@ -68,6 +68,7 @@ def test_a_point_that_cannot_work_is_refused_before_anything_is_run(values, mess
         with_settings(CELL, values)
 
 
+@pytest.mark.full
 def test_settings_are_in_the_map_in_the_run_and_in_the_record(tmp_path):
     room = write_room(tmp_path / "room.ply")
     values = {
@@ -95,6 +96,7 @@ def test_settings_are_in_the_map_in_the_run_and_in_the_record(tmp_path):
     assert found["training"]["lambda_dssim"] == 0.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["ours", "ours-pano"])
 def test_a_sweep_over_numbers_compiles_once(name):
     free = np.zeros((12, 12, 10), dtype=bool)

@@ -241,6 +241,7 @@ def test_a_mistake_ends_the_command_with_one_line(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.full
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     room = write_room(tmp_path / "room.ply")
     tiny = dataclasses.replace(CONDITIONS, snapshots=("views:3",))

@@ -14,6 +14,7 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator, OracleReadError
 from r3jax.planning.policy import make_policy, policy_names
 from tests.exploration.toys import BoxRoom, Wander
+from tests.tiers import quick_and_full
 
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=4)
 
@@ -79,7 +80,7 @@ class Watched:
         return self.inner.follow(state, map_state, grid, T_world_camera, waypoints)
 
 
-@pytest.mark.parametrize("name", policy_names())
+@pytest.mark.parametrize("name", quick_and_full(policy_names(), ["ours-pano"]))
 def test_no_policy_holds_the_simulator(name):
     policy = Watched(make_policy(name, num_candidates=20, num_frontier=6))
     result = explore(BoxRoom(), policy, budget="views:3", config=CONFIG)

@@ -22,6 +22,7 @@ from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.exploration.killed_run import CONFIG, small_policy
 from tests.exploration.toys import BoxRoom, Wander
+from tests.tiers import quick_and_full
 from tests.trace.runs import make_header
 
 VIEWS, CUT = 6, 3
@@ -83,7 +84,10 @@ def whole(tmp_path_factory):
     return path_of
 
 
-@pytest.mark.parametrize("name", ["wander", "ours-pano", "active-gs", "uniform", "frontier"])
+@pytest.mark.parametrize(
+    "name",
+    quick_and_full(["wander", "ours-pano", "active-gs", "uniform", "frontier"], ["wander"]),
+)
 def test_a_run_in_two_parts_is_the_run_in_one(tmp_path, whole, name):
     run_in(tmp_path / "run", name, CUT)
     simulator = BoxRoom()
@@ -287,7 +291,11 @@ def _kill_at_random_moments(path, views, kills, span, rng):
 
 @pytest.mark.parametrize(
     ("views", "kills", "span"),
-    [(12, 5, 1.5), pytest.param(40, 30, 2.5, marks=pytest.mark.slow)],
+    [
+        (6, 1, 1.5),
+        pytest.param(12, 5, 1.5, marks=pytest.mark.full),
+        pytest.param(40, 30, 2.5, marks=pytest.mark.slow),
+    ],
 )
 def test_a_run_survives_kills_at_random_moments(tmp_path, views, kills, span):
     _finish(tmp_path / "whole", views)

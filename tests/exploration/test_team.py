@@ -33,6 +33,7 @@ from tests.exploration.killed_run import CONFIG, SCORING, small_policy
 from tests.exploration.test_guard import Cheat
 from tests.exploration.toys import BoxRoom, Wander
 from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.tiers import quick_and_full
 
 WIDE = Camera.from_fov(32, 32, 100.0)
 VIEWS = 5
@@ -80,7 +81,7 @@ def of_one_camera(members, frames):
     return map_state, grid
 
 
-@pytest.mark.parametrize("name", ["wander", "ours-pano"])
+@pytest.mark.parametrize("name", quick_and_full(["wander", "ours-pano"], ["wander"]))
 def test_a_team_of_one_is_the_camera_alone(name):
     policy = Wander() if name == "wander" else small_policy(name)
     alone = explore(BoxRoom(), policy, budget=f"views:{VIEWS}", seed=3, config=CONFIG)
@@ -124,6 +125,7 @@ def law_merged_is_one_cameras(
     assert result.seconds == max(m.rows[-1].seconds for m in result.members)
 
 
+@pytest.mark.full
 @settings(max_examples=6)
 @given(
     st.integers(0, 1000), st.sampled_from([0.0, 0.4, 1.0, 100.0]), st.sampled_from([0.2, 0.8, 1.4])
@@ -261,6 +263,7 @@ def first_choices():
     return [tuple(m.rows[1].pose[:3, 2].round(3)) for m in result.members]
 
 
+@pytest.mark.full
 def test_two_cameras_do_not_turn_to_the_same_thing():
     first, second = first_choices()
     assert first != second

@@ -13,6 +13,8 @@ from r3jax.formats.colmap.text import read_text, write_text
 from r3jax.formats.lenses import MODELS, Lens
 from tests.formats.colmap_models import assert_equal, random_pose
 
+pytestmark = pytest.mark.full
+
 pycolmap = pytest.importorskip("pycolmap")
 
 WAYS = {"binary": (write_binary, read_binary), "text": (write_text, read_text)}

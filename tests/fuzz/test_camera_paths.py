@@ -16,6 +16,8 @@ from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CASES = 200
 """In the normal suite."""
 

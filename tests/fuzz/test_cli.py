@@ -33,6 +33,8 @@ from tests.fuzz.tree import Entry, Files
 from tests.fuzz.worker import Reader
 from tests.trace.runs import make_header
 
+pytestmark = pytest.mark.full
+
 CASES = 300
 """In the normal suite."""
 

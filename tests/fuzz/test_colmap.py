@@ -20,6 +20,8 @@ from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files, Link, pick_up
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CASES = 400
 """In the normal suite."""
 

@@ -22,6 +22,8 @@ from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files, pick_up
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CASES = 800
 """In the normal suite."""
 

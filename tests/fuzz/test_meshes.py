@@ -21,6 +21,8 @@ from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Fifo, Files
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CASES = 900
 """In the normal suite."""
 

@@ -19,6 +19,8 @@ from tests.fuzz.test_recordings import encoded
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CASES = 400
 """In the normal suite."""
 

@@ -18,6 +18,8 @@ from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CASES = 600
 """In the normal suite."""
 

@@ -20,6 +20,8 @@ from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 from tests.trace.runs import make_header, make_view
 
+pytestmark = pytest.mark.full
+
 CASES = 700
 """In the normal suite."""
 

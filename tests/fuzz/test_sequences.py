@@ -19,6 +19,8 @@ from tests.formats import sequences
 from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CASES = 150
 """Of each, in the normal suite."""
 

@@ -29,6 +29,8 @@ from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files, pick_up
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CASES = 100
 """In the normal suite: each takes 50 ms."""
 

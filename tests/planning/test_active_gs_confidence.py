@@ -278,7 +278,7 @@ def test_laws(law):
     law(modules_now())
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutants_are_caught(mutant):
     assert_caught(CHAIN, mutant)
 

@@ -98,6 +98,6 @@ MUTANTS = [
 ]
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)

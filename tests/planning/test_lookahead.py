@@ -206,6 +206,6 @@ def test_laws_hold_without_a_fault():
         law(modules)
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)

@@ -21,6 +21,7 @@ from r3jax.scoring import batch
 from r3jax.scoring.config import ScoringConfig
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, known_flat, pose_at
 from tests.planning.test_travel import assert_inside
+from tests.tiers import quick_and_full
 
 CAMERA = Camera.from_fov(16, 16, 60.0)
 SCORING = ScoringConfig(max_range=4.0, zbuffer_size=16)
@@ -97,7 +98,7 @@ def assert_obeys(motion: Motion, start: np.ndarray, before: np.ndarray, decision
         assert_inside(np.repeat(~below[:, :, None], 10, axis=2), way)
 
 
-@pytest.mark.parametrize("name", policy_names())
+@pytest.mark.parametrize("name", quick_and_full(policy_names(), ["ours-pano", "frontier"]))
 @pytest.mark.parametrize("motion_name", CONSTRAINED)
 def test_every_policy_keeps_to_every_motion(name, motion_name, world):
     motion = MOTIONS[motion_name]

@@ -170,6 +170,6 @@ def test_the_law_holds_without_a_fault():
     law_greedy(load(CHAIN))
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)

@@ -37,6 +37,7 @@ from r3jax.scoring.near import near
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import center, known_flat
 from tests.planning.walls import SEEN_FROM, VOXEL, box, wall
+from tests.tiers import quick_and_full
 
 NUM, REFINED = 12, 3  # one shape: one compile
 CAMERA = Camera.from_fov(48, 48, 60.0)
@@ -129,6 +130,7 @@ def law_safe(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) 
     np.testing.assert_allclose(where.limits.obeyed(after), after, atol=1e-6)
 
 
+@pytest.mark.full
 @given(seeds, st.sampled_from(list(MOTIONS)))
 @settings(max_examples=12)
 def test_no_view_gets_worse_or_collides(seed, motion_name):
@@ -179,6 +181,7 @@ def test_climbing_gains():
     law_gains({"refine": real})
 
 
+@pytest.mark.full
 def test_turning_alone_gains_and_stays():
     where = situation_of(MOTIONS["free"])
     config = dataclasses.replace(CONFIG, refine_radius=0.0)
@@ -210,6 +213,7 @@ def badly_seen() -> tuple[r3jax.MapState, OccupancyGrid]:
     return state, box(9.0)
 
 
+@pytest.mark.full
 def test_a_climb_comes_near_the_best_of_a_dense_grid():
     """Positions and directions all over the box and round the start, one by one."""
     scoring = ScoringConfig(max_range=4.0, zbuffer_size=32)
@@ -235,7 +239,9 @@ def test_a_climb_comes_near_the_best_of_a_dense_grid():
     assert found["utility"][0] > 0.95 * best
 
 
-@pytest.mark.parametrize("name", ["ours", "ours-pano", "ours-demand", "ours-ahead"])
+@pytest.mark.parametrize(
+    "name", quick_and_full(["ours", "ours-pano", "ours-demand", "ours-ahead"], ["ours-pano"])
+)
 def test_decisions_with_refinement(name):
     """The choice is one of the candidates, and what it was worth before is no more than after."""
     state, grid = known_flat()
@@ -321,6 +327,6 @@ def test_laws_hold_without_a_fault():
         law(modules)
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)

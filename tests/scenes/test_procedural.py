@@ -63,6 +63,7 @@ def test_an_unknown_name_lists_the_known_ones():
             call("attic")
 
 
+@pytest.mark.full
 def test_another_process_builds_the_same_bytes(worlds):
     code = "from r3jax.scenes import procedural as p; print(p.build('flat').content_hash)"
     env = {**os.environ, "PYTHONHASHSEED": "7"}

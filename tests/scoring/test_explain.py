@@ -183,7 +183,7 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-@each(MUTANTS, in_gate=5)
+@each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)
 
@@ -224,6 +224,7 @@ def test_the_totals_are_the_utility_of_the_same_view(known, seed, lambda1):
     np.testing.assert_allclose(np.asarray(found.shares).sum(axis=0), expected, atol=2e-6)
 
 
+@pytest.mark.full
 def test_many_views_are_explained_at_once(known):
     state, grid, camera = known
     directions = jnp.array([[1.0, 0.2, 0.0], [-1.0, 0.1, -0.2], [0.1, 1.0, 0.4]])

@@ -203,6 +203,6 @@ def test_law_holds_without_a_fault():
     law_seen(load(CHAIN))
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)

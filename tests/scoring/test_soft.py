@@ -281,6 +281,6 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)

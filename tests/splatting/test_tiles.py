@@ -141,6 +141,6 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-@each(MUTANTS, in_gate=2)
+@each(MUTANTS)
 def test_mutants_are_caught(mutant):
     assert_caught(CHAIN, mutant)

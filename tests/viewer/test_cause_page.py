@@ -18,6 +18,8 @@ from r3jax.viewer.blocks import CAUSE
 from r3jax.viewer.colors import CAUSE_COLORS, UNSEEN
 from tests.viewer.conftest import VIEWS
 
+pytestmark = pytest.mark.full
+
 PATIENCE = 240.0  # seconds; of a machine with other work, that compiles
 STEP = VIEWS - 1
 

@@ -24,6 +24,8 @@ from r3jax.cli.options import View
 from r3jax.cli.view import open_viewer
 from tests.viewer.conftest import VIEWS
 
+pytestmark = pytest.mark.full
+
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 FLAGS = (
     "--no-sandbox",

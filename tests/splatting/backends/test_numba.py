@@ -16,6 +16,7 @@ from r3jax.splatting.backends import numba
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 from tests.splatting.clouds import random_cloud, safe_pixels, view
+from tests.tiers import quick_and_full
 
 COUNT, SIZE, BUDGET = 120, (50, 38), 1 << 12
 BACKENDS = {"numba": numba.rasterise, "reference": reference.rasterise}
@@ -118,7 +119,9 @@ def test_fewer_harmonics_agree(degree):
     assert_gradients_agree(3, safe, scene, camera, pose, jnp.zeros((COUNT, 2)))
 
 
-@pytest.mark.parametrize("size", [(96, 70), (16, 16), (5, 3), (1, 1), (17, 33)])
+@pytest.mark.parametrize(
+    "size", quick_and_full([(96, 70), (16, 16), (5, 3), (1, 1), (17, 33)], [(17, 33)])
+)
 def test_sizes_that_are_no_multiple_of_a_tile(size):
     scene, (camera, pose) = random_cloud(4, COUNT), view(*size)
     assert_images_agree(scene, camera, pose)
