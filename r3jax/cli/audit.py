@@ -3,9 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Table
 
 from r3jax.audit import sentences
 from r3jax.audit.audit import Audit, audit
@@ -16,7 +13,14 @@ from r3jax.audit.report import write_report
 from r3jax.audit.source import source_of
 from r3jax.audit.survey import Wishes
 from r3jax.cli.captures import open_capture
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import (
+    BarColumn,
+    Console,
+    MofNCompleteColumn,
+    Table,
+    TextColumn,
+    progress_bar,
+)
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Audit as Options
 from r3jax.formats.captures import PosedImages
@@ -99,12 +103,11 @@ class Stages:
     def __init__(self, console: Console):
         """Shows nothing before it is entered."""
         self._console = console
-        self._bar = Progress(
+        self._bar = progress_bar(
+            console,
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
             MofNCompleteColumn(),
-            console=console,
-            disable=not console.is_terminal,
             transient=True,
         )
         self._task = self._bar.add_task("", total=None)
@@ -116,7 +119,7 @@ class Stages:
             return
         self._bar.reset(self._task, description=stage, total=max(steps, 1))
         if not self._console.is_terminal:
-            self._console.print(stage, **PLAIN)
+            self._console.say(stage)
 
     def __enter__(self) -> "Stages":
         """Shows the bar."""
@@ -130,13 +133,13 @@ class Stages:
 
 def _show(console: Console, found: Audit, written: dict[str, Path]) -> None:
     for sentence in sentences.verdict(found):
-        console.print(sentence, highlight=False, markup=False)
+        console.print(sentence)
     if found.regions:
         console.print(_regions(found))
     if found.plan.views:
         console.print(_views(found))
     for what, path in written.items():
-        console.print(f"{what}  {path}", **PLAIN)
+        console.say(f"{what}  {path}")
 
 
 def _regions(found: Audit) -> Table:

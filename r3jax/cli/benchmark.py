@@ -7,8 +7,6 @@ from types import TracebackType
 from typing import Any
 
 import jax
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
 from r3jax.benchmark.cells import Cell
 from r3jax.benchmark.conditions import Conditions, parse_settings
@@ -17,7 +15,7 @@ from r3jax.benchmark.engines.local import run_here, run_in_processes, visible_gp
 from r3jax.benchmark.engines.slurm import run_on_cluster
 from r3jax.benchmark.plan import Request, cells_left, make_plan
 from r3jax.benchmark.record import collect, read_records
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import BarColumn, Console, SpinnerColumn, TaskID, TextColumn, progress_bar
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Benchmark
 from r3jax.cli.results import print_results
@@ -54,7 +52,7 @@ def run_benchmark(options: Benchmark) -> int:
     records = read_records(options.out, cells)
     if records:
         print_results(Console(), records)
-    console.print(f"records  {collected}", **PLAIN)
+    console.say(f"records  {collected}")
     return _conclude(console, progress.failures, interrupted)
 
 
@@ -121,24 +119,23 @@ def _run(
 def _announce(
     console: Console, options: Benchmark, cells: Sequence[Cell], left: Sequence[Cell]
 ) -> None:
-    console.print(f"{len(cells)} cells, {len(cells) - len(left)} of them done", **PLAIN)
+    console.say(f"{len(cells)} cells, {len(cells) - len(left)} of them done")
     crowded = options.engine == "local" and options.jobs > max(1, len(visible_gpus()))
     if left and crowded and options.clock == "wall":
-        console.print(
+        console.say(
             f"warning: {options.jobs} cells at a time slow each other down, and the wall clock "
             "charges the policies for it; --jobs 1 or --clock model measure the same for all",
             style="yellow",
-            **PLAIN,
         )
 
 
 def _conclude(console: Console, failures: Sequence[Event], interrupted: bool) -> int:
     for event in failures:
-        console.print(f"failed   {event.cell.name}: {event.text}", style="red", **PLAIN)
+        console.say(f"failed   {event.cell.name}: {event.text}", style="red")
     if failures:
-        console.print("the error's traceback is in error.txt of the cell's folder", **PLAIN)
+        console.say("the error's traceback is in error.txt of the cell's folder")
     if interrupted:
-        console.print("interrupted: the same command goes on from here", **PLAIN)
+        console.say("interrupted: the same command goes on from here")
         return 130
     return 1 if failures else 0
 
@@ -161,13 +158,12 @@ class BenchmarkProgress:
         self._begin = time.monotonic()
         self._tasks: dict[str, TaskID] = {}
         self.failures: list[Event] = []
-        self._bar = Progress(
+        self._bar = progress_bar(
+            console,
             SpinnerColumn(),
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
-            TextColumn("[dim]{task.fields[facts]}"),
-            console=console,
-            disable=not console.is_terminal,
+            TextColumn("{task.fields[facts]}", style="dim"),
         )
         self._overall = self._bar.add_task(
             "cells", total=total, completed=self._done, facts=self._facts()
@@ -195,7 +191,7 @@ class BenchmarkProgress:
         collect(self._root)
         if not self._console.is_terminal:
             what = "done" if event.kind == "done" else f"failed: {event.text}"
-            self._console.print(f"{event.cell.name}: {what}; {self._facts()}", **PLAIN)
+            self._console.say(f"{event.cell.name}: {what}; {self._facts()}")
 
     def _facts(self) -> str:
         text = f"{self._done}/{self._total} done"

@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+_BLANKS = "\n\u00a0"
+"""What is not printable by name, but harmless."""
+
 
 class UserError(Exception):
     """Something that the user can mend, in one line."""
@@ -30,3 +33,12 @@ def check_resolution(pixels: int | None) -> None:
 def one_line(error: BaseException) -> str:
     """An error's text without line breaks."""
     return " ".join(str(error).split())
+
+
+def printable(text: str) -> str:
+    """Text whose control characters are spelled out: a name may hold what moves the cursor."""
+    return "".join(c if c.isprintable() or c in _BLANKS else _spelled(c) for c in text)
+
+
+def _spelled(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")

@@ -8,12 +8,18 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Table
 
 from r3jax.cli.captures import Capture, open_capture
+from r3jax.cli.console import (
+    BarColumn,
+    Console,
+    MofNCompleteColumn,
+    Progress,
+    Table,
+    Text,
+    TextColumn,
+    progress_bar,
+)
 from r3jax.cli.errors import UserError, check_resolution, one_line
 from r3jax.cli.options import Evaluate
 from r3jax.cli.selection import (
@@ -40,7 +46,6 @@ from r3jax.splatting.views import Views, load_views
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import package_versions
 
-_PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
 _NETWORKS = {"alex": "AlexNet", "vgg": "VGG16"}
 
 
@@ -125,12 +130,11 @@ def _map(capture: Capture, numbers: list[int]) -> MapState:
 
 
 def _bar(console: Console) -> Progress:
-    return Progress(
+    return progress_bar(
+        console,
         TextColumn("rendering"),
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
-        console=console,
-        disable=not console.is_terminal,
         transient=True,
     )
 
@@ -201,8 +205,8 @@ def _described(outcome: Outcome) -> str:
 
 def _show(console: Console, options: Evaluate, outcome: Outcome, written: dict[str, Path]) -> None:
     rows = outcome.judgment.rows
-    console.print(_described(outcome), **_PLAIN)
-    console.print(f"model: {outcome.training.model}, {outcome.num_gaussians} Gaussians", **_PLAIN)
+    console.say(_described(outcome))
+    console.say(f"model: {outcome.training.model}, {outcome.num_gaussians} Gaussians")
     console.print(_table(outcome.summaries))
     lpips = (
         "no LPIPS"
@@ -214,8 +218,6 @@ def _show(console: Console, options: Evaluate, outcome: Outcome, written: dict[s
         f"{lpips}. Brackets: 95 % bootstrap interval of the mean over views. The 5th percentile "
         "is the bad tail (of LPIPS the 95th).",
         style="dim",
-        highlight=False,
-        markup=False,
     )
     coverage = np.mean([row.coverage for row in rows])
     holes = 1.0 - np.mean([row.measured for row in rows])
@@ -223,11 +225,11 @@ def _show(console: Console, options: Evaluate, outcome: Outcome, written: dict[s
     expected = [row.renderability for row in rows if row.renderability is not None]
     if expected:
         facts += f", mean renderability {np.mean(expected):.3f}"
-    console.print(facts, **_PLAIN)
+    console.say(facts)
     for what, path in written.items():
-        console.print(f"{what}  {path}", **_PLAIN)
+        console.say(f"{what}  {path}")
     for warning in _warnings(outcome):
-        console.print(f"warning: {warning}", style="yellow", **_PLAIN)
+        console.say(f"warning: {warning}", style="yellow")
 
 
 def _table(summaries: tuple[Summary, ...]) -> Table:
@@ -243,9 +245,9 @@ def _table(summaries: tuple[Summary, ...]) -> Table:
         low, high = summary.interval
         poor = "" if summary.poor_share is None else f"{100 * summary.poor_share:.1f} %"
         table.add_row(
-            escape(summary.metric.title),
-            f"[bold]{show(summary.mean)}[/bold]",
-            escape(f"[{show(low)}, {show(high)}]"),
+            summary.metric.title,
+            Text(show(summary.mean), style="bold"),
+            f"[{show(low)}, {show(high)}]",
             show(summary.median),
             show(summary.percentile_5),
             f"{show(summary.worst)} ({summary.worst_view})",

@@ -6,9 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, check_folder_name, one_line
 from r3jax.cli.options import Explore, Team
 from r3jax.cli.pages import check_viser
@@ -82,7 +80,7 @@ def run_explore(options: Explore) -> int:
         if page is not None:
             feed = stack.enter_context(page(expedition))
             policy, on_view = feed.watch(policy), feed.on_step
-            console.print(f"live      {feed.url}", **PLAIN)
+            console.say(f"live      {feed.url}")
         progress = stack.enter_context(RunProgress(console, plan.budget))
 
         def on_step(row: StepRow) -> None:
@@ -187,7 +185,7 @@ def _resume(options: Explore, path: Path, console: Console) -> Expedition:
     with console.status(f"opening {run.header.scene['name']} ..."):
         simulator = simulator_of_run(run)
     recorder, run = RunWriter.resume(path, header)
-    console.print(f"goes on behind view {len(run.rows)} of {path}", **PLAIN)
+    console.say(f"goes on behind view {len(run.rows)} of {path}")
     return Expedition(plan, simulator, recorder, run.header.seed, run, _decided_from(run))
 
 
@@ -276,37 +274,35 @@ def warn_of_versions(console: Console, run: Run) -> None:
     now, then = package_versions(), run.header.packages
     changed = [f"{k} {then.get(k)} -> {v}" for k, v in now.items() if then.get(k) != v]
     if changed:
-        console.print(
+        console.say(
             f"the run was begun with other versions ({', '.join(changed)}): what follows may "
             "differ in the last digits from what would have followed then",
-            **PLAIN,
         )
 
 
 def _conclude(console: Console, path: Path, result: Result) -> None:
     """Data set, report, and a few words; a full disk must not hide how the run ended."""
-    console.print(f"{result.reason.value}: {result.message}", **PLAIN)
+    console.say(f"{result.reason.value}: {result.message}")
     if result.state.views == 0:
         return
     if result.reason in EXIT_CODES:
-        console.print(f"go on     r3jax explore --resume {path}", **PLAIN)
+        console.say(f"go on     r3jax explore --resume {path}")
     try:
         with console.status("writing the data set and the report ..."):
             run = read_run(path)
             write_data_set(run, result)
             page = write_report(run, result.state.map_state, result.state.grid)
     except (RunError, OSError) as error:
-        console.print(f"the report could not be written: {one_line(error)}", **PLAIN)
+        console.say(f"the report could not be written: {one_line(error)}")
         return
     last = result.rows[-1]
-    console.print(
+    console.say(
         f"{len(result.rows)} views, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
         f"{100 * last.coverage.known_share:.0f} % of the box explored, mean renderability "
         f"{last.coverage.mean_renderability:.2f}",
-        **PLAIN,
     )
-    console.print(f"data set  {path / 'transforms.json'}", **PLAIN)
-    console.print(f"report    {page}", **PLAIN)
+    console.say(f"data set  {path / 'transforms.json'}")
+    console.say(f"report    {page}")
 
 
 def write_data_set(run: Run, result: Result) -> None:

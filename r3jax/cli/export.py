@@ -1,8 +1,6 @@
 """`r3jax export`: a run as a data set of nerfstudio or COLMAP."""
 
-from rich.console import Console
-
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Export
 from r3jax.formats.errors import FormatError
@@ -25,9 +23,9 @@ def run_export(options: Export) -> int:
             points = export_run(run, options.out, options.format)
     except (RunError, FormatError, OSError) as error:
         raise UserError(one_line(error)) from error
-    console.print(f"{len(run.rows)} images, {points} points", **PLAIN)
-    console.print(f"exported  {options.out}", **PLAIN)
+    console.say(f"{len(run.rows)} images, {points} points")
+    console.say(f"exported  {options.out}")
     if options.format == "nerfstudio":
         unit = 1.0 / DEPTH_STEPS_PER_METRE
-        console.print(f"depth     nerfstudio-data --depth-unit-scale-factor {unit:g}", **PLAIN)
+        console.say(f"depth     nerfstudio-data --depth-unit-scale-factor {unit:g}")
     return 0

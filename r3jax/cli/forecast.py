@@ -2,9 +2,7 @@
 
 from collections import deque
 
-from rich.console import Console
-
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Forecast
 from r3jax.evaluation.outlook import LEVEL, outlook_figure, outlook_lines
@@ -35,17 +33,16 @@ def run_forecast(options: Forecast) -> int:
     except (RunError, ValueError, OSError) as error:
         raise UserError(one_line(error)) from error
     out = Console()
-    out.print(
+    out.say(
         f"PSNR of free-space views [dB], calibrated on {calibration.source}; intervals hold "
         f"{100 * LEVEL:.0f} % of its errors in scenes that it had not seen",
-        **PLAIN,
     )
-    out.print("views   mean   p10   p50", style="bold", markup=False)
+    out.print("views   mean   p10   p50", style="bold")
     for views, forecast in zip(outlook.views, outlook.forecasts, strict=True):
         mean, low, middle = (forecast.value(name) for name in ("mean", "p10", "p50"))
-        out.print(f"{views:5d}  {mean:5.1f} {low:5.1f} {middle:5.1f}", **PLAIN)
+        out.say(f"{views:5d}  {mean:5.1f} {low:5.1f} {middle:5.1f}")
     for line in outlook_lines(outlook):
-        out.print(line, **PLAIN)
+        out.say(line)
     if options.plot is not None:
-        out.print(f"plot  {options.plot}", **PLAIN)
+        out.say(f"plot  {options.plot}")
     return 0

@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
+from r3jax.cli.console import Console, Table
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Info
 from r3jax.evaluation.summary import stage_times, summary
@@ -81,7 +79,7 @@ def _show_run(console: Console, path: Path) -> None:
     console.print(table)
     page = path / "report" / "report.html"
     if page.exists():
-        console.print(f"report  {page}", highlight=False, soft_wrap=True)
+        console.say(f"report  {page}")
 
 
 def _show_recording(console: Console, options: Info, path: Path) -> None:
@@ -93,9 +91,8 @@ def _show_recording(console: Console, options: Info, path: Path) -> None:
     console.print(
         f"{len(recording)} frames of {camera.width}x{camera.height} px; renderability of each "
         "frame before it is mapped:",
-        highlight=False,
     )
-    console.print("frame  renderability  new voxels  voxels  path [m]", style="bold", markup=False)
+    console.print("frame  renderability  new voxels  voxels  path [m]", style="bold")
     reports: list[FrameReport] = []
     for report, _ in follow_recording(recording, voxel_size=options.voxel_size):
         reports.append(report)
@@ -103,8 +100,7 @@ def _show_recording(console: Console, options: Info, path: Path) -> None:
         console.print(
             f"{report.index:5d}  {report.renderability:13.3f}  {report.new_voxels:10d}  "
             f"{report.voxels:6d}  {report.metres:8.2f}  {bar}",
-            highlight=False,
         )
     if options.plot is not None:
         write_atomic(options.plot, to_png(revisit_figure(recording, reports)))
-        console.print(f"plot  {options.plot}", highlight=False, soft_wrap=True)
+        console.say(f"plot  {options.plot}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from r3jax.cli.errors import UserError
+from r3jax.cli.errors import UserError, printable
 from r3jax.cli.options import (
     Audit,
     Benchmark,
@@ -82,7 +82,7 @@ def _main(args: Sequence[str] | None) -> int:
     try:
         return _run(command)
     except UserError as error:
-        print(f"r3jax: {error}", file=sys.stderr)
+        print(f"r3jax: {printable(str(error))}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:  # what a command has not caught itself
         print("r3jax: interrupted; what was recorded before is complete", file=sys.stderr)

@@ -3,9 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from rich.console import Console
-
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Merge
 from r3jax.exploration.replay import check_alike, parts_of, rebuild
@@ -35,8 +33,8 @@ def run_merge(options: Merge) -> int:
     except (RunError, OSError) as error:
         raise UserError(one_line(error)) from error
     views = " + ".join(str(len(run.rows)) for run in runs)
-    console.print(f"{views} views, {int(map_state.num_occupied)} voxels", **PLAIN)
-    console.print(f"merged    {out}", **PLAIN)
+    console.say(f"{views} views, {int(map_state.num_occupied)} voxels")
+    console.say(f"merged    {out}")
     return 0
 
 

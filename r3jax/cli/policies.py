@@ -1,9 +1,6 @@
 """`r3jax policies`: who can choose views, and where each rule comes from."""
 
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
+from r3jax.cli.console import Console, Table, Text
 from r3jax.cli.options import Policies
 from r3jax.planning.policy import describe, policy_names, source_of
 

@@ -2,16 +2,15 @@
 
 from types import TracebackType
 
-from rich.console import Console
-from rich.progress import (
+from r3jax.cli.console import (
     BarColumn,
-    Progress,
+    Console,
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
+    progress_bar,
 )
-
 from r3jax.exploration.budget import Budget
 from r3jax.trace.rows import StepRow
 
@@ -36,18 +35,17 @@ class RunProgress:
         self._budget = budget
         self._views = 0
         self._logged = -1
-        self._bar = Progress(
+        self._bar = progress_bar(
+            console,
             SpinnerColumn(),
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
             TextColumn("{task.percentage:>3.0f} %"),
-            TextColumn("[dim]{task.fields[facts]}"),
-            TextColumn("[dim]elapsed"),
+            TextColumn("{task.fields[facts]}", style="dim"),
+            TextColumn("elapsed", style="dim"),
             TimeElapsedColumn(),
-            TextColumn("[dim]left"),
+            TextColumn("left", style="dim"),
             TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
         )
         self._task = self._bar.add_task("starting", total=1.0, facts="")
 
@@ -71,7 +69,7 @@ class RunProgress:
         line = int(share * _LOG_LINES)
         if not self._console.is_terminal and line > self._logged:
             self._logged = line
-            self._console.print(f"view {self._views}: {facts}", highlight=False)
+            self._console.print(f"view {self._views}: {facts}")
 
     def __enter__(self) -> "RunProgress":
         """Shows the bar."""

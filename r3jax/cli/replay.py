@@ -1,8 +1,6 @@
 """`r3jax replay`: do the recorded frames rebuild the stored map?"""
 
-from rich.console import Console
-
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Replay
 from r3jax.exploration.replay import differences
@@ -27,12 +25,12 @@ def run_replay(options: Replay) -> int:
     except (RunError, OSError) as error:
         raise UserError(one_line(error)) from error
     if not found:
-        console.print(f"{views} frames rebuild the stored map and grid, bit for bit", **PLAIN)
+        console.say(f"{views} frames rebuild the stored map and grid, bit for bit")
         return 0
-    console.print(f"{views} frames do not rebuild what is stored:", **PLAIN)
+    console.say(f"{views} frames do not rebuild what is stored:")
     for difference in found:
         what = f"{difference.num_different} elements, by at most {difference.largest:g}"
         text = "another shape" if difference.num_different < 0 else what
-        console.print(f"  {difference.name}: {text}", **PLAIN)
-    console.print("made by another version of this package, or on another kind of device?", **PLAIN)
+        console.say(f"  {difference.name}: {text}")
+    console.say("made by another version of this package, or on another kind of device?")
     return _DIFFERS

@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table as RichTable
-
+from r3jax.cli.console import Console, Text
+from r3jax.cli.console import Table as RichTable
 from r3jax.evaluation.equal_terms import snapshots_of
 from r3jax.evaluation.table_parts import Entry, Table
 from r3jax.evaluation.tables import quality_table
@@ -28,25 +26,21 @@ def print_results(console: Console, records: Sequence[dict[str, Any]]) -> None:
         console.print(_for_terminal(table))
         notes |= dict.fromkeys(table.notes)
     for note in notes:
-        console.print(note, style="dim", highlight=False, markup=False)
+        console.print(note, style="dim")
 
 
 def _for_terminal(table: Table) -> RichTable:
-    shown = RichTable(*table.heads, title=escape(table.title), box=None, title_justify="left")
+    shown = RichTable(*table.heads, title=table.title, box=None, title_justify="left")
     for column in table.columns:
-        shown.add_column(escape(column), justify="right", no_wrap=True)
+        shown.add_column(column, justify="right", no_wrap=True)
     last = None
     for row in table.rows:
         method, *others = row.labels
         labels = [method if method != last else "", *others]
         last = method
-        shown.add_row(*map(escape, labels), *map(_entry, row.entries))
+        shown.add_row(*labels, *map(_entry, row.entries))
     return shown
 
 
-def _entry(entry: Entry) -> str:
-    if entry.value is None:
-        return "–"
-    text = escape(entry.text)
-    mark = _MARKS.get(entry.rank)
-    return f"[{mark}]{text}[/{mark}]" if mark else text
+def _entry(entry: Entry) -> Text:
+    return Text("–" if entry.value is None else entry.text, style=_MARKS.get(entry.rank, ""))

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, check_folder_name, one_line
 from r3jax.cli.explore import EXIT_CODES, refuse_others, warn_of_versions
 from r3jax.cli.options import Explore, Team
@@ -147,7 +145,7 @@ def _go_on(options: Team, folder: Path, console: Console, stack: contextlib.Exit
         members.append(Member(simulator, plan_of_run(run).policy))
         recorded.append(run)
     views = " + ".join(str(len(run.rows)) for run in recorded)
-    console.print(f"goes on behind views {views} of {folder}, decided and mapped anew", **PLAIN)
+    console.say(f"goes on behind views {views} of {folder}, decided and mapped anew")
     meet_every = float(parent["meet_every"])
     return _Crew(plan, members, recorders, first.header.seed, meet_every, recorded)
 
@@ -228,22 +226,22 @@ def _header(
 def _conclude(console: Console, folder: Path, result: TeamResult) -> None:
     """Data sets, reports, and a few words; a full disk must not hide how the team ended."""
     for number, member in enumerate(result.members):
-        console.print(f"{number}: {member.reason.value}: {member.message}", **PLAIN)
+        console.say(f"{number}: {member.reason.value}: {member.message}")
     if any(member.reason in EXIT_CODES for member in result.members):
-        console.print(f"go on     r3jax team --resume {folder}", **PLAIN)
+        console.say(f"go on     r3jax team --resume {folder}")
     if any(member.state.views == 0 for member in result.members):
         return
     try:
         with console.status("writing the data sets and the reports ..."):
             pages = _write(folder, result)
     except (RunError, OSError) as error:
-        console.print(f"the data set could not be written: {one_line(error)}", **PLAIN)
+        console.say(f"the data set could not be written: {one_line(error)}")
         return
     for line in _against_time(result.views):
-        console.print(line, **PLAIN)
-    console.print(f"data set  {folder / 'transforms.json'}", **PLAIN)
+        console.say(line)
+    console.say(f"data set  {folder / 'transforms.json'}")
     for page in pages:
-        console.print(f"report    {page}", **PLAIN)
+        console.say(f"report    {page}")
 
 
 def _write(folder: Path, result: TeamResult) -> list[Path]:

@@ -4,13 +4,11 @@ import csv
 import io
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 from r3jax.cli.captures import Capture, open_capture
+from r3jax.cli.console import BarColumn, Console, SpinnerColumn, TextColumn, progress_bar
 from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
 from r3jax.cli.options import Train
 from r3jax.cli.selection import RECORD_FORMAT
@@ -27,7 +25,6 @@ from r3jax.splatting.views import Views, load_views, split_views
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import package_versions
 
-_PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
 _LOG_LINES = 10
 """Lines that a training leaves in a log."""
 
@@ -141,21 +138,18 @@ def _conclude(console: Console, options: Train, folder: Path, result: train.FitR
     history = result.history
     done = history.first_step + len(history.loss) - 1
     if result.interrupted:
-        console.print(f"interrupted after step {done}; --resume goes on", **_PLAIN)
+        console.say(f"interrupted after step {done}; --resume goes on")
     if len(history.psnr):
         latest = history.psnr[-100:].mean()
-        console.print(
+        console.say(
             f"{done} steps, {int(history.num_gaussians[-1])} Gaussians, PSNR of the latest "
             f"training views {latest:.2f} dB",
-            **_PLAIN,
         )
     if result.dropped:
-        console.print(
-            f"{result.dropped} Gaussians found no room: raise --capacity for finer detail", **_PLAIN
-        )
-    console.print(f"model  {folder / 'scene.ply'}", **_PLAIN)
+        console.say(f"{result.dropped} Gaussians found no room: raise --capacity for finer detail")
+    console.say(f"model  {folder / 'scene.ply'}")
     if options.hold_out and not result.interrupted:
-        console.print(f"next   {_next_command(options, folder)}", **_PLAIN)
+        console.say(f"next   {_next_command(options, folder)}")
 
 
 def _next_command(options: Train, folder: Path) -> str:
@@ -172,13 +166,12 @@ class TrainProgress:
     def __init__(self, console: Console, iterations: int):
         """Shows nothing before it is entered."""
         self._console, self._logged = console, -1
-        self._bar = Progress(
+        self._bar = progress_bar(
+            console,
             SpinnerColumn(),
             TextColumn("step {task.completed:.0f}/{task.total:.0f}"),
             BarColumn(bar_width=24),
-            TextColumn("[dim]{task.fields[facts]}"),
-            console=console,
-            disable=not console.is_terminal,
+            TextColumn("{task.fields[facts]}", style="dim"),
         )
         self._task = self._bar.add_task("", total=iterations, facts="compiling on first use")
 
@@ -192,7 +185,7 @@ class TrainProgress:
         line = progress.step * _LOG_LINES // progress.iterations
         if not self._console.is_terminal and line > self._logged:
             self._logged = line
-            self._console.print(f"step {progress.step}: {facts}", highlight=False)
+            self._console.print(f"step {progress.step}: {facts}")
 
     def __enter__(self) -> "TrainProgress":
         """Shows the bar."""

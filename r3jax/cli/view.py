@@ -9,11 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from r3jax.cli.captures import Capture
-from r3jax.cli.console import PLAIN
+from r3jax.cli.console import (
+    BarColumn,
+    Console,
+    MofNCompleteColumn,
+    TextColumn,
+    TimeRemainingColumn,
+    progress_bar,
+)
 from r3jax.cli.errors import UserError, check_folder_name, one_line
 from r3jax.cli.options import Evaluate, View
 from r3jax.cli.pages import check_viser
@@ -54,8 +59,8 @@ def run_view(options: View) -> int:
         if options.video:
             raise UserError("--video belongs to --export FOLDER")
         with open_viewer(options, run, console) as viewer:
-            console.print(f"view      {viewer.url}", **PLAIN)
-            console.print("Ctrl-C ends it", **PLAIN)
+            console.say(f"view      {viewer.url}")
+            console.say("Ctrl-C ends it")
             with contextlib.suppress(KeyboardInterrupt):
                 until_interrupted()
     except (RunError, FormatError, ValueError, OSError, ImportError) as error:
@@ -96,7 +101,7 @@ def open_viewer(options: View, run: Run, console: Console) -> Generator[Viewer]:
     try:
         if options.host not in LOOPBACK:
             text = f"everybody who can reach {options.host} sees the page, and can use it"
-            console.print(text, style="yellow", **PLAIN)
+            console.say(text, style="yellow")
         with console.status("opening the run ..."):
             splats = _splats(run, options.name)
             scene = None if options.no_scene else Scene(run)
@@ -225,13 +230,12 @@ def _export(run: Run, out: Path, video: bool, console: Console) -> int:
     """
     if video:
         load_av()  # says what is missing before an hour has passed
-    with Progress(
+    with progress_bar(
+        console,
         TextColumn("drawing"),
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        console=console,
-        disable=not console.is_terminal,
         transient=True,
     ) as bar:
         task = bar.add_task("", total=None)
@@ -242,5 +246,5 @@ def _export(run: Run, out: Path, video: bool, console: Console) -> int:
             on_picture=lambda done, total: bar.update(task, completed=done, total=total),
         )
     for path in written:
-        console.print(f"written   {path}", **PLAIN)
+        console.say(f"written   {path}")
     return 0

@@ -3,7 +3,9 @@
 import io
 
 from matplotlib.axes import Axes
+from matplotlib.axis import Tick
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 INK = "#1f2937"
 """Text and frames."""
@@ -67,7 +69,10 @@ def blank(axes: Axes, title: str = "") -> Axes:
 
 
 def to_png(figure: Figure) -> bytes:
-    """The figure as PNG bytes."""
+    """The figure as PNG bytes. Dollar signs in names are no formulas; log axes write theirs so."""
+    numbers = {label for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
+    for text in figure.findobj(Text):
+        text.set_parse_math(text in numbers)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()

@@ -97,3 +97,8 @@ def test_it_is_a_png_whose_pictures_do_not_overlap():
 def test_no_views_is_a_mistake():
     with pytest.raises(ValueError, match="at least one view"):
         contact_sheet([], "title")
+
+
+def test_a_dollar_sign_in_a_name_is_no_formula():
+    figure = contact_sheet([sheet_view(0)], "runs/$x^$")
+    assert style.to_png(figure).startswith(b"\x89PNG")
