@@ -24,6 +24,8 @@ from .splatting.train import FitResult, fit
 from .splatting.training_config import TrainConfig
 from .splatting.views import Views, load_views
 
+__version__: str
+
 __all__ = [
     "Camera",
     "Explanation",

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from r3jax.exploration.budget import Budget, parse_budget
-from r3jax.exploration.clock import ClockName
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import ClockName, ExplorationConfig
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.motion import Motion, make_motion, motion_of_record
 from r3jax.planning.policy import Policy, make_policy

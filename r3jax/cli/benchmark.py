@@ -15,6 +15,7 @@ from r3jax.benchmark.engines.local import run_here, run_in_processes, visible_gp
 from r3jax.benchmark.engines.slurm import run_on_cluster
 from r3jax.benchmark.plan import Request, cells_left, make_plan
 from r3jax.benchmark.record import collect, read_records
+from r3jax.cli.checks import seeds_of, words
 from r3jax.cli.console import BarColumn, Console, SpinnerColumn, TaskID, TextColumn, progress_bar
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Benchmark
@@ -57,13 +58,6 @@ def run_benchmark(options: Benchmark) -> int:
 
 
 def _request(options: Benchmark) -> Request:
-    def words(text: str) -> tuple[str, ...]:
-        return tuple(word.strip() for word in text.split(",") if word.strip())
-
-    try:
-        seeds = tuple(int(seed) for seed in words(options.seeds))
-    except ValueError:
-        raise ValueError(f"--seeds are whole numbers with commas, got {options.seeds!r}") from None
     conditions = Conditions(
         budget=options.budget,
         snapshots=words(options.snapshots or ""),
@@ -83,7 +77,7 @@ def _request(options: Benchmark) -> Request:
     return Request(
         scenes=words(options.scenes),
         policies=words(options.policies),
-        seeds=seeds,
+        seeds=seeds_of(options),
         conditions=conditions,
         max_test_views=options.test_views or None,
         settings=_settings("settings", options.settings),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from r3jax.cli.checks import check_capture
 from r3jax.cli.errors import UserError
 from r3jax.formats.captures import PosedImages
 from r3jax.formats.colmap.reader import find_model, read_colmap
@@ -28,7 +29,7 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
 _KNOWN = (
     "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json, a COLMAP "
     "model (cameras.bin or cameras.txt, here or in sparse/0), a scene of Replica-SLAM (traj.txt, "
-    "results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes (frame-*.color.png)"
+    "results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes (frame-*.color.png or .jpg)"
 )
 
 
@@ -85,6 +86,5 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y") -> Capture:
     for fits, read in _FORMATS:
         if fits(path):
             return Capture(path, read(path))
-    if not path.is_dir():
-        raise UserError(f"{path}: there is no such folder")
+    check_capture(path)
     raise UserError(f"{path}: this is neither {_KNOWN}")

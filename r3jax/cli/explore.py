@@ -6,14 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from r3jax.cli.checks import default_name
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, check_folder_name, one_line
+from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Explore, Team
 from r3jax.cli.pages import check_viser
 from r3jax.cli.progress import RunProgress
 from r3jax.cli.setup import (
     Plan,
-    default_name,
     header_of,
     plan_of_options,
     plan_of_run,
@@ -141,18 +141,11 @@ def _open_page(options: Explore, stack: contextlib.ExitStack) -> Callable[[Exped
 
 def _set_out(options: Explore, console: Console) -> Expedition:
     """What can be checked quickly comes before the scene is built."""
-    if options.name is not None:
-        check_folder_name(options.name)
-    if options.resume is not None and options.fork is not None:
-        raise ValueError("--resume goes on with a run, --fork begins another one: give one of them")
-    if (options.at is None) != (options.fork is None):
-        raise ValueError("--fork RUN and --at VIEW belong together")
     if options.resume is not None:
         return _resume(options, options.resume, console)
     if options.fork is not None:
         return _fork(options, options.fork, console)
-    if options.scene is None:
-        raise ValueError("give a --scene, or --resume RUN; `r3jax info` lists the scenes")
+    assert options.scene is not None
     plan = plan_of_options(options)
     name = options.name or default_name(options, options.scene, plan.policy.name)
     with console.status(f"opening {options.scene} ..."):

@@ -31,8 +31,6 @@ def run_info(options: Info) -> int:
         else:
             raise UserError(
                 f"{path}: neither a run (no run.json) nor a recording (no poses.txt and images/)"
-                if path.is_dir()
-                else f"{path}: there is no such folder"
             )
     except (RunError, FormatError, OSError) as error:
         raise UserError(one_line(error)) from error

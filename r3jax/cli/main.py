@@ -8,6 +8,7 @@ from pathlib import Path
 
 import tyro
 
+import r3jax
 from r3jax.cli.errors import UserError, printable
 from r3jax.cli.options import (
     Audit,
@@ -25,6 +26,7 @@ from r3jax.cli.options import (
     Train,
     View,
 )
+from r3jax.cli.options.numbers import number_rules
 
 _COMMANDS = {
     "demo": Demo,
@@ -70,13 +72,18 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _main(args: Sequence[str] | None) -> int:
+    if list(sys.argv[1:] if args is None else args) == ["--version"]:
+        print(f"r3jax {r3jax.__version__}")
+        return 0
     command = tyro.extras.subcommand_cli_from_dict(
         _COMMANDS,
         prog="r3jax",
         description="Where to look next for 3D Gaussian splatting: explores a scene with an RGB-D "
-        "camera, chooses every view by closed-form renderability, and leaves a data set.",
+        "camera, chooses every view by closed-form renderability, and leaves a data set. "
+        "--version prints the version.",
         args=args,
         config=(tyro.conf.FlagCreatePairsOff,),
+        registry=number_rules(),
     )
     _keep_compilations()
     try:
@@ -90,10 +97,13 @@ def _main(args: Sequence[str] | None) -> int:
 
 
 def _run(command: object) -> int:
-    """Calls `run_NAME` of `r3jax.cli.NAME` for the command NAME.
+    """Checks the options, and calls `run_NAME` of `r3jax.cli.NAME` for the command NAME.
 
     Imports what the command needs and nothing else, so that --help does not wait for JAX.
     """
+    from r3jax.cli.checks import check_options  # not for --help, which needs no NumPy
+
+    check_options(command)
     (name,) = (name for name, kind in _COMMANDS.items() if kind is type(command))
     return getattr(importlib.import_module(f"r3jax.cli.{name}"), f"run_{name}")(command)
 

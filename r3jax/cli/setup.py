@@ -2,20 +2,20 @@
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.cli.checks import DEFAULT_BUDGET, DEFAULT_POLICY, loop_of_options, motion_of_options
 from r3jax.cli.options import Explore
 from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.replay import config_of, planner_config_of
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.motion import Motion, make_motion
+from r3jax.planning.motion import Motion
 from r3jax.planning.policy import Policy, make_policy
 from r3jax.scenes.registry import open_scene, scene_hash
 from r3jax.scoring.config import ScoringConfig
@@ -23,9 +23,6 @@ from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import RunHeader, camera_fields, package_versions, settings_of
 from r3jax.trace.reader import Run
-
-DEFAULT_POLICY = "ours-pano"
-DEFAULT_BUDGET = "views:100"
 
 
 @dataclass(frozen=True)
@@ -43,32 +40,10 @@ def plan_of_options(options: Explore) -> Plan:
     Raises:
         ValueError: a setting that cannot work.
     """
-    if not 16 <= options.resolution <= 4096:
-        raise ValueError(f"--resolution must lie between 16 and 4096, got {options.resolution}")
-    if not 0 <= options.seed < 1 << 32:
-        raise ValueError(f"--seed must lie between 0 and 2^32 - 1, got {options.seed}")
-    config = ExplorationConfig(
-        voxel_size=options.voxel_size,
-        cell_size=options.cell_size,
-        max_range=options.max_range,
-        capacity=options.capacity,
-        allow_growth=not options.fixed_capacity,
-        clock=options.clock,
-        until=options.until,
-    )
+    config = loop_of_options(options)
     budget = parse_budget(options.budget or DEFAULT_BUDGET)
     policy = policy_of_options(options, options.max_range, motion_of_options(options))
     return Plan(budget, config, policy)
-
-
-def motion_of_options(options: Explore) -> Motion:
-    """What carries the camera: a preset, and what the options change of it.
-
-    Raises:
-        ValueError: a setting that cannot work.
-    """
-    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Motion)}
-    return make_motion(options.motion, **{k: v for k, v in given.items() if v is not None})
 
 
 def policy_of_options(options: Explore, max_range: float, motion: Motion) -> Policy:
@@ -183,16 +158,6 @@ def header_of(options: Explore, plan: Plan, simulator: Simulator) -> RunHeader:
 def policy_fields(policy: Policy) -> dict[str, Any]:
     """A policy as a header names it."""
     return {"name": policy.name, "settings": settings_of(policy)}
-
-
-def default_name(options: Explore, scene: str, policy: str) -> str:
-    """A run's name where none is given."""
-    kind, colon, rest = scene.partition(":")
-    stem = Path(rest).stem if colon else scene
-    if kind == "habitat" and colon:
-        stem = f"habitat-{stem.removesuffix('.stage_config')}"
-    motion = "" if options.motion == "free" else f"-{options.motion}"
-    return f"{stem}-{policy}{motion}-seed{options.seed}"
 
 
 def _start_pose(start: Any) -> np.ndarray | None:

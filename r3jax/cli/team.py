@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from r3jax.cli.checks import singles_of, team_folder
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, check_folder_name, one_line
+from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.explore import EXIT_CODES, refuse_others, warn_of_versions
 from r3jax.cli.options import Explore, Team
 from r3jax.cli.progress import RunProgress
@@ -91,17 +92,13 @@ def run_team(options: Team) -> int:
 
 def _set_out(options: Team, console: Console, stack: contextlib.ExitStack) -> tuple[Path, _Crew]:
     """A new team: what can be checked quickly comes before the scene is built."""
-    if options.name is not None:
-        check_folder_name(options.name)
-    if options.scene is None:
-        raise ValueError("give a --scene, or --resume TEAM; `r3jax info` lists the scenes")
-    if not options.meet_every >= 0.0:
-        raise ValueError(f"--meet-every must be a time >= 0 [s], got {options.meet_every}")
-    singles = _singles(options)
+    assert options.scene is not None
+    singles = [
+        dataclasses.replace(single, budget=options.budget or DEFAULT_BUDGET)
+        for single in singles_of(options)
+    ]
     plans = [plan_of_options(single) for single in singles]
-    stem = Path(options.scene.partition(":")[2] or options.scene).stem
-    name = options.name or f"{stem}-team{options.cameras}-seed{options.seed}"
-    folder = options.out / name
+    folder = team_folder(options, options.scene)
     _check_leftovers(folder, options.cameras)
     with console.status(f"opening {options.scene} {options.cameras} times ..."):
         singles, simulators = _with_starts(singles)
@@ -148,38 +145,6 @@ def _go_on(options: Team, folder: Path, console: Console, stack: contextlib.Exit
     console.say(f"goes on behind views {views} of {folder}, decided and mapped anew")
     meet_every = float(parent["meet_every"])
     return _Crew(plan, members, recorders, first.header.seed, meet_every, recorded)
-
-
-def _singles(options: Team) -> list[Explore]:
-    """The options of each camera as if it flew alone.
-
-    Raises:
-        ValueError: neither one value for all cameras nor one for each.
-    """
-    if not 1 <= options.cameras <= 16:
-        raise ValueError(f"--cameras must lie between 1 and 16, got {options.cameras}")
-    for name in ("policy", "fov", "resolution"):
-        num = len(getattr(options, name))
-        if num not in (1, options.cameras):
-            raise ValueError(
-                f"--{name} takes one value for all {options.cameras} cameras or one for each, "
-                f"got {num}"
-            )
-    shared = {
-        field.name: getattr(options, field.name)
-        for field in dataclasses.fields(options)
-        if field.name not in ("cameras", "policy", "fov", "resolution", "budget", "meet_every")
-    }
-    return [
-        Explore(
-            **shared,
-            policy=options.policy[number % len(options.policy)],
-            fov=options.fov[number % len(options.fov)],
-            resolution=options.resolution[number % len(options.resolution)],
-            budget=options.budget or DEFAULT_BUDGET,
-        )
-        for number in range(options.cameras)
-    ]
 
 
 def _with_starts(singles: list[Explore]) -> tuple[list[Explore], list[Simulator]]:

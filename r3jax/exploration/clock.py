@@ -3,13 +3,13 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 
-T = TypeVar("T")
+from r3jax.exploration.config import ClockName
 
-ClockName = Literal["wall", "model"]
+T = TypeVar("T")
 
 
 @runtime_checkable

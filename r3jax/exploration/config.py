@@ -2,9 +2,11 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
-from r3jax.exploration.clock import ClockName
 from r3jax.forecast.goal import parse_goal
+
+ClockName = Literal["wall", "model"]
 
 MAX_CAPACITY = 1 << 27
 """Rows of a map: 5 GB."""

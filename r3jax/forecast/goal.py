@@ -2,11 +2,20 @@
 
 import math
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
-from r3jax.forecast.forecast import Forecast
 from r3jax.forecast.psnr import MEAN, percent_of
 
 _EXAMPLE = "use psnr:25 for the mean of all views, psnr:20@p10 for all but the worst tenth"
+
+
+@runtime_checkable
+class Judged(Protocol):
+    """What a goal asks of a forecast, which takes JAX to make."""
+
+    def value(self, name: str) -> float:
+        """A statistic of the PSNR [dB]."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -19,7 +28,7 @@ class Goal:
     statistic: str = MEAN
     """`mean`, or a percentile: `p10`."""
 
-    def reached(self, forecast: Forecast) -> bool:
+    def reached(self, forecast: Judged) -> bool:
         """True if the forecast is at least as good."""
         return forecast.value(self.statistic) >= self.psnr
 

@@ -1,6 +1,6 @@
 """Reads a sequence of the 7-Scenes data set (Shotton et al. 2013).
 
-    frame-000000.color.png    8-bit RGB, 640x480
+    frame-000000.color.png    8-bit RGB, 640x480; or .color.jpg, as some hand it on
     frame-000000.depth.png    uint16, millimetres; 0 and 65535 are no measurement
     frame-000000.pose.txt     a 4x4 camera-to-world matrix, OpenCV axes
 
@@ -21,12 +21,12 @@ from r3jax.formats.poses import mend_pose
 
 _LENS = Lens("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0))
 _UNIT = DepthUnit(0.001, invalid=65535)
-_COLOR = ".color.png"
+_COLORS = (".color.png", ".color.jpg", ".color.jpeg")
 
 
 def is_seven_scenes(path: Path) -> bool:
     """True if the folder looks like a sequence of the data set."""
-    return path.is_dir() and any(path.glob(f"frame-*{_COLOR}"))
+    return path.is_dir() and any(any(path.glob(f"frame-*{color}")) for color in _COLORS)
 
 
 def read_seven_scenes(path: Path | str) -> PosedImages:
@@ -40,14 +40,18 @@ def read_seven_scenes(path: Path | str) -> PosedImages:
             that are missing are noticed when they are read.
     """
     path = Path(path)
-    images = tuple(sorted(path.glob(f"frame-*{_COLOR}")))
-    if not images:
-        raise FormatError(path, f"the folder holds no frame-*{_COLOR}")
-    bases = [image.name.removesuffix(_COLOR) for image in images]
+    found = {
+        image.name.removesuffix(color): image
+        for color in reversed(_COLORS)  # where a frame has both, the PNG is the original
+        for image in path.glob(f"frame-*{color}")
+    }
+    if not found:
+        raise FormatError(path, f"the folder holds no frame-*{_COLORS[0]} or .jpg")
+    bases = sorted(found)
     return PosedImages(
         path=path,
-        image_paths=images,
-        lenses=(_LENS,) * len(images),
+        image_paths=tuple(found[base] for base in bases),
+        lenses=(_LENS,) * len(bases),
         poses=np.stack([_pose(path / f"{base}.pose.txt") for base in bases]),
         depth_paths=tuple(path / f"{base}.depth.png" for base in bases),
         depth_unit=_UNIT,

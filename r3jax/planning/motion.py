@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
+from r3jax.foreign.choices import did_you_mean
+
 UNLIMITED = (-math.inf, math.inf)
 """Heights of a carrier that may be at any [m]."""
 
@@ -138,7 +140,8 @@ def make_motion(name: str = "free", **changes: Any) -> Motion:
         ValueError: no motion has that name, it has no such field, or a value cannot work.
     """
     if name not in MOTIONS:
-        raise ValueError(f"unknown motion {name!r}; known: {', '.join(MOTIONS)}")
+        hint = did_you_mean(name, MOTIONS)
+        raise ValueError(f"unknown motion {name!r}{hint}; known: {', '.join(MOTIONS)}")
     known = [field.name for field in fields(Motion)]
     unknown = [field for field in changes if field not in known]
     if unknown:

@@ -1,6 +1,7 @@
 """The plug point of the loop: what a policy is asked, what it answers, and which ones exist."""
 
 import enum
+import importlib
 import inspect
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol, runtime_checkable
@@ -13,6 +14,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.config import PlannerConfig
+from r3jax.planning.policies import HOMES, check_policy
 
 
 class Outcome(enum.Enum):
@@ -113,40 +115,9 @@ class Policy(Protocol):
         ...
 
 
-def _registry() -> dict[str, Any]:
-    """Every policy by name. Imported late: the policies import this module."""
-    from r3jax.planning.policies.active_gamer import ActiveGamer
-    from r3jax.planning.policies.active_gs import ActiveGS, ActiveGSNoDepth
-    from r3jax.planning.policies.ahead import OursAhead
-    from r3jax.planning.policies.cover import Cover
-    from r3jax.planning.policies.demand import OursDemand
-    from r3jax.planning.policies.frontier import Frontier
-    from r3jax.planning.policies.random import Random
-    from r3jax.planning.policies.renderability import Ours, OursPano
-    from r3jax.planning.policies.uniform import Uniform
-    from r3jax.planning.policies.unseen import Unseen, UnseenDepth
-
-    known = (
-        Ours,
-        OursPano,
-        OursDemand,
-        OursAhead,
-        ActiveGS,
-        ActiveGSNoDepth,
-        ActiveGamer,
-        Cover,
-        Unseen,
-        UnseenDepth,
-        Frontier,
-        Uniform,
-        Random,
-    )
-    return {policy.name: policy for policy in known}
-
-
 def policy_names() -> tuple[str, ...]:
     """Names that `make_policy` knows."""
-    return tuple(_registry())
+    return tuple(HOMES)
 
 
 def describe(name: str) -> str:
@@ -188,7 +159,7 @@ def make_policy(name: str, **settings: Any) -> Policy:
 
 
 def _policy_class(name: str) -> Any:
-    registry = _registry()
-    if name not in registry:
-        raise ValueError(f"unknown policy {name!r}; known: {', '.join(registry)}")
-    return registry[name]
+    """Imported late: the policies import this module."""
+    check_policy(name)
+    module, _, kind = HOMES[name].rpartition(".")
+    return getattr(importlib.import_module(f"r3jax.planning.policies.{module}"), kind)

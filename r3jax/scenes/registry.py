@@ -1,12 +1,12 @@
 """Scenes by name: the embedded rooms, any mesh file, Replica's scenes, and Habitat-Sim."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 
 from r3jax.geometry.cameras import Camera
 from r3jax.scenes import procedural, replica
+from r3jax.scenes.names import OUTSIDE, habitat_file, outside_scenes, split_name
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.habitat import HabitatSimulator
 from r3jax.simulators.habitat_stage import read_stage
@@ -15,28 +15,12 @@ from r3jax.simulators.noise import NoisySimulator
 from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.simulators.world import World
 
-_OUTSIDE = {
-    "mesh": ("the mesh file", "a file, as in mesh:house.glb"),
-    "replica": ("the Replica scene", "a scene, as in replica:office0"),
-    "habitat": ("Habitat-Sim on", "a scene of Replica, or a file, as in habitat:house.glb"),
-}
-"""What comes before a colon: how a description begins, and what must follow the colon."""
+__all__ = ["describe", "open_scene", "open_world", "outside_scenes", "scene_hash", "scene_names"]
 
 
 def scene_names() -> list[str]:
     """Names of the embedded scenes; `outside_scenes` says what else can be opened."""
     return list(procedural.names())
-
-
-def outside_scenes() -> dict[str, str]:
-    """How to name scenes that are not embedded, each with a line about them."""
-    return {
-        "mesh:<file>": "any GLB, glTF, PLY or OBJ file",
-        "replica:<name>": "hotel0, office0 to office4, room0 to room2 of the Replica dataset; "
-        f"{replica.ROOT} names its folder",
-        "habitat:<scene>": "Habitat-Sim (conda) on a scene of Replica, or on a .glb, .ply or "
-        ".stage_config.json file",
-    }
 
 
 def describe(name: str) -> str:
@@ -45,8 +29,8 @@ def describe(name: str) -> str:
     Raises:
         ValueError: the scene is unknown; the message lists the known ones.
     """
-    kind, rest = _split(name)
-    return f"{_OUTSIDE[kind][0]} {rest}" if kind in _OUTSIDE else procedural.describe(name)
+    kind, rest = split_name(name)
+    return f"{OUTSIDE[kind][0]} {rest}" if kind in OUTSIDE else procedural.describe(name)
 
 
 def open_world(spec: str, up: str | None = None) -> World:
@@ -61,11 +45,11 @@ def open_world(spec: str, up: str | None = None) -> World:
         ValueError: the scene is unknown, `up` is given for an embedded scene, or the mesh file is
             refused (see `load_world`) or missing.
     """
-    kind, rest = _split(spec)
+    kind, rest = split_name(spec)
     if kind == "mesh":
         return load_world(rest, up)
     if kind == "habitat":
-        return load_world(read_stage(_habitat_file(rest)).mesh, up)
+        return load_world(read_stage(habitat_file(rest)).mesh, up)
     if up not in (None, "z"):
         raise ValueError(f"up={up!r} is for mesh files; the scene {spec!r} is z-up")
     if kind == "replica":
@@ -98,11 +82,11 @@ def open_scene(
         ValueError: see `open_world`, `RaycastSimulator` and `HabitatSimulator`.
         ImportError: a Habitat scene, and Habitat-Sim is not installed; says how to get it.
     """
-    kind, rest = _split(spec)
+    kind, rest = split_name(spec)
     simulator: Simulator
     if kind == "habitat":
         simulator = HabitatSimulator(
-            _habitat_file(rest),
+            habitat_file(rest),
             camera,
             up=up,
             max_range=max_range,
@@ -128,23 +112,3 @@ def scene_hash(simulator: Simulator) -> str:
     if not isinstance(inner, RaycastSimulator):
         raise ValueError(f"a {type(inner).__name__} has no world that could be hashed")
     return inner.world.content_hash
-
-
-def _habitat_file(rest: str) -> Path:
-    """The file that Habitat loads for what follows `habitat:`."""
-    return replica.stage_file(rest) if rest in replica.names() else Path(rest)
-
-
-def _split(spec: str) -> tuple[str, str]:
-    """What opens a scene (a key of `_OUTSIDE`, or "embedded"), and its name or file there."""
-    kind, colon, rest = spec.partition(":")
-    if colon and kind in _OUTSIDE:
-        if not rest:
-            raise ValueError(f"{spec} needs {_OUTSIDE[kind][1]}")
-        return kind, rest
-    if spec not in procedural.names():
-        raise ValueError(
-            f"unknown scene {spec!r}; known are {', '.join(procedural.names())}, and "
-            f"{', '.join(outside_scenes())}"
-        )
-    return "embedded", spec

@@ -2,8 +2,8 @@
 
 import pytest
 
+from r3jax.cli.checks import default_name
 from r3jax.cli.options import Explore
-from r3jax.cli.setup import default_name
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def busy_port():
 
 def test_a_folder_that_is_no_run_is_told(tmp_path, capsys):
     assert "this folder is not a run" in say(["view", tmp_path], capsys)
-    assert "this folder is not a run" in say(["view", tmp_path / "nowhere"], capsys)
+    assert "there is no such folder" in say(["view", tmp_path / "nowhere"], capsys)
 
 
 def test_a_run_without_views_is_told(path, tmp_path, capsys):

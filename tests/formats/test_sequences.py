@@ -1,5 +1,6 @@
 """Replica-SLAM, TUM and 7-Scenes: pixels, metres, poses and intrinsics as their pages say."""
 
+import io
 import json
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from PIL import Image
 
 from r3jax.cli.captures import open_capture
 from r3jax.formats.errors import FormatError
@@ -86,6 +88,16 @@ def test_tum_without_k_takes_the_benchmarks_camera_for_its_own_size_only(tmp_pat
     large = sequences.encoded(np.zeros((480, 640, 3), np.uint8))
     lay_out(tmp_path, files | {n: large for n in files if n.startswith("rgb/")})
     assert read_tum(tmp_path).lenses[0].params == (525.0, 525.0, 320.0, 240.0)
+
+
+def test_seven_scenes_may_have_its_colors_as_jpeg(tmp_path):
+    files = sequences.seven_scenes()
+    rgb = np.asarray(Image.open(io.BytesIO(files.pop("frame-000001.color.png"))))
+    lay_out(tmp_path, {**files, "frame-000001.color.jpg": sequences.encoded(rgb, "jpeg")})
+    images = read_seven_scenes(tmp_path)
+    assert [path.suffix for path in images.image_paths] == [".png", ".jpg"]
+    assert np.abs(images.rgb(1).astype(int) - rgb).mean() < 10.0
+    np.testing.assert_allclose(images.poses, poses(2), atol=2e-7)
 
 
 def test_seven_scenes_has_two_numbers_for_no_measurement(tmp_path):

@@ -8,30 +8,23 @@ mirror-like materials, windows on which depth sensors fail, and doorways that a 
 radius passes. World: z up, metres; one room's floor has a corner at the origin.
 """
 
-from r3jax.scenes.procedural.catalog import (
-    apartment,
-    classroom,
-    corridor,
-    flat,
-    gallery,
-    kitchen_diner,
-    library,
-    loft,
-    office,
-)
+import importlib
+
+from r3jax.foreign.choices import did_you_mean
 from r3jax.simulators.world import World
 
 _SCENES = {
-    "flat": flat,
-    "kitchen": kitchen_diner,
-    "loft": loft,
-    "apartment": apartment,
-    "office": office,
-    "gallery": gallery,
-    "corridor": corridor,
-    "classroom": classroom,
-    "library": library,
+    "flat": "flat",
+    "kitchen": "kitchen_diner",
+    "loft": "loft",
+    "apartment": "apartment",
+    "office": "office",
+    "gallery": "gallery",
+    "corridor": "corridor",
+    "classroom": "classroom",
+    "library": "library",
 }
+"""Names, and the files of the catalog that make them; these load when first asked for."""
 
 
 def names() -> tuple[str, ...]:
@@ -41,8 +34,9 @@ def names() -> tuple[str, ...]:
 
 def _scene(name: str):
     if name not in _SCENES:
-        raise ValueError(f"unknown procedural scene {name!r}; known: {', '.join(_SCENES)}")
-    return _SCENES[name]
+        hint = did_you_mean(name, _SCENES)
+        raise ValueError(f"unknown procedural scene {name!r}{hint}; known: {', '.join(_SCENES)}")
+    return importlib.import_module(f"r3jax.scenes.procedural.catalog.{_SCENES[name]}")
 
 
 def build(name: str) -> World:

@@ -1,0 +1,104 @@
+"""What is refused before JAX is imported, and in which words."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from r3jax.cli.main import main
+from r3jax.cli.options.numbers import whole_number
+from r3jax.planning.policy import make_policy, policy_names
+from r3jax.trace.writer import RunWriter
+from tests.trace.runs import make_header
+
+REFUSED = {
+    "explore --scene apartement": "did you mean apartment?",
+    "explore --scene house.glb": "did you mean mesh:house.glb?",
+    "explore --scene mash:house.glb": "did you mean mesh:house.glb?",
+    "explore --scene mesh:nowhere.glb": "no such mesh file: nowhere.glb",
+    "explore --scene habitat:nowhere.glb": "no such file for Habitat: nowhere.glb",
+    "explore --scene flat --policy our-pano": "did you mean ours-pano?",
+    "explore --scene flat --budget hours:1": "use views:100, seconds:300 or metres:25",
+    "explore --scene flat --until psnr": "is not understood",
+    "explore --scene flat --name a/b": "--name is the name of one folder",
+    "explore --scene flat --name run": "the run exists already",
+    "explore --scene flat --speed 0": "speed must be positive",
+    "explore --resume nowhere": "nowhere: there is no such folder",
+    "explore --fork run": "--fork RUN and --at VIEW belong together",
+    "team --scene ofice": "did you mean office?",
+    "team --scene flat --policy ours fronteer": "did you mean frontier?",
+    "team --resume run": "there is no such folder",
+    "benchmark --scenes flat,ofice": "did you mean office?",
+    "benchmark --policies ours,cvoer": "did you mean cover?",
+    "benchmark --snapshots views:x": "'x' is not a number",
+    "train nowhere": "nowhere: there is no such folder",
+    "train runs --resolution 3": "--resolution must be at least 16",
+    "evaluate runs --name ../x": "--name is the name of one folder",
+    "audit scan.r3d": "scan.r3d: this is a file; the archives of Record3D are not read",
+    "audit scan.ply": "scan.ply: this is a file; a capture is a folder",
+    "replay runs": "runs: this folder is not a run",
+    "merge runs/run nowhere": "nowhere: there is no such folder",
+    "info nowhere": "nowhere: there is no such folder",
+    "demo --views 0": "must be positive",
+}
+
+
+def test_names_budgets_and_paths_are_refused_before_jax_is_imported(tmp_path):
+    with RunWriter(tmp_path / "runs" / "run", make_header()):
+        pass
+    for name in ("scan.r3d", "scan.ply"):
+        (tmp_path / name).touch()
+    program = (
+        "import json, sys\n"
+        "from r3jax.cli.main import main\n"
+        "for words in json.load(sys.stdin):\n"
+        "    assert main(words.split()) == 2, words\n"
+        "heavy = {'jax', 'trimesh', 'equinox', 'scipy', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        input=json.dumps(list(REFUSED)),
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) == len(REFUSED)
+    for line, words in zip(lines, REFUSED.values(), strict=True):
+        assert line.startswith("r3jax: ")
+        assert words in line
+
+
+def test_every_policy_has_the_name_that_leads_to_it():
+    assert [make_policy(name).name for name in policy_names()] == list(policy_names())
+
+
+@pytest.mark.parametrize(
+    ("text", "number"), [("1e5", 100_000), ("512", 512), ("-3", -3), ("2.0", 2), ("50_000", 50_000)]
+)
+def test_whole_numbers_may_be_written_as_people_do(text, number):
+    assert whole_number(text) == number
+
+
+@pytest.mark.parametrize("text", ["512x512", "1.5", "", "nan", "inf", "1e999999999", "0x10"])
+def test_what_is_no_whole_number_is_said_so(text):
+    with pytest.raises(ValueError, match="it takes one whole number"):
+        whole_number(text)
+
+
+def test_a_number_that_cannot_be_read_is_told_in_words(capsys):
+    for words in (["--resolution", "512x512"], ["--iterations", "a"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(["train", "run", *words])
+        assert stopped.value.code == 2
+        said = capsys.readouterr().err
+        assert "it takes one whole number" in said
+        assert "int" not in said.replace("INT", "")
+
+
+def test_the_version_is_told(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("r3jax ")
