@@ -13,16 +13,10 @@ from r3jax.audit.report import write_report
 from r3jax.audit.source import source_of
 from r3jax.audit.survey import Wishes
 from r3jax.cli.captures import open_capture
-from r3jax.cli.console import (
-    BarColumn,
-    Console,
-    MofNCompleteColumn,
-    Table,
-    TextColumn,
-    progress_bar,
-)
+from r3jax.cli.console import Console, Table
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Audit as Options
+from r3jax.cli.progress import Stages
 from r3jax.formats.captures import PosedImages
 from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import pinhole_lens
@@ -95,40 +89,6 @@ def _read_path(path: Path) -> CameraPath:
     else:
         poses = source.poses
     return CameraPath(poses, (pinhole_lens(source.camera),) * len(poses))
-
-
-class Stages:
-    """A bar on a terminal, a line for each stage in a log."""
-
-    def __init__(self, console: Console):
-        """Shows nothing before it is entered."""
-        self._console = console
-        self._bar = progress_bar(
-            console,
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            transient=True,
-        )
-        self._task = self._bar.add_task("", total=None)
-
-    def on_progress(self, stage: str, steps: int) -> None:
-        """A stage begins, or one of its steps is done (no name)."""
-        if not stage:
-            self._bar.advance(self._task, steps)
-            return
-        self._bar.reset(self._task, description=stage, total=max(steps, 1))
-        if not self._console.is_terminal:
-            self._console.say(stage)
-
-    def __enter__(self) -> "Stages":
-        """Shows the bar."""
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Takes the bar down."""
-        self._bar.stop()
 
 
 def _show(console: Console, found: Audit, written: dict[str, Path]) -> None:

@@ -34,6 +34,9 @@ from r3jax.scenes.names import check_scene
 DEFAULT_POLICY = "ours-pano"
 DEFAULT_BUDGET = "views:100"
 
+LEAST_CAPACITY = 1 << 14
+"""Rows that a map which may grow has at the start: all is compiled anew whenever it doubles."""
+
 
 def check_options(options: object) -> None:
     """Refuses what can be seen to be wrong at once.
@@ -180,7 +183,7 @@ def loop_of_options(options: Explore) -> ExplorationConfig:
         raise ValueError(f"--resolution must lie between 16 and 4096, got {options.resolution}")
     if not 0 <= options.seed < 1 << 32:
         raise ValueError(f"--seed must lie between 0 and 2^32 - 1, got {options.seed}")
-    return ExplorationConfig(
+    config = ExplorationConfig(
         voxel_size=options.voxel_size,
         cell_size=options.cell_size,
         max_range=options.max_range,
@@ -189,6 +192,9 @@ def loop_of_options(options: Explore) -> ExplorationConfig:
         clock=options.clock,
         until=options.until,
     )
+    if config.allow_growth and config.capacity < LEAST_CAPACITY:
+        config = dataclasses.replace(config, capacity=LEAST_CAPACITY)
+    return config
 
 
 def motion_of_options(options: Explore) -> Motion:

@@ -22,6 +22,7 @@ from r3jax.cli.console import (
 )
 from r3jax.cli.errors import UserError, check_resolution, one_line
 from r3jax.cli.options import Evaluate
+from r3jax.cli.progress import Stages
 from r3jax.cli.selection import (
     TestSet,
     Training,
@@ -78,7 +79,9 @@ def run_evaluate(options: Evaluate) -> int:
         written = _write(options, outcome, folder)
         if capture.run is not None and folder == _default_folder(capture, outcome.training):
             _, state, grid = capture.run.checkpoint()
-            written["report"] = write_report(capture.run, state, grid)
+            with Stages(Console(stderr=True)) as stages:
+                page = write_report(capture.run, state, grid, stages.on_progress)
+            written["report"] = page
     except (ValueError, OSError, ImportError, RunError, FormatError) as error:
         raise UserError(one_line(error)) from error
     _show(Console(), options, outcome, written)

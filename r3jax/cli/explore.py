@@ -11,7 +11,7 @@ from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Explore, Team
 from r3jax.cli.pages import check_viser
-from r3jax.cli.progress import RunProgress
+from r3jax.cli.progress import RunProgress, Stages
 from r3jax.cli.setup import (
     Plan,
     header_of,
@@ -281,10 +281,12 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
     if result.reason in EXIT_CODES:
         console.say(f"go on     r3jax explore --resume {path}")
     try:
-        with console.status("writing the data set and the report ..."):
+        with Stages(console) as stages:
+            stages.on_progress("writing the data set", 0)
             run = read_run(path)
             write_data_set(run, result)
-            page = write_report(run, result.state.map_state, result.state.grid)
+            state = result.state
+            page = write_report(run, state.map_state, state.grid, stages.on_progress)
     except (RunError, OSError) as error:
         console.say(f"the report could not be written: {one_line(error)}")
         return

@@ -5,6 +5,7 @@ from types import TracebackType
 from r3jax.cli.console import (
     BarColumn,
     Console,
+    MofNCompleteColumn,
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
@@ -82,5 +83,39 @@ class RunProgress:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        """Takes the bar down."""
+        self._bar.stop()
+
+
+class Stages:
+    """A bar on a terminal, a line for each stage in a log."""
+
+    def __init__(self, console: Console):
+        """Shows nothing before it is entered."""
+        self._console = console
+        self._bar = progress_bar(
+            console,
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=None)
+
+    def on_progress(self, stage: str, steps: int) -> None:
+        """A stage begins, or one of its steps is done (no name)."""
+        if not stage:
+            self._bar.advance(self._task, steps)
+            return
+        self._bar.reset(self._task, description=stage, total=max(steps, 1))
+        if not self._console.is_terminal:
+            self._console.say(stage)
+
+    def __enter__(self) -> "Stages":
+        """Shows the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """Takes the bar down."""
         self._bar.stop()

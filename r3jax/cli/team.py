@@ -12,7 +12,7 @@ from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.explore import EXIT_CODES, refuse_others, warn_of_versions
 from r3jax.cli.options import Explore, Team
-from r3jax.cli.progress import RunProgress
+from r3jax.cli.progress import RunProgress, Stages
 from r3jax.cli.setup import (
     Plan,
     header_of,
@@ -21,7 +21,7 @@ from r3jax.cli.setup import (
     simulator_of_options,
     simulator_of_run,
 )
-from r3jax.evaluation.report import write_report
+from r3jax.evaluation.report import Progress, write_report
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.team import Member, TeamResult, TeamView, explore_team
 from r3jax.files import write_atomic
@@ -197,8 +197,9 @@ def _conclude(console: Console, folder: Path, result: TeamResult) -> None:
     if any(member.state.views == 0 for member in result.members):
         return
     try:
-        with console.status("writing the data sets and the reports ..."):
-            pages = _write(folder, result)
+        with Stages(console) as stages:
+            stages.on_progress("writing the data sets", 0)
+            pages = _write(folder, result, stages.on_progress)
     except (RunError, OSError) as error:
         console.say(f"the data set could not be written: {one_line(error)}")
         return
@@ -209,7 +210,7 @@ def _conclude(console: Console, folder: Path, result: TeamResult) -> None:
         console.say(f"report    {page}")
 
 
-def _write(folder: Path, result: TeamResult) -> list[Path]:
+def _write(folder: Path, result: TeamResult, on_progress: Progress) -> list[Path]:
     """What all have in common beside the runs, and what every run has; returns the reports."""
     lines = "".join(json.dumps(dataclasses.asdict(view)) + "\n" for view in result.views)
     write_atomic(folder / "coverage.jsonl", lines.encode())
@@ -221,7 +222,7 @@ def _write(folder: Path, result: TeamResult) -> list[Path]:
         write_points(place / "exports" / "points.ply", *points)
     for run in runs:
         write_transforms(run, "exports/points.ply")
-        pages.append(write_report(run, result.map_state, result.grid))
+        pages.append(write_report(run, result.map_state, result.grid, on_progress))
     write_team_transforms(folder, runs, "exports/points.ply")
     return pages
 

@@ -20,6 +20,9 @@ _OCCUPIED = (0.68, 0.71, 0.76)
 _HEIGHT, _WIDTH = 256, 512
 """Size of a panorama picture [px]."""
 
+_LARGEST = 2048
+"""Width and height of a floor picture at most, unless the grid itself has more cells [px]."""
+
 _HEADROOM = 0.35
 """The floor picture shows what lies below the cameras' height plus this [m]."""
 
@@ -45,7 +48,8 @@ def floor_picture(
     shape = np.asarray(grid.log_odds.shape)
     layer = int(np.clip((height - origin[2]) / cell, 0, shape[2] - 1))
     voxel = float(map_state.voxel_size)
-    scale = max(1, round(cell / voxel))
+    # A pixel shows a voxel, unless the cells are so much larger that nobody could see one.
+    scale = max(1, min(round(cell / voxel), _LARGEST // int(shape[:2].max())))
     picture = np.full((*shape[:2], 3), _UNKNOWN)
     picture[np.asarray(grid.free)[:, :, layer]] = _FREE
     picture[np.asarray(grid.occupied)[:, :, layer]] = _OCCUPIED

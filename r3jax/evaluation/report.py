@@ -2,7 +2,9 @@
 
 import html
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from matplotlib.figure import Figure
 
@@ -26,6 +28,8 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
+
+T = TypeVar("T")
 
 _NOTES = {
     "plan": (
@@ -69,13 +73,23 @@ _NOTES = {
 }
 
 
-def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
+Progress = Callable[[str, int], None]
+"""Called when a stage begins, with its name and steps; and without a name when steps are done."""
+
+
+def write_report(
+    run: Run,
+    map_state: MapState,
+    grid: OccupancyGrid,
+    on_progress: Progress = lambda stage, steps: None,
+) -> Path:
     """Writes `report/*.png` and `report/report.html`.
 
     Args:
         run: the run, finished or cut off.
         map_state: its map after the last view.
         grid: its coarse grid after the last view.
+        on_progress: for a progress bar; a long run is looked back at for minutes.
 
     Returns:
         The HTML page; the pictures are inside it, so it can be sent as one file.
@@ -93,16 +107,18 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     drawn: dict[str, Figure | str] = {
         "plan": figures.plan_figure(run, map_state, grid),
         "progress": figures.progress_figure(run),
-        "reasons": _reasons(run, outlook),
+        "reasons": _reasons(run, outlook, on_progress),
         "forecast": _forecast(outlook, map_state, grid),
         "panorama": figures.panorama_figure(panorama),
         "views": figures.strip_figure(run),
         "cost": figures.cost_figure(run),
     }
+    on_progress("drawing the report", len(drawn))
     folder = run.path / "report"
     folder.mkdir(exist_ok=True)
     sections: list[str] = []
     for name, figure in drawn.items():
+        on_progress("", 1)
         if isinstance(figure, str):
             sections.append(section(_NOTES[name][0], html.escape(figure), ""))
             continue
@@ -121,12 +137,20 @@ def write_report(run: Run, map_state: MapState, grid: OccupancyGrid) -> Path:
     return path
 
 
-def _reasons(run: Run, outlook: Outlook) -> Figure | str:
+def _reasons(run: Run, outlook: Outlook, on_progress: Progress) -> Figure | str:
     """What the views were chosen for, or why that is not known; the outlook sees the maps too."""
+    on_progress("looking back at the views", len(run.rows))
+    states = outlook.watch(_counted(states_of(run), on_progress))
     try:
-        return reasons_figure(utility_by_cause(run, outlook.watch(states_of(run))))
+        return reasons_figure(utility_by_cause(run, states))
     except RunError as error:  # merged from other runs, or settings that this version cannot read
         return f"Not known: {error.reason}."
+
+
+def _counted(states: Iterator[T], on_progress: Progress) -> Iterator[T]:
+    for state in states:
+        yield state
+        on_progress("", 1)
 
 
 def _forecast(outlook: Outlook, map_state: MapState, grid: OccupancyGrid) -> Figure | str:

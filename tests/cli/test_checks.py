@@ -23,6 +23,7 @@ REFUSED = {
     "explore --scene flat --until psnr": "is not understood",
     "explore --scene flat --name a/b": "--name is the name of one folder",
     "explore --scene flat --name run": "the run exists already",
+    "explore --scene flat --heights 1 2": "heights 1 to 2 m above the start leave out the start",
     "explore --scene flat --speed 0": "speed must be positive",
     "explore --resume nowhere": "nowhere: there is no such folder",
     "explore --fork run": "--fork RUN and --at VIEW belong together",

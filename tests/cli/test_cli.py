@@ -187,8 +187,7 @@ def test_output_that_nobody_reads_is_no_traceback():
 def test_progress_says_what_is_happening():
     import io
 
-    from rich.console import Console
-
+    from r3jax.cli.console import Console
     from r3jax.cli.progress import RunProgress
 
     terminal = Console(file=io.StringIO(), force_terminal=True, width=160)

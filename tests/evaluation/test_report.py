@@ -48,7 +48,16 @@ def reported(tmp_path_factory):
     with RunWriter(path, header) as recorder:
         result = explore(room, Wander(), budget="views:4", config=CONFIG, recorder=recorder)
     run = read_run(path)
-    page = write_report(run, result.state.map_state, result.state.grid)
+    stages: list[list] = []
+
+    def on_progress(stage, steps):
+        if stage:
+            stages.append([stage, steps, 0])
+        else:
+            stages[-1][2] += steps
+
+    page = write_report(run, result.state.map_state, result.state.grid, on_progress)
+    assert stages == [["looking back at the views", 4, 4], ["drawing the report", 7, 7]]
     return run, result, page
 
 
@@ -219,3 +228,10 @@ def test_the_panorama_picture_shows_directions():
     assert 0.0 <= picture.value[height // 2, column[0]] <= 1.0
     assert picture.azimuth == pytest.approx(np.pi / 2)
     assert picture.elevation == pytest.approx(0.0)
+
+
+def test_the_floor_picture_of_huge_cells_stays_small():
+    grid = empty_grid(np.array([[0.0] * 3, [3000.0] * 3]), 1000.0)
+    picture, extent = floor_picture(empty_map(64, voxel_size=0.05), grid, 1.0)
+    assert max(picture.shape) <= 2048
+    assert extent[1] - extent[0] >= 3000.0

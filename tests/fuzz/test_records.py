@@ -8,9 +8,9 @@ import json
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from r3jax.benchmark.record import read_records
+from r3jax.cli.console import Console
 from r3jax.cli.results import print_results
 from tests.evaluation.records import record
 from tests.fuzz.referee import CASES_SLOW

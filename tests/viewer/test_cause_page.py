@@ -6,7 +6,8 @@ import time
 
 import numpy as np
 import pytest
-from rich.console import Console
+
+from r3jax.cli.console import Console
 
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 
 import r3jax
+from r3jax.cli.console import Console
 
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 pytest.importorskip(

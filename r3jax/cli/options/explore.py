@@ -120,7 +120,7 @@ class Explore:
     """Edge of a cell of the coarse grid [m]."""
 
     capacity: Annotated[int, tyro.conf.arg(metavar="ROWS")] = 1 << 17
-    """Rows of the map at the start, a power of two."""
+    """Rows of the map at the start, a power of two; a map that may grow has 16384 at least."""
 
     fixed_capacity: bool = False
     """Never grow the map: what finds no row is counted as dropped and reported."""

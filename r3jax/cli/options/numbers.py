@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
-from types import NoneType
-from typing import Any, get_args
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
@@ -44,7 +44,8 @@ _READERS: dict[Any, Callable[[str], int | float]] = {int: whole_number, float: _
 
 
 def _rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    kinds = set(get_args(info.type) or (info.type,))
+    is_union = get_origin(info.type) in (Union, UnionType)
+    kinds = set(get_args(info.type)) if is_union else {info.type}
     is_optional = NoneType in kinds
     kinds -= {NoneType}
     if len(kinds) != 1 or not kinds <= set(_READERS):

@@ -70,7 +70,7 @@ class Team:
     """Edge of a cell of the coarse grid [m]."""
 
     capacity: Annotated[int, tyro.conf.arg(metavar="ROWS")] = 1 << 17
-    """Rows of the map at the start, a power of two."""
+    """Rows of the map at the start, a power of two; a map that may grow has 16384 at least."""
 
     candidates: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Candidates per decision (policy's default: 100)."""
