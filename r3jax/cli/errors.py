@@ -1,5 +1,8 @@
 """Errors that end a command with one line and no traceback."""
 
+import contextlib
+import shlex
+from collections.abc import Generator
 from pathlib import Path
 
 _BLANKS = "\n\u00a0"
@@ -28,6 +31,24 @@ def check_resolution(pixels: int | None) -> None:
     """
     if pixels is not None and pixels < 16:
         raise UserError(f"--resolution must be at least 16, got {pixels}")
+
+
+def resume_command(command: str, path: Path) -> str:
+    """What goes on with a run, to be copied into a shell."""
+    return f"r3jax {command} --resume {shlex.quote(str(path))}"
+
+
+@contextlib.contextmanager
+def resumable(command: str, path: Path) -> Generator[None]:
+    """Lets Ctrl-C tell how to go on with what is on disk, at whatever moment it comes.
+
+    Raises:
+        KeyboardInterrupt: as it came, with a message.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"go on with `{resume_command(command, path)}`") from None
 
 
 def one_line(error: BaseException) -> str:

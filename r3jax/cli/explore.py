@@ -8,7 +8,7 @@ from typing import Any
 
 from r3jax.cli.checks import default_name
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.errors import UserError, one_line, resumable, resume_command
 from r3jax.cli.options import Explore, Team
 from r3jax.cli.pages import check_viser
 from r3jax.cli.progress import RunProgress, Stages
@@ -76,6 +76,7 @@ def run_explore(options: Explore) -> int:
         except (ValueError, OSError, ImportError) as error:
             raise UserError(one_line(error)) from error
         plan, recorder = expedition.plan, stack.enter_context(expedition.recorder)
+        stack.enter_context(resumable("explore", recorder.path))
         policy, on_view = plan.policy, lambda row: None
         if page is not None:
             feed = stack.enter_context(page(expedition))
@@ -102,7 +103,8 @@ def run_explore(options: Explore) -> int:
             )
         except RunError as error:
             raise UserError(one_line(error)) from error
-    _conclude(console, recorder.path, result)
+    with resumable("explore", recorder.path):
+        _conclude(console, recorder.path, result)
     return EXIT_CODES.get(result.reason, 0)
 
 
@@ -276,10 +278,10 @@ def warn_of_versions(console: Console, run: Run) -> None:
 def _conclude(console: Console, path: Path, result: Result) -> None:
     """Data set, report, and a few words; a full disk must not hide how the run ended."""
     console.say(f"{result.reason.value}: {result.message}")
+    if result.reason in EXIT_CODES:
+        console.say(f"go on     {resume_command('explore', path)}")
     if result.state.views == 0:
         return
-    if result.reason in EXIT_CODES:
-        console.say(f"go on     r3jax explore --resume {path}")
     try:
         with Stages(console) as stages:
             stages.on_progress("writing the data set", 0)

@@ -91,8 +91,9 @@ def _main(args: Sequence[str] | None) -> int:
     except UserError as error:
         print(f"r3jax: {printable(str(error))}", file=sys.stderr)
         return USER_ERROR
-    except KeyboardInterrupt:  # what a command has not caught itself
-        print("r3jax: interrupted; what was recorded before is complete", file=sys.stderr)
+    except KeyboardInterrupt as error:  # what a command has not caught itself
+        how = printable(str(error)) or "what was recorded before is complete"
+        print(f"r3jax: interrupted; {how}", file=sys.stderr)
         return INTERRUPTED
 
 

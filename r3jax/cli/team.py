@@ -9,7 +9,7 @@ from typing import Any
 
 from r3jax.cli.checks import singles_of, team_folder
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.errors import UserError, one_line, resumable, resume_command
 from r3jax.cli.explore import EXIT_CODES, refuse_others, warn_of_versions
 from r3jax.cli.options import Explore, Team
 from r3jax.cli.progress import RunProgress, Stages
@@ -71,6 +71,7 @@ def run_team(options: Team) -> int:
                 folder, crew = options.resume, _go_on(options, options.resume, console, stack)
         except (ValueError, OSError, ImportError) as error:
             raise UserError(one_line(error)) from error
+        stack.enter_context(resumable("team", folder))
         progress = stack.enter_context(RunProgress(console, crew.plan.budget))
         try:
             result = explore_team(
@@ -86,7 +87,8 @@ def run_team(options: Team) -> int:
             )
         except RunError as error:
             raise UserError(one_line(error)) from error
-    _conclude(console, folder, result)
+    with resumable("team", folder):
+        _conclude(console, folder, result)
     return max(EXIT_CODES.get(member.reason, 0) for member in result.members)
 
 
@@ -193,7 +195,7 @@ def _conclude(console: Console, folder: Path, result: TeamResult) -> None:
     for number, member in enumerate(result.members):
         console.say(f"{number}: {member.reason.value}: {member.message}")
     if any(member.reason in EXIT_CODES for member in result.members):
-        console.say(f"go on     r3jax team --resume {folder}")
+        console.say(f"go on     {resume_command('team', folder)}")
     if any(member.state.views == 0 for member in result.members):
         return
     try:

@@ -138,7 +138,7 @@ def _conclude(console: Console, options: Train, folder: Path, result: train.FitR
     history = result.history
     done = history.first_step + len(history.loss) - 1
     if result.interrupted:
-        console.say(f"interrupted after step {done}; --resume goes on")
+        console.say(f"interrupted after step {done}; the same command with --resume goes on")
     if len(history.psnr):
         latest = history.psnr[-100:].mean()
         console.say(

@@ -146,6 +146,21 @@ def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monke
     assert "interrupted" in (tmp_path / "box" / "report" / "report.html").read_text()
 
 
+@pytest.mark.parametrize("place", ["exploration.loop.start_state", "cli.explore.write_data_set"])
+def test_ctrl_c_names_what_goes_on_at_any_moment(room, tmp_path, monkeypatch, capsys, place):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"r3jax.{place}", interrupt)
+    folder = tmp_path / "a b"
+    assert explore(room, folder, "--budget", "views:1") == 130
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last == f"r3jax: interrupted; go on with `r3jax explore --resume '{folder / 'box'}'`"
+    monkeypatch.undo()
+    assert main(["explore", "--resume", str(folder / "box")]) == 0
+    assert len(read_run(folder / "box").rows) == 1
+
+
 @pytest.mark.full
 def test_the_demo_overwrites_its_own_folder_only(tmp_path):
     for name in ("demo", "other"):
