@@ -144,7 +144,7 @@ def _(options: Audit) -> None:
     if options.out is not None:
         _check_folder(options.out)
     if options.path is not None and not options.path.exists():
-        raise UserError(f"{options.path}: there is no such file or folder")
+        raise UserError(f"{options.path}: there is no such folder or file")
 
 
 @_check.register
@@ -289,7 +289,9 @@ def _check_free(folder: Path, overwrite: bool) -> None:
 
 
 def _check_folder(path: Path) -> None:
-    """Refuses a file where a folder is to be written."""
+    """Refuses a file where a folder is to be written, and what no folder can be called."""
+    if "\0" in str(path):
+        raise UserError("--out: this cannot be the name of a folder")
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: this is a file, --out is a folder")
 

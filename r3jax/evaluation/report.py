@@ -139,7 +139,7 @@ def write_report(
 
 def _reasons(run: Run, outlook: Outlook, on_progress: Progress) -> Figure | str:
     """What the views were chosen for, or why that is not known; the outlook sees the maps too."""
-    on_progress("looking back at the views", len(run.rows))
+    on_progress("looking back at the views", len(run.rows) - 1)  # nothing was chosen after the last
     states = outlook.watch(_counted(states_of(run), on_progress))
     try:
         return reasons_figure(utility_by_cause(run, states))
@@ -149,8 +149,8 @@ def _reasons(run: Run, outlook: Outlook, on_progress: Progress) -> Figure | str:
 
 def _counted(states: Iterator[T], on_progress: Progress) -> Iterator[T]:
     for state in states:
-        yield state
         on_progress("", 1)
+        yield state
 
 
 def _forecast(outlook: Outlook, map_state: MapState, grid: OccupancyGrid) -> Figure | str:

@@ -6,7 +6,9 @@ import sys
 
 import pytest
 
+from r3jax.cli.checks import loop_of_options
 from r3jax.cli.main import main
+from r3jax.cli.options import Explore
 from r3jax.cli.options.numbers import whole_number
 from r3jax.planning.policy import make_policy, policy_names
 from r3jax.trace.writer import RunWriter
@@ -71,6 +73,14 @@ def test_names_budgets_and_paths_are_refused_before_jax_is_imported(tmp_path):
     for line, words in zip(lines, REFUSED.values(), strict=True):
         assert line.startswith("r3jax: ")
         assert words in line
+
+
+def test_a_map_that_may_grow_begins_with_room():
+    assert loop_of_options(Explore(capacity=2)).capacity == 1 << 14
+    assert loop_of_options(Explore(capacity=2, fixed_capacity=True)).capacity == 2
+    assert loop_of_options(Explore(capacity=1 << 15)).capacity == 1 << 15
+    with pytest.raises(ValueError, match="power of two"):
+        loop_of_options(Explore(capacity=1000))
 
 
 def test_every_policy_has_the_name_that_leads_to_it():
