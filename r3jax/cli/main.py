@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 import r3jax
-from r3jax.cli.errors import UserError, printable
+from r3jax.cli.errors import UserError, one_line, printable
 from r3jax.cli.options import (
     Audit,
     Benchmark,
@@ -89,7 +89,7 @@ def _main(args: Sequence[str] | None) -> int:
     try:
         return _run(command)
     except UserError as error:
-        print(f"r3jax: {printable(str(error))}", file=sys.stderr)
+        print(f"r3jax: {printable(one_line(error))}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt as error:  # what a command has not caught itself
         how = printable(str(error)) or "what was recorded before is complete"

@@ -10,7 +10,6 @@ from r3jax.cli.checks import loop_of_options
 from r3jax.cli.main import main
 from r3jax.cli.options import Explore
 from r3jax.cli.options.numbers import whole_number
-from r3jax.planning.policy import make_policy, policy_names
 from r3jax.trace.writer import RunWriter
 from tests.trace.runs import make_header
 
@@ -81,10 +80,6 @@ def test_a_map_that_may_grow_begins_with_room():
     assert loop_of_options(Explore(capacity=1 << 15)).capacity == 1 << 15
     with pytest.raises(ValueError, match="power of two"):
         loop_of_options(Explore(capacity=1000))
-
-
-def test_every_policy_has_the_name_that_leads_to_it():
-    assert [make_policy(name).name for name in policy_names()] == list(policy_names())
 
 
 @pytest.mark.parametrize(
