@@ -1,7 +1,8 @@
-"""What trimesh leaves out of glTF files: the texture transforms of KHR_texture_transform."""
+"""What trimesh leaves out of glTF files: texture transforms, and doubts about what they claim."""
 
 import math
 import struct
+import urllib.parse
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.fields import check_type
+from r3jax.foreign.files import check_regular
 from r3jax.foreign.json_text import parse_json
 
 _MAX_JSON = 256 << 20
@@ -16,26 +18,146 @@ _MAX_JSON = 256 << 20
 
 _EXTENSION = "KHR_texture_transform"
 
+_NUMBER_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+"""Bytes of a number by glTF's `componentType`."""
 
-def texture_transforms(path: Path) -> dict[str, np.ndarray]:
+_ROW_NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+"""Numbers in a row by glTF's `type`."""
+
+_FEW = 1 << 23
+"""Files that name no more numbers, repeated ones counted, are never bombs."""
+
+_REPEATS = 4
+"""How often a larger file may name what it stores, on average."""
+
+_MAX_PRIMITIVES = 1 << 15
+"""Meshes in a file; trimesh takes a millisecond for each, however small."""
+
+_STRIP = 5
+"""The `mode` of triangle strips: nearly every index of them begins a triangle of its own."""
+
+
+def check_claims(path: Path, tree: dict[str, Any]) -> None:
+    """Refuses a glTF file that claims, or repeats, far more than it stores.
+
+    Room is made for what is claimed, for every primitive anew.
+
+    Args:
+        path: the file; its buffers lie in it or beside it.
+        tree: its JSON.
+
+    Raises:
+        ForeignFileError: an accessor that reaches beyond its buffer view or has none; views,
+            accessors or primitives that name the same bytes again and again; fields that are
+            missing or of another type.
+    """
+    stored = _stored(path, tree)
+    views = _part(tree, "bufferViews", list[dict[str, Any]], [])
+    lengths = [_whole(view, "byteLength") for view in views]
+    _check_sum("buffer views", [(length, length) for length in lengths], stored)
+    accessors = _part(tree, "accessors", list[dict[str, Any]], [])
+    sizes = [_accessor_size(i, a, views, lengths) for i, a in enumerate(accessors)]
+    _check_sum("accessors", sizes, stored)
+    named: list[tuple[int, int]] = []
+    primitives = 0
+    for mesh in _part(tree, "meshes", list[dict[str, Any]], []):
+        for primitive in _part(mesh, "primitives", list[dict[str, Any]], []):
+            primitives += 1
+            attributes = _part(primitive, "attributes", dict[str, int], {})
+            used = [_at(sizes, i, "accessor") for i in attributes.values()]
+            if "indices" in primitive:
+                numbers, held = _at(sizes, _whole(primitive, "indices"), "accessor")
+                expanded = 3 if primitive.get("mode") == _STRIP else 1
+                used.append((expanded * numbers, expanded * held))
+            named += used
+    if primitives > _MAX_PRIMITIVES:
+        raise ForeignFileError(f"it holds {primitives} meshes: join those of one material first")
+    _check_sum("meshes", named, stored)
+
+
+def _stored(path: Path, tree: dict[str, Any]) -> int:
+    """Bytes of a file and of those beside it that its buffers name, each once."""
+    names = {
+        _part(buffer, "uri", str, "") for buffer in _part(tree, "buffers", list[dict[str, Any]], [])
+    }
+    stored = check_regular(path)
+    for name in names:
+        if name and not name.startswith("data:"):
+            try:
+                stored += check_regular(path.parent / urllib.parse.unquote(name))
+            except (OSError, ForeignFileError):
+                continue  # whoever opens it says what is wrong with it
+    return stored
+
+
+def _accessor_size(
+    number: int, accessor: dict[str, Any], views: list[dict[str, Any]], lengths: list[int]
+) -> tuple[int, int]:
+    """Numbers in an accessor, and their bytes."""
+    if "bufferView" not in accessor or "sparse" in accessor:
+        raise ForeignFileError(
+            f"accessor {number} has no buffer view of its own: compressed and sparse meshes are "
+            "not read; export it without compression (Draco, meshopt)"
+        )
+    which, count = _whole(accessor, "bufferView"), _whole(accessor, "count")
+    length = _at(lengths, which, "buffer view")
+    bytes_each = _NUMBER_BYTES.get(_part(accessor, "componentType", int, 0))
+    per_row = _ROW_NUMBERS.get(_part(accessor, "type", str, ""))
+    if bytes_each is None or per_row is None:
+        raise ForeignFileError(f"accessor {number} is of a type that glTF does not have")
+    row = bytes_each * per_row
+    stride = _whole(views[which], "byteStride", row)
+    needed = _whole(accessor, "byteOffset", 0) + (count - 1) * stride + row
+    if count and needed > length:
+        raise ForeignFileError(
+            f"accessor {number} claims {needed} bytes of a buffer view that has {length}: is the "
+            "file cut off?"
+        )
+    return count * per_row, count * row
+
+
+def _check_sum(what: str, sizes: list[tuple[int, int]], stored: int) -> None:
+    """Refuses parts, (numbers, bytes) each, that are together far more than what is stored."""
+    numbers, held = (sum(column) for column in zip(*sizes, strict=True)) if sizes else (0, 0)
+    if numbers > _FEW and held > _REPEATS * stored:
+        raise ForeignFileError(
+            f"its {what} name {held} bytes, but only {stored} are stored: it repeats itself, and "
+            "is not unpacked"
+        )
+
+
+def _at(items: list[Any], index: int, what: str) -> Any:
+    if not 0 <= index < len(items):
+        raise ForeignFileError(f"there is no {what} {index}, only {len(items)}")
+    return items[index]
+
+
+def _whole(tree: dict[str, Any], name: str, default: int | None = None) -> int:
+    """An entry that is a whole number >= 0."""
+    value = tree.get(name, default)
+    check_type(name, value, int)
+    if value < 0:
+        raise ForeignFileError(f"`{name}` is {value}")
+    return value
+
+
+def texture_transforms(tree: dict[str, Any]) -> dict[str, np.ndarray]:
     """How each material of a glTF file moves the texture coordinates of its base colour.
 
     The extension is defined by the Khronos group: uv' = translation * rotation * scale * uv, in
     glTF's own coordinates, where v grows downwards.
 
     Args:
-        path: a `.glb` or `.gltf` file that can be read as such.
+        tree: the JSON of the file.
 
     Returns:
         By the material's name: the affine map [3, 3] of (u, v, 1), with v growing upwards. Only
         materials that move anything are listed.
 
     Raises:
-        ForeignFileError: the JSON of the file is damaged, or a transform has no numbers.
+        ForeignFileError: fields of another type, or a transform has no numbers.
     """
     moves: dict[str, np.ndarray] = {}
-    tree = _read_tree(path)
-    check_type("glTF", tree, dict[str, Any])
     for material in _part(tree, "materials", list[dict[str, Any]], []):
         surface = _part(material, "pbrMetallicRoughness", dict[str, Any], {})
         texture = _part(surface, "baseColorTexture", dict[str, Any], {})
@@ -72,12 +194,34 @@ def _affine(settings: dict[str, Any]) -> np.ndarray:
     return flip @ downwards @ flip
 
 
-def _read_tree(path: Path) -> dict[str, Any]:
-    """The JSON of a glTF file; of a GLB it is the first chunk, after 20 bytes of header."""
+def read_tree(path: Path) -> dict[str, Any]:
+    """The JSON of a `.glb` or `.gltf` file; of a GLB it is the first chunk, behind 20 bytes.
+
+    Raises:
+        ForeignFileError: a chunk that is longer than the file; no JSON, or none of a glTF file.
+        OSError: it cannot be read.
+    """
     with open(path, "rb") as file:
         head = file.read(20)
-        if head[:4] != b"glTF":
+        if head[:4] == b"glTF" and len(head) == 20:
+            _check_chunks(path)
+            (length,) = struct.unpack("<I", head[12:16])
+            tree = parse_json(file.read(min(length, _MAX_JSON)))
+        else:
             file.seek(0)
-            return parse_json(file.read(_MAX_JSON))
-        (length,) = struct.unpack("<I", head[12:16])
-        return parse_json(file.read(min(length, _MAX_JSON)))
+            tree = parse_json(file.read(_MAX_JSON))
+    check_type("glTF", tree, dict[str, Any])
+    return tree
+
+
+def _check_chunks(path: Path) -> None:
+    """Refuses a GLB whose chunks claim to be longer than it: room is made for what is claimed."""
+    size = check_regular(path)
+    with open(path, "rb") as file:
+        at = 12  # behind the header
+        while at + 8 <= size:
+            file.seek(at)
+            (length,) = struct.unpack("<I", file.read(4))
+            at += 8 + length
+    if at > size:
+        raise ForeignFileError("it is cut off: a chunk is longer than what is left of the file")

@@ -4,7 +4,6 @@ A mesh may name buffers, materials and images. Only regular files below its own 
 no image is unpacked before its size is known, and archives are not opened at all.
 """
 
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,13 @@ import numpy as np
 
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.files import check_regular
+from r3jax.simulators.gltf import check_claims, read_tree, texture_transforms
 
 SUFFIXES = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")
 """Formats that are read."""
+
+GLTF_SUFFIXES = (".glb", ".gltf")
+"""Those of glTF."""
 
 _IMAGES = ("PNG", "JPEG", "WEBP", "BMP", "TGA")
 """Formats of textures; Pillow knows others that start programs of their own."""
@@ -28,11 +31,11 @@ _SMALL = 512 << 20
 _SQUEEZE = 200
 """Larger ones are, if they were packed tighter than this: photographs reach a tenth of it."""
 
-_MANY_FACES = 1 << 22
-"""Meshes with no more faces, repeated ones counted, are never bombs."""
+_MANY_ROWS = 1 << 22
+"""Meshes with no more faces and vertices, repeated ones counted, are never bombs."""
 
 _REPEATS = 4
-"""How often the faces of a larger mesh may be repeated on average."""
+"""How often those of a larger mesh may be repeated on average."""
 
 
 class MeshFile:
@@ -51,9 +54,15 @@ class MeshFile:
                 "OBJ, STL or OFF file"
             )
         self._bytes = check_regular(path)
-        if path.suffix.lower() == ".glb":
-            _check_chunks(path, self._bytes)
+        self.texture_moves: dict[str, np.ndarray] = {}
+        """How materials move their textures, see `texture_transforms`."""
+
+        if path.suffix.lower() in GLTF_SUFFIXES:
+            tree = read_tree(path)
+            check_claims(path, tree)
+            self.texture_moves = texture_transforms(tree)
         self._texels = 0
+        self._textures: dict[int, np.ndarray] = {}
         self.scene = self._load(path)
         try:
             nodes = [self.scene.graph[node] for node in self.scene.graph.nodes_geometry]
@@ -65,11 +74,13 @@ class MeshFile:
         self._check_repeats()
 
     def texture(self, image: Any) -> np.ndarray:
-        """The texels of one of its images, [h, w, 3] uint8.
+        """The texels of one of its images, [h, w, 3] uint8; unpacked once, however often asked.
 
         Raises:
             ForeignFileError: not an image of a usual format, damaged, or far too large.
         """
+        if id(image) in self._textures:  # the scene keeps its images alive
+            return self._textures[id(image)]
         if image.format not in (None, *_IMAGES):
             raise ForeignFileError(f"a texture is in the format {image.format}, not {_IMAGES}")
         width, height = image.size
@@ -81,21 +92,29 @@ class MeshFile:
                 "out of a small file: it is not unpacked"
             )
         try:
-            return np.array(image.convert("RGB"), dtype=np.uint8)
+            texels = np.array(image.convert("RGB"), dtype=np.uint8)
         except Exception as error:  # struct, zlib, syntax, overflow: every decoder has its own
             raise ForeignFileError(f"a texture cannot be read ({error!s:.200})") from None
+        self._textures[id(image)] = texels
+        return texels
 
     def _load(self, path: Path) -> Any:
         import trimesh
         from trimesh.resolvers import FilePathResolver
 
         refused: list[str] = []
+        known: dict[str, bytes] = {}
         owner = self
 
         class Beside(FilePathResolver):
-            """Files beside the mesh; trimesh itself refuses names that lead elsewhere."""
+            """Files beside the mesh, each read once; trimesh refuses names that lead elsewhere."""
 
             def get(self, name: str) -> bytes:
+                if name not in known:
+                    known[name] = self._read(name)
+                return known[name]
+
+            def _read(self, name: str) -> bytes:
                 try:
                     owner._bytes += check_regular(self.absolute(name))
                 except ForeignFileError as error:  # trimesh goes on without it: we do not
@@ -117,26 +136,15 @@ class MeshFile:
 
     def _check_repeats(self) -> None:
         """A small scene graph can repeat a mesh without end."""
-        faces = {name: _num_faces(mesh) for name, mesh in self.scene.geometry.items()}
-        stored = sum(faces.values())
-        repeated = sum(faces.get(name, 0) for _, name in self.placed)
-        if repeated > max(_MANY_FACES, _REPEATS * stored):
+        rows = {name: _num_rows(mesh) for name, mesh in self.scene.geometry.items()}
+        stored = sum(rows.values())
+        repeated = sum(rows.get(name, 0) for _, name in self.placed)
+        if repeated > max(_MANY_ROWS, _REPEATS * stored):
             raise ForeignFileError(
-                f"its {stored} faces are repeated until they are {repeated}: it is not unpacked"
+                f"its {stored} faces and vertices are repeated until they are {repeated}: it is "
+                "not unpacked"
             )
 
 
-def _check_chunks(path: Path, size: int) -> None:
-    """Refuses a GLB whose chunks claim to be longer than it: room is made for what is claimed."""
-    with open(path, "rb") as file:
-        at = 12  # behind the header
-        while at + 8 <= size:
-            file.seek(at)
-            (length,) = struct.unpack("<I", file.read(4))
-            at += 8 + length
-    if at > size:
-        raise ForeignFileError("it is cut off: a chunk is longer than what is left of the file")
-
-
-def _num_faces(mesh: Any) -> int:
-    return len(getattr(mesh, "faces", ()))
+def _num_rows(mesh: Any) -> int:
+    return len(getattr(mesh, "faces", ())) + len(getattr(mesh, "vertices", ()))

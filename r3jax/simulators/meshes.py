@@ -14,11 +14,9 @@ from typing import Any
 import numpy as np
 
 from r3jax.foreign.errors import ForeignFileError
-from r3jax.simulators.gltf import texture_transforms
-from r3jax.simulators.mesh_files import MeshFile
+from r3jax.simulators.mesh_files import GLTF_SUFFIXES, MeshFile
 from r3jax.simulators.world import Material, World
 
-_GLTF_SUFFIXES = (".glb", ".gltf")
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _PLAIN = Material(color=(0.7, 0.7, 0.7))
 """What a surface without any colour looks like."""
@@ -63,11 +61,9 @@ def load_world(path: str | Path, up: str | None = None) -> World:
     turn = world_from_file(path, up)
     if not path.is_file():
         raise ValueError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
-    is_gltf = path.suffix.lower() in _GLTF_SUFFIXES
     try:
         file = MeshFile(path)
-        moves = texture_transforms(path) if is_gltf else {}
-        nodes = [_part_of(file, T, name, moves) for T, name in file.placed]
+        nodes = [_part_of(file, T, name) for T, name in file.placed]
     except (ForeignFileError, OSError) as error:
         raise ValueError(
             f"cannot read the mesh file {path}: {error} (is it damaged, or a format other than "
@@ -93,7 +89,7 @@ def world_from_file(path: Path, up: str | None = None) -> np.ndarray:
     """
     if up not in (None, "y", "z"):
         raise ValueError(f"up must be 'y' or 'z', got {up!r}")
-    is_gltf = path.suffix.lower() in _GLTF_SUFFIXES
+    is_gltf = path.suffix.lower() in GLTF_SUFFIXES
     return _Z_UP_FROM_Y_UP if up == "y" or (up is None and is_gltf) else np.eye(3)
 
 
@@ -108,9 +104,7 @@ def _refuse_empty(path: Path, scene: Any) -> None:
     raise ValueError(f"{path} holds an empty mesh: no vertices, no faces; export it again")
 
 
-def _part_of(
-    file: MeshFile, T: np.ndarray, name: str, moves: dict[str, np.ndarray]
-) -> _Part | None:
+def _part_of(file: MeshFile, T: np.ndarray, name: str) -> _Part | None:
     """A mesh in its place, `T_world_node`; None for points, lines and empty meshes.
 
     Raises:
@@ -129,7 +123,8 @@ def _part_of(
         )
     vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
     uv, colors, material = _appearance(file, mesh, faces)
-    move = moves.get(str(getattr(getattr(mesh.visual, "material", None), "name", "")))
+    material_name = str(getattr(getattr(mesh.visual, "material", None), "name", ""))
+    move = file.texture_moves.get(material_name)
     if move is not None:
         uv = uv @ move[:2, :2].T + move[:2, 2]
     if np.linalg.det(T[:3, :3]) < 0.0:  # a mirrored node: keep the front faces in front

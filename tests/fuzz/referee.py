@@ -55,14 +55,20 @@ class Referee:
         assert verdicts["read"], f"no case of {module} was harmless: is the seed read at all?"
         assert verdicts["refused"], f"no case of {module} was refused"
 
-    def check_crafted(self, reader: str) -> None:
+    def check_crafted(self, reader: str, warm: str | None = None) -> None:
         """Runs the seeds of a reader as the cases: ones that were made by hand.
+
+        Args:
+            reader: the cases.
+            warm: a reader that imports and compiles the same, and is run before them.
 
         Raises:
             AssertionError: as for `check`.
         """
         number, seeds, failures = 0, 1, []
         while number < seeds:
+            if warm is not None and warm not in self._warm:
+                self._warm_up(warm)
             answer = self._ask(reader, -1 - number, _HANG)
             if answer["verdict"] == "failed":
                 failures.append(f"case {number}: {answer['why']}")

@@ -5,6 +5,7 @@ lines of JSON: what the case is, once it lies on the disk, and what became of it
 first seed itself, -2 the second. What kills this process kills nothing else.
 """
 
+import contextlib
 import importlib
 import json
 import os
@@ -12,7 +13,7 @@ import resource
 import sys
 import traceback
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,9 @@ class Reader:
 
     make: Callable[[np.random.Generator, Files], tuple[Files, str]] = mutate
     """Makes a case from a seed."""
+
+    ceiling: int | None = None
+    """Address space that a case may add; asking for more fails at once [bytes]."""
 
 
 class Guard:
@@ -138,15 +142,30 @@ def _resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
+def _mapped() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
 def _peak() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def _limit_memory() -> None:
     """What a reader asks for beyond all measure fails at once and leaves the machine alone."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + 3 * MEMORY
+    limit = _mapped() + 3 * MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+@contextlib.contextmanager
+def _under(ceiling: int | None) -> Iterator[None]:
+    """Lets the process grow by so much and no further."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if ceiling is not None:
+        resource.setrlimit(resource.RLIMIT_AS, (_mapped() + ceiling, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def main() -> None:
@@ -177,7 +196,8 @@ def main() -> None:
         if number >= 0 and resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
             _limit_memory()
         print(json.dumps({"what": what, "seeds": len(seeds)}), file=answers, flush=True)
-        verdict, why = run_case(reader, folder, guard)
+        with _under(reader.ceiling):
+            verdict, why = run_case(reader, folder, guard)
         print(json.dumps({"verdict": verdict, "why": why}), file=answers, flush=True)
 
 

@@ -281,3 +281,34 @@ def test_a_face_that_names_no_vertex(tmp_path):
 def test_up_must_be_an_axis(tmp_path):
     with pytest.raises(ValueError, match="up must be 'y' or 'z'"):
         load_world(saved(tmp_path, plain(), "a.ply"), up="x")
+
+
+def test_many_meshes_of_one_picture_unpack_it_once(tmp_path):
+    """So that a large scene is not taken for a bomb."""
+    image = Image.new("RGB", (4096, 4096))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+    scene = trimesh.Scene()
+    for _ in range(12):
+        visual = trimesh.visual.TextureVisuals(uv=UV, material=material)
+        scene.add_geometry(trimesh.Trimesh(CORNERS, FACES, visual=visual, process=False))
+    world = load_world(saved(tmp_path, scene, "a.glb"))
+    assert len({id(material.texture) for material in world.materials}) == 1
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (lambda tree: tree["accessors"][0].pop("bufferView"), "has no buffer view of its own"),
+        (lambda tree: tree["accessors"][0].update(count=10**12), "claims .* bytes of a buffer"),
+        (lambda tree: tree["accessors"][0].update(bufferView=99), "there is no buffer view 99"),
+        (lambda tree: tree["accessors"][0].update(count=-1), "`count` is -1"),
+        (
+            lambda tree: tree["meshes"][0]["primitives"][0].update(indices=99),
+            "there is no accessor 99",
+        ),
+    ],
+)
+def test_claims_of_a_glb_that_it_does_not_keep(tmp_path, edit, reason):
+    path = glb_with(saved(tmp_path, plain(), "a.glb"), edit)
+    with pytest.raises(ValueError, match=rf"a\.glb: .*{reason}"):
+        load_world(path)
