@@ -51,6 +51,12 @@ class Cell:
     up: str | None = None
     """Vertical axis of a mesh file; None: as its format has it."""
 
+    scale: float = 1.0
+    """Metres in a unit of a mesh file. It and the next count with the scene's hash."""
+
+    cull_backfaces: bool = False
+    """Whether faces seen from behind are not there."""
+
     @property
     def scene_name(self) -> str:
         """What tables call the scene: a mesh file without folder and suffix."""

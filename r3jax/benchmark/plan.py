@@ -12,6 +12,7 @@ from r3jax.benchmark.cells import Cell, snapshots_left
 from r3jax.benchmark.conditions import Conditions
 from r3jax.benchmark.judging import FOLDER, JudgingViews, judging_path, save_judging_views
 from r3jax.evaluation.test_views import ViewSet, load_view_set, render_view_set
+from r3jax.exploration.step import check_world
 from r3jax.scenes.registry import open_scene
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.splatting.views import load_views
@@ -41,6 +42,12 @@ class Request:
 
     up: str | None = None
     """Vertical axis of mesh files; None: as their format has it."""
+
+    scale: float = 1.0
+    """Metres in a unit of the mesh files."""
+
+    cull_backfaces: bool = False
+    """Whether faces seen from behind are not there."""
 
 
 def make_plan(
@@ -80,6 +87,8 @@ def make_plan(
                     num_test_views=len(view_set),
                     settings=request.settings,
                     up=request.up,
+                    scale=request.scale,
+                    cull_backfaces=request.cull_backfaces,
                 )
             )
     return tuple(cells)
@@ -97,7 +106,16 @@ def _prepare_scene(
     conditions, folder = request.conditions, Path(root) / FOLDER
     on_stage(f"opening {scene}")
     # Always the same start, whatever the seeds: the test set is what can be reached from it.
-    truth = GroundTruth(open_scene(scene, up=request.up, noise=0.0, seed=0))
+    simulator = open_scene(
+        scene,
+        up=request.up,
+        scale=request.scale,
+        cull_back_faces=request.cull_backfaces,
+        noise=0.0,
+        seed=0,
+    )
+    check_world(simulator.bounds, conditions.exploration_config().cell_size)
+    truth = GroundTruth(simulator)
     on_stage(f"finding the test views of {scene}")
     view_set = load_view_set(folder, truth, max_views=request.max_test_views)
     path = judging_path(root, view_set.scene_hash, view_set.hash, conditions)

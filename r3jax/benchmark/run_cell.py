@@ -133,6 +133,8 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
     simulator = open_scene(
         cell.scene,
         up=cell.up,
+        scale=cell.scale,
+        cull_back_faces=cell.cull_backfaces,
         camera=conditions.camera,
         noise=conditions.noise,
         seed=cell.seed,
@@ -151,6 +153,8 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
             "name": cell.scene,
             "hash": found,
             "up": cell.up,
+            "scale": cell.scale,
+            "cull_backfaces": cell.cull_backfaces,
             "noise": conditions.noise,
             "max_range": conditions.max_range,
             "start": None,

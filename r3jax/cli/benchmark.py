@@ -82,6 +82,8 @@ def _request(options: Benchmark) -> Request:
         max_test_views=options.test_views or None,
         settings=_settings("settings", options.settings),
         up=options.up,
+        scale=options.scale,
+        cull_backfaces=options.cull_backfaces,
     )
 
 

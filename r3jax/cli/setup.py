@@ -13,6 +13,7 @@ from r3jax.cli.options import Explore
 from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.replay import config_of, planner_config_of
+from r3jax.exploration.step import check_world
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.motion import Motion
@@ -97,18 +98,22 @@ def simulator_of_options(options: Explore) -> Simulator:
     """The scene of a new run.
 
     Raises:
-        ValueError: the scene is unknown, or its file is refused.
+        ValueError: the scene is unknown, its file is refused, or it cannot be explored.
     """
     assert options.scene is not None
-    return open_scene(
+    simulator = open_scene(
         options.scene,
         up=options.up,
+        scale=options.scale,
+        cull_back_faces=options.cull_backfaces,
         camera=Camera.from_fov(options.resolution, options.resolution, options.fov),
         noise=options.noise,
         seed=options.seed,
         max_range=options.max_range,
         start_pose=_start_pose(options.start),
     )
+    check_world(simulator.bounds, options.cell_size)  # before there is a folder
+    return simulator
 
 
 def simulator_of_run(run: Run) -> Simulator:
@@ -122,7 +127,7 @@ def simulator_of_run(run: Run) -> Simulator:
     try:
         simulator = open_scene(
             scene["name"],
-            up=scene["up"],
+            **ways_to_open(scene),
             camera=run.camera,
             noise=scene["noise"],
             seed=run.header.seed,
@@ -140,9 +145,19 @@ def simulator_of_run(run: Run) -> Simulator:
     return simulator
 
 
+def ways_to_open(scene: dict[str, Any]) -> dict[str, Any]:
+    """How `open_scene` shows the scene of a header; older headers lack what there was not yet."""
+    return {
+        "up": scene.get("up"),
+        "scale": scene.get("scale", 1.0),
+        "cull_back_faces": scene.get("cull_backfaces", False),
+    }
+
+
 def header_of(options: Explore, plan: Plan, simulator: Simulator) -> RunHeader:
     """What fixes a new run."""
-    how = {name: getattr(options, name) for name in ("up", "noise", "max_range", "start")}
+    names = ("up", "scale", "cull_backfaces", "noise", "max_range", "start")
+    how = {name: getattr(options, name) for name in names}
     return RunHeader(
         scene={"name": options.scene, "hash": scene_hash(simulator), **how},
         policy=policy_fields(plan.policy),

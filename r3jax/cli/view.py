@@ -23,7 +23,7 @@ from r3jax.cli.errors import UserError, check_folder_name, one_line
 from r3jax.cli.options import Evaluate, View
 from r3jax.cli.pages import check_viser
 from r3jax.cli.selection import find_training
-from r3jax.cli.setup import plan_of_run
+from r3jax.cli.setup import plan_of_run, ways_to_open
 from r3jax.exploration.replay import config_of
 from r3jax.formats.errors import FormatError
 from r3jax.scenes.registry import open_scene, scene_hash
@@ -207,7 +207,7 @@ class Scene:
         try:
             simulator = open_scene(
                 scene["name"],
-                up=scene.get("up"),
+                **ways_to_open(scene),
                 camera=picture_camera(self._run.camera),
                 noise=0.0,
                 max_range=None,

@@ -20,7 +20,13 @@ from r3jax.forecast.forecast import forecast_map
 from r3jax.forecast.goal import parse_goal
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import angle_between
-from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
+from r3jax.mapping.occupancy import (
+    MAX_CELLS,
+    OccupancyGrid,
+    empty_grid,
+    integrate_depth,
+    mark_free_ball,
+)
 from r3jax.mapping.state import empty_map
 from r3jax.planning.limits import begin_at
 from r3jax.planning.motion import motion_of
@@ -28,6 +34,15 @@ from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.scoring.sighting import look
 from r3jax.trace.images import frame_hash, stored_form
 from r3jax.trace.rows import StepRow, make_choice
+
+_LEAST_EXTENT = 1.0
+"""Smaller worlds have no place with half a metre free all round [m]."""
+
+_LEAST_HEIGHT = 0.1
+"""Thinner ones are surfaces [m]."""
+
+_LEAST_HOUSE, _LARGEST_HOUSE = 2.0, 500.0
+"""Extents that what is explored usually has [m]."""
 
 _integrate_depth = jax.jit(integrate_depth)
 _mark_free_ball = jax.jit(mark_free_ball)
@@ -45,7 +60,7 @@ def start_state(
 
     Raises:
         ValueError: a start pose outside the world's box, or at a height where what carries the
-            camera cannot be.
+            camera cannot be; a world that cannot be explored (see `check_world`).
     """
     simulator, config = mission.simulator, mission.config
     pose = np.asarray(simulator.start_pose, dtype=np.float64)
@@ -55,11 +70,43 @@ def start_state(
             f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
             f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
         )
+    check_world(simulator.bounds, config.cell_size)
     pose = begin_at(motion_of(mission.policy), pose)
     grid = first_grid(np.stack([lower, upper]), [pose, *other_starts], config)
     map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
     policy_state = mission.policy.init(simulator.camera, grid, key=init_key)
     return LoopState(0, map_state, grid, policy_state, pose)
+
+
+def check_world(bounds: np.ndarray, cell_size: float) -> None:
+    """Refuses a world that is too small, too flat or too large to be explored.
+
+    Args:
+        bounds: its box, [2, 3] [m].
+        cell_size: edge of a cell of the coarse grid [m].
+
+    Raises:
+        ValueError: says what is odd, and which scale would mend it.
+    """
+    extent = np.ptp(np.asarray(bounds, np.float64), axis=0)
+    size = f"the world is {' x '.join(f'{length:.3g}' for length in extent)} m large"
+    units = {0.001: "millimeters", 0.01: "centimeters", 1000.0: "kilometers"}
+    hints = [
+        f"; if its mesh is in {unit}, give --scale {scale:g}"
+        for scale, unit in units.items()
+        if _LEAST_HOUSE <= scale * extent.max() <= _LARGEST_HOUSE
+    ]
+    hint = hints[0] if hints else ""
+    if not extent.max() >= _LEAST_EXTENT:
+        raise ValueError(f"{size}: too small for a camera with {_LEAST_EXTENT / 2:g} m free{hint}")
+    if not extent.min() >= _LEAST_HEIGHT:
+        raise ValueError(f"{size}: it is flat, there is no space to explore")
+    cells = float(np.prod(extent / cell_size + 2.0))
+    if not cells <= MAX_CELLS:
+        raise ValueError(
+            f"{size}: {cells:.2g} cells of {cell_size:g} m, more than {MAX_CELLS:.0e}"
+            f"{hint or '; give a larger --cell-size, or cut the mesh'}"
+        )
 
 
 def first_grid(

@@ -55,7 +55,7 @@ BLOCKS_ACROSS = 64
 _OCTANTS = tuple((x, y, z) for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25))
 """Centres of a cell's octants, from its centre, in cells."""
 
-_MAX_CELLS = 50_000_000
+MAX_CELLS = 50_000_000
 """More than this is a mistake in the bounds (a scene in millimetres), not a grid."""
 
 
@@ -112,10 +112,10 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
         raise ValueError(f"cell_size must be positive [m], got {cell_size}")
     # The small tolerance keeps a side of exactly 12 cells from becoming 13 by rounding.
     cells = np.ceil((box[1] - box[0]) / cell_size - 1e-6) + 2.0
-    if float(np.prod(cells)) > _MAX_CELLS:
+    if float(np.prod(cells)) > MAX_CELLS:
         raise ValueError(
             f"bounds {box.tolist()} at {cell_size} m make {np.prod(cells):.3g} cells, more than "
-            f"{_MAX_CELLS:.0e}: are the bounds in metres?"
+            f"{MAX_CELLS:.0e}: are the bounds in metres?"
         )
     return OccupancyGrid(
         log_odds=jnp.zeros(tuple(int(c) for c in cells), dtype=jnp.float32),

@@ -33,21 +33,24 @@ def describe(name: str) -> str:
     return f"{OUTSIDE[kind][0]} {rest}" if kind in OUTSIDE else procedural.describe(name)
 
 
-def open_world(spec: str, up: str | None = None) -> World:
+def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> World:
     """The triangles and materials behind a scene's name.
 
     Args:
         spec: the name of an embedded scene, or one of `outside_scenes`. Of a Habitat scene this is
             the mesh that it shows.
         up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
+        scale: metres in a unit of a mesh file.
 
     Raises:
-        ValueError: the scene is unknown, `up` is given for an embedded scene, or the mesh file is
-            refused (see `load_world`) or missing.
+        ValueError: the scene is unknown, `up` or `scale` is given for a scene that is no mesh
+            file, or the mesh file is refused (see `load_world`) or missing.
     """
     kind, rest = split_name(spec)
     if kind == "mesh":
-        return load_world(rest, up)
+        return load_world(rest, up, scale)
+    if scale != 1.0:
+        raise ValueError(f"scale={scale!r} is for mesh files (mesh:<file>); {spec!r} has metres")
     if kind == "habitat":
         return load_world(read_stage(habitat_file(rest)).mesh, up)
     if up not in (None, "z"):
@@ -61,6 +64,8 @@ def open_scene(
     spec: str,
     *,
     up: str | None = None,
+    scale: float | int = 1.0,
+    cull_back_faces: bool = False,
     camera: Camera | None = None,
     noise: float | int = 0.01,
     seed: int = 0,
@@ -72,6 +77,8 @@ def open_scene(
     Args:
         spec: the name of an embedded scene, or one of `outside_scenes`.
         up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
+        scale: metres in a unit of a mesh file: 0.001 for one in millimeters.
+        cull_back_faces: look through faces seen from behind, as Habitat always does.
         camera: intrinsics; None: 512x512 pixels, 60 degrees.
         noise: standard deviation of the depth as a share of the depth; 0: exact depth.
         seed: of the noise, and of the search for a start where the scene has none.
@@ -85,6 +92,8 @@ def open_scene(
     kind, rest = split_name(spec)
     simulator: Simulator
     if kind == "habitat":
+        if scale != 1.0:
+            raise ValueError(f"scale={scale!r}: Habitat scales nothing, apply it to the mesh file")
         simulator = HabitatSimulator(
             habitat_file(rest),
             camera,
@@ -95,7 +104,12 @@ def open_scene(
         )
     else:
         simulator = RaycastSimulator(
-            open_world(spec, up), camera, max_range=max_range, start_pose=start_pose, seed=seed
+            open_world(spec, up, scale),
+            camera,
+            max_range=max_range,
+            start_pose=start_pose,
+            cull_back_faces=cull_back_faces,
+            seed=seed,
         )
     return NoisySimulator(simulator, noise, seed) if noise != 0.0 else simulator
 
@@ -107,8 +121,6 @@ def scene_hash(simulator: Simulator) -> str:
         ValueError: the simulator does not come from `open_scene`.
     """
     inner = simulator.simulator if isinstance(simulator, NoisySimulator) else simulator
-    if isinstance(inner, HabitatSimulator):
-        return inner.content_hash
-    if not isinstance(inner, RaycastSimulator):
+    if not isinstance(inner, HabitatSimulator | RaycastSimulator):
         raise ValueError(f"a {type(inner).__name__} has no world that could be hashed")
-    return inner.world.content_hash
+    return inner.content_hash

@@ -67,12 +67,12 @@ class GroundTruth:
 
     @property
     def scene_hash(self) -> str:
-        """SHA-256 of geometry, colours and lamps."""
+        """SHA-256 of what is shown: geometry, colours, lamps."""
         return self._scene_hash
 
     @functools.cached_property
     def _scene_hash(self) -> str:
-        return self._simulator.world.content_hash
+        return self._simulator.content_hash
 
     def free_positions(self, spacing: Sequence[float | int], margin: float | int) -> np.ndarray:
         """Lattice points that a camera can reach from the start.

@@ -7,6 +7,7 @@ Transparency is ignored: a surface is there or it is not.
 Shape symbols: V vertices; F faces.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ class _Part:
     material: Material
 
 
-def load_world(path: str | Path, up: str | None = None) -> World:
+def load_world(path: str | Path, up: str | None = None, scale: float | int = 1.0) -> World:
     """Reads a mesh file.
 
     Textures, vertex colours, face colours, plain colours and mixtures of them are kept; the nodes
@@ -49,16 +50,17 @@ def load_world(path: str | Path, up: str | None = None) -> World:
     Args:
         path: the file.
         up: the file's vertical axis, "y" or "z"; None: y for glTF, z for everything else.
+        scale: metres in a unit of the file: 0.001 for one in millimeters.
 
     Returns:
-        The world, z up, named `mesh:<path>`.
+        The world, z up, in metres, named `mesh:<path>`.
 
     Raises:
         ValueError: the file is missing or cannot be read, holds no mesh or only points, has
-            vertices that are not finite, or has no extent.
+            vertices that are not finite, or has no extent; a scale that is no positive number.
     """
     path = Path(path)
-    turn = world_from_file(path, up)
+    turn = scaled_turn(path, up, scale)
     if not path.is_file():
         raise ValueError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
     try:
@@ -91,6 +93,17 @@ def world_from_file(path: Path, up: str | None = None) -> np.ndarray:
         raise ValueError(f"up must be 'y' or 'z', got {up!r}")
     is_gltf = path.suffix.lower() in GLTF_SUFFIXES
     return _Z_UP_FROM_Y_UP if up == "y" or (up is None and is_gltf) else np.eye(3)
+
+
+def scaled_turn(path: Path, up: str | None, scale: float | int) -> np.ndarray:
+    """`world_from_file` times the scale, [3, 3].
+
+    Raises:
+        ValueError: `up` is no axis, or `scale` no positive number.
+    """
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0.0 < scale < math.inf:
+        raise ValueError(f"scale must be a number > 0, the metres in a unit, got {scale!r}")
+    return scale * world_from_file(path, up)
 
 
 def _refuse_empty(path: Path, scene: Any) -> None:
@@ -242,5 +255,6 @@ def _check(path: Path, world: World) -> None:
         )
     if extent.max() > _MAX_EXTENT:
         raise ValueError(
-            f"{path} extends {extent.max():.3g} m; the unit is metres: scale the mesh first"
+            f"{path} extends {extent.max():.3g} m; the unit is metres: scale the mesh first, with "
+            "--scale 0.001 if it is in millimeters"
         )

@@ -9,6 +9,7 @@ Shape symbols: H W image size; n rays; F faces.
 
 import copy
 import functools
+import hashlib
 
 import jax
 import jax.numpy as jnp
@@ -88,6 +89,12 @@ class RaycastSimulator:
     def bounds(self) -> np.ndarray:
         """Axis-aligned box of the mesh, [2, 3] [m]."""
         return self._bounds.copy()
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of what is shown: of the world, and that back faces are not if so."""
+        known = self.world.content_hash
+        return hashlib.sha256(f"culled {known}".encode()).hexdigest() if self._cull else known
 
     @property
     def start_pose(self) -> np.ndarray:

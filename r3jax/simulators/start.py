@@ -90,6 +90,8 @@ def find_start(
     rng = np.random.default_rng(seed)
     points = rng.uniform(bounds[0], bounds[1], size=(_CANDIDATES, 3))
     candidates = _at_eye_height(points, scene)
+    # Above a scan that is lower than the eye, the eye is outside.
+    candidates = candidates[(candidates <= bounds[1]).all(axis=1)]
     if len(candidates) == 0:
         return None
     tier, roomy = _enclosure(candidates, scene)

@@ -73,6 +73,12 @@ class Benchmark:
     up: Literal["y", "z"] | None = None
     """Vertical axis of mesh files; by default y for GLB and glTF, z for the others."""
 
+    scale: float = 1.0
+    """Metres in a unit of the mesh files: 0.001 for files in millimeters."""
+
+    cull_backfaces: bool = False
+    """Look through faces seen from behind, as Habitat-Sim always does."""
+
     backend: Literal["auto", "numba", "xla", "splax"] = "auto"
     """Rasteriser: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
 

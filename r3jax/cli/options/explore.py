@@ -78,6 +78,12 @@ class Explore:
     up: Literal["y", "z"] | None = None
     """Vertical axis of a mesh file; by default y for GLB and glTF, z for the others."""
 
+    scale: float = 1.0
+    """Metres in a unit of a mesh file: 0.001 for one in millimeters."""
+
+    cull_backfaces: bool = False
+    """Look through faces seen from behind, as Habitat-Sim always does."""
+
     noise: float = 0.01
     """Standard deviation of the depth noise as a share of the depth."""
 
