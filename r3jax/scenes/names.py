@@ -22,7 +22,8 @@ def outside_scenes() -> dict[str, str]:
         "replica:<name>": "hotel0, office0 to office4, room0 to room2 of the Replica dataset; "
         f"{replica.ROOT} names its folder",
         "habitat:<scene>": "Habitat-Sim (conda) on a scene of Replica, or on a .glb, .ply or "
-        ".stage_config.json file",
+        ".stage_config.json file; vertex colors of a PLY (so Replica's) come out dark in it, they "
+        "are the ray caster's instead",
     }
 
 
@@ -69,6 +70,8 @@ def habitat_file(rest: str) -> Path:
     """The file that Habitat loads for what follows `habitat:`.
 
     Raises:
-        ValueError: it is one of Replica's scenes, and its file is missing.
+        ValueError: neither a file nor a scene of Replica; lists these.
     """
-    return replica.stage_file(rest) if rest in replica.names() else Path(rest)
+    path = Path(rest)
+    is_file = bool(path.suffix) or len(path.parts) > 1 or path.exists()
+    return path if is_file and rest not in replica.names() else replica.stage_file(rest)

@@ -33,6 +33,9 @@ _REPEATS = 4
 _MAX_PRIMITIVES = 1 << 15
 """Meshes in a file; trimesh takes a millisecond for each, however small."""
 
+_LINES = (1, 2, 3)
+"""The `mode` of lines, loops and strips of them."""
+
 _STRIP = 5
 """The `mode` of triangle strips: nearly every index of them begins a triangle of its own."""
 
@@ -139,6 +142,13 @@ def _whole(tree: dict[str, Any], name: str, default: int | None = None) -> int:
     if value < 0:
         raise ForeignFileError(f"`{name}` is {value}")
     return value
+
+
+def num_lines(tree: dict[str, Any]) -> int:
+    """Primitives that are lines: of a tree that `check_claims` let through."""
+    meshes = _part(tree, "meshes", list[dict[str, Any]], [])
+    modes = [primitive.get("mode") for mesh in meshes for primitive in mesh.get("primitives", [])]
+    return sum(mode in _LINES for mode in modes)
 
 
 def texture_transforms(tree: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -7,18 +7,25 @@ Habitat-Sim is not on the Python package index, so there is no extra for it; it 
 or, where these packages do not fit (r3jax needs Python 3.11 and NumPy 2), from source:
 https://github.com/facebookresearch/habitat-sim. No display is needed, and no GPU.
 
-Surfaces are shown in their stored colours, without lights. Two of Habitat's ways matter here:
-faces are seen from their front only, and a mesh without a material (any PLY, so also Replica's)
-is tinted by a default material; its depth is right all the same.
+Surfaces are shown in their stored colours, without lights. Three of Habitat's ways matter here:
+faces are seen from their front only; lines are drawn, which no ray meets; and a mesh without a
+material (any PLY, so also Replica's) is shown dark and tinted by a default material, a mean of 84
+of 255 off, though its depth is right. Of a PLY the colours are therefore the ray caster's, as
+stored in the file; for Replica the ray caster alone (`replica:<name>`) shows the same faster.
 
 Range and noise are ours, as those of the ray caster: depth beyond `max_range` is inf, and
 `NoisySimulator` adds the noise. Where Habitat finds no surface its depth is 0, which is our
 "no measurement" (the ray caster says inf there: it knows that nothing is there).
 """
 
+import contextlib
 import ctypes
 import hashlib
 import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +47,10 @@ _MIN_AGREEMENT = 0.5
 """Least share of pixels that show the same surface; in the right world it is over 0.99."""
 
 
+_NOISE = ("SSD Load Failure", r"\.scn exists but failed to load")
+"""Lines that Habitat writes at every start, about a file that is not there and not needed."""
+
+
 class HabitatSimulator:
     """RGB-D frames from Habitat-Sim, in the world of the `mesh:` scene of the same file.
 
@@ -57,6 +68,7 @@ class HabitatSimulator:
         start_pose: np.ndarray | None = None,
         seed: int = 0,
         gpu_device_id: int | None = None,
+        mesh_colors: bool | None = None,
     ) -> None:
         """Loads the scene, into Habitat and for the start.
 
@@ -69,6 +81,8 @@ class HabitatSimulator:
             seed: of the search for a start.
             gpu_device_id: CUDA device whose renderer is used, -1 for any; None: see
                 `default_gpu_device`.
+            mesh_colors: take the colours from the mesh file by ray casting, the depth alone from
+                Habitat; None: for a PLY, whose vertex colours Habitat shows dark.
 
         Raises:
             ImportError: Habitat-Sim is not installed; says how to get it.
@@ -90,6 +104,14 @@ class HabitatSimulator:
             lighting=False,
             seed=seed,
         )
+        self._mesh_colors = stage.is_ply if mesh_colors is None else mesh_colors
+        lines = self._mesh.world.notes.get("lines")
+        if lines is not None:
+            warnings.warn(
+                f"{stage.mesh} has {lines} meshes of lines: Habitat draws them, no ray meets them "
+                "(mesh:<file> does not show them); take them out to compare the two",
+                stacklevel=2,
+            )
         self._max_depth = np.float32(np.inf if max_range is None else max_range)
         self._is_same_world = False
         if gpu_device_id is None:
@@ -123,7 +145,8 @@ class HabitatSimulator:
     @property
     def content_hash(self) -> str:
         """SHA-256 of what is shown; another one than that of the ray caster's scene."""
-        return hashlib.sha256(f"habitat {self._mesh.world.content_hash}".encode()).hexdigest()
+        who = "habitat, colors of the mesh" if self._mesh_colors else "habitat"
+        return hashlib.sha256(f"{who} {self._mesh.world.content_hash}".encode()).hexdigest()
 
     def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
         """The RGB-D frame at a pose [4, 4].
@@ -136,8 +159,9 @@ class HabitatSimulator:
         T = np.asarray(T_world_camera, dtype=np.float64)
         image, depth = self._observe(T)
         depth = np.where(depth <= self._max_depth, depth, np.float32(np.inf))
+        rgb = jnp.asarray(image.astype(np.float32) / np.float32(255.0))
         return Frame(
-            rgb=jnp.asarray(image.astype(np.float32) / np.float32(255.0)),
+            rgb=self._mesh.render(T).rgb if self._mesh_colors else rgb,
             depth=jnp.asarray(depth),
             T_world_camera=jnp.asarray(T.astype(np.float32)),
             camera=self._camera,
@@ -163,7 +187,8 @@ class HabitatSimulator:
             raise ValueError(
                 f"Habitat and the mesh file agree on {is_same.mean():.0%} of what the start sees: "
                 "Habitat shows another world, or the same turned. Do up and front in the stage "
-                "config name the mesh's axes, and do its faces have their front inside the rooms?"
+                "config name the axes of a GLB (a PLY is never turned), and do the faces have "
+                "their front inside the rooms?"
             )
 
 
@@ -194,7 +219,8 @@ class _Habitat:
         agent.sensor_specifications = sensors
         agent.action_space = {}
         self._new_state = habitat_sim.AgentState
-        self._simulator = habitat_sim.Simulator(habitat_sim.Configuration(settings, [agent]))
+        with _without_noise():
+            self._simulator = habitat_sim.Simulator(habitat_sim.Configuration(settings, [agent]))
 
     def observe(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Colours [H, W, 3] uint8 and z-depth [H, W] float32 from a place in Habitat's world.
@@ -211,6 +237,30 @@ class _Habitat:
         self._simulator.get_agent(0).set_state(state)
         seen = self._simulator.get_sensor_observations()
         return np.asarray(seen["rgb"])[..., :3], np.asarray(seen["depth"], np.float32)
+
+
+@contextlib.contextmanager
+def _without_noise() -> Generator[None]:
+    """Keeps the lines of `_NOISE` from the terminal; everything else arrives there.
+
+    Habitat writes from C++, to the descriptor, and may end the process: so it is another process
+    that passes the rest on, however this one ends.
+    """
+    sys.stderr.flush()
+    terminal = os.dup(2)
+    patterns = [word for pattern in _NOISE for word in ("-e", pattern)]
+    passer = ["grep", "--line-buffered", "-a", "-v", *patterns]
+    try:
+        with subprocess.Popen(passer, stdin=subprocess.PIPE, stdout=terminal) as process:
+            assert process.stdin is not None
+            os.dup2(process.stdin.fileno(), 2)
+            try:
+                yield
+            finally:
+                sys.stderr.flush()
+                os.dup2(terminal, 2)  # it closes the other end: the process comes to its end
+    finally:
+        os.close(terminal)
 
 
 def default_gpu_device() -> int:

@@ -1,7 +1,8 @@
 """What Habitat-Sim makes of a scene's file: which mesh it shows, and how it turns it.
 
-Measured on 0.3.3: a bare GLB is taken as z-up and turned, a bare PLY is not turned, and a stage
-config (`<name>.stage_config.json`) says by `up` and `front` which axes its mesh has.
+Measured on 0.3.3: a bare GLB is taken as z-up and turned, and a stage config
+(`<name>.stage_config.json`) says by `up` and `front` which axes its GLB has. A PLY is never turned,
+whatever its stage config says: of all 24 rotations the identity alone agreed.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from r3jax.foreign.json_text import parse_json
 from r3jax.simulators.habitat_poses import BARE_GLB, habitat_from_axes
 
 _CONFIG = ".stage_config.json"
+_PLY = ".ply"
 _MAX_CONFIG = 1 << 20
 """Stage configs have a few hundred bytes."""
 
@@ -37,6 +39,11 @@ class Stage:
     habitat_from_file: np.ndarray
     """Rotation [3, 3] from the mesh file's axes to Habitat's world."""
 
+    @property
+    def is_ply(self) -> bool:
+        """True if the mesh is a PLY."""
+        return self.mesh.suffix.lower() == _PLY
+
 
 def read_stage(path: str | Path) -> Stage:
     """Finds out what Habitat will show.
@@ -52,7 +59,7 @@ def read_stage(path: str | Path) -> Stage:
     try:
         if path.name.lower().endswith(_CONFIG):
             return _read_config(path)
-        turn = {".glb": BARE_GLB, ".ply": np.eye(3)}.get(path.suffix.lower())
+        turn = {".glb": BARE_GLB, _PLY: np.eye(3)}.get(path.suffix.lower())
         if turn is None:
             raise ForeignFileError(f"Habitat scenes are .glb, .ply or {_CONFIG} files")
         check_regular(path)
@@ -75,6 +82,18 @@ def _read_config(path: Path) -> Stage:
             raise ForeignFileError(
                 f"{name} {config[name]!s:.60} is not supported, only {value}: apply it to the mesh"
             )
+    mesh = (path.parent / config["render_asset"]).absolute()
+    try:
+        check_regular(mesh)
+    except FileNotFoundError:
+        raise ForeignFileError(f"its render_asset {mesh} is missing") from None
+    except ForeignFileError as error:
+        raise ForeignFileError(f"its render_asset {mesh}: {error}") from None
+    return Stage(path, mesh, np.eye(3) if mesh.suffix.lower() == _PLY else _axes_of(config))
+
+
+def _axes_of(config: dict[str, Any]) -> np.ndarray:
+    """The rotation [3, 3] that a stage config's `up` and `front` ask for."""
     lacking = [name for name in ("up", "front") if name not in config]
     if lacking:
         raise ForeignFileError(
@@ -83,14 +102,7 @@ def _read_config(path: Path) -> Stage:
         )
     for name in ("up", "front"):
         check_type(name, config[name], list[float])
-    mesh = (path.parent / config["render_asset"]).absolute()
     try:
-        check_regular(mesh)
-        turn = habitat_from_axes(config["up"], config["front"])
-    except FileNotFoundError:
-        raise ForeignFileError(f"its render_asset {mesh} is missing") from None
-    except ForeignFileError as error:
-        raise ForeignFileError(f"its render_asset {mesh}: {error}") from None
+        return habitat_from_axes(config["up"], config["front"])
     except ValueError as error:
         raise ForeignFileError(str(error)) from None
-    return Stage(path, mesh, turn)

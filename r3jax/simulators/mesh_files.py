@@ -11,7 +11,7 @@ import numpy as np
 
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.files import check_regular
-from r3jax.simulators.gltf import check_claims, read_tree, texture_transforms
+from r3jax.simulators.gltf import check_claims, num_lines, read_tree, texture_transforms
 
 SUFFIXES = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")
 """Formats that are read."""
@@ -57,10 +57,14 @@ class MeshFile:
         self.texture_moves: dict[str, np.ndarray] = {}
         """How materials move their textures, see `texture_transforms`."""
 
+        self.num_lines = 0
+        """Meshes that are lines, which no ray meets."""
+
         if path.suffix.lower() in GLTF_SUFFIXES:
             tree = read_tree(path)
             check_claims(path, tree)
             self.texture_moves = texture_transforms(tree)
+            self.num_lines = num_lines(tree)
         self._texels = 0
         self._textures: dict[int, np.ndarray] = {}
         self.scene = self._load(path)

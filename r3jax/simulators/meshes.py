@@ -76,6 +76,8 @@ def load_world(path: str | Path, up: str | None = None, scale: float | int = 1.0
         _refuse_empty(path, file.scene)
     world = _assemble(path, parts, turn)
     _check(path, world)
+    if file.num_lines:
+        world.notes["lines"] = str(file.num_lines)
     return world
 
 

@@ -7,6 +7,7 @@ import trimesh
 from r3jax.geometry.cameras import Camera
 from r3jax.scenes import registry
 from r3jax.simulators.base import Simulator
+from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.noise import NoisySimulator
 
 CAMERA = Camera.from_fov(64, 64, 60.0)
@@ -109,3 +110,25 @@ def test_a_mesh_without_a_file_name():
 def test_the_up_axis_is_for_mesh_files():
     with pytest.raises(ValueError, match="is for mesh files"):
         registry.open_scene(registry.scene_names()[0], up="y")
+
+
+def test_a_scene_can_be_seen_without_its_back_faces(tmp_path):
+    """As Habitat sees it: from outside, a room seen from within is open."""
+    path = tmp_path / "box.ply"
+    trimesh.creation.box(extents=(6, 4, 3)).export(path)  # its faces look outwards
+    pose = np.eye(4)
+    options = {"camera": CAMERA, "noise": 0.0, "max_range": None, "start_pose": pose}
+    two_sided = registry.open_scene(f"mesh:{path}", **options)
+    culled = registry.open_scene(f"mesh:{path}", cull_back_faces=True, **options)
+    assert np.isfinite(two_sided.render(pose).depth).all()
+    assert np.isinf(culled.render(pose).depth).all()
+    assert registry.scene_hash(two_sided) != registry.scene_hash(culled)
+    assert GroundTruth(culled).scene_hash == registry.scene_hash(culled)
+
+
+def test_a_mesh_is_scaled(room_file):
+    mesh = f"mesh:{room_file}"
+    meters = registry.open_world(mesh)
+    smaller = registry.open_world(mesh, scale=0.001)
+    np.testing.assert_allclose(smaller.vertices, 0.001 * meters.vertices)
+    assert registry.open_world(mesh, scale=1).content_hash == meters.content_hash

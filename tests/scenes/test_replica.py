@@ -17,8 +17,6 @@ from r3jax.simulators.raycast import RaycastSimulator
 from tests.simulators.fake_habitat import FakeHabitat
 
 CAMERA = Camera.from_fov(32, 24, 60.0)
-HABITAT_FROM_MESH = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""What Replica's stage configs ask for: z becomes y, y becomes -z."""
 
 
 @pytest.fixture
@@ -39,16 +37,17 @@ def root(tmp_path, monkeypatch):
 
 @pytest.fixture
 def fake(root, monkeypatch):
-    """A Habitat-Sim that shows office_0, turned as its stage config asks."""
+    """A Habitat-Sim that shows office_0 as the real one does: not turned, though its stage config
+    asks for it, and dark."""
     world = load_world(root / "office_0" / "mesh.ply")
     caster = RaycastSimulator(world, CAMERA, max_range=None, supersample=0)
 
     def answer(position, rotation):
         pose = np.eye(4)
-        pose[:3, :3] = HABITAT_FROM_MESH.T @ rotation @ np.diag([1.0, -1.0, -1.0])
-        pose[:3, 3] = HABITAT_FROM_MESH.T @ position
+        pose[:3, :3] = rotation @ np.diag([1.0, -1.0, -1.0])
+        pose[:3, 3] = position
         frame = caster.render(pose)
-        return np.uint8(np.round(np.asarray(frame.rgb) * 255)), np.asarray(frame.depth)
+        return np.uint8(np.round(np.asarray(frame.rgb) * 100)), np.asarray(frame.depth)
 
     fake = FakeHabitat(answer)
     for name, module in fake.modules.items():
@@ -87,6 +86,11 @@ def test_habitat_shows_the_same_scene(fake, root):
     a, b = theirs.render(pose), ours.render(pose)
     np.testing.assert_allclose(a.depth, b.depth, rtol=1e-4)
     np.testing.assert_allclose(a.rgb, b.rgb, atol=0.01)
+    dark = habitat.HabitatSimulator(
+        replica.stage_file("office0"), CAMERA, mesh_colors=False, seed=1
+    )
+    np.testing.assert_allclose(dark.render(pose).rgb, np.asarray(b.rgb) * 100 / 255, atol=0.01)
+    assert dark.content_hash != registry.scene_hash(theirs)
     assert fake.started[0][0].scene_id.startswith(str(root / "office_0" / "habitat"))
     assert registry.scene_hash(theirs) != registry.scene_hash(ours)
     assert "office0" in registry.describe("habitat:office0")
@@ -132,8 +136,9 @@ def test_without_the_files_it_says_which_and_how_to_get_them(root):
 
 
 def test_other_scenes_are_answered_with_the_known_ones(root):
-    with pytest.raises(ValueError, match=r"unknown Replica scene 'attic0'.*hotel0.*room2"):
-        registry.open_scene("replica:attic0", camera=CAMERA)
+    for kind in ("replica", "habitat"):
+        with pytest.raises(ValueError, match=r"unknown Replica scene 'office9'.*hotel0.*room2"):
+            registry.open_scene(f"{kind}:office9", camera=CAMERA)
 
 
 @pytest.mark.parametrize("scene", ["replica:", "habitat:"])

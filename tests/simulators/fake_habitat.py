@@ -5,12 +5,19 @@ CUDA device on a machine without) and what it does by default (sensors 1.5 m abo
 a buffer that it uses again) is imitated; pictures come from a function of the sensor's state.
 """
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+NOISE = (
+    b"[00:00:01:000001]:[Error]:[Scene] SemanticScene.h(331)::checkFileExists : SSD Load Failure! "
+    b"File /x.scn exists but failed to load.\n"
+)
+"""What the real one writes, of a file that is not there."""
 
 Answer = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Position [3] and OpenGL axes [3, 3] of a sensor in Habitat's world to its pictures."""
@@ -57,6 +64,9 @@ class FakeHabitat:
     def __init__(self, answer: Answer, *, has_cuda: bool = False) -> None:
         self._answer = answer
         self._has_cuda = has_cuda
+        self.writes = NOISE
+        """What it writes to the terminal at every start."""
+
         self.started: list[tuple[object, list[object]]] = []
         """Settings and sensors of every simulator that was started."""
 
@@ -96,6 +106,7 @@ class FakeHabitat:
             raise SystemExit("the real one ends the process")
         assert settings.enable_physics is False
         assert agent.action_space == {}
+        os.write(2, self.writes)
         self.started.append((settings, agent.sensor_specifications))
         return _Simulator(agent.sensor_specifications, self._answer, self.states)
 

@@ -3,12 +3,16 @@
 A stand-in answers with frames that the real one gave. Tests of the real one need it installed.
 """
 
+import os
+import signal
+import subprocess
 import sys
 from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from r3jax.geometry.cameras import Camera
@@ -19,7 +23,7 @@ from r3jax.simulators.noise import NoisySimulator
 from r3jax.simulators.raycast import RaycastSimulator
 from tests.conftest import shared_path
 from tests.mutants import Modules, Mutant, assert_caught, each
-from tests.simulators.fake_habitat import FakeHabitat
+from tests.simulators.fake_habitat import NOISE, FakeHabitat
 from tests.simulators.habitat_golden import Golden, load_house, load_simple_room
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -231,6 +235,33 @@ def test_without_habitat_it_says_how_to_get_it(room, monkeypatch):
     monkeypatch.setitem(sys.modules, "habitat_sim", None)
     with pytest.raises(ImportError, match=r"conda install habitat-sim headless.*mesh:<file>"):
         habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up)
+
+
+def test_noise_is_kept_from_the_terminal_and_trouble_is_not(room, monkeypatch, capfd):
+    fake = installed(FakeHabitat(recorded(room)), monkeypatch)
+    habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up)
+    assert capfd.readouterr().err == ""
+    fake.writes = b"unable to create a context\n" + NOISE + b"no texture"
+    habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up)
+    os.write(2, b"later")
+    assert capfd.readouterr().err == "unable to create a context\nno texture\nlater"
+
+
+def test_trouble_is_told_when_habitat_ends_the_process():
+    program = "import os; from r3jax.simulators import habitat\n"
+    program += "with habitat._without_noise(): os.write(2, b'no device'); os.abort()"
+    done = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE)
+    assert done.returncode == -signal.SIGABRT
+    assert done.stderr == b"no device\n"
+
+
+def test_lines_are_warned_of(tmp_path, monkeypatch):
+    scene = trimesh.Scene([trimesh.creation.box((4, 4, 3))])
+    scene.add_geometry(trimesh.load_path(np.array([[0.0, 0, 0], [1, 1, 1]])))
+    scene.export(tmp_path / "a.glb")
+    installed(FakeHabitat(lambda position, rotation: (None, None)), monkeypatch)
+    with pytest.warns(UserWarning, match="1 meshes of lines: Habitat draws them, no ray meets"):
+        habitat.HabitatSimulator(tmp_path / "a.glb", CAMERA)
 
 
 def cuda_with(devices: int, *, is_broken: bool = False):

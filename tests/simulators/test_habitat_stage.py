@@ -16,6 +16,7 @@ TURN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 def config(tmp_path):
     """Writes a stage config into `habitat/`, beside a mesh, as Replica has them."""
     (tmp_path / "mesh.ply").write_bytes(b"ply")
+    (tmp_path / "mesh.glb").write_bytes(b"glb")
     (tmp_path / "habitat").mkdir()
 
     def write(text):
@@ -37,11 +38,19 @@ def test_bare_meshes_as_measured(tmp_path, name, turn):
 @pytest.mark.parametrize(("axes", "turn"), [(Z_UP, TURN), (Y_UP, np.eye(3))])
 def test_a_stage_config_says_its_axes(config, tmp_path, axes, turn):
     more = {"scale": [1.0, 1.0, 1.0], "units_to_meters": 1, "semantic_asset": "mesh_semantic.ply"}
-    path = config({"render_asset": "../mesh.ply", **axes, **more})
+    path = config({"render_asset": "../mesh.glb", **axes, **more})
     stage = read_stage(path)
     assert stage.file == path
-    assert stage.mesh.resolve() == tmp_path / "mesh.ply"
+    assert stage.mesh.resolve() == tmp_path / "mesh.glb"
     np.testing.assert_array_equal(stage.habitat_from_file, turn)
+
+
+@pytest.mark.parametrize("axes", [Z_UP, Y_UP, {}, {"up": [0, 0, 1], "front": [0, 0, 1]}])
+def test_a_ply_is_never_turned_whatever_its_config_says(config, axes):
+    """Measured on the real one: four configs, all 24 rotations, the identity each time."""
+    stage = read_stage(config({"render_asset": "../mesh.ply", **axes}))
+    assert stage.is_ply
+    np.testing.assert_array_equal(stage.habitat_from_file, np.eye(3))
 
 
 @pytest.mark.parametrize(
@@ -51,13 +60,13 @@ def test_a_stage_config_says_its_axes(config, tmp_path, axes, turn):
         ({"render_asset": 3, **Z_UP}, "render_asset"),
         ({"render_asset": "no.ply", **Z_UP}, r"render_asset .*no\.ply is missing"),
         ({"render_asset": "..", **Z_UP}, "this is a folder"),
-        ({"render_asset": "../mesh.ply"}, "does not say up and front"),
-        ({"render_asset": "../mesh.ply", "up": [0, 0, 1]}, "does not say front"),
-        ({"render_asset": "../mesh.ply", "up": "z", "front": [0, 1, 0]}, "up"),
-        ({"render_asset": "../mesh.ply", "up": [0, 0, 1], "front": [0, 0, 1]}, "right angles"),
-        ({"render_asset": "../mesh.ply", "up": [0, 1], "front": [0, 0, 1]}, "3 numbers"),
-        ({"render_asset": "../mesh.ply", **Z_UP, "scale": [2, 2, 2]}, "scale .* not supported"),
-        ({"render_asset": "../mesh.ply", **Z_UP, "origin": [1, 0, 0]}, "origin .* not supported"),
+        ({"render_asset": "../mesh.glb"}, "does not say up and front"),
+        ({"render_asset": "../mesh.glb", "up": [0, 0, 1]}, "does not say front"),
+        ({"render_asset": "../mesh.glb", "up": "z", "front": [0, 1, 0]}, "up"),
+        ({"render_asset": "../mesh.glb", "up": [0, 0, 1], "front": [0, 0, 1]}, "right angles"),
+        ({"render_asset": "../mesh.glb", "up": [0, 1], "front": [0, 0, 1]}, "3 numbers"),
+        ({"render_asset": "../mesh.glb", **Z_UP, "scale": [2, 2, 2]}, "scale .* not supported"),
+        ({"render_asset": "../mesh.glb", **Z_UP, "origin": [1, 0, 0]}, "origin .* not supported"),
         (["render_asset"], "stage config"),
         ("{", "not JSON"),
     ],
