@@ -97,7 +97,7 @@ def world_from_file(path: Path, up: str | None = None) -> np.ndarray:
     return _Z_UP_FROM_Y_UP if up == "y" or (up is None and is_gltf) else np.eye(3)
 
 
-def scaled_turn(path: Path, up: str | None, scale: float | int) -> np.ndarray:
+def scaled_turn(path: Path, up: str | None, scale: Any) -> np.ndarray:
     """`world_from_file` times the scale, [3, 3].
 
     Raises:

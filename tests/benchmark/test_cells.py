@@ -43,7 +43,7 @@ CONDITION_CHANGES = {
 
 
 def test_every_field_is_either_changed_here_or_does_not_matter():
-    assert CHANGES.keys() | {"scene", "up", "conditions"} == {
+    assert CHANGES.keys() | {"scene", "up", "scale", "cull_backfaces", "conditions"} == {
         field.name for field in dataclasses.fields(Cell)
     }
     assert CONDITION_CHANGES.keys() | {"snapshots"} == {
