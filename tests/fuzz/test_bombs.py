@@ -178,7 +178,7 @@ def meshes() -> Iterator[tuple[str, bytes]]:
         json.dumps({**one_mesh([named]), "bufferViews": [view], **itself, **padding}).encode(),
     )
     corners = b"".join(b"v %d %d 0\n" % (i % 100, i // 100) for i in range(30_000))
-    groups = b"".join(b"usemtl m%d\nf 1 2 %d\n" % (i, i + 3) for i in range(2_000))
+    groups = b"".join(b"usemtl m%d\nf 1 2 %d\n" % (i, i + 3) for i in range(200))
     yield "obj", corners + groups
     yield "obj", corners + b"f" + b"".join(b" %d" % (i + 1) for i in range(30_000)) + b"\n"
     text = b"ply\nformat ascii 1.0\nelement vertex 3000000000\nproperty float x\nproperty float y\n"
