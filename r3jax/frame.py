@@ -1,6 +1,5 @@
 """A posed RGB-D image: all that a simulator, a recording or a robot hands over."""
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -9,14 +8,23 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from r3jax.arguments import one
 from r3jax.arrays import color_image, depth_image, own_matrix, pinhole_camera
-from r3jax.geometry.cameras import Camera, is_traced, rigid_error
+from r3jax.geometry.cameras import Camera, is_rigid, is_traced, rigid_error
 
 
 def _as_image(image: ArrayLike) -> Array:
     """Half and double precision become float32; integers stay, to be refused by name."""
     array = jnp.asarray(image)
     return array.astype(jnp.float32) if jnp.issubdtype(array.dtype, jnp.floating) else array
+
+
+def _as_pose(pose: ArrayLike) -> Array:
+    """Single precision; under jit, where it cannot be refused, a pose that is not rigid is NaN."""
+    T = jnp.asarray(pose, dtype=jnp.float32)
+    if T.shape != (4, 4) or not is_traced(T):
+        return T
+    return T * jnp.where(is_rigid(T), 1.0, jnp.nan)
 
 
 class Frame(eqx.Module):
@@ -34,9 +42,7 @@ class Frame(eqx.Module):
     depth: Float[Array, "H W"] = eqx.field(converter=_as_image)
     """z-depth [m]. 0: no measurement. inf: nothing within the sensor's range."""
 
-    T_world_camera: Float[Array, "4 4"] = eqx.field(
-        converter=functools.partial(jnp.asarray, dtype=jnp.float32)
-    )
+    T_world_camera: Float[Array, "4 4"] = eqx.field(converter=_as_pose)
     """Camera-to-world pose; OpenCV axes, world z up [m]."""
 
     camera: Camera
@@ -132,3 +138,6 @@ class Frame(eqx.Module):
     def position(self) -> Float[Array, " 3"]:
         """Camera centre in the world [m]."""
         return self.T_world_camera[:3, 3]
+
+
+a_frame = one(Frame, "Frame.from_arrays makes one of arrays", leaf="depth", ndim=2)

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from r3jax.arguments import checked
 from r3jax.geometry.cameras import is_traced
-from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.state import MapState, a_map, empty_map
 from r3jax.mapping.table import find_or_insert
 
 CHUNK = 1 << 13
@@ -116,6 +117,7 @@ def _join_map(state: MapState, other: MapState) -> MapState:
     return eqx.tree_at(lambda m: m.dropped, state, state.dropped + other.dropped)
 
 
+@checked(a=a_map, b=a_map)
 def merge(a: MapState, b: MapState) -> MapState:
     """The map that has seen what `a` and `b` have seen, in a table of `a`'s capacity.
 
@@ -133,6 +135,7 @@ def merge(a: MapState, b: MapState) -> MapState:
     return _join_map(a, b)
 
 
+@checked(state=a_map)
 def grow(state: MapState, capacity: int) -> MapState:
     """The same map in a larger table. Outside jit: shapes change.
 

@@ -4,11 +4,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from r3jax.arguments import checked, points_of_3
 from r3jax.geometry.voxels import pack, voxel_index
-from r3jax.mapping.state import MapState
+from r3jax.mapping.state import MapState, a_map
 from r3jax.mapping.table import find
 
 
+@checked(state=a_map, points_world=points_of_3)
 @jax.jit
 def lookup(state: MapState, points_world: Float[Array, "*n 3"]) -> Int[Array, "*n"]:
     """Row of the voxel that holds each point; `state.capacity` where the map has none.
@@ -16,9 +18,13 @@ def lookup(state: MapState, points_world: Float[Array, "*n 3"]) -> Int[Array, "*
     Args:
         state: the map.
         points_world: points [m]; points that are not finite are in no voxel.
+
+    Raises:
+        TypeError: no map, or no array.
+        ValueError: points without three coordinates.
     """
     points = points_world.reshape(-1, 3)
-    is_finite = jnp.all(jnp.isfinite(points), axis=1)
+    is_finite = jnp.all(jnp.isfinite(points), axis=1) & jnp.isfinite(state.voxel_size)
     index = voxel_index(jnp.where(is_finite[:, None], points, 0.0), state.voxel_size)
     low, high = pack(index[:, 0], index[:, 1], index[:, 2])
     row = find(state.key, jnp.stack([low, high]), is_finite)

@@ -28,8 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.frame import Frame
-from r3jax.geometry.cameras import Camera, invert_pose, pixel_rays
+from r3jax.arguments import checked, one
+from r3jax.frame import Frame, a_frame
+from r3jax.geometry.cameras import Camera, invert_pose, pixel_rays, sound
 
 FREE_LOG_ODDS = -1.3862944
 """A cell is free below this: p = 0.2."""
@@ -85,6 +86,9 @@ class OccupancyGrid(eqx.Module):
     def unexplored(self) -> Bool[Array, "X Y Z"]:
         """Cells that are neither."""
         return ~(self.free | self.occupied)
+
+
+a_grid = one(OccupancyGrid, "r3jax.empty_grid makes one", leaf="log_odds", ndim=3)
 
 
 def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyGrid:
@@ -184,6 +188,7 @@ def mark_free_ball(
     return eqx.tree_at(lambda g: g.log_odds, grid, vouched)
 
 
+@checked(grid=a_grid, frame=a_frame)
 def integrate_depth(
     grid: OccupancyGrid, frame: Frame, max_range: float | Float[Array, ""] = 5.0
 ) -> OccupancyGrid:
@@ -196,7 +201,13 @@ def integrate_depth(
         max_range: range of the sensor, straight from the camera's centre [m].
 
     Returns:
-        The grid after the frame. Measurements outside the grid are ignored.
+        The grid after the frame. Measurements outside the grid are ignored. Where the frame's
+        pose is not rigid (which only jit lets through), the edge of the cells is NaN, and so is
+        every score from then on.
+
+    Raises:
+        TypeError: no grid, or no frame.
+        ValueError: several at once, without `jax.vmap`.
     """
     reach = jnp.asarray(max_range, dtype=jnp.float32)
     hit = _hit_cells(grid, frame, reach)
@@ -206,7 +217,8 @@ def integrate_depth(
     step = STEP * jnp.clip(1.0 - STEP_DECAY * distance, 0.0, 1.0)
     change = jnp.where(hit, step, jnp.where(passed, -step, 0.0))
     log_odds = jnp.clip(grid.log_odds + change, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
-    return eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+    cell_size = grid.cell_size * sound(frame.camera, frame.T_world_camera)
+    return eqx.tree_at(lambda g: (g.log_odds, g.cell_size), grid, (log_odds, cell_size))
 
 
 def _hit_cells(

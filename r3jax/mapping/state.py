@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from r3jax.arguments import one
 from r3jax.geometry.voxels import EMPTY_WORD
 
 
@@ -69,6 +70,9 @@ class MapState(eqx.Module):
         """Memory of one row [bytes]."""
         rows = (self.key, self.visited, self.count, self.mean, self.m2, self.resolution)
         return sum(x.nbytes for x in rows) // self.capacity
+
+
+a_map = one(MapState, "r3jax.empty_map makes one", leaf="count", ndim=1)
 
 
 def empty_map(

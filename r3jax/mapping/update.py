@@ -3,14 +3,16 @@
 Shape symbols: P points of a frame; M observations that join at once; H W image size.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from r3jax.frame import Frame
-from r3jax.geometry.cameras import is_traced
+from r3jax.arguments import checked
+from r3jax.frame import Frame, a_frame
+from r3jax.geometry.cameras import is_traced, sound
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
 from r3jax.geometry.voxels import unpack, voxel_center
@@ -23,7 +25,7 @@ from r3jax.mapping.associate import (
 )
 from r3jax.mapping.compact import positions_of_set
 from r3jax.mapping.join import CHUNK, Statistics, bin_words, join
-from r3jax.mapping.state import MapState
+from r3jax.mapping.state import MapState, a_map
 
 
 def observe_voxels(
@@ -88,7 +90,8 @@ def _integrate(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     depth = frame.depth
-    is_measured = (depth > 0.0) & jnp.isfinite(depth) & (depth <= max_range)
+    factor = sound(frame.camera, frame.T_world_camera)
+    is_measured = (depth > 0.0) & jnp.isfinite(depth) & (depth <= max_range) & (factor > 0.0)
     # A branch, not a select: XLA would compute the medians again in each of their consumers.
     valid = jax.lax.cond(
         drop_edges,
@@ -97,13 +100,15 @@ def _integrate(
     )
     points = points_of_pixels(frame, jnp.where(is_measured, depth, 1.0))
     groups = group_by_voxel(points, frame.rgb.reshape(-1, 3), valid.reshape(-1), state.voxel_size)
-    return integrate_groups(state, groups, frame.position, frame.camera.focal)
+    after = integrate_groups(state, groups, frame.position, frame.camera.focal)
+    return eqx.tree_at(lambda m: m.voxel_size, after, factor * after.voxel_size)
 
 
 _integrate_jitted = jax.jit(_integrate)
 _integrate_donating = jax.jit(_integrate, donate_argnums=0)
 
 
+@checked(state=a_map, frame=a_frame)
 def integrate(
     state: MapState,
     frame: Frame,
@@ -117,6 +122,9 @@ def integrate(
     Pixels on depth edges take no part: their color mixes two surfaces. Compiled on first use
     for each image size and capacity. `MapState.dropped` counts what found no row.
 
+    A pose that is not rigid cannot come from outside jit; under jit such a frame adds nothing, and
+    the edge of the voxels becomes NaN, and so every score from then on.
+
     Args:
         state: the map before the frame.
         frame: the frame. Depth 0 (no measurement) and inf (out of range) are ignored.
@@ -126,7 +134,9 @@ def integrate(
             does not grow with the capacity, where a copy of a million rows takes 15 ms.
 
     Raises:
-        ValueError: a range that is not positive (where it is known, that is outside jit).
+        TypeError: no map, or no frame.
+        ValueError: a range that is not positive (where it is known, that is outside jit); several
+            maps or frames at once, without `jax.vmap`.
     """
     if not is_traced(max_range) and not float(max_range) > 0.0:
         raise ValueError(f"max_range must be positive [m], got {float(max_range)}")
@@ -154,6 +164,7 @@ def _integrate_points(
     return integrate_groups(state, groups, camera_position, focal)
 
 
+@checked(state=a_map)
 def integrate_points(
     state: MapState,
     points_world: ArrayLike,

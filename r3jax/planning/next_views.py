@@ -17,9 +17,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from r3jax.arguments import a_camera, checked
 from r3jax.geometry.cameras import Camera, rigid_error
-from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
-from r3jax.mapping.state import MapState
+from r3jax.mapping.occupancy import OccupancyGrid, a_grid, centers_on_host
+from r3jax.mapping.state import MapState, a_map
 from r3jax.planning.candidates import best_views, spread
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
@@ -49,6 +50,7 @@ Ask = Callable[[Voxels, Cells, np.ndarray], tuple[np.ndarray, np.ndarray]]
 turn, and the utility of each [m]."""
 
 
+@checked(state=a_map, grid=a_grid, camera=a_camera)
 def next_views(
     state: MapState,
     grid: OccupancyGrid,

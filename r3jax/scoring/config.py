@@ -4,6 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from r3jax.arguments import one, or_none
+
 
 def _float32(value: float | Array) -> Float[Array, ""]:
     return jnp.asarray(value, dtype=jnp.float32)
@@ -48,3 +50,6 @@ class ScoringConfig(eqx.Module):
             raise ValueError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
         if self.panorama_size < 2 or self.panorama_size & (self.panorama_size - 1):
             raise ValueError(f"panorama_size must be a power of two, got {self.panorama_size}")
+
+
+scoring_settings = or_none(one(ScoringConfig, "None: its defaults"))

@@ -15,12 +15,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
+from r3jax.arguments import a_camera, a_pose, checked
+from r3jax.geometry.cameras import Camera, sound
+from r3jax.mapping.occupancy import OccupancyGrid, a_grid
+from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.cells import cells_of, visible_cells
 from r3jax.scoring.chunks import Selection, for_selected
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import ScoringConfig, scoring_settings
 from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.views import pinhole_view
 from r3jax.scoring.visibility import seen_in
@@ -53,6 +54,7 @@ class Explanation(eqx.Module):
     """Unexplored cells that the view sees: each is lambda1 of what was never seen."""
 
 
+@checked(state=a_map, grid=a_grid, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
 @jax.jit
 def explain_view(
     state: MapState,
@@ -81,9 +83,10 @@ def explain_view(
     position = T_world_camera[:3, 3]
     shares, rendering = _divide_visible(voxels, visible, position, camera.focal, config.kappa)
     exploration = config.lambda1 * jnp.sum(unseen, dtype=jnp.float32)
+    factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
     return Explanation(
-        totals=jnp.concatenate([exploration[None], rendering]),
-        shares=shares,
+        totals=factor * jnp.concatenate([exploration[None], rendering]),
+        shares=factor * shares,
         visible=visible.mask,
         cells=unseen.reshape(grid.log_odds.shape),
     )

@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.arguments import a_camera, a_point, checked
+from r3jax.geometry.cameras import Camera, pose_along, sound
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
+from r3jax.mapping.occupancy import OccupancyGrid, a_grid
+from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_cells
 from r3jax.scoring.chunks import Selection
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import ScoringConfig, scoring_settings
 from r3jax.scoring.demand import Demand, gain_by_direction
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.views import panorama_view
@@ -42,6 +43,7 @@ class Panorama(eqx.Module):
     """The roll-free pose at the position that looks along the best direction."""
 
 
+@checked(state=a_map, grid=a_grid, camera=a_camera, position=a_point, config=scoring_settings)
 @jax.jit
 def panorama(
     state: MapState,
@@ -62,7 +64,9 @@ def panorama(
     """
     config = ScoringConfig() if config is None else config
     voxels = voxels_of(state, config.delta)
-    return panorama_of(voxels, cells_of(grid), camera, position, config)
+    scores = panorama_of(voxels, cells_of(grid), camera, position, config)
+    factor = sound(camera, scores.T_world_camera, state.voxel_size, grid.cell_size)
+    return jax.tree.map(lambda part: factor * part, scores)
 
 
 def panorama_of(

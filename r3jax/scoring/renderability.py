@@ -12,14 +12,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.geometry.cameras import Camera
+from r3jax.arguments import a_camera, a_point, a_pose, checked
+from r3jax.geometry.cameras import Camera, is_traced, sound
 from r3jax.geometry.numerics import safe_norm, safe_power
-from r3jax.mapping.state import MapState
+from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.chunks import for_selected, select
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import ScoringConfig, scoring_settings
 from r3jax.scoring.directions import seen_directions
 from r3jax.scoring.views import pinhole_view
 from r3jax.scoring.visibility import voxels_in_pixels
@@ -117,9 +119,14 @@ def _score_present_jvp(
 def _voxel_renderability(
     state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], kappa: str
 ) -> Renderability:
-    return _score_present(voxels_of(state), camera_position, focal, kappa)
+    terms = _score_present(voxels_of(state), camera_position, focal, kappa)
+    positive = jnp.stack([focal, state.voxel_size])
+    is_sound = jnp.all(jnp.isfinite(camera_position)) & jnp.all(jnp.isfinite(positive))
+    factor = jnp.where(is_sound & jnp.all(positive > 0.0), 1.0, jnp.nan)
+    return jax.tree.map(lambda term: factor * term, terms)
 
 
+@checked(state=a_map)
 def voxel_renderability(
     state: MapState, camera_position: ArrayLike, focal: ArrayLike = 1.0, kappa: str = "box"
 ) -> Renderability:
@@ -140,12 +147,13 @@ def voxel_renderability(
     """
     position = jnp.asarray(camera_position, dtype=jnp.float32)
     focal = jnp.asarray(focal, dtype=jnp.float32)
-    if position.shape != (3,):
-        raise ValueError(f"camera_position must have shape [3], got {position.shape}")
+    a_point("camera_position", position)
     if focal.ndim != 0:
         raise ValueError(f"focal must be one number [px], got shape {focal.shape}")
     if kappa not in ("box", "one"):
         raise ValueError(f"kappa must be 'box' or 'one', got {kappa!r}")
+    if not is_traced(focal) and not 0.0 < float(focal) < np.inf:
+        raise ValueError(f"focal must be positive and finite [px], got {float(focal)}")
     return _voxel_renderability(state, position, focal, kappa)
 
 
@@ -168,6 +176,7 @@ class TermImages(eqx.Module):
     """gamma: the sharpness that it was seen with."""
 
 
+@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
 @jax.jit
 def term_images(
     state: MapState,
@@ -183,12 +192,14 @@ def term_images(
     view = pinhole_view(camera, T_world_camera, config)
     seen, row = voxels_in_pixels(voxels_of(state, config.delta), view, config)
     terms = score_voxels(seen, T_world_camera[:3, 3], camera.focal, config.kappa)
-    image: Callable[[Array], Array] = lambda term: term.reshape(row.shape)
+    factor = sound(camera, T_world_camera, state.voxel_size)
+    image: Callable[[Array], Array] = lambda term: factor * term.reshape(row.shape)
     return TermImages(
         row, image(terms.value), image(terms.bias), image(terms.noise), image(terms.resolution)
     )
 
 
+@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
 @jax.jit
 def renderability_image(
     state: MapState,
@@ -205,6 +216,7 @@ def renderability_image(
     return term_images(state, camera, T_world_camera, config).value
 
 
+@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
 @jax.jit
 def renderability(
     state: MapState,

@@ -4,11 +4,12 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Bool, Float
 
-from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
+from r3jax.arguments import a_camera, a_pose, checked
+from r3jax.geometry.cameras import Camera, sound
+from r3jax.mapping.occupancy import OccupancyGrid, a_grid
+from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_cells
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import ScoringConfig, scoring_settings
 from r3jax.scoring.demand import Demand, gain_by_direction
 from r3jax.scoring.lack import lack_by_direction
 from r3jax.scoring.views import pinhole_view
@@ -29,6 +30,7 @@ class ViewUtility(eqx.Module):
     """lambda1 U_G + U_R."""
 
 
+@checked(state=a_map, grid=a_grid, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
 @jax.jit
 def view_utility(
     state: MapState,
@@ -44,7 +46,9 @@ def view_utility(
     """
     config = ScoringConfig() if config is None else config
     voxels = voxels_of(state, config.delta)
-    return utility_of_view(voxels, cells_of(grid), camera, T_world_camera, config)
+    utility = utility_of_view(voxels, cells_of(grid), camera, T_world_camera, config)
+    factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
+    return jax.tree.map(lambda part: factor * part, utility)
 
 
 def utility_of_view(

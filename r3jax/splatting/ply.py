@@ -12,11 +12,12 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.arguments import checked
 from r3jax.files import write_atomic
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.files import check_regular
 from r3jax.splatting.errors import SceneFileError
-from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.scene import GaussianScene, a_scene
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -61,6 +62,7 @@ class _Element:
     """True if rows differ in length."""
 
 
+@checked(scene=a_scene)
 def write_scene(path: Path | str, scene: GaussianScene) -> None:
     """Writes the used rows of a scene; reading the file gives the same numbers, bit for bit.
 

@@ -6,10 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from r3jax.geometry.cameras import Camera, is_traced
+from r3jax.arguments import a_camera, a_point, a_pose, checked, one, or_none
+from r3jax.geometry.cameras import Camera, is_traced, sound
 from r3jax.splatting.backend import Composite, find_backend
 from r3jax.splatting.config import RasterConfig, fitting_budget
-from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.scene import GaussianScene, a_scene
 
 
 class Rendering(eqx.Module):
@@ -31,6 +32,13 @@ class Rendering(eqx.Module):
     """How many of them found no room; if any, the images are NaN."""
 
 
+@checked(
+    scene=a_scene,
+    camera=a_camera,
+    T_world_camera=a_pose,
+    background=or_none(a_point),
+    config=or_none(one(RasterConfig, "None: its defaults")),
+)
 def render(
     scene: GaussianScene,
     camera: Camera,
@@ -45,7 +53,8 @@ def render(
     Differentiable by the scene, the pose, the intrinsics and the background. The budget of
     intersections is fixed while tracing: where a view needs more, `overflow` counts what found
     no room and the images are NaN, because an image with missing Gaussians looks plausible.
-    Outside jit (and if the config leaves the budget open) it is raised until the view fits.
+    Outside jit (and if the config leaves the budget open) it is raised until the view fits. A pose
+    that is not rigid is refused outside jit, and gives NaN under it.
 
     Args:
         scene: the Gaussians.
@@ -60,12 +69,12 @@ def render(
         Color, expected depth and alpha.
 
     Raises:
-        ValueError: shapes that do not fit together, or an unknown backend.
+        TypeError: arguments of another kind.
+        ValueError: shapes that do not fit together, a pose that is not rigid, or an unknown
+            backend.
         ImportError: the backend's packages are not installed.
     """
     config = RasterConfig() if config is None else config
-    if T_world_camera.shape != (4, 4):
-        raise ValueError(f"T_world_camera is a 4x4 matrix, got shape {T_world_camera.shape}")
     background = jnp.zeros(3) if background is None else background
     if center_offsets is None:
         center_offsets = jnp.zeros((scene.capacity, 2))
@@ -76,16 +85,24 @@ def render(
         budget = fitting_budget(int(composite.num_intersections))
         config = dataclasses.replace(config, max_intersections=budget)
         composite = rasterise(scene, camera, T_world_camera, center_offsets, config)
-    return _finish(composite, background)
+    return _finish(composite, background, sound(camera, T_world_camera))
 
 
-def _finish(composite: Composite, background: Float[Array, " 3"]) -> Rendering:
-    """Puts the background behind, divides depth by alpha, spoils what overflowed."""
+def _finish(
+    composite: Composite, background: Float[Array, " 3"], factor: Float[Array, ""]
+) -> Rendering:
+    """Puts the background behind, divides depth by alpha, spoils what overflowed.
+
+    Args:
+        composite: the Gaussians.
+        background: RGB behind them.
+        factor: 1, or NaN for a view that cannot be meant.
+    """
     alpha = composite.alpha
     covered = alpha > 0.0
     depth = jnp.where(covered, composite.depth_sum / jnp.where(covered, alpha, 1.0), 0.0)
     rgb = composite.rgb + (1.0 - alpha)[..., None] * background[None, None, :]
-    spoil = jnp.where(composite.overflow > 0, jnp.nan, 0.0)
+    spoil = jnp.where(composite.overflow > 0, jnp.nan, 0.0) * factor
     return Rendering(
         rgb=rgb + spoil,
         depth=depth + spoil,

@@ -8,6 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from r3jax.arguments import one
+
 DEAD_LOGIT = -100.0
 """Opacity logit of an unused row: its opacity rounds to 0, and so does every gradient."""
 
@@ -48,6 +50,9 @@ class GaussianScene(eqx.Module):
     def is_alive(self) -> Bool[Array, " n"]:
         """True for the rows in use."""
         return self.opacity_logits > 0.5 * DEAD_LOGIT
+
+
+a_scene = one(GaussianScene, "r3jax.fit and r3jax.read_scene give one", leaf="means", ndim=2)
 
 
 def empty_scene(capacity: int, sh_degree: int = 3) -> GaussianScene:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r3jax.arguments import checked, one, or_none
 from r3jax.splatting.checkpoints import (
     begin_checkpoints,
     only_training,
@@ -26,7 +27,7 @@ from r3jax.splatting.config import fitting_budget
 from r3jax.splatting.errors import TrainingDiverged
 from r3jax.splatting.initialise import initialise
 from r3jax.splatting.memory import check_memory
-from r3jax.splatting.scene import GaussianScene, empty_scene
+from r3jax.splatting.scene import GaussianScene, a_scene, empty_scene
 from r3jax.splatting.train_step import (
     DIVERGED,
     DONE,
@@ -115,6 +116,11 @@ class _Run(eqx.Module):
     schedule: Schedule
 
 
+@checked(
+    views=one(Views, "r3jax.load_views makes them of frames"),
+    config=or_none(one(TrainConfig, "None: its defaults")),
+    scene=or_none(a_scene),
+)
 def fit(
     views: Views,
     config: TrainConfig | None = None,
@@ -152,6 +158,7 @@ def fit(
             process that trains in `folder`.
         TrainingDiverged: the loss or a gradient is no longer finite. The last good checkpoint
             stays.
+        TypeError: arguments of another kind.
         ValueError: settings that do not fit together.
     """
     config = TrainConfig() if config is None else config

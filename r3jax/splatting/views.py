@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from r3jax.frame import Frame
+from r3jax.frame import Frame, a_frame
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.errors import ViewsError
 
@@ -96,9 +96,12 @@ def load_views(frames: Iterable[Frame], resolution: int | None = None) -> Views:
         The views in the order of the frames.
 
     Raises:
+        TypeError: one frame alone, or what is none.
         ViewsError: no frames, or frames of different sizes.
         ValueError: a resolution below 1.
     """
+    if isinstance(frames, Frame):
+        raise TypeError("frames must be several, got one Frame: put it into a list")
     if resolution is not None and resolution < 1:
         raise ValueError(f"resolution is the longer side in pixels, at least 1, got {resolution}")
     rgb: list[np.ndarray] = []
@@ -107,6 +110,7 @@ def load_views(frames: Iterable[Frame], resolution: int | None = None) -> Views:
     cameras: list[Camera] = []
     size = (0, 0)
     for number, frame in enumerate(frames):
+        a_frame(f"frames[{number}]", frame)
         found = (frame.camera.width, frame.camera.height)
         size = found if number == 0 else size
         if found != size:

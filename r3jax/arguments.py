@@ -1,0 +1,148 @@
+"""Refuses arguments of the public calls that would give a plausible number for a wrong question.
+
+Kinds and shapes are known while tracing, so they are refused under jit too. Values are looked at
+where they are known; under jit a pose that is none makes the result NaN (`geometry.cameras.sound`).
+"""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+
+from r3jax.geometry.cameras import Camera, is_traced, rigid_error
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+Check = Callable[[str, Any], None]
+"""Told the name and the value of an argument; raises what is wrong with it."""
+
+
+def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorates a call with checks of arguments, by their names. Defaults are not checked."""
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        order = list(inspect.signature(function).parameters)
+        usage = f"{getattr(function, '__name__', '')}({', '.join(order)})"
+        places = [(order.index(name), name, check) for name, check in checks.items()]
+
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            for place, name, check in places:
+                if place < len(args):
+                    value = args[place]
+                elif name in kwargs:
+                    value = kwargs[name]
+                else:
+                    continue
+                try:
+                    check(name, value)
+                except TypeError as error:
+                    raise TypeError(f"{error}; the call is {usage}") from None
+            return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def one(kind: type, hint: str, leaf: str = "", ndim: int = 0) -> Check:
+    """Checks that an argument is one object of a kind, not an array nor several stacked.
+
+    Args:
+        kind: its class.
+        hint: where such an object comes from.
+        leaf: an array in it; empty: it has none.
+        ndim: the axes that this array has in one object.
+
+    Returns:
+        The check. It raises a TypeError for another kind, and a ValueError for a stack.
+    """
+
+    def check(name: str, value: Any) -> None:
+        if not isinstance(value, kind):
+            raise TypeError(
+                f"{name} must be an r3jax.{kind.__name__} ({hint}), got {describe(value)}"
+            )
+        if leaf and (found := np.ndim(getattr(value, leaf))) != ndim:
+            raise ValueError(
+                f"{name} must be one {kind.__name__}, but its {leaf} has {found} axes instead of "
+                f"{ndim}: use jax.vmap over several"
+            )
+
+    return check
+
+
+def or_none(check: Check) -> Check:
+    """Lets None through."""
+    return lambda name, value: None if value is None else check(name, value)
+
+
+a_camera = one(
+    Camera,
+    "of a matrix of intrinsics: Camera(width, height, fx, fy, cx, cy), of an angle of view: "
+    "Camera.from_fov",
+    leaf="fx",
+)
+
+
+def a_pose(name: str, value: Any) -> None:
+    """Checks that an argument is one rigid transform, [4, 4].
+
+    Raises:
+        TypeError: no array.
+        ValueError: another shape, several poses, or one that is not rigid or not finite.
+    """
+    shape = _shape(name, value, "[4, 4]")
+    if shape != (4, 4):
+        raise ValueError(
+            f"{name} must be one pose, a 4x4 matrix, got shape {shape}{_stacked(shape, (4, 4))}"
+        )
+    if not is_traced(value) and (problem := rigid_error(np.asarray(value))) is not None:
+        raise ValueError(f"{name}: {problem}")
+
+
+def a_point(name: str, value: Any) -> None:
+    """Checks that an argument is one finite point or direction, [3].
+
+    Raises:
+        TypeError: no array.
+        ValueError: another shape, several points, or one that is not finite.
+    """
+    shape = _shape(name, value, "[3]")
+    if shape != (3,):
+        raise ValueError(f"{name} must have shape [3], got {shape}{_stacked(shape, (3,))}")
+    if not is_traced(value) and not np.isfinite(point := np.asarray(value)).all():
+        raise ValueError(f"{name} is not finite: {point.tolist()}")
+
+
+def points_of_3(name: str, value: Any) -> None:
+    """Checks that an argument is an array of points, [..., 3].
+
+    Raises:
+        TypeError: no array.
+        ValueError: another shape.
+    """
+    shape = _shape(name, value, "[..., 3]")
+    if shape[-1:] != (3,):
+        raise ValueError(f"{name} must have shape [..., 3], got {shape}")
+
+
+def describe(value: Any) -> str:
+    """What an argument is, for errors."""
+    shape = getattr(value, "shape", None)
+    return type(value).__name__ if shape is None else f"an array of shape {tuple(shape)}"
+
+
+def _shape(name: str, value: Any, wanted: str) -> tuple[int, ...]:
+    if not hasattr(value, "shape") or not hasattr(value, "dtype"):
+        raise TypeError(f"{name} must be an array {wanted}, got {describe(value)}")
+    return tuple(value.shape)
+
+
+def _stacked(shape: tuple[int, ...], wanted: tuple[int, ...]) -> str:
+    if shape[1:] == wanted:
+        return f": the call takes one at a time, use jax.vmap over the {shape[0]}"
+    return ""
