@@ -12,6 +12,12 @@ from r3jax.arguments import one
 from r3jax.arrays import color_image, depth_image, own_matrix, pinhole_camera
 from r3jax.geometry.cameras import Camera, is_rigid, is_traced, rigid_error
 
+FAR = 50.0
+"""A median depth beyond this is taken for one in another unit [m]."""
+
+_LOOK = 64
+"""Pixels across that the median is taken of: it is the same to a few percent."""
+
 
 def _as_image(image: ArrayLike) -> Array:
     """Half and double precision become float32; integers stay, to be refused by name."""
@@ -27,13 +33,32 @@ def _as_pose(pose: ArrayLike) -> Array:
     return T * jnp.where(is_rigid(T), 1.0, jnp.nan)
 
 
+def _refuse_far(depth: ArrayLike) -> None:
+    """Refuses depth that is surely in another unit, where it is known."""
+    if is_traced(depth) or np.ndim(depth) != 2:
+        return
+    array = np.asarray(depth)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        return  # refused as what it is
+    rows, columns = (max(1, size // _LOOK) for size in array.shape)
+    some = array[::rows, ::columns].astype(np.float64)
+    measured = some[(some > 0.0) & np.isfinite(some)]
+    if len(measured) and (median := float(np.median(measured))) > FAR:
+        raise ValueError(
+            f"the median depth is {median:.4g} m: is it in millimeters? (Frame.from_arrays: "
+            "depth_scale=0.001; transforms.json: depth_unit_scale_factor; Frame with far=True: it "
+            "is so far indeed)"
+        )
+
+
 class Frame(eqx.Module):
     """One posed RGB-D image. A frame that is malformed cannot be constructed.
 
     Raises:
         ValueError: shapes that do not fit the camera, integer images (divide by 255 first),
             colours outside [0, 1] or not finite, depth that is NaN or negative, a pose that is
-            not finite or not rigid. Values are checked where they are known (outside jit).
+            not finite or not rigid, a median depth of more than 50 m (without `far`). Values are
+            checked where they are known (outside jit).
     """
 
     rgb: Float[Array, "H W 3"] = eqx.field(converter=_as_image)
@@ -48,6 +73,21 @@ class Frame(eqx.Module):
     camera: Camera
     """Intrinsics of both images."""
 
+    def __init__(
+        self,
+        rgb: ArrayLike,
+        depth: ArrayLike,
+        T_world_camera: ArrayLike,
+        camera: Camera,
+        *,
+        far: bool = False,
+    ):
+        """Takes the fields, and whether a median depth of more than 50 m is meant (`far`)."""
+        self.rgb, self.depth, self.T_world_camera = rgb, depth, T_world_camera
+        self.camera = camera
+        if not far:
+            _refuse_far(depth)
+
     @staticmethod
     def from_arrays(
         rgb: Any,
@@ -57,6 +97,7 @@ class Frame(eqx.Module):
         *,
         depth_scale: float | int | None = None,
         pixel_center: float | int = 0.0,
+        far: bool = False,
     ) -> "Frame":
         """A frame from the arrays of another program.
 
@@ -76,6 +117,7 @@ class Frame(eqx.Module):
                 only floats can be.
             pixel_center: where the matrix has the center of the upper left pixel [px]: 0 in
                 OpenCV and ROS, 0.5 in COLMAP and nerfstudio. A `Camera` has it at 0.5.
+            far: the median depth may exceed 50 m; otherwise that is taken for a wrong unit.
 
         Raises:
             ValueError: what `Frame` refuses; colours or depth of a type or shape that cannot be
@@ -89,6 +131,7 @@ class Frame(eqx.Module):
             depth=depth_image(depth, depth_scale),
             T_world_camera=own_matrix("T_world_camera", T_world_camera),
             camera=pinhole_camera(camera, height, width, pixel_center),
+            far=far,
         )
 
     def __check_init__(self) -> None:

@@ -53,6 +53,7 @@ BAD = {
     "transposed": ({"rgb": np.zeros((8, 6, 3), np.float32)}, r"camera's image is \(6, 8, 3\)"),
     "depth of another size": ({"depth": np.ones((3, 4), np.float32)}, r"depth has shape \(3, 4\)"),
     "depth with a channel": ({"depth": np.ones((6, 8, 1), np.float32)}, "depth has shape"),
+    "float depth in mm": ({"depth": np.full((6, 8), 2e3)}, r"median depth is 2000 m.*millimeters"),
     "another camera": ({"camera": Camera.from_fov(16, 12)}, "camera's image is"),
     "uint8 image": ({"rgb": np.zeros((6, 8, 3), np.uint8)}, "rgb must be float32, got uint8.*255"),
     "depth in mm": ({"depth": np.full((6, 8), 900, np.uint16)}, "depth must be float32.*metres"),
@@ -78,6 +79,12 @@ BAD = {
 def test_bad_frame_is_refused(change, words):
     with pytest.raises(ValueError, match=words):
         Frame(**SOUND | change)
+
+
+def test_what_is_far_indeed_is_taken_on_the_callers_word():
+    far = np.full((6, 8), 2e3)
+    assert float(Frame(**SOUND | {"depth": far}, far=True).depth[0, 0]) == 2e3
+    assert float(Frame(**SOUND | {"depth": np.where(far > 0, np.inf, far)}).depth[0, 0]) == np.inf
 
 
 def test_frames_pass_through_transformations():

@@ -128,7 +128,7 @@ def audit(
         on_progress: for a progress bar.
 
     Raises:
-        ValueError: a wish that makes no sense.
+        ValueError: a wish that makes no sense; depth images that contradict the poses.
         FormatError, RunError: a file is missing or broken, or says nothing of depth.
     """
     wishes = Wishes() if wishes is None else wishes

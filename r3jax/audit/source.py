@@ -99,6 +99,7 @@ class Source:
                 alignment.poses(self.poses[index : index + 1])[0], dtype=jnp.float32
             ),
             camera=self.camera(index),
+            far=True,  # in units of the audit
         )
 
 

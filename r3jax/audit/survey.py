@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from r3jax.audit.agreement import Look, check_agreement
 from r3jax.audit.alignment import Alignment, estimated_up, rotation_to_z, up_of
 from r3jax.audit.source import Source
 from r3jax.formats.errors import FormatError
+from r3jax.frame import FAR
 from r3jax.geometry.voxels import INDEX_LIMIT
 
 RANGE = 5.0
@@ -24,6 +26,9 @@ MARGIN = 0.3
 
 _ROOM = (2.0, 5.0)
 """Depths (95th percentile) of captures in metres that are rooms [m]."""
+
+_FARTHEST = 20.0
+"""Of a range that makes sense, in depths."""
 
 _NEAR_BY = 2.5
 """Range of smaller captures, in depths: objects on a table have space round them."""
@@ -93,6 +98,9 @@ class Wishes:
     seed: int = 0
     """Of the random views that the suggested ones are compared with."""
 
+    trust_depth: bool = False
+    """True: depth images are taken as they are, even if they contradict the poses."""
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -131,14 +139,17 @@ def survey_of(source: Source, wishes: Wishes) -> Survey:
     """Looks at some pictures and decides.
 
     Raises:
-        ValueError: a wish that makes no sense.
+        ValueError: a wish that makes no sense; depth images that contradict the poses.
         FormatError: no picture has any depth; or a file is missing or broken.
     """
     _check(wishes)
     count = min(len(source), wishes.max_frames)
     chosen = np.unique(np.linspace(0, len(source) - 1, count).round().astype(np.int64))
-    depths, points = _measured(source, chosen)
+    looks = _looks(source, chosen)
+    depths, points = _measured(source, looks)
     median, far = (float(v) for v in np.percentile(depths, [50.0, 95.0]))
+    if source.is_dense and not wishes.trust_depth:
+        _check_depth(looks, median)
     scale = RANGE / _range(far, source.is_metric, wishes.max_range)
     cameras = source.poses[:, :3, 3]
     is_near = float(np.abs(cameras).max()) * scale < _FAR_AWAY
@@ -177,34 +188,44 @@ def _check(wishes: Wishes) -> None:
         raise ValueError(f"--views must be at most {_MOST_VIEWS}, got {wishes.num_views}")
 
 
-def _measured(source: Source, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _looks(source: Source, chosen: np.ndarray) -> list[Look]:
+    looked = chosen[np.unique(np.linspace(0, len(chosen) - 1, _SURVEYED).round().astype(int))]
+    return [Look(source.read(i)[1], source.camera(i), source.poses[i]) for i in looked.tolist()]
+
+
+def _measured(source: Source, looks: list[Look]) -> tuple[np.ndarray, np.ndarray]:
     """Some of the depths [k] and their points [k, 3], in the capture's coordinates."""
     rng = np.random.default_rng(0)
-    depths: list[np.ndarray] = []
-    points: list[np.ndarray] = []
-    looked = chosen[np.unique(np.linspace(0, len(chosen) - 1, _SURVEYED).round().astype(int))]
-    for index in looked.tolist():
-        _, depth = source.read(index)
-        row, column = np.nonzero((depth > 0.0) & np.isfinite(depth))
-        if len(row) > _VALUES:
-            some = rng.choice(len(row), _VALUES, replace=False)
-            row, column = row[some], column[some]
-        z = depth[row, column].astype(np.float64)
-        camera, pose = source.camera(index), source.poses[index]
-        x = (column + 0.5 - float(camera.cx)) / float(camera.fx)
-        y = (row + 0.5 - float(camera.cy)) / float(camera.fy)
-        local = z[:, None] * np.stack([x, y, np.ones_like(x)], axis=1)
-        depths.append(z)
-        points.append(local @ pose[:3, :3].T + pose[:3, 3])
-    found = np.concatenate(depths)
-    if len(found) < 3:
+    local = [look.points(_VALUES, rng) for look in looks]
+    depths = np.concatenate([points[:, 2] for points in local])
+    if len(depths) < 3:
         raise FormatError(Path(source.name), "no picture shows anything whose depth is known")
-    return found, np.concatenate(points)
+    world = [
+        points @ look.pose[:3, :3].T + look.pose[:3, 3]
+        for points, look in zip(local, looks, strict=True)
+    ]
+    return depths, np.concatenate(world)
+
+
+def _check_depth(looks: list[Look], median: float) -> None:
+    """Refuses depth that no indoor camera measures, or that the poses contradict."""
+    if median > FAR:
+        raise ValueError(
+            f"the median depth is {median:.4g} m: is its unit right (millimeters are 0.001 of a "
+            "meter; in a transforms.json: depth_unit_scale_factor)? --trust-depth audits it all "
+            "the same"
+        )
+    check_agreement(looks)
 
 
 def _range(far: float, is_metric: bool, wanted: float | None) -> float:
     """How far pictures show things [capture units]."""
     if wanted is not None:
+        if wanted > _FARTHEST * far:
+            raise ValueError(
+                f"--max-range {wanted:g} is far beyond what the pictures show (95 % lies within "
+                f"{far:.3g}): everything would lie in a few voxels"
+            )
         return wanted
     if not is_metric:
         return 1.05 * far

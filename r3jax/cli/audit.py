@@ -62,6 +62,7 @@ def _wishes(options: Options) -> Wishes:
         folds=options.folds,
         num_views=options.views,
         seed=options.seed,
+        trust_depth=options.trust_depth,
     )
 
 

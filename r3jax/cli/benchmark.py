@@ -74,6 +74,7 @@ def _request(options: Benchmark) -> Request:
         backend=options.backend,
         lpips=options.lpips,
     )
+    conditions.exploration_config().check_scales()
     return Request(
         scenes=words(options.scenes),
         policies=words(options.policies),

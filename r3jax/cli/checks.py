@@ -194,6 +194,7 @@ def loop_of_options(options: Explore) -> ExplorationConfig:
     )
     if config.allow_growth and config.capacity < LEAST_CAPACITY:
         config = dataclasses.replace(config, capacity=LEAST_CAPACITY)
+    config.check_scales()
     return config
 
 

@@ -5,8 +5,8 @@ from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Export
 from r3jax.formats.errors import FormatError
 from r3jax.formats.exports import export_run
+from r3jax.trace import DEPTH_STEPS_PER_METRE
 from r3jax.trace.errors import RunError
-from r3jax.trace.images import DEPTH_STEPS_PER_METRE
 from r3jax.trace.reader import read_run
 
 

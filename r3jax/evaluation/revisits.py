@@ -45,7 +45,15 @@ def follow_recording(
 
     Yields:
         The report of a frame, and the map after it.
+
+    Raises:
+        ValueError: voxels that are no size, or larger than a fifth of the range.
     """
+    if voxel_size > 0.2 * max_range:
+        raise ValueError(
+            f"voxel_size must be at most a fifth of the range of {max_range:g} m, got "
+            f"{voxel_size:g}"
+        )
     score = jax.jit(renderability)
     state = empty_map(voxel_size=voxel_size)
     metres = 0.0

@@ -5,11 +5,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 from r3jax.forecast.goal import parse_goal
+from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 
 ClockName = Literal["wall", "model"]
 
 MAX_CAPACITY = 1 << 27
 """Rows of a map: 5 GB."""
+
+LARGEST_DEPTH = (BEYOND_RANGE - 1) / DEPTH_STEPS_PER_METRE
+"""What lies farther is recorded as beyond the range [m]."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,24 @@ class ExplorationConfig:
 
     until_every: int = 5
     """Views from one look at the forecast to the next; it takes most of a second."""
+
+    def check_scales(self) -> None:
+        """Refuses lengths that do not fit together; what was recorded with them is still read.
+
+        Raises:
+            ValueError: a range beyond what depth images can hold, or voxels so large that a map of
+                them tells nothing.
+        """
+        if self.max_range > LARGEST_DEPTH:
+            raise ValueError(
+                f"max_range must be at most {LARGEST_DEPTH:.1f} m, which a depth image can hold, "
+                f"got {self.max_range:g}"
+            )
+        if self.voxel_size > 0.2 * self.max_range:
+            raise ValueError(
+                f"voxel_size must be at most a fifth of the range of {self.max_range:g} m, got "
+                f"{self.voxel_size:g}"
+            )
 
     def __post_init__(self) -> None:
         """Refuses what cannot work."""

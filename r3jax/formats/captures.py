@@ -117,7 +117,7 @@ class PosedImages:
 
         Raises:
             FormatError: the image has distortion (undistort it first), there is no depth image,
-                or a file is missing, broken or of another size.
+                or a file is missing, broken, of another size, or of another unit of depth.
         """
         lens, path = self.lenses[index], self.image_paths[index]
         if not lens.is_pinhole:
@@ -126,14 +126,19 @@ class PosedImages:
                 f"the image is distorted ({lens.model}): undistort the capture first, for example "
                 "by COLMAP's image_undistorter",
             )
-        if self.depth_paths[index] is None:
+        depth_path = self.depth_paths[index]
+        if depth_path is None:
             raise FormatError(path, "there is no depth image that belongs to it")
-        return Frame(
-            rgb=jnp.asarray(self.rgb(index).astype(np.float32) / np.float32(255.0)),
-            depth=jnp.asarray(self.depth(index)),
-            T_world_camera=jnp.asarray(self.poses[index], dtype=jnp.float32),
-            camera=lens.camera,
-        )
+        rgb, depth = self.rgb(index), self.depth(index)
+        try:
+            return Frame(
+                rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
+                depth=jnp.asarray(depth),
+                T_world_camera=jnp.asarray(self.poses[index], dtype=jnp.float32),
+                camera=lens.camera,
+            )
+        except ValueError as error:
+            raise FormatError(depth_path, str(error)) from None
 
     def rgb(self, index: int) -> np.ndarray:
         """The pixels of one image as they are, distortion included, [H, W, 3] uint8.

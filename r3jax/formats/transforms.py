@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from r3jax.files import write_atomic
-from r3jax.trace.images import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
+from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow
 

@@ -165,6 +165,7 @@ class HabitatSimulator:
             depth=jnp.asarray(depth),
             T_world_camera=jnp.asarray(T.astype(np.float32)),
             camera=self._camera,
+            far=True,
         )
 
     def _observe(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

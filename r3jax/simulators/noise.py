@@ -71,6 +71,7 @@ class NoisySimulator:
             depth=jnp.asarray(noisy),
             T_world_camera=frame.T_world_camera,
             camera=frame.camera,
+            far=True,
         )
 
     def _generator(self, frame: Frame) -> np.random.Generator:

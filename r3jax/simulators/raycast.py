@@ -165,6 +165,7 @@ class RaycastSimulator:
             depth=jnp.asarray(depth),
             T_world_camera=jnp.asarray(T.astype(np.float32)),
             camera=self._camera,
+            far=True,
         )
 
     @functools.cached_property

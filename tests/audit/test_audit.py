@@ -298,11 +298,20 @@ def test_a_capture_of_a_rooms_size_stays_as_it_is_and_others_are_scaled(depth, r
     assert survey.length(survey.voxel_size) >= 0.01 * range_in_metres
 
 
+def test_a_median_depth_that_no_room_has_is_refused_unless_it_is_meant():
+    millimeters = one_picture(np.full((36, 48), 2000.0, np.float32))
+    with pytest.raises(ValueError, match=r"median depth is 2000 m: is its unit right"):
+        survey_of(millimeters, Wishes())
+    assert survey_of(millimeters, Wishes(up="-y", trust_depth=True)).median_depth == 2000.0
+
+
 @pytest.mark.parametrize(
     ("wishes", "message"),
     [
         ({"voxel_size": 0.0}, "--voxel-size must be positive"),
         ({"max_range": float("nan")}, "--max-range must be positive"),
+        ({"max_range": 5000.0}, "--max-range 5000 is far beyond what the pictures show"),
+        ({"voxel_size": 5.0}, "larger than a fifth of the range"),
         ({"num_views": -1}, "--views must be at least 0"),
         ({"num_views": 10**9}, "--views must be at most"),
         ({"folds": 1}, "--folds must be at least 2"),

@@ -165,3 +165,16 @@ def test_the_name_of_a_capture_is_that_of_its_folder(captures):
     assert open_capture(captures / "nerfstudio" / "transforms.json").name == "nerfstudio"
     assert open_capture(captures / "colmap").name == "colmap"
     assert open_capture(captures / "colmap").models.parts == ("runs", "colmap", "models")
+
+
+def test_a_wrong_unit_of_depth_ends_in_one_line_and_no_folder(captures, tmp_path, capsys):
+    write_nerfstudio(tmp_path / "capture", round_poses(), depth=True)
+    path = tmp_path / "capture" / "transforms.json"
+    content = json.loads(path.read_text())
+    content["depth_unit_scale_factor"] = 5 * content.get("depth_unit_scale_factor", 0.001)
+    path.write_text(json.dumps(content))
+    assert audit(path, tmp_path / "out") == 2
+    said = capsys.readouterr().err
+    assert "the depth images contradict the poses" in said
+    assert "multiplied by 0.2" in said
+    assert not (tmp_path / "out").exists()

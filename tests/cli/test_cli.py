@@ -101,6 +101,8 @@ def test_info_follows_a_recording(shared, tmp_path, capsys):
         (["--budget", "minutes:5"], ["minutes:5", "views:100"]),
         (["--resolution", "3"], ["--resolution"]),
         (["--voxel-size", "-1"], ["voxel_size must be positive"]),
+        (["--voxel-size", "5"], ["voxel_size must be at most a fifth of the range of 5 m"]),
+        (["--max-range", "5000"], ["max_range must be at most 13.1 m"]),
         (["--capacity", "1000"], ["power of two"]),
         (["--scene", "mesh:/nowhere/house.glb"], ["/nowhere/house.glb"]),
         (["--scene", "mesh:"], ["mesh:"]),

@@ -20,9 +20,10 @@ from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 from r3jax.trace.checkpoints import map_tables
 from r3jax.trace.header import camera_fields
-from r3jax.trace.images import BEYOND_RANGE, DEPTH_STEPS_PER_METRE, frame_hash, stored_form
+from r3jax.trace.images import frame_hash, stored_form
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.box_room import write_room

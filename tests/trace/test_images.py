@@ -9,9 +9,9 @@ from hypothesis.extra import numpy as hnp
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.trace import BEYOND_RANGE
 from r3jax.trace.errors import RunError
 from r3jax.trace.images import (
-    BEYOND_RANGE,
     content_hash,
     encode_png,
     from_integers,

@@ -42,5 +42,8 @@ class Audit:
     folds: int = 8
     """Own frames are judged by a map without every N-th picture, themselves among them."""
 
+    trust_depth: bool = False
+    """Take the depth images as they are, even if they contradict the poses or each other."""
+
     seed: int = 0
     """Of the random views that the suggested ones are compared with."""
