@@ -97,7 +97,7 @@ def open_viewer(options: View, run: Run, console: Console) -> Generator[Viewer]:
     from r3jax.viewer.story import RecordedStory
     from r3jax.viewer.surface import Sources
 
-    server = open_server(options.host, options.port)
+    server = open_server(options.host, options.port, options.allow)
     try:
         if options.host not in LOOPBACK:
             text = f"everybody who can reach {options.host} sees the page, and can use it"

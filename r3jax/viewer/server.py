@@ -1,11 +1,26 @@
-"""The web server of the viewer: on this machine only, unless told otherwise."""
+"""The web server of the viewer: on this machine only, for its own page only, unless told otherwise.
+
+A browser lets any web page open a websocket to any address, this machine's too; and a page may
+give its own name this machine's address (DNS rebinding). So every request says two things that are
+looked at: under which name it was sent (Host), and which page sent it (Origin).
+"""
 
 import contextlib
 import errno
+import http
+import http.client
 import io
+import ipaddress
 import socket
+import threading
+from collections.abc import Callable, Collection, Generator
+from typing import Any
+from urllib.parse import urlsplit
 
 import viser
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 """Addresses that no other machine can reach."""
@@ -20,12 +35,14 @@ class _PrivateServer(viser.ViserServer):
         return None
 
 
-def open_server(host: str, port: int) -> viser.ViserServer:
+def open_server(host: str, port: int, allow: Collection[str] = ()) -> viser.ViserServer:
     """Starts a server with an empty page.
 
     Args:
         host: the address to listen at; nobody else can reach what listens at 127.0.0.1.
         port: 0 takes any free one.
+        allow: names of machines under which the page may be asked for, and whose pages may use it,
+            beside this machine's own.
 
     Raises:
         ValueError: no number of a port.
@@ -34,12 +51,107 @@ def open_server(host: str, port: int) -> viser.ViserServer:
     if not 0 <= port <= 65535:
         raise ValueError(f"--port must lie between 0 and 65535, got {port}")
     _check_free(host, port)
-    with contextlib.redirect_stdout(io.StringIO()):  # it would print a box of its own
+    # It would print a box of its own.
+    with contextlib.redirect_stdout(io.StringIO()), _guarded(_Guard(host, allow)):
         server = _PrivateServer(host=host, port=port, label="r3jax", verbose=False)
     if port not in (0, server.get_port()):  # taken meanwhile: it has gone on to the next one
         close_server(server)
         raise OSError(_in_use(host, port))
+    if _answer(server, f"{_STRANGER}:1") != http.HTTPStatus.FORBIDDEN:
+        close_server(server)
+        raise OSError("this version of viser lets any web page in: another one is needed")
     return server
+
+
+_STRANGER = "stranger.invalid"
+
+_Hook = Callable[[ServerConnection, Request], Any]
+
+
+class _Guard:
+    """Which requests are answered."""
+
+    def __init__(self, host: str, allow: Collection[str]):
+        """Takes the address to listen at, and the names that are let in beside it."""
+        self._is_open = host not in LOOPBACK
+        own = (host, socket.gethostname(), f"{socket.gethostname()}.local") if self._is_open else ()
+        self._allowed = {_bare(name) for name in allow}
+        self._names = self._allowed | {_bare(name) for name in (*own, *LOOPBACK)}
+
+    def refusal(self, request: Request) -> str | None:
+        """Why a request is not answered, or None."""
+        hosts = request.headers.get_all("Host")
+        origins = request.headers.get_all("Origin")
+        if len(hosts) != 1 or len(origins) > 1:
+            return "one Host and at most one Origin"
+        name = _name(f"http://{hosts[0]}")
+        # Who listens for others is asked by its address too, and no page can own an address.
+        if name not in self._names and not (self._is_open and _is_address(name)):
+            return f"not served as {name!r}: r3jax view --allow {name}"
+        if not origins or urlsplit(origins[0]).netloc.lower() == hosts[0].lower():
+            return None
+        page = _name(origins[0])
+        return None if page in self._allowed else f"pages of {page!r} may not: --allow {page}"
+
+    def hook(self, answer: _Hook | None) -> _Hook:
+        """Asked before every answer, of pages and of websockets."""
+
+        def process(connection: ServerConnection, request: Request) -> Response | None:
+            reason = self.refusal(request)
+            if reason is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"refused: {reason}\n")
+            return None if answer is None else answer(connection, request)
+
+        return process
+
+
+def _bare(name: str) -> str:
+    return name.strip("[]").rstrip(".").lower()
+
+
+def _name(url: str) -> str:
+    """The machine of an address, without its port; empty if there is none."""
+    try:
+        return _bare(urlsplit(url).hostname or "")
+    except ValueError:
+        return ""
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+_PATCHING = threading.Lock()
+
+
+@contextlib.contextmanager
+def _guarded(guard: _Guard) -> Generator[None]:
+    """Viser asks nobody whom to serve: what it serves with asks, while it starts."""
+    serve = websockets.asyncio.server.serve
+
+    def serve_guarded(*args: Any, process_request: _Hook | None = None, **options: Any) -> Any:
+        return serve(*args, process_request=guard.hook(process_request), **options)
+
+    with _PATCHING:
+        websockets.asyncio.server.serve = serve_guarded
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = serve
+
+
+def _answer(server: viser.ViserServer, host: str) -> int:
+    """The status of the page when it is asked for under a name."""
+    connection = http.client.HTTPConnection(_reachable(server), server.get_port(), timeout=10.0)
+    try:
+        connection.request("GET", "/", headers={"Host": host})
+        return connection.getresponse().status
+    finally:
+        connection.close()
 
 
 def close_server(server: viser.ViserServer) -> None:
@@ -74,7 +186,10 @@ def _in_use(host: str, port: int) -> str:
 
 def url_of(server: viser.ViserServer) -> str:
     """Where a browser on this machine finds the page."""
-    host = server.get_host()
-    if host in ("0.0.0.0", "::"):
-        host = "127.0.0.1"
+    host = _reachable(server)
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
+
+
+def _reachable(server: viser.ViserServer) -> str:
+    """An address of this machine that the server listens at."""
+    return {"0.0.0.0": "127.0.0.1", "::": "127.0.0.1"}.get(server.get_host(), server.get_host())

@@ -1,5 +1,6 @@
 """Who can reach the page, and what is said when nobody can."""
 
+import http.client
 import socket
 import urllib.request
 from pathlib import Path
@@ -41,6 +42,68 @@ def test_only_this_machine_can_reach_it(server):
     for address in addresses_of_this_machine():
         with pytest.raises(OSError, match="refused"):
             socket.create_connection((address, server.get_port()), timeout=10)
+
+
+def ask(server, upgrade=False, **headers) -> int:
+    """Status of the answer to a page (200 where it is served) or to a websocket (101)."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=30)
+    port = server.get_port()
+    fields = {"Host": f"127.0.0.1:{port}"} if "Host" not in headers else {}
+    fields |= {name: value.format(port=port) for name, value in headers.items()}
+    if upgrade:
+        fields |= {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+        fields |= {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="}
+    connection.putrequest("GET", "/", skip_host=True)
+    for name, value in fields.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+FOREIGN = {
+    "another page": {"Origin": "http://evil.example"},
+    "another page of this machine": {"Origin": "http://127.0.0.1:1"},
+    "a page of nobody": {"Origin": "null"},
+    "another name": {"Host": "evil.example"},
+    "another name and its page": {
+        "Host": "evil.example:{port}",
+        "Origin": "http://evil.example:{port}",
+    },
+    "an address of another": {"Host": "192.0.2.1:{port}"},
+    "nonsense": {"Host": "[:::{port}"},
+}
+OWN = {
+    "no browser": {},
+    "its own page": {"Origin": "http://127.0.0.1:{port}"},
+    "a tunnel": {"Host": "localhost:9000", "Origin": "http://localhost:9000"},
+    "the other loopback": {"Host": "[::1]:{port}", "Origin": "http://[::1]:{port}"},
+}
+
+
+@pytest.mark.parametrize("headers", FOREIGN.values(), ids=FOREIGN)
+def test_other_web_pages_are_refused(server, headers):
+    assert ask(server, **headers) == 403
+    assert ask(server, upgrade=True, **headers) == 403
+
+
+@pytest.mark.parametrize("headers", OWN.values(), ids=OWN)
+def test_its_own_page_is_served(server, headers):
+    assert ask(server, **headers) == 200
+    assert ask(server, upgrade=True, **headers) == 101
+
+
+def test_an_open_server_answers_to_addresses_and_to_the_names_that_are_allowed():
+    server = open_server("0.0.0.0", 0, allow=("proxy.example",))
+    try:
+        assert ask(server, Host="192.0.2.1:{port}", Origin="http://192.0.2.1:{port}") == 200
+        assert ask(server, Host="proxy.example", Origin="https://proxy.example") == 200
+        assert ask(server, upgrade=True, Origin="https://proxy.example") == 101
+        assert ask(server, Host="evil.example") == 403
+        assert ask(server, upgrade=True, Origin="http://evil.example") == 403
+    finally:
+        close_server(server)
 
 
 def test_no_tunnel_is_opened_whoever_asks(server):

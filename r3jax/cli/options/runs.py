@@ -95,6 +95,10 @@ class View:
     """Address to listen at. By default nobody but this machine can see the page; 0.0.0.0 shows it
     to everybody who can reach the machine."""
 
+    allow: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
+    """Names under which the page may be asked for, and whose web pages may use it, beside this
+    machine's own: of a proxy, or of a name server's."""
+
     name: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
     """Name of the trained model, as given to `r3jax train`; by default `last` or the newest."""
 
