@@ -61,13 +61,13 @@ class Frame(eqx.Module):
             checked where they are known (outside jit).
     """
 
-    rgb: Float[Array, "H W 3"] = eqx.field(converter=_as_image)
+    rgb: Float[Array, "H W 3"]
     """Colour in [0, 1]."""
 
-    depth: Float[Array, "H W"] = eqx.field(converter=_as_image)
+    depth: Float[Array, "H W"]
     """z-depth [m]. 0: no measurement. inf: nothing within the sensor's range."""
 
-    T_world_camera: Float[Array, "4 4"] = eqx.field(converter=_as_pose)
+    T_world_camera: Float[Array, "4 4"]
     """Camera-to-world pose; OpenCV axes, world z up [m]."""
 
     camera: Camera
@@ -83,8 +83,8 @@ class Frame(eqx.Module):
         far: bool = False,
     ):
         """Takes the fields, and whether a median depth of more than 50 m is meant (`far`)."""
-        self.rgb, self.depth, self.T_world_camera = rgb, depth, T_world_camera
-        self.camera = camera
+        self.rgb, self.depth = _as_image(rgb), _as_image(depth)
+        self.T_world_camera, self.camera = _as_pose(T_world_camera), camera
         if not far:
             _refuse_far(depth)
 

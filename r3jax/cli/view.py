@@ -2,6 +2,8 @@
 
 import contextlib
 import functools
+import os
+import sys
 import threading
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
@@ -63,6 +65,7 @@ def run_view(options: View) -> int:
             console.say("Ctrl-C ends it")
             with contextlib.suppress(KeyboardInterrupt):
                 until_interrupted()
+            end_at_once()
     except (RunError, FormatError, ValueError, OSError, ImportError) as error:
         raise UserError(one_line(error)) from error
     return 0
@@ -71,6 +74,17 @@ def run_view(options: View) -> int:
 def until_interrupted() -> None:
     """Waits for Ctrl-C."""
     threading.Event().wait()
+
+
+def end_at_once() -> None:
+    """Ends the process: the page writes nothing, and what it works on may take half a minute yet.
+
+    An answer that is being worked out or compiled cannot be stopped, and Python would wait for it,
+    as viser does for its browsers.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,12 @@
 """`r3jax view` and `explore --live`, as a user meets them."""
 
+import os
 import shutil
+import signal
 import socket
+import subprocess
 import sys
+import time
 
 import pytest
 
@@ -120,7 +124,32 @@ def test_a_page_is_shown_until_it_is_interrupted(path, capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(view, "until_interrupted", interrupt)
+    monkeypatch.setattr(view, "end_at_once", lambda: None)
     assert main(["view", str(path), "--port", "0"]) == 0
     shown = capsys.readouterr()
     assert "view      http://127.0.0.1:" in shown.err
     assert shown.out == ""
+
+
+def test_ctrl_c_ends_the_page_while_it_works_out_its_first_answer(path, tmp_path):
+    """For which it has to compile: half a minute that Ctrl-C used to wait for."""
+    pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
+    environment = {
+        **os.environ,
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
+        "PYTHONUNBUFFERED": "1",
+    }
+    words = [sys.executable, "-c", "from r3jax.cli.main import main; raise SystemExit(main())"]
+    words += ["view", str(path), "--port", "0", "--no-scene"]
+    with subprocess.Popen(words, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            while "Ctrl-C ends it" not in (line := process.stderr.readline()):
+                assert line, "the page has not been shown"
+            begun = time.monotonic()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=60) == 0
+            assert time.monotonic() - begun < 2.0
+            assert "Traceback" not in process.stderr.read()
+        finally:
+            process.kill()
