@@ -18,7 +18,7 @@ from r3jax.files import write_atomic
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.fields import check_fields
 from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.json_text import parse_json, sealed, unsealed
 from r3jax.foreign.versions import VersionError, check_version
 from r3jax.trace.header import package_versions, plain_settings
 from r3jax.trace.rows import StepRow
@@ -148,7 +148,7 @@ def write_record(path: Path, record: dict[str, Any]) -> None:
     Raises:
         OSError: the disk is full, not writable, ...
     """
-    line = json.dumps(record, allow_nan=False, separators=(",", ":"))
+    line = json.dumps(sealed(record), allow_nan=False, separators=(",", ":"))
     write_atomic(path, line.encode() + b"\n")
 
 
@@ -184,6 +184,7 @@ def _read_record(path: Path) -> dict[str, Any]:
         record = parse_json(read_bytes(path, _MAX_BYTES))
         if isinstance(record, dict):
             check_version(record.get("format"), FORMAT)
+            record = unsealed(record)
         check_fields("record", record, _KINDS)
         for name, kinds in _PARTS.items():
             check_fields(name, record[name], kinds)

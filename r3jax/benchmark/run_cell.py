@@ -6,9 +6,9 @@ goes on behind the last complete stage (a training behind its last checkpoint).
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import json
-import shutil
 import time
 import traceback
 from collections.abc import Callable, Generator
@@ -30,6 +30,8 @@ from r3jax.files import lock_folder, write_atomic
 from r3jax.scenes.registry import open_scene, scene_hash
 from r3jax.scoring.renderability import renderability
 from r3jax.splatting import train
+from r3jax.splatting.checkpoints import remove_checkpoints
+from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import load_views
@@ -194,9 +196,10 @@ def _begin_or_resume(path: Path, header: RunHeader) -> tuple[RunWriter, Run | No
             return RunWriter.resume(path)
         except RunError as error:  # of another version, damaged, not ours to write
             raise CellError(f"{error}; move it away to explore anew") from None
-    if path.exists():
-        shutil.rmtree(path)  # killed before the header was whole: nothing was recorded
-    return RunWriter(path, header), None
+    try:
+        return RunWriter(path, header), None
+    except RunError as error:  # somebody else's folder
+        raise CellError(str(error)) from None
 
 
 def steps_within(run: Run, snapshot: str) -> tuple[StepRow, ...]:
@@ -246,7 +249,8 @@ def _do_snapshot(
     outcome = run.end.outcome if len(steps) == len(run.rows) else StopReason.BUDGET.value
     record = make_record(root, cell, snapshot, steps, outcome, judgment.rows)
     write_record(paths.record(snapshot), record)
-    shutil.rmtree(paths.checkpoints(snapshot))  # the model is kept, the optimizer's state is not
+    # The model is kept, the optimizer's state is not.
+    remove_checkpoints(paths.checkpoints(snapshot))
 
 
 def _train(
@@ -258,17 +262,20 @@ def _train(
     views = load_views(frames, cell.conditions.train_resolution)
     config = cell.conditions.train_config(cell.seed)
     folder = paths.checkpoints(snapshot)
-    is_begun = any(path.name.isdigit() for path in folder.glob("*"))
-    result = train.fit(
+    fit = functools.partial(
+        train.fit,
         views,
         config,
         folder=folder,
-        resume=is_begun,
         checkpoint_every=max(1, min(1000, config.iterations // 5)),
         on_progress=lambda progress: on_stage(
             f"training, step {progress.step}/{progress.iterations}"
         ),
     )
+    try:
+        result = fit(resume=True)
+    except CheckpointError:  # nothing there yet, or all of it is damaged
+        result = fit(overwrite=True)
     if result.interrupted:
         raise KeyboardInterrupt
     paths.model(snapshot).parent.mkdir(parents=True, exist_ok=True)

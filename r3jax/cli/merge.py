@@ -56,6 +56,7 @@ def merge_runs(runs: list[Run], out: Path, *, overwrite: bool = False) -> MapSta
     Raises:
         RunError: the runs do not fit together, cannot be read, or `out` cannot be written.
     """
+    _check_apart(runs)
     for run in runs[1:]:
         check_alike(runs[0], run)
         if run.header.camera != runs[0].header.camera:
@@ -80,6 +81,17 @@ def merge_runs(runs: list[Run], out: Path, *, overwrite: bool = False) -> MapSta
     write_points(points, *voxel_points(map_state))
     write_transforms(merged, points.relative_to(out).as_posix())
     return map_state
+
+
+def _check_apart(runs: list[Run]) -> None:
+    """Refuses views that would count twice.
+
+    Raises:
+        RunError: a run is given twice, under whatever path.
+    """
+    for number, run in enumerate(runs):
+        if any(run.path.samefile(other.path) for other in runs[:number]):
+            raise RunError(run.path, "a run is not merged with itself: give two different runs")
 
 
 def _header(runs: list[Run]) -> RunHeader:

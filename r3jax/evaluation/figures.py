@@ -187,8 +187,8 @@ def strip_figure(run: Run, count: int = 12) -> Figure:
     for axes in grid.flat:
         style.blank(axes)
     for axes, step in zip(grid.flat, steps, strict=False):
-        with Image.open(run.image_path(int(step))) as image:
-            image.thumbnail((256, 256))
-            axes.imshow(np.asarray(image))
+        image = Image.fromarray(run.images(int(step))[0])
+        image.thumbnail((256, 256))
+        axes.imshow(np.asarray(image))
         axes.set_title(f"view {step + 1}", fontsize=8, color=style.MUTED, loc="left", pad=2)
     return figure

@@ -13,8 +13,6 @@ Shape symbols: P positions; V views.
 import functools
 import hashlib
 import json
-import os
-import uuid
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -303,10 +301,7 @@ def _write(path: Path, view_set: ViewSet) -> None:
         "hash": view_set.hash,
     }
     text = json.dumps(head)[:-1] + ',\n"views": [\n' + ",\n".join(lines) + "\n]}\n"
-    # A name of its own: two processes that write the same set must not share a temporary file.
-    own = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-    write_atomic(own, text.encode())
-    os.replace(own, path)
+    write_atomic(path, text.encode())
 
 
 def _from_record(record: dict[str, Any]) -> ViewSet:

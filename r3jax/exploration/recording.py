@@ -26,8 +26,10 @@ def record_end(recorder: RunWriter, state: LoopState, stop: Stop) -> Stop:
     try:
         if state.views > 0:
             recorder.checkpoint(state.views - 1, state_tables(state), wait=True)
+    except RecordingStopped as error:  # the frames stay, and the map can be made of them again
+        stop = Stop(stop.reason, f"{stop.message}; the last map is not stored ({error.reason})")
+    try:
         recorder.finish(stop.reason.value, stop.message)
     except RecordingStopped as error:
-        unsaid = f"{stop.message}; the end could not be recorded ({error.reason})"
-        return Stop(stop.reason, unsaid)
+        return Stop(stop.reason, f"{stop.message}; the end is not recorded ({error.reason})")
     return stop

@@ -1,10 +1,13 @@
 """JSON without what Python's reader lets through: NaN, doubled keys, endless nesting."""
 
+import hashlib
 import json
 import math
 from typing import Any
 
 from r3jax.foreign.errors import ForeignFileError
+
+_SEAL = "seal"
 
 _LARGEST_WHOLE = 1 << 63
 """Whole numbers beyond this fit in no array and no float."""
@@ -62,3 +65,30 @@ def _whole(word: str) -> int:
     if len(word) > 20 or abs(int(word)) >= _LARGEST_WHOLE:
         raise ForeignFileError(f"the number {word[:40]} is too large")
     return int(word)
+
+
+def sealed(plain: dict[str, Any]) -> dict[str, Any]:
+    """A JSON object with a seal, a hash of all that it says: its last field."""
+    return {**plain, _SEAL: _seal_of(plain)}
+
+
+def unsealed(plain: dict[str, Any]) -> dict[str, Any]:
+    """A JSON object without its seal; one that was never sealed as it is.
+
+    Raises:
+        ForeignFileError: the seal is not that of the rest.
+    """
+    if _SEAL not in plain:
+        return plain
+    rest = {name: value for name, value in plain.items() if name != _SEAL}
+    if plain[_SEAL] != _seal_of(rest):
+        raise ForeignFileError(
+            f"it was damaged or changed: its `{_SEAL}` is of another content (who changes it by "
+            "hand must take that field out)"
+        )
+    return rest
+
+
+def _seal_of(plain: dict[str, Any]) -> str:
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()

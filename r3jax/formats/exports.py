@@ -44,8 +44,8 @@ def export_run(run: Run, out: Path, kind: Format) -> int:
 
     Raises:
         FormatError: the run has no views, `out` holds something, or is no name of a folder.
-        RunError: the stored map cannot be read.
-        OSError: an image is missing, or the disk is full, not writable, ...
+        RunError: the stored map or an image cannot be read, or is not what was recorded.
+        OSError: the disk is full, not writable, ...
     """
     if not run.rows:
         raise FormatError(run.path, "the run has no views yet: there is nothing to export")
@@ -77,6 +77,7 @@ def _fill(out: Path, run: Run, kind: Format, xyz: np.ndarray, rgb: np.ndarray) -
     for name in ("images", "depth"):
         (out / name).mkdir()
     for row in run.rows:
+        run.images(row.step)  # says what is wrong with them
         image = run.image_path(row.step)
         shutil.copyfile(image, out / "images" / image.name)
         shutil.copyfile(run.depth_path(row.step), out / "depth" / image.name)

@@ -2,18 +2,19 @@
 
 import hashlib
 import json
-import shutil
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from r3jax.checkpoints import discard, make_folder, numbered, read_arrays, write_checkpoint
 from r3jax.files import lock_folder, write_atomic
 from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.files import check_tree, read_bytes
+from r3jax.foreign.files import read_bytes
 from r3jax.foreign.json_text import parse_json
 from r3jax.foreign.versions import check_version
 from r3jax.splatting.errors import CheckpointError
@@ -71,13 +72,14 @@ def only_training(folder: Path, *, is_new: bool) -> Generator[None]:
     """
     if is_new:
         folder.mkdir(parents=True, exist_ok=True)
-    else:
-        _newest(folder)  # nothing is written into a folder that holds no training
+    elif not numbered(folder):  # nothing is written into a folder that holds no training
+        raise CheckpointError(folder, "there is no checkpoint to resume from")
     try:
         lock = lock_folder(folder)
     except BlockingIOError:
         raise CheckpointError(folder, "another process is training here") from None
     with lock:
+        make_folder(folder)
         yield
 
 
@@ -88,15 +90,15 @@ def begin_checkpoints(folder: Path, settings: dict[str, Any], *, overwrite: bool
         CheckpointError: there is a training already.
         OSError: the disk is full, not writable, ...
     """
-    older = _checkpoints(folder)
+    older = numbered(folder)
     if older and not overwrite:
         raise CheckpointError(
             folder,
             "a training was stored here already: resume it, overwrite it, or choose another folder",
         )
     for old in older:
-        shutil.rmtree(old)
-    folder.mkdir(parents=True, exist_ok=True)
+        discard(old)
+    make_folder(folder)
     write_atomic(folder / _SETTINGS, json.dumps(settings, indent=1).encode())
 
 
@@ -106,25 +108,30 @@ def save_checkpoint(folder: Path, state: TrainState) -> None:
     Raises:
         OSError: the disk is full, not writable, ...
     """
-    import orbax.checkpoint as ocp
-
-    with ocp.StandardCheckpointer() as checkpointer:
-        # Orbax writes under a temporary name and renames: a checkpoint is whole or absent.
-        checkpointer.save((folder / f"{int(state.step):07d}").resolve(), state, force=True)
-        checkpointer.wait_until_finished()
-    for old in _checkpoints(folder)[:-KEPT]:
-        shutil.rmtree(old)
+    tables = {"state": {name: np.asarray(leaf) for name, leaf in _named(state).items()}}
+    write_checkpoint(folder / f"{int(state.step):07d}", tables)
+    for old in numbered(folder)[:-KEPT]:
+        discard(old)
 
 
-def _checkpoints(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.glob("[0-9]*") if p.is_dir() and p.name.isdigit())
+def remove_checkpoints(folder: Path) -> None:
+    """Deletes a training's checkpoints, and the folder if it holds nothing else.
+
+    Raises:
+        OSError: a checkpoint cannot be deleted.
+    """
+    for old in numbered(folder):
+        discard(old)
+    for name in (_SETTINGS, "lock"):
+        (folder / name).unlink(missing_ok=True)
+    with suppress(OSError):  # something of the user's is there
+        folder.rmdir()
 
 
-def _newest(folder: Path) -> Path:
-    found = _checkpoints(folder)
-    if not found:
-        raise CheckpointError(folder, "there is no checkpoint to resume from")
-    return found[-1]
+def _named(state: Any) -> dict[str, Any]:
+    """The arrays of a state (or of nested tables) by their names, such as `scene.means`."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
 def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) -> TrainState:
@@ -135,40 +142,43 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) ->
         settings: of the training that is to go on; see `settings_record`.
         like: a state of the same shapes; its values are not used.
 
+    Returns:
+        The newest one that is whole: a damaged one costs the steps since the one before.
+
     Raises:
         CheckpointError: there is none, it belongs to other settings (the message names them), or
-            it cannot be read.
+            none can be read.
     """
-    import orbax.checkpoint as ocp
-
-    newest = _newest(folder)
     _check_settings(folder, settings)
-    sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    to_shape: Callable[[jax.Array], jax.ShapeDtypeStruct] = lambda x: jax.ShapeDtypeStruct(
-        x.shape, x.dtype, sharding=sharding
-    )
-    try:
-        check_tree(newest)
-        with ocp.StandardCheckpointer() as checkpointer:
-            state = checkpointer.restore(newest.resolve(), jax.tree.map(to_shape, like))
-        _check_state(state, like)
-    except Exception as error:  # whatever a damaged file makes Orbax's storage raise
-        raise CheckpointError(
-            newest, f"cannot be read ({error!s:.500}); delete it to fall back on the one before"
-        ) from None
-    return state
+    failure = CheckpointError(folder, "there is no checkpoint to resume from")
+    for path in reversed(numbered(folder)):
+        try:
+            return _state_of(read_arrays(path), like)
+        except (OSError, ForeignFileError) as error:
+            failure = CheckpointError(
+                path, f"cannot be read ({error}), nor any before it: overwrite it to begin anew"
+            )
+    raise failure
 
 
-def _check_state(state: TrainState, like: TrainState) -> None:
-    """Refuses a state of other shapes, and numbers that no training would have gone on with."""
-    for (path, leaf), wanted in zip(
-        jax.tree_util.tree_leaves_with_path(state), jax.tree.leaves(like), strict=True
-    ):
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
-        if leaf.shape != wanted.shape or leaf.dtype != wanted.dtype:
-            raise ForeignFileError(f"{name} is {leaf.dtype}{leaf.shape}, not {wanted.shape}")
+def _state_of(stored: dict[str, Any], like: TrainState) -> TrainState:
+    """A state from its arrays. Earlier versions of this package nested them, by field.
+
+    Raises:
+        ForeignFileError: arrays that are missing or of another shape, and numbers that no
+            training would have gone on with.
+    """
+    arrays = {name.removeprefix("state."): x for name, x in _named(stored).items()}
+    leaves: list[jax.Array] = []
+    for name, wanted in _named(like).items():
+        leaf = arrays.get(name)
+        if leaf is None or leaf.shape != wanted.shape or leaf.dtype != wanted.dtype:
+            found = "missing" if leaf is None else f"{leaf.dtype}{leaf.shape}"
+            raise ForeignFileError(f"{name} is {found}, not {wanted.dtype}{wanted.shape}")
         if not np.isfinite(leaf).all():
             raise ForeignFileError(f"{name} has numbers that are not finite")
+        leaves.append(jnp.array(leaf))  # a copy: training gives its buffers away
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
 def _check_settings(folder: Path, settings: dict[str, Any]) -> None:

@@ -7,7 +7,6 @@ package hold `map` and `grid` only.
 
 import contextlib
 import json
-import shutil
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -16,18 +15,21 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.foreign.files import check_tree
+from r3jax.checkpoints import (
+    Tables,
+    discard,
+    make_folder,
+    numbered,
+    read_arrays,
+    write_checkpoint,
+)
+from r3jax.foreign.errors import ForeignFileError
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
 
 KEPT = 3
 """Older checkpoints are deleted."""
-
-Tables = Mapping[str, Mapping[str, np.ndarray]]
-"""Named arrays, by table."""
-
-_DISCARDED = ".discarded-"
 
 
 class CheckpointWriter:
@@ -37,13 +39,10 @@ class CheckpointWriter:
         """Makes the folder and clears away what a killed process left behind.
 
         Raises:
-            OSError: the folder cannot be made.
+            OSError: the folder is a link, or cannot be made.
         """
+        make_folder(folder)
         self._folder = folder.resolve()
-        self._folder.mkdir(parents=True, exist_ok=True)
-        for entry in self._folder.iterdir():
-            if not entry.name.isdigit():
-                shutil.rmtree(entry, ignore_errors=True)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._under_way: Future[None] | None = None
 
@@ -85,19 +84,9 @@ class CheckpointWriter:
 
     def _write(self, step: int, tree: dict[str, dict[str, np.ndarray]]) -> None:
         """In the thread: writes one and discards all but the newest three."""
-        import orbax.checkpoint as ocp
-
-        try:
-            with ocp.PyTreeCheckpointer() as checkpointer:
-                # Orbax writes under a temporary name and renames.
-                checkpointer.save(self._folder / f"{step:06d}", tree, force=True)
-        except (ValueError, RuntimeError) as error:  # how Orbax's storage reports a full disk
-            raise OSError(f"the checkpoint of view {step} failed: {error}") from error
-        for old in checkpoint_steps(self._folder)[:-KEPT]:
-            # Out of sight first: a checkpoint that is half deleted must not look like one.
-            discarded = self._folder / f"{_DISCARDED}{old:06d}"
-            (self._folder / f"{old:06d}").rename(discarded)
-            shutil.rmtree(discarded, ignore_errors=True)
+        write_checkpoint(self._folder / f"{step:06d}", tree)
+        for old in numbered(self._folder)[:-KEPT]:
+            discard(old)
 
     def close(self) -> None:
         """Waits and ends the thread. What `wait` would say of the last one is lost."""
@@ -108,30 +97,24 @@ class CheckpointWriter:
 
 def checkpoint_steps(folder: Path) -> list[int]:
     """The views after which a state is stored, oldest first."""
-    found = folder.glob("[0-9]*")
-    return sorted(int(p.name) for p in found if p.is_dir() and p.name.isdigit())
+    return [int(path.name) for path in numbered(folder)]
 
 
 def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]:
     """The tables that were stored after view `step`.
 
     Raises:
-        RunError: it is not there, or it cannot be read.
+        RunError: it is not there, damaged, or it cannot be read.
     """
-    import jax
-    import orbax.checkpoint as ocp
-
-    path = (folder / f"{step:06d}").resolve()
+    path = folder / f"{step:06d}"
     try:
-        check_tree(path)
-        with ocp.PyTreeCheckpointer() as checkpointer:
-            tree = checkpointer.metadata(path).item_metadata.tree
-            # NumPy: device arrays would cut 64-bit numbers short.
-            as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
-            tables = checkpointer.restore(path, args=ocp.args.PyTreeRestore(restore_args=as_numpy))
-    except Exception as error:  # whatever a damaged file makes Orbax's storage raise
-        raise RunError(path, f"the checkpoint cannot be read ({error})") from None
-    if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
+        tables = read_arrays(path)
+    except (OSError, ForeignFileError) as error:
+        raise RunError(
+            path,
+            f"the checkpoint cannot be read ({error}); resuming the run makes it anew",
+        ) from None
+    if not all(isinstance(table, dict) for table in tables.values()):
         raise RunError(path, "the checkpoint does not hold tables of arrays")
     return {name: _stored(table) for name, table in tables.items()}
 

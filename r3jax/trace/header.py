@@ -15,7 +15,7 @@ from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.fields import build, check_type
 from r3jax.foreign.files import read_bytes
 from r3jax.foreign.images import MAX_PIXELS
-from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.json_text import parse_json, sealed, unsealed
 from r3jax.foreign.names import check_relative
 from r3jax.foreign.versions import VersionError, check_version
 from r3jax.geometry.cameras import Camera
@@ -25,8 +25,9 @@ from r3jax.trace.errors import RunError
 FORMAT = "r3jax-run"
 """What run.json says it is."""
 
-VERSION = 2
-"""Format version that this package writes. Version 1 knew no `parent`; it is read too."""
+VERSION = 3
+"""Format version that this package writes. Version 1 knew no `parent`, versions 1 and 2 no `seal`;
+they are read too."""
 
 _MAX_BYTES = 16 << 20
 """Settings take some kilobytes."""
@@ -145,7 +146,7 @@ def package_versions() -> dict[str, str]:
 def header_to_json(header: RunHeader) -> str:
     """The text of run.json."""
     plain = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(header)}
-    return json.dumps(plain, indent=2, allow_nan=False) + "\n"
+    return json.dumps(sealed(plain), indent=2, allow_nan=False) + "\n"
 
 
 def read_header(path: Path) -> RunHeader:
@@ -160,14 +161,16 @@ def read_header(path: Path) -> RunHeader:
         raise RunError(path, "the file is missing: this folder is not a run") from None
     except (OSError, ForeignFileError) as error:
         raise RunError(path, f"the file cannot be read ({error})") from None
-    if not isinstance(plain, dict) or plain.pop("format", None) != FORMAT:
+    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         raise RunError(path, f"the file does not describe a run (no format {FORMAT!r})")
     try:
-        check_version(plain.pop("version", None), VERSION)
+        check_version(plain.get("version"), VERSION)
     except VersionError as error:
         raise RunError(path, f"the run has {error}") from None
     try:
-        header = build(RunHeader, plain)
+        fields = unsealed(plain)
+        del fields["format"], fields["version"]
+        header = build(RunHeader, fields)
         _check(header)
     except ValueError as error:
         raise RunError(path, f"a setting is missing or malformed ({error})") from None

@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.fields import check_type
 from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.json_text import parse_json, unsealed
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -68,14 +69,20 @@ class Run:
         Raises:
             RunError: an image is missing, broken, or not the one that was recorded.
         """
-        row = self.rows[step]
-        camera = self.camera
-        size = (camera.width, camera.height)
+        return from_integers(*self.images(step), self.rows[step].pose, self.camera)
+
+    def images(self, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """The images of one view as they are stored: [H, W, 3] uint8 and [H, W] uint16.
+
+        Raises:
+            RunError: an image is missing, broken, or not the one that was recorded.
+        """
+        size = (self.camera.width, self.camera.height)
         rgb = read_png(self.image_path(step), *size, is_depth=False)
         depth = read_png(self.depth_path(step), *size, is_depth=True)
-        if content_hash(rgb, depth) != row.sha256:
+        if content_hash(rgb, depth) != self.rows[step].sha256:
             raise RunError(self.image_path(step), "the pixels differ from those recorded")
-        return from_integers(rgb, depth, row.pose, camera)
+        return rgb, depth
 
     def frames(self) -> Iterator[Frame]:
         """Every frame in order, read one by one."""
@@ -152,6 +159,8 @@ def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
     for line in complete_lines(path):
         try:
             plain = parse_json(line)
+            check_type("timings", plain, dict[str, Any])
+            plain = unsealed(plain)
             check_type("timings", plain, dict[str, float])
         except ForeignFileError:
             continue

@@ -10,7 +10,7 @@ import numpy as np
 
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.fields import build
-from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.json_text import parse_json, sealed, unsealed
 from r3jax.geometry.cameras import rigid_error
 from r3jax.planning.policy import Decision, PlanInfo
 
@@ -149,7 +149,7 @@ def to_json(row: StepRow | EndRow) -> str:
     """One line of trace.jsonl, keys in a fixed order."""
     kind = "step" if isinstance(row, StepRow) else "end"
     plain = {"kind": kind, **dataclasses.asdict(row, dict_factory=_plain_dict)}
-    return json.dumps(plain, allow_nan=False, separators=(",", ":"))
+    return json.dumps(sealed(plain), allow_nan=False, separators=(",", ":"))
 
 
 def from_json(line: str) -> StepRow | EndRow:
@@ -162,6 +162,7 @@ def from_json(line: str) -> StepRow | EndRow:
     plain = parse_json(line)
     if not isinstance(plain, dict) or plain.get("kind") not in ("step", "end"):
         raise ForeignFileError("a row is an object with the kind `step` or `end`")
+    plain = unsealed(plain)
     if plain.pop("kind") == "end":
         return build(EndRow, plain)
     row = build(

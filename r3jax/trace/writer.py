@@ -3,17 +3,25 @@
 import contextlib
 import datetime
 import json
-import shutil
+import os
 from dataclasses import replace
-from io import FileIO
 from pathlib import Path
 from types import TracebackType
 
-from r3jax.files import append_line, lock_folder, sync_folder, write_atomic
+from r3jax.checkpoints import Tables, discard, numbered
+from r3jax.files import (
+    append_line,
+    lock_folder,
+    remove_own,
+    remove_partial,
+    sync_folder,
+    write_atomic,
+)
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.files import read_bytes
+from r3jax.foreign.json_text import sealed
 from r3jax.frame import Frame
-from r3jax.trace.checkpoints import CheckpointWriter, Tables
+from r3jax.trace.checkpoints import CheckpointWriter
 from r3jax.trace.errors import RecordingStopped, RunError
 from r3jax.trace.header import RunHeader, header_to_json, package_versions, read_header
 from r3jax.trace.images import encode_png, to_integers
@@ -23,18 +31,36 @@ from r3jax.trace.rows import EndRow, StepRow, from_json, to_json
 _MAX_IMAGE_BYTES = 256 << 20
 """No encoded image of a run comes near it."""
 
-_CONTENT = (
-    "run.json",
+_ROOM = ".room"
+_ROOM_BYTES = 64 << 10
+"""Kept free while a run is written, so that a full disk has room for the row that says so."""
+
+_BEGUN = ("lock", "trace.jsonl", "frames", "report", _ROOM)
+"""What there may be before run.json is."""
+
+_OWN = (
     "trace.jsonl",
     "timings.jsonl",
     "history.jsonl",
     "transforms.json",
-    "frames",
-    "checkpoints",
-    "report",
-    "models",
-    "exports",
+    _ROOM,
+    "frames/[0-9]*.png",
+    *(
+        f"report/{name}.png"
+        for name in (
+            *("plan", "progress", "reasons", "forecast", "panorama", "views", "cost"),
+            *("training", "evaluation"),
+        )
+    ),
+    *(f"report/{name}" for name in ("report.html", "evaluation.json", "evaluation.csv")),
+    "report/evaluation.parquet",
+    "exports/points.ply",
+    *(f"models/*/{name}" for name in ("scene.ply", "points.ply", "history.csv", "train.json")),
+    *(f"models/*/{name}" for name in ("lock", "checkpoints/lock", "checkpoints/training.json")),
+    *("models/*/checkpoints", "models/*"),
+    *("frames", "checkpoints", "report", "models", "exports"),
 )
+"""Everything in a run that this package makes, but run.json, the lock and the checkpoints."""
 
 
 class RunWriter:
@@ -55,14 +81,18 @@ class RunWriter:
         """
         self.path = Path(path)
         try:
-            if self.path.exists():
-                _clear(self.path, overwrite=overwrite)
-            for name in ("frames", "report"):
-                (self.path / name).mkdir(parents=True, exist_ok=True)
-            write_atomic(self.path / "run.json", header_to_json(header).encode())
-            (self.path / "trace.jsonl").touch()
-            self._lock = _lock(self.path)
-            self._begin(header, views=0)
+            _check_free(self.path, overwrite=overwrite)  # nothing is written where no run may be
+            self.path.mkdir(parents=True, exist_ok=True)
+            with self._locked():
+                _check_free(self.path, overwrite=overwrite)  # another process may have been faster
+                _clear(self.path)
+                for name in ("frames", "report"):
+                    (self.path / name).mkdir(exist_ok=True)
+                (self.path / "trace.jsonl").touch()
+                # The last: a folder with a run.json can be gone on with.
+                write_atomic(self.path / "run.json", header_to_json(header).encode())
+                self._checkpoints = CheckpointWriter(self.path / "checkpoints")
+                self._begin(header, views=0)
         except OSError as error:
             raise RunError(self.path, f"cannot make the run folder ({error.strerror})") from error
 
@@ -87,20 +117,31 @@ class RunWriter:
         writer.path = Path(path)
         read_header(writer.path / "run.json")  # says what is wrong before anything is touched
         try:
-            writer._lock = _lock(writer.path)
-            with contextlib.ExitStack() as on_failure:
-                on_failure.callback(writer._lock.close)
+            with writer._locked():
                 run = read_run(writer.path)
+                writer._checkpoints = CheckpointWriter(writer.path / "checkpoints")
                 _mend(writer.path)
                 if header is not None:
                     write_atomic(writer.path / "run.json", header_to_json(header).encode())
-                on_failure.pop_all()
-            writer._begin(header or run.header, views=len(run.rows))
+                writer._begin(header or run.header, views=len(run.rows))
         except OSError as error:
             raise RunError(
                 writer.path, f"cannot go on with the run ({error.strerror or error})"
             ) from error
         return writer, replace(run, header=header or run.header, end=None)
+
+    @contextlib.contextmanager
+    def _locked(self):
+        """Takes the lock, and keeps it unless the block fails."""
+        try:
+            self._lock = lock_folder(self.path)
+        except BlockingIOError:
+            raise RunError(self.path, "another process is writing this run") from None
+        try:
+            yield
+        except BaseException:
+            self._lock.close()
+            raise
 
     def _begin(self, header: RunHeader, *, views: int) -> None:
         self.views = views
@@ -111,11 +152,9 @@ class RunWriter:
             "budget": header.budget,
             "packages": package_versions(),
         }
-        with contextlib.ExitStack() as on_failure:
-            on_failure.callback(self._lock.close)
-            append_line(self.path / "history.jsonl", json.dumps(begin))
-            self._checkpoints = CheckpointWriter(self.path / "checkpoints")
-            on_failure.pop_all()
+        append_line(self.path / "history.jsonl", json.dumps(begin))
+        # No zeros: some file systems store them in no room at all.
+        write_atomic(self.path / _ROOM, os.urandom(_ROOM_BYTES))
 
     def add(self, row: StepRow, frame: Frame) -> None:
         """Stores one view: the images first, then the row, so that a row's images exist.
@@ -162,9 +201,9 @@ class RunWriter:
 
     def add_timings(self, step: int, stages: dict[str, float]) -> None:
         """Stores what the stages of one view really took [s], outside the mission clock too."""
-        line = json.dumps({"step": step, **{k: round(v, 6) for k, v in stages.items()}})
-        with self._guarded(), open(self.path / "timings.jsonl", "a", encoding="utf-8") as file:
-            file.write(line + "\n")
+        line = sealed({"step": step, **{k: round(v, 6) for k, v in stages.items()}})
+        with self._guarded():
+            append_line(self.path / "timings.jsonl", json.dumps(line))
 
     def checkpoint(self, step: int, tables: Tables, *, wait: bool = False) -> None:
         """Stores the state after view `step` (`exploration.resume.state_tables`) in the background.
@@ -178,13 +217,14 @@ class RunWriter:
             self._checkpoints.save(step, tables, wait=wait)
 
     def finish(self, outcome: str, message: str) -> None:
-        """Stores how the run ended.
+        """Stores how the run ended, on a full disk in the room that was kept for it.
 
         Raises:
             RecordingStopped: the disk refused this, or a checkpoint that was under way.
         """
-        with self._guarded():
-            self._checkpoints.wait()
+        with self._guarded(), contextlib.ExitStack() as afterwards:
+            afterwards.callback(self._checkpoints.wait)
+            (self.path / _ROOM).unlink(missing_ok=True)
             append_line(self.path / "trace.jsonl", to_json(EndRow(outcome, message, self.views)))
 
     @contextlib.contextmanager
@@ -202,6 +242,8 @@ class RunWriter:
         """Frees the threads and the lock."""
         try:
             self._checkpoints.close()
+            with contextlib.suppress(OSError):
+                (self.path / _ROOM).unlink(missing_ok=True)
         finally:
             self._lock.close()
 
@@ -217,13 +259,6 @@ class RunWriter:
     ) -> None:
         """Frees the lock, whatever happened."""
         self.close()
-
-
-def _lock(folder: Path) -> FileIO:
-    try:
-        return lock_folder(folder)
-    except BlockingIOError:
-        raise RunError(folder, "another process is writing this run") from None
 
 
 def _mend(path: Path) -> None:
@@ -242,25 +277,45 @@ def _mend(path: Path) -> None:
     if timings.exists() and not timings.read_bytes().endswith(b"\n"):
         write_atomic(timings, "".join(f"{line}\n" for line in complete_lines(timings)).encode())
     for folder in (path, path / "frames"):
-        for leftover in folder.glob(".*.partial"):
-            leftover.unlink(missing_ok=True)
+        remove_partial(folder)
 
 
-def _clear(path: Path, *, overwrite: bool) -> None:
-    """Makes room for a new run, or says why not."""
+def _check_free(path: Path, *, overwrite: bool) -> None:
+    """Says why no new run may begin here.
+
+    Raises:
+        RunError: a file, something that is not a run, or a run that may not be overwritten.
+    """
+    if not path.exists():
+        return
     if not path.is_dir():
         raise RunError(path, "is a file; a run needs a folder")
-    present = {entry.name for entry in path.iterdir()}
-    if not present:
-        return
-    if "run.json" not in present:
+    if (path / "run.json").exists():
+        if not overwrite:
+            raise RunError(path, "the run exists already: choose another name or give --overwrite")
+    elif not all(_is_begun(entry) for entry in path.iterdir()):
         raise RunError(path, "the folder holds something that is not a run: choose another name")
-    if not overwrite:
-        raise RunError(path, "the run exists already: choose another name or give --overwrite")
-    with _lock(path):
-        for name in _CONTENT:
-            target = path / name
-            if target.is_dir() and not target.is_symlink():
-                shutil.rmtree(target)
-            else:
-                target.unlink(missing_ok=True)
+
+
+def _is_begun(entry: Path) -> bool:
+    """Whether a process that was killed while it began a run may have left this."""
+    if entry.name.startswith(".run.json.") or entry.name.startswith(f".{_ROOM}."):
+        return True
+    if entry.name not in _BEGUN or entry.is_symlink():
+        return False
+    return (
+        not any(entry.iterdir())
+        if entry.is_dir()
+        else entry.name != "trace.jsonl" or (entry.stat().st_size == 0)
+    )
+
+
+def _clear(path: Path) -> None:
+    """Deletes the run that is there, but for run.json, which the new one replaces."""
+    for folder in (path / "checkpoints", *path.glob("models/*/checkpoints")):
+        if folder.resolve() == path.resolve() / folder.relative_to(path):
+            for old in numbered(folder):
+                discard(old)
+    for folder in (path, path / "frames"):
+        remove_partial(folder)
+    remove_own(path, _OWN)

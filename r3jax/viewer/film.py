@@ -13,7 +13,6 @@ import numpy as np
 from PIL import Image
 
 from r3jax.formats.errors import FormatError
-from r3jax.trace.images import read_png
 from r3jax.trace.reader import Run
 from r3jax.viewer.blocks import QUANTITIES, block_colors
 from r3jax.viewer.known import Known, cut_height, known_at, scoring_of
@@ -104,9 +103,7 @@ class Film:
         ]
 
     def _sheet(self, step: int, quantity: str) -> Sheet:
-        camera = self.run.camera
-        size = (camera.width, camera.height)
-        image = read_png(self.run.image_path(step), *size, is_depth=False)
+        image, _ = self.run.images(step)
         return Sheet.of_run(self.run, step, image, quantity)
 
 

@@ -14,7 +14,6 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
-from r3jax.trace.images import read_png
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow
 from r3jax.viewer.decisions import Offer
@@ -250,5 +249,4 @@ class LiveStory:
 
 
 def _recorded_image(run: Run, step: int) -> np.ndarray:
-    camera = run.camera
-    return read_png(run.image_path(step), camera.width, camera.height, is_depth=False)
+    return run.images(step)[0]

@@ -10,12 +10,20 @@ import time
 
 import jax
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 
 from r3jax.files import lock_folder
+from r3jax.splatting.checkpoints import (
+    begin_checkpoints,
+    read_checkpoint,
+    remove_checkpoints,
+)
 from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.ply import write_scene
+from r3jax.splatting.scene import empty_scene
 from r3jax.splatting.train import fit
+from r3jax.splatting.train_step import start_state
 from tests.splatting.ball import ROOMY, ball_views, config
 
 
@@ -99,15 +107,53 @@ def test_nothing_to_resume_from(views, tmp_path):
         fit(views, config(), folder=tmp_path, resume=True)
 
 
+def damage(path):
+    """Turns one bit of the largest file round."""
+    largest = max((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    data = bytearray(largest.read_bytes())
+    data[len(data) // 2] ^= 8
+    largest.write_bytes(data)
+
+
+def test_a_damaged_checkpoint_costs_the_steps_since_the_one_before(views, folder):
+    damage(folder / "0000020")
+    result = fit(views, config(), folder=folder, resume=True)
+    assert result.history.first_step == 13
+    jax.tree.map(np.testing.assert_array_equal, result.scene, fit(views, config()).scene)
+
+
 def test_what_cannot_be_read_is_named(views, folder):
-    newest = folder / "0000020"
-    for path in newest.rglob("*"):
-        if path.is_file():
-            path.write_bytes(b"")
-    with pytest.raises(CheckpointError, match="0000020: cannot be read"):
+    for name in ("0000012", "0000020"):
+        damage(folder / name)
+    with pytest.raises(CheckpointError, match="0000012: cannot be read .*SHA-256"):
         fit(views, config(), folder=folder, resume=True)
-    shutil.rmtree(newest)
-    assert not fit(views, config(), folder=folder, resume=True).interrupted
+
+
+def test_nothing_of_the_user_is_deleted(views, folder, tmp_path):
+    mine = [folder / "2019" / "photo", folder / "0000099" / "photo", tmp_path / "victim" / "photo"]
+    for path in mine:
+        path.parent.mkdir()
+        path.touch()
+    (folder / "0000098").symlink_to(tmp_path / "victim")
+    begin_checkpoints(folder, {}, overwrite=True)
+    remove_checkpoints(folder)
+    assert all(path.exists() for path in mine)
+    assert sorted(path.name for path in folder.iterdir()) == ["0000098", "0000099", "2019"]
+    (tmp_path / "link").symlink_to(tmp_path / "victim")
+    with pytest.raises(OSError, match="must not be a link"):
+        fit(views, config(), folder=tmp_path / "link")
+    assert mine[2].exists()
+
+
+def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
+    """Its arrays were nested, and nothing was hashed."""
+    state = start_state(empty_scene(8, 1))
+    begin_checkpoints(tmp_path, {"format": 1})
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(tmp_path / "0000000", state)
+        checkpointer.wait_until_finished()
+    back = read_checkpoint(tmp_path, {"format": 1}, state)
+    jax.tree.map(np.testing.assert_array_equal, back, state)
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"format":'])

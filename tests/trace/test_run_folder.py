@@ -3,6 +3,11 @@
 import errno
 import json
 import os
+import re
+import shutil
+import subprocess
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -101,16 +106,20 @@ def test_an_image_that_was_swapped_is_found(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 3}, "newer r3jax"),
+        ({"version": 4}, "newer r3jax"),
         ({"version": 0}, "format version 0"),
         ({"format": "other"}, "does not describe a run"),
         ({"camera": {"width": 8}}, "missing or malformed"),
         ({"surprise": 1}, "missing or malformed"),
+        ({"seed": 4}, "damaged or changed"),
     ],
 )
 def test_another_header_gets_a_clear_message(tmp_path, change, message):
     path = write_run(tmp_path / "run") / "run.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    plain = json.loads(path.read_text()) | change
+    if "seed" not in change:  # changed by hand: the seal has to go
+        del plain["seal"]
+    path.write_text(json.dumps(plain))
     with pytest.raises(RunError, match=message):
         read_run(tmp_path / "run")
 
@@ -155,6 +164,123 @@ def test_files_of_the_user_inside_a_run_survive_overwriting(tmp_path):
     note.write_text("mine")
     write_run(tmp_path / "run", overwrite=True)
     assert note.read_text() == "mine"
+
+
+def test_nothing_of_the_user_is_overwritten_inside_a_run(tmp_path):
+    path = write_run(tmp_path / "run")
+    mine = [path / name for name in ("frames/mine.png", "report/mine.png", "models/mine/house.ply")]
+    mine += [path / "exports" / "mine.blend", tmp_path / "victim" / "000000.png"]
+    for file in mine:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(b"x")
+    (path / "models" / "linked").symlink_to(tmp_path / "victim")
+    (tmp_path / "victim" / "scene.ply").write_bytes(b"x")
+    write_run(path, views=1, overwrite=True)
+    assert all(file.read_bytes() == b"x" for file in [*mine, tmp_path / "victim" / "scene.ply"])
+    assert len(read_run(path).rows) == 1
+    assert not (path / "frames" / "000002.png").exists()
+
+
+@pytest.mark.parametrize("how", ["resume", "overwrite"])
+def test_nothing_is_deleted_or_written_through_a_link(tmp_path, how):
+    path = write_run(tmp_path / "run", end=False)
+    victim = tmp_path / "victim"
+    (victim / "photos").mkdir(parents=True)
+    (victim / ".000001.png.0123abcd.partial").write_bytes(b"x")
+    (victim / "profile").write_text("mine\n")
+    for name, target in (("checkpoints", "."), ("history.jsonl", "profile")):
+        if (path / name).is_dir():
+            shutil.rmtree(path / name)
+        (path / name).unlink(missing_ok=True)
+        (path / name).symlink_to(victim / target)
+    before = sorted(victim.rglob("*"))
+    if how == "resume":
+        with pytest.raises(RunError, match="link"):
+            RunWriter.resume(path)
+    else:
+        write_run(path, overwrite=True)
+    assert sorted(victim.rglob("*")) == before
+    assert (victim / "profile").read_text() == "mine\n"
+
+
+def test_only_one_of_two_that_begin_a_run_writes_it(tmp_path):
+    """Each holds its lock while the other looks; what lies there is the winner's alone."""
+    for number in range(30):
+        start, path = threading.Barrier(2), tmp_path / str(number)
+
+        def begin(seed, start=start, path=path):
+            start.wait()
+            try:
+                return RunWriter(path, make_header(seed=seed))
+            except RunError:
+                return None
+
+        with ThreadPoolExecutor(2) as pool:
+            writers = list(pool.map(begin, (0, 1)))
+        (winner,) = [seed for seed, writer in enumerate(writers) if writer is not None]
+        assert read_run(path).header.seed == winner
+        writers[winner].close()
+
+
+@pytest.mark.parametrize("left", [[], ["lock"], ["lock", "frames/", "report/", "trace.jsonl"]])
+def test_a_run_that_was_killed_while_it_began_can_begin_again(tmp_path, left):
+    for name in left:
+        path = tmp_path / "run" / name
+        path.parent.mkdir(exist_ok=True)
+        path.mkdir() if name.endswith("/") else path.touch()
+    assert len(read_run(write_run(tmp_path / "run")).rows) == 3
+
+
+def test_every_flipped_bit_of_a_row_is_refused_or_repaired(tmp_path):
+    path = write_run(tmp_path / "run")
+    whole, rng = read_run(path), np.random.default_rng(0)
+    for name in ("run.json", "trace.jsonl", "timings.jsonl"):
+        data = (path / name).read_bytes()
+        for bit in rng.integers(8 * len(data), size=200):
+            changed = bytearray(data)
+            changed[bit // 8] ^= 1 << bit % 8
+            (path / name).write_bytes(changed)
+            try:
+                found = read_run(path)
+            except RunError:
+                continue
+            assert found.header == whole.header
+            assert [to_json(row) for row in found.rows] == [to_json(row) for row in whole.rows]
+            assert found.end in (None, whole.end)  # a lost last newline: cut off, it says
+            assert set(map(str, found.timings)) <= set(map(str, whole.timings))
+        (path / name).write_bytes(data)
+
+
+def test_a_run_without_seals_is_read(tmp_path):
+    """As earlier versions wrote them."""
+    path = write_run(tmp_path / "run")
+    for name in ("run.json", "trace.jsonl"):
+        text = (path / name).read_text()
+        (path / name).write_text(re.sub(r',\s*"seal": ?"[0-9a-f]{64}"', "", text))
+    assert "seal" not in (path / "trace.jsonl").read_text()
+    assert len(read_run(path).rows) == 3
+
+
+def test_a_really_full_disk_keeps_room_for_the_end(tmp_path):
+    """On a file system of 2 MB, where a user may mount one."""
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(tmp_path)], capture_output=True
+    )
+    if mounted.returncode != 0:
+        pytest.skip("needs the right to mount a file system")
+    try:
+        with RunWriter(tmp_path / "run", make_header()) as writer:
+            writer.add(*make_view(0))
+            with pytest.raises(OSError, match="No space left"):
+                (tmp_path / "filler").write_bytes(bytes(4 << 20))
+            with pytest.raises(RecordingStopped, match="No space left"):
+                writer.add(*make_view(1))
+            writer.finish("recording-stopped", "the disk is full")
+        run = read_run(tmp_path / "run")
+        assert (len(run.rows), run.outcome) == (1, "recording-stopped: the disk is full")
+        assert not (tmp_path / "run" / ".room").exists()
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=True)
 
 
 def test_two_writers_cannot_share_a_run(tmp_path):

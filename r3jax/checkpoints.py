@@ -1,0 +1,202 @@
+"""Numbered checkpoints in a folder: each whole or absent, and with the hash of all its files.
+
+Orbax writes the arrays. Of what it wrote the SHA-256 of every file is kept in `sha256.json`; with
+it in place the checkpoint gets its name, a number. A checkpoint without that file is of an
+earlier version of this package, and read unchecked.
+
+Nothing is ever deleted here but what bears a name that only this package gives, and nothing at
+all through a link.
+"""
+
+import errno
+import hashlib
+import json
+import logging
+import os
+import re
+import shutil
+import sys
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.files import sync_folder, write_atomic
+from r3jax.foreign.errors import ForeignFileError
+from r3jax.foreign.fields import check_type
+from r3jax.foreign.files import check_tree, read_bytes
+from r3jax.foreign.json_text import parse_json
+
+Tables = Mapping[str, Mapping[str, np.ndarray]]
+"""Named arrays, by table."""
+
+_HASHES = "sha256.json"
+_MAX_BYTES = 16 << 20
+_ORBAX = "_CHECKPOINT_METADATA"
+"""A file in every checkpoint, by which its folder is known."""
+
+_DIGITS = 6
+_WRITING, _DISCARDED = ".writing-", ".discarded-"
+_LEFTOVER = re.compile(
+    rf"{re.escape(_WRITING)}\d+(\.orbax-checkpoint-tmp.*)?"
+    rf"|{re.escape(_DISCARDED)}\d+"
+    r"|\d+\.orbax-checkpoint-tmp.*"  # of earlier versions of this package
+)
+
+
+def make_folder(folder: Path) -> None:
+    """Makes the folder of checkpoints and clears away what a killed process left behind.
+
+    Raises:
+        OSError: it is a link, or cannot be made.
+    """
+    if folder.is_symlink():
+        # What is deleted at its other end was perhaps never ours.
+        reason = "a folder of checkpoints must not be a link"
+        raise NotADirectoryError(errno.ENOTDIR, reason, str(folder))
+    folder.mkdir(parents=True, exist_ok=True)
+    _clear_leftovers(folder)
+
+
+def _clear_leftovers(folder: Path) -> None:
+    for entry in folder.iterdir():
+        if _LEFTOVER.fullmatch(entry.name) and entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry, ignore_errors=True)
+
+
+def numbered(folder: Path) -> list[Path]:
+    """The checkpoints in a folder, oldest first."""
+    if folder.is_symlink():
+        return []
+    found = [path for path in folder.glob("[0-9]*") if _is_checkpoint(path)]
+    return sorted(found, key=lambda path: int(path.name))
+
+
+def _is_checkpoint(path: Path) -> bool:
+    is_number = path.name.isdecimal() and path.name.isascii() and len(path.name) >= _DIGITS
+    return is_number and not path.is_symlink() and (path / _ORBAX).is_file()
+
+
+def discard(path: Path) -> None:
+    """Deletes a checkpoint that `numbered` has named.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    # Out of sight first: a checkpoint that is half deleted must not look like one.
+    hidden = path.with_name(f"{_DISCARDED}{path.name}")
+    path.rename(hidden)
+    shutil.rmtree(hidden, ignore_errors=True)
+
+
+def write_checkpoint(path: Path, tables: Tables) -> None:
+    """Writes one: it is there as a whole, or not at all.
+
+    Args:
+        path: a number in a folder that `make_folder` has made, in which nobody else writes.
+        tables: the arrays.
+
+    Raises:
+        OSError: the disk is full, not writable, ...; or something of that name is there that is
+            no checkpoint.
+    """
+    import orbax.checkpoint as ocp
+
+    writing = path.with_name(f"{_WRITING}{path.name}")
+    with _quiet():
+        try:
+            with ocp.PyTreeCheckpointer() as checkpointer:
+                checkpointer.save(writing.resolve(), dict(tables), force=True)
+            _write_hashes(writing)
+            if _is_checkpoint(path):
+                discard(path)
+            writing.rename(path)
+            sync_folder(path.parent)
+        except (ValueError, RuntimeError) as error:  # how Orbax's storage reports a full disk
+            _clear_leftovers(path.parent)
+            is_full = "RESOURCE_EXHAUSTED" in str(error) or "No space left" in str(error)
+            reason = os.strerror(errno.ENOSPC) if is_full else " ".join(str(error).split())[:300]
+            raise OSError(errno.ENOSPC if is_full else errno.EIO, reason, str(path)) from error
+        except OSError:
+            _clear_leftovers(path.parent)
+            raise
+
+
+def _write_hashes(folder: Path) -> None:
+    hashes = {name: _sha256(path) for name, path in _files(folder).items()}
+    write_atomic(folder / _HASHES, json.dumps(hashes, indent=1, sort_keys=True).encode())
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    files = (path for path in folder.rglob("*") if not path.is_dir())
+    return {path.relative_to(folder).as_posix(): path for path in files if path.name != _HASHES}
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_arrays(path: Path) -> dict[str, Any]:
+    """The arrays of a checkpoint, nested as they were written.
+
+    Raises:
+        ForeignFileError: it is damaged, or cannot be read.
+        OSError: it is not there, or not permitted.
+    """
+    import jax
+    import orbax.checkpoint as ocp
+
+    check_tree(path)
+    _check_hashes(path)
+    try:
+        with _quiet(), ocp.PyTreeCheckpointer() as checkpointer:
+            tree = checkpointer.metadata(path.resolve()).item_metadata.tree
+            # NumPy: device arrays would cut 64-bit numbers short.
+            as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
+            args = ocp.args.PyTreeRestore(restore_args=as_numpy)
+            arrays = checkpointer.restore(path.resolve(), args=args)
+    except Exception as error:  # whatever a damaged file makes Orbax's storage raise
+        raise ForeignFileError(" ".join(str(error).split())[:500]) from None
+    if not isinstance(arrays, dict):
+        raise ForeignFileError("it does not hold tables of arrays")
+    return arrays
+
+
+def _check_hashes(folder: Path) -> None:
+    try:
+        stored = parse_json(read_bytes(folder / _HASHES, _MAX_BYTES))
+    except FileNotFoundError:
+        return
+    check_type(_HASHES, stored, dict[str, str])
+    found = _files(folder)
+    for name, sha256 in stored.items():
+        if name not in found:
+            raise ForeignFileError(f"{name[:80]} is missing")
+        if _sha256(found[name]) != sha256:
+            raise ForeignFileError(f"{name[:80]} is damaged: its SHA-256 is not the one kept")
+
+
+@contextmanager
+def _quiet() -> Generator[None]:
+    """Keeps Orbax from printing tracebacks of an error that it also raises.
+
+    Its log has one from every thread. Arrays that fail after the first one report to an event
+    loop which Orbax has closed by then, and Python prints a traceback for each.
+    """
+    log, hook = logging.getLogger("absl"), sys.unraisablehook
+    level = log.level
+
+    def without_loops(unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            hook(unraisable)
+
+    log.setLevel(logging.CRITICAL + 1)
+    sys.unraisablehook = without_loops
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        log.setLevel(level)
