@@ -1,6 +1,7 @@
 """`r3jax evaluate`: judges a model by test views and writes what came out."""
 
 import dataclasses
+import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,7 @@ from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
 from r3jax.evaluation.report import write_report
 from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
 from r3jax.files import write_atomic
+from r3jax.foreign.json_text import sealed
 from r3jax.formats.errors import FormatError
 from r3jax.mapping.state import MapState
 from r3jax.splatting.config import RasterConfig
@@ -150,11 +152,14 @@ def _write(options: Evaluate, outcome: Outcome, folder: Path) -> dict[str, Path]
     """The files, under what they hold."""
     written = {"rows": folder / f"evaluation.{options.rows}", "summary": folder / "evaluation.json"}
     write_rows(written["rows"], outcome.judgment.rows)
-    record = json.dumps(_record(options, outcome), indent=1, allow_nan=False)
-    write_atomic(written["summary"], record.encode())
+    record = _record(options, outcome)
     if options.worst:
         written["worst views"] = folder / "evaluation.png"
-        write_atomic(written["worst views"], style.to_png(_sheet(options, outcome)))
+        sheet = style.to_png(_sheet(options, outcome))
+        record["sheet_sha256"] = hashlib.sha256(sheet).hexdigest()
+        write_atomic(written["worst views"], sheet)
+    text = json.dumps(sealed(record), indent=1, allow_nan=False)
+    write_atomic(written["summary"], text.encode())
     return written
 
 

@@ -13,7 +13,7 @@ from r3jax.cli.options import Evaluate
 from r3jax.foreign.errors import ForeignFileError
 from r3jax.foreign.fields import check_type
 from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.json_text import parse_json, unsealed
 from r3jax.foreign.versions import check_version
 from r3jax.frame import Frame
 
@@ -107,6 +107,7 @@ def _read_record(path: Path) -> dict[str, Any]:
     record = parse_json(read_bytes(path, _MAX_BYTES))
     check_type("train.json", record, dict[str, Any])
     check_version(record.get("format", 1), RECORD_FORMAT)  # the first ones did not say
+    record = unsealed(record)
     for name, kind in _KINDS.items():
         if name in record:
             check_type(name, record[name], kind)

@@ -24,7 +24,7 @@ from r3jax.cli.setup import (
 from r3jax.evaluation.report import Progress, write_report
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.team import Member, TeamResult, TeamView, explore_team
-from r3jax.files import write_atomic
+from r3jax.files import lock_folder, write_atomic
 from r3jax.formats.pointcloud import voxel_points, write_points
 from r3jax.formats.transforms import write_team_transforms, write_transforms
 from r3jax.planning.limits import begin_at
@@ -113,6 +113,9 @@ def _set_out(options: Team, console: Console, stack: contextlib.ExitStack) -> tu
             zip(singles, plans, simulators, strict=True)
         )
     ]
+    folder.mkdir(parents=True, exist_ok=True)
+    _only_writer(folder, stack)
+    _check_leftovers(folder, options.cameras)  # another process may have been faster
     recorders = [
         stack.enter_context(RunWriter(folder / str(number), header, overwrite=options.overwrite))
         for number, header in enumerate(headers)
@@ -123,6 +126,8 @@ def _set_out(options: Team, console: Console, stack: contextlib.ExitStack) -> tu
 def _go_on(options: Team, folder: Path, console: Console, stack: contextlib.ExitStack) -> _Crew:
     """A team that was cut off: its members' runs say what it was."""
     refuse_others(options, "--resume", _WITH_RESUME)
+    read_run(folder / "0")  # says what is wrong before anything is written
+    _only_writer(folder, stack)
     first = read_run(folder / "0")
     if not first.header.is_of_team:
         raise ValueError(f"{first.path} did not fly in a team: `r3jax explore --resume` it")
@@ -147,6 +152,14 @@ def _go_on(options: Team, folder: Path, console: Console, stack: contextlib.Exit
     console.say(f"goes on behind views {views} of {folder}, decided and mapped anew")
     meet_every = float(parent["meet_every"])
     return _Crew(plan, members, recorders, first.header.seed, meet_every, recorded)
+
+
+def _only_writer(folder: Path, stack: contextlib.ExitStack) -> None:
+    """Until the stack ends no other process writes this team."""
+    try:
+        stack.enter_context(lock_folder(folder))
+    except BlockingIOError:
+        raise ValueError(f"{folder}: another process is writing this team") from None
 
 
 def _with_starts(singles: list[Explore]) -> tuple[list[Explore], list[Simulator]]:
@@ -178,6 +191,9 @@ def _with_starts(singles: list[Explore]) -> tuple[list[Explore], list[Simulator]
 
 def _check_leftovers(folder: Path, cameras: int) -> None:
     """A smaller team must not be written over a larger one: whose run would the last one be?"""
+    present = {path.name for path in folder.iterdir()} if folder.is_dir() else set[str]()
+    if present - {"lock"} and "0" not in present:
+        raise ValueError(f"{folder} holds something that is not a team: give another --name")
     if (folder / str(cameras)).exists():
         raise ValueError(f"{folder} holds a team of more than {cameras}: give another --name")
 

@@ -1,8 +1,11 @@
 """`r3jax train`: from a run or a recording to a model on disk."""
 
+import contextlib
 import csv
+import hashlib
 import io
 import json
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,8 @@ from r3jax.cli.console import BarColumn, Console, SpinnerColumn, TextColumn, pro
 from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
 from r3jax.cli.options import Train
 from r3jax.cli.selection import RECORD_FORMAT
-from r3jax.files import write_atomic
+from r3jax.files import lock_folder, write_atomic
+from r3jax.foreign.json_text import sealed
 from r3jax.formats.errors import FormatError
 from r3jax.formats.pointcloud import write_points
 from r3jax.splatting import train
@@ -46,18 +50,18 @@ def run_train(options: Train) -> int:
         training, held_out = split_views(len(capture), options.hold_out)
         with console.status(f"reading {len(capture)} views ..."):
             views = load_views(capture.frames(), options.resolution).take(training)
-        folder.mkdir(parents=True, exist_ok=True)
-        with TrainProgress(console, config.iterations) as progress:
-            result = train.fit(
-                views,
-                config,
-                folder=folder / "checkpoints",
-                resume=options.resume,
-                overwrite=options.overwrite,
-                on_progress=progress.on_progress,
-            )
-        _write_model(folder, result)
-        _write_record(folder / "train.json", options, config, views, training, held_out)
+        with _only_writer(options, folder):
+            with TrainProgress(console, config.iterations) as progress:
+                result = train.fit(
+                    views,
+                    config,
+                    folder=folder / "checkpoints",
+                    resume=options.resume,
+                    overwrite=options.overwrite,
+                    on_progress=progress.on_progress,
+                )
+            _write_model(folder, result)
+            _write_record(folder / "train.json", options, config, views, training, held_out)
     except (ValueError, ArithmeticError, OSError, ImportError, RunError, FormatError) as error:
         raise UserError(one_line(error)) from error
     _conclude(console, options, folder, result)
@@ -82,13 +86,32 @@ def _folder(options: Train, capture: Capture) -> Path:
     """The model's folder; one that is there is kept, unless the user says otherwise."""
     check_folder_name(options.name)
     folder = (options.out or capture.models) / options.name
-    in_use = folder.is_dir() and any(folder.iterdir())
-    if in_use and not (options.overwrite or options.resume):
+    _check_free(options, folder)
+    return folder
+
+
+def _check_free(options: Train, folder: Path) -> None:
+    present = {path.name for path in folder.iterdir()} - {"lock"} if folder.is_dir() else set[str]()
+    if present and not (options.overwrite or options.resume):
         raise UserError(
             f"{folder} holds a model: --resume goes on with it, --overwrite replaces it, "
             "--name NAME makes another"
         )
-    return folder
+    if present and not present & {"scene.ply", "train.json", "checkpoints"}:
+        raise UserError(f"{folder} holds something that is not a model: give another --name")
+
+
+@contextlib.contextmanager
+def _only_writer(options: Train, folder: Path) -> Generator[None]:
+    """Within it no other process trains this model, from its first file to its last."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = lock_folder(folder)
+    except BlockingIOError:
+        raise UserError(f"{folder}: another process is training here") from None
+    with lock:
+        _check_free(options, folder)  # another process may have been faster
+        yield
 
 
 def _write_record(
@@ -108,8 +131,9 @@ def _write_record(
         "test_views": held_out.tolist(),
         "config": config.as_record(),
         "packages": package_versions(),
+        "history_sha256": hashlib.sha256((path.parent / "history.csv").read_bytes()).hexdigest(),
     }
-    write_atomic(path, json.dumps(record, indent=1).encode())
+    write_atomic(path, json.dumps(sealed(record), indent=1).encode())
 
 
 def _write_model(folder: Path, result: train.FitResult) -> None:

@@ -1,6 +1,7 @@
 """What the report of a run says about the model that was trained on it."""
 
 import csv
+import hashlib
 import html
 import io
 from dataclasses import dataclass
@@ -12,9 +13,9 @@ from matplotlib.figure import Figure
 
 from r3jax.evaluation import style
 from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_fields
+from r3jax.foreign.fields import check_fields, check_type
 from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json
+from r3jax.foreign.json_text import parse_json, unsealed
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
@@ -78,11 +79,15 @@ def read_judged_model(run: Run) -> JudgedModel | None:
         return None
     try:
         evaluation = parse_json(read_bytes(path, _MAX_BYTES))
+        check_type("evaluation", evaluation, dict[str, Any])
+        evaluation = unsealed(evaluation)
         _check(evaluation)
         curve = Path(evaluation["model"]).parent / "history.csv"
         history = _read_columns(curve) if curve.exists() else {}
         sheet = path.with_suffix(".png")
         image = read_bytes(sheet, _MAX_BYTES) if sheet.exists() else None
+        if image is not None:
+            _check_hash(sheet, image, evaluation.get("sheet_sha256"))
     except (OSError, ValueError, csv.Error) as error:
         raise RunError(
             path, f"the evaluation cannot be read ({error!s:.300}): evaluate again"
@@ -110,7 +115,13 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
         ValueError, csv.Error: not a table, or not with these columns.
         OSError: it cannot be read.
     """
-    text = read_bytes(path, _MAX_BYTES).decode("utf-8")
+    data = read_bytes(path, _MAX_BYTES)
+    beside = path.with_name("train.json")
+    if beside.exists():
+        training = parse_json(read_bytes(beside, _MAX_BYTES))
+        check_type("train.json", training, dict[str, Any])
+        _check_hash(path, data, unsealed(training).get("history_sha256"))
+    text = data.decode("utf-8")
     rows = list(csv.DictReader(io.StringIO(text)))
     try:
         columns = {name: np.array([float(row[name]) for row in rows]) for name in _COLUMNS}
@@ -119,6 +130,16 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
     if not all((np.abs(column) <= _LARGEST).all() for column in columns.values()):
         raise ForeignFileError(f"{path} holds a value that is no number, or beyond all measure")
     return columns if rows else {}
+
+
+def _check_hash(path: Path, data: bytes, sha256: str | None) -> None:
+    """Refuses a file whose hash is not the one kept of it; earlier versions kept none.
+
+    Raises:
+        ForeignFileError: says which.
+    """
+    if sha256 not in (None, hashlib.sha256(data).hexdigest()):
+        raise ForeignFileError(f"{path} is damaged: its SHA-256 is not the one kept")
 
 
 def training_figure(history: dict[str, np.ndarray]) -> Figure:

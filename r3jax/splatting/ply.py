@@ -3,7 +3,9 @@
 Shape symbols: n Gaussians, k harmonics per color channel (1, 4, 9 or 16).
 """
 
+import hashlib
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +44,8 @@ _BLOCK = 1 << 22
 _LONGEST_WORD = 400
 """A number with more digits is something else."""
 
+_HASH = re.compile(rb"(?<=\n)comment sha256 ([0-9a-f]{64})\n")
+
 _POSITION = ["x", "y", "z"]
 _NORMAL = ["nx", "ny", "nz"]
 _DC = [f"f_dc_{i}" for i in range(3)]
@@ -67,7 +71,8 @@ def write_scene(path: Path | str, scene: GaussianScene) -> None:
     """Writes the used rows of a scene; reading the file gives the same numbers, bit for bit.
 
     Binary, little endian, float32: x y z, nx ny nz (zeros), f_dc, f_rest (all of red, then
-    green, then blue), opacity (before the sigmoid), scale (logarithms), rot (wxyz).
+    green, then blue), opacity (before the sigmoid), scale (logarithms), rot (wxyz). A comment in
+    the header is the SHA-256 of all the rest.
 
     Raises:
         SceneFileError: no Gaussians, or parameters that are not finite.
@@ -86,8 +91,10 @@ def write_scene(path: Path | str, scene: GaussianScene) -> None:
     table = np.concatenate(columns, axis=1).astype("<f4")
     _check_values(path, names, table)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property float {name}" for name in names] + ["end_header", ""]
-    write_atomic(path, "\n".join(header).encode() + table.tobytes())
+    header += [f"property float {name}" for name in names]
+    before, after = "\n".join([*header, ""]).encode(), b"end_header\n" + table.tobytes()
+    sha256 = hashlib.sha256(before + after).hexdigest()
+    write_atomic(path, before + f"comment sha256 {sha256}\n".encode() + after)
 
 
 def read_scene(path: Path | str) -> GaussianScene:
@@ -97,13 +104,15 @@ def read_scene(path: Path | str) -> GaussianScene:
     the file may be binary of either byte order or text, and hold other elements.
 
     Raises:
-        SceneFileError: the file is missing, not a PLY, cut off, lacks fields, is compressed, or
-            holds no Gaussians, numbers that are not finite or rotations that are zero.
+        SceneFileError: the file is missing, not a PLY, cut off, lacks fields, is compressed, is
+            not what its hash was made of, or holds no Gaussians, numbers that are not finite or
+            rotations that are zero.
     """
     path = Path(path)
     try:
         check_regular(path)
         with open(path, "rb") as file:
+            _check_hash(file)
             byte_order, elements = _read_header(path, file)
             vertex, before = _find_vertices(path, elements)
             num_rest = _count_rest(path, {name for name, _ in vertex.fields})
@@ -135,6 +144,23 @@ def _scene_fields(num_rest: int) -> list[str]:
     """Names of the columns in the order of the original program."""
     rest = [f"f_rest_{i}" for i in range(num_rest)]
     return [*_POSITION, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION]
+
+
+def _check_hash(file: BinaryIO) -> None:
+    """Compares the file with the hash in its header, if there is one; rewinds it.
+
+    Raises:
+        ForeignFileError: it is not what was written.
+    """
+    head = file.read(1 << 16)
+    found = _HASH.search(head[: head.find(b"end_header") + 1])
+    if found is not None:
+        digest = hashlib.sha256(head[: found.start()] + head[found.end() :])
+        while block := file.read(_BLOCK):
+            digest.update(block)
+        if digest.hexdigest() != found[1].decode():
+            raise ForeignFileError("it was damaged or changed: its SHA-256 is of another content")
+    file.seek(0)
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:

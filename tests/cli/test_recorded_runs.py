@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 
+import jax
 import numpy as np
 import pytest
 
@@ -115,6 +116,7 @@ def test_a_mistake_is_named_and_changes_nothing(part, capsys, words, message):
 def test_another_scene_under_the_same_name_is_noticed(room, part, capsys):
     header = json.loads((part / "run.json").read_text())
     header["scene"]["hash"] = "0" * 64
+    del header["seal"]
     (part / "run.json").write_text(json.dumps(header))
     assert main(["explore", "--resume", str(part)]) == 2
     assert "is not the one that the run was recorded in" in capsys.readouterr().err
@@ -123,6 +125,7 @@ def test_another_scene_under_the_same_name_is_noticed(room, part, capsys):
 def test_other_versions_are_told(part, capsys):
     header = json.loads((part / "run.json").read_text())
     header["packages"]["jax"] = "0.1"
+    del header["seal"]
     (part / "run.json").write_text(json.dumps(header))
     assert main(["explore", "--resume", str(part)]) == 0
     assert "begun with other versions (jax 0.1 -> " in capsys.readouterr().err
@@ -184,6 +187,28 @@ def test_a_merged_run_has_seen_what_both_have_seen(runs, tmp_path):
     assert float(merged.count.sum()) == float(joined.count.sum())
     known = lambda grid: int((grid.free | grid.occupied).sum())
     assert known(grid) >= max(known(rebuild([r])[1]) for r in (first, second))
+
+
+def test_a_run_is_not_merged_with_itself(runs, tmp_path, capsys):
+    (tmp_path / "link").symlink_to(runs / "whole")
+    for other in (runs / "whole", tmp_path / "link"):
+        words = ["merge", str(runs / "whole"), str(other), "--out", str(tmp_path / "twice")]
+        assert main(words) == 2
+        assert "a run is not merged with itself" in capsys.readouterr().err
+    assert not (tmp_path / "twice").exists()
+
+
+def test_resuming_repairs_the_last_map(runs, part, capsys):
+    whole = read_run(part).load_checkpoint(2)
+    files = (p for p in (part / "checkpoints" / "000002").rglob("*") if p.is_file())
+    largest = max(files, key=lambda p: p.stat().st_size)
+    data = bytearray(largest.read_bytes())
+    data[len(data) // 2] ^= 1
+    largest.write_bytes(data)
+    assert main(["replay", str(part)]) == 2
+    assert "resuming the run makes it anew" in capsys.readouterr().err
+    assert main(["explore", "--resume", str(part)]) == 0
+    jax.tree.map(np.testing.assert_array_equal, read_run(part).load_checkpoint(2), whole)
 
 
 def test_a_merged_run_is_forked_not_resumed(runs, tmp_path, capsys):

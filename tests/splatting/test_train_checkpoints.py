@@ -125,7 +125,7 @@ def test_a_damaged_checkpoint_costs_the_steps_since_the_one_before(views, folder
 def test_what_cannot_be_read_is_named(views, folder):
     for name in ("0000012", "0000020"):
         damage(folder / name)
-    with pytest.raises(CheckpointError, match="0000012: cannot be read .*SHA-256"):
+    with pytest.raises(CheckpointError, match=r"0000012: cannot be read .*SHA-256"):
         fit(views, config(), folder=folder, resume=True)
 
 
