@@ -115,11 +115,13 @@ def save_checkpoint(folder: Path, state: TrainState) -> None:
 
 
 def remove_checkpoints(folder: Path) -> None:
-    """Deletes a training's checkpoints, and the folder if it holds nothing else.
+    """Deletes a training's checkpoints, and the folder if it holds nothing else; never a link.
 
     Raises:
         OSError: a checkpoint cannot be deleted.
     """
+    if folder.is_symlink():
+        return
     for old in numbered(folder):
         discard(old)
     for name in (_SETTINGS, "lock"):

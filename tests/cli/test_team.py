@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from r3jax.cli.main import main
+from r3jax.files import lock_folder
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.simulators.start import APART
 from r3jax.trace.reader import read_run
@@ -70,6 +71,16 @@ def test_a_team_goes_on(pair, room, tmp_path, capsys):
     assert f"goes on behind views {VIEWS} + {VIEWS} of" in capsys.readouterr().err
     for name in ("transforms.json", "coverage.jsonl", "0/trace.jsonl", "1/run.json"):
         assert (tmp_path / "pair" / name).read_bytes() == (tmp_path / "long" / name).read_bytes()
+
+
+def test_two_processes_do_not_write_one_team(room, pair, tmp_path, capsys):
+    with lock_folder(pair):
+        assert main(["team", "--resume", str(pair)]) == 2
+        assert "another process is writing this team" in capsys.readouterr().err
+    (tmp_path / "pair").mkdir()
+    (tmp_path / "pair" / "transforms.json").touch()
+    assert team(room, tmp_path) == 2
+    assert "holds something that is not a team" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

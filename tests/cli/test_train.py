@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from r3jax.cli.main import main
+from r3jax.files import lock_folder
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.ply import read_scene
@@ -101,6 +102,17 @@ def test_overwrite_replaces_a_model(recording, tmp_path, capsys):
     assert train(recording, tmp_path, "--overwrite", "--resume") == 2
     assert "choose one" in capsys.readouterr().err
     assert (tmp_path / "last" / "scene.ply").read_bytes() == scenes[1]
+
+
+def test_two_processes_do_not_train_one_model(recording, models, tmp_path, capsys):
+    with lock_folder(models / "last"):
+        assert train(recording, models, "--overwrite") == 2
+    assert "another process is training here" in capsys.readouterr().err
+    (tmp_path / "last").mkdir()
+    (tmp_path / "last" / "thesis.txt").touch()
+    assert train(recording, tmp_path, "--overwrite") == 2
+    assert "holds something that is not a model" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "last").iterdir()] == ["thesis.txt"]
 
 
 def test_resume_of_other_settings_is_refused(recording, models, capsys):

@@ -15,7 +15,7 @@ from r3jax.mapping.state import empty_map
 from r3jax.trace.checkpoints import CheckpointWriter, load_checkpoint, map_tables, read_checkpoint
 from r3jax.trace.errors import RunError
 from tests.fuzz.referee import CASES_SLOW
-from tests.fuzz.tree import Files, pick_up
+from tests.fuzz.tree import Files, pick_up, unsealed
 from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
@@ -30,7 +30,7 @@ def seeds() -> list[Files]:
         writer = CheckpointWriter(Path(name))
         writer.save(3, map_tables(empty_map(64), grid))
         writer.close()
-        return [pick_up(Path(name))]
+        return [unsealed(pick_up(Path(name)))]
 
 
 def read(folder: Path) -> None:

@@ -16,7 +16,7 @@ from r3jax.trace.images import encode_png, to_integers
 from r3jax.trace.reader import read_run
 from r3jax.trace.rows import EndRow, to_json
 from tests.fuzz.referee import CASES_SLOW
-from tests.fuzz.tree import Files
+from tests.fuzz.tree import Files, unsealed
 from tests.fuzz.worker import Reader
 from tests.trace.runs import make_header, make_view
 
@@ -39,6 +39,7 @@ def seeds() -> list[Files]:
     files["trace.jsonl"] = "".join(line + "\n" for line in lines).encode()
     timing = json.dumps({"step": 0, "render": 0.1, "plan": 0.25}) + "\n"
     files["timings.jsonl"] = 3 * timing.encode()
+    files = unsealed(files)
     rows_only = {name: files[name] for name in ("run.json", "trace.jsonl", "timings.jsonl")}
     return [files, rows_only]
 

@@ -14,7 +14,7 @@ from r3jax.splatting.errors import SceneFileError
 from r3jax.splatting.ply import read_scene, write_scene
 from r3jax.splatting.scene import GaussianScene
 from tests.fuzz.referee import CASES_SLOW
-from tests.fuzz.tree import Files, pick_up
+from tests.fuzz.tree import Files, pick_up, unsealed
 from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
@@ -34,7 +34,7 @@ def seeds() -> list[Files]:
                 draw(5, 3), draw(5, 4), draw(5, 3), draw(5), draw(5, harmonics, 3)
             )
             write_scene(path, scene)
-            written.append(pick_up(path.parent))
+            written.append(unsealed(pick_up(path.parent)))
     return [*written, {"scene.ply": _as_text(written[0]["scene.ply"])}]
 
 

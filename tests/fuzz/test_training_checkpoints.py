@@ -26,7 +26,7 @@ from r3jax.splatting.train_step import TrainState, start_state
 from r3jax.splatting.training_config import TrainConfig
 from r3jax.splatting.views import Views
 from tests.fuzz.referee import CASES_SLOW
-from tests.fuzz.tree import Files, pick_up
+from tests.fuzz.tree import Files, pick_up, unsealed
 from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
@@ -57,7 +57,7 @@ def seeds() -> list[Files]:
     with tempfile.TemporaryDirectory() as name:
         begin_checkpoints(Path(name), settings())
         save_checkpoint(Path(name), state())
-        return [pick_up(Path(name))]
+        return [unsealed(pick_up(Path(name)))]
 
 
 def read(folder: Path) -> None:

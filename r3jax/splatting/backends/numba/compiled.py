@@ -20,10 +20,12 @@ def _forget_outdated_code() -> None:
     Numba compares a kernel with its own file only, not with the files of what it inlines.
     """
     here = Path(__file__).parent
-    newest = max(source.stat().st_mtime for source in here.glob("*.py"))
+    sources = {source.stem: source.stat().st_mtime for source in here.glob("*.py")}
+    newest = max(sources.values())
     for index in here.glob("__pycache__/*.nbi"):
+        is_ours = index.name.partition(".")[0] in sources  # of a kernel in one of these files
         with contextlib.suppress(OSError):
-            if index.stat().st_mtime < newest:
+            if is_ours and index.stat().st_mtime < newest:
                 index.unlink()
 
 

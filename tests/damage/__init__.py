@@ -1,0 +1,1 @@
+"""What kills, torn files and flipped bits may do to what lies on disk."""
