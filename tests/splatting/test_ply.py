@@ -1,5 +1,6 @@
 """Scene files: what is written is read again, and other programs' files are read as they are."""
 
+import hashlib
 import struct
 
 import equinox as eqx
@@ -81,10 +82,12 @@ def law_layout(modules: Modules, path) -> None:
     names += [f"f_rest_{i}" for i in range(9)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
-    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    header += "".join(f"property float {name}\n" for name in names)
     values = [1, 2, 3, 0, 0, 0, 10, 20, 30, 11, 12, 13, 21, 22, 23, 31, 32, 33, 0.75]
     values += [-1, -2, -3, 0.5, 0.25, -0.5, 2]
-    expected = header.encode() + struct.pack("<26f", *values)
+    rest = b"end_header\n" + struct.pack("<26f", *values)
+    sha256 = hashlib.sha256(header.encode() + rest).hexdigest()
+    expected = header.encode() + f"comment sha256 {sha256}\n".encode() + rest
     modules["ply"].write_scene(path, scene)
     assert path.read_bytes() == expected
 
@@ -283,6 +286,21 @@ def test_a_file_that_is_cut_off(tmp_path_factory, missing):
     left = (COUNT * 23 * 4 - missing) // (23 * 4)
     reason = refused(tmp_path_factory.mktemp("ply"), data[:-missing])
     assert f"promises {COUNT} Gaussians, {left} are there" in reason
+
+
+def test_every_flipped_bit_is_refused_or_without_effect(tmp_path):
+    path = tmp_path / "scene.ply"
+    write_scene(path, simple_scene())
+    data, whole, refusals = path.read_bytes(), read_scene(path), 0
+    for bit in np.random.default_rng(0).integers(8 * len(data), size=300):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            assert_same_bits(read_scene(path), whole)
+        except SceneFileError:
+            refusals += 1
+    assert refusals > 280  # all but the word `sha256` of the comment
 
 
 def test_absurd_counts_are_found_before_memory_is_asked_for(tmp_path):
