@@ -27,7 +27,8 @@ def record_end(recorder: RunWriter, state: LoopState, stop: Stop) -> Stop:
         if state.views > 0:
             recorder.checkpoint(state.views - 1, state_tables(state), wait=True)
     except RecordingStopped as error:  # the frames stay, and the map can be made of them again
-        stop = Stop(stop.reason, f"{stop.message}; the last map is not stored ({error.reason})")
+        if error.reason not in stop.message:
+            stop = Stop(stop.reason, f"{stop.message}; the last map is not stored ({error.reason})")
     try:
         recorder.finish(stop.reason.value, stop.message)
     except RecordingStopped as error:

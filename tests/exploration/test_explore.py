@@ -18,6 +18,7 @@ from r3jax.exploration.state import StopReason
 from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import empty_map
 from r3jax.scoring.sighting import look
+from r3jax.trace import checkpoints
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.exploration.toys import UPPER, BoxRoom, Wander
@@ -219,6 +220,19 @@ def test_a_full_disk_ends_the_run_and_keeps_what_was_recorded(tmp_path, monkeypa
     run = read_run(tmp_path / "run")
     assert len(run.rows) == len(result.rows) < 5
     assert len(list(run.frames())) == len(run.rows)
+
+
+def test_a_checkpoint_that_the_disk_refuses_ends_the_run_and_says_so(tmp_path, monkeypatch, capfd):
+    def full(path, tables):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(checkpoints, "write_checkpoint", full)
+    result = run_in(tmp_path / "run")
+    assert result.reason is StopReason.RECORDING_STOPPED
+    run = read_run(tmp_path / "run")
+    assert run.outcome == f"recording-stopped: {result.message}"
+    assert result.message.count("No space left on device") == 1
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_table_grows_before_it_is_full_and_loses_nothing():
