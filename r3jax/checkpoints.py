@@ -16,7 +16,8 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Generator, Mapping
+import time
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,9 @@ _HASHES = "sha256.json"
 _MAX_BYTES = 16 << 20
 _ORBAX = "_CHECKPOINT_METADATA"
 """A file in every checkpoint, by which its folder is known."""
+
+_STRAGGLING = 0.5
+"""After an error the other arrays' reports come in within this time [s]."""
 
 _DIGITS = 6
 _WRITING, _DISCARDED = ".writing-", ".discarded-"
@@ -181,22 +185,30 @@ def _check_hashes(folder: Path) -> None:
 
 @contextmanager
 def _quiet() -> Generator[None]:
-    """Keeps Orbax from printing tracebacks of an error that it also raises.
-
-    Its log has one from every thread. Arrays that fail after the first one report to an event
-    loop which Orbax has closed by then, and Python prints a traceback for each.
-    """
+    """Keeps Orbax from printing tracebacks of an error that it also raises."""
     log, hook = logging.getLogger("absl"), sys.unraisablehook
     level = log.level
-
-    def without_loops(unraisable: Any) -> None:
-        if str(unraisable.exc_value) != "Event loop is closed":
-            hook(unraisable)
-
-    log.setLevel(logging.CRITICAL + 1)
-    sys.unraisablehook = without_loops
+    log.setLevel(logging.CRITICAL + 1)  # every thread of Orbax logs a traceback
+    if not isinstance(hook, _WithoutLoops):
+        sys.unraisablehook = _WithoutLoops(hook)
     try:
         yield
-    finally:
         sys.unraisablehook = hook
+    except BaseException:
+        time.sleep(_STRAGGLING)  # the hook stays, but is gone when the process ends
+        raise
+    finally:
         log.setLevel(level)
+
+
+class _WithoutLoops:
+    """Leaves out what arrays report that fail after the first one: Orbax has closed their loop."""
+
+    def __init__(self, hook: Callable[[Any], Any]):
+        """Takes the hook that is told everything else."""
+        self._hook = hook
+
+    def __call__(self, unraisable: Any) -> None:
+        """Python's `sys.unraisablehook`."""
+        if str(unraisable.exc_value) != "Event loop is closed":
+            self._hook(unraisable)
