@@ -18,6 +18,8 @@ from tests.fuzz import containers
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
+pytestmark = pytest.mark.full
+
 CEILING = 1 << 30
 """For files of at most two megabytes, and all that is read at once of what they unpack to."""
 
