@@ -1,5 +1,6 @@
 """Strict JAX, one hypothesis profile, and the shared data that some tests compare with."""
 
+import ctypes
 import gc
 import os
 import signal
@@ -54,18 +55,28 @@ def shared_path(*parts: str) -> Path:
     return path
 
 
+_MOST_MAPPINGS = 20_000
+_MOST_MEMORY = 1_700 << 20
+"""Of a test process before it forgets what it has compiled [bytes]."""
+
+
 @pytest.fixture(scope="module", autouse=True)
-def _few_mappings():
-    """Drops compiled code between files before the process runs out of memory mappings.
+def _few_programs():
+    """Drops compiled code between files before the process runs out of mappings or memory.
 
     XLA's CPU compiler maps every computation; Linux allows 65 530 mappings a process (the
     default of vm.max_map_count), the whole suite needs more, and LLVM aborts at the limit.
     """
     yield
     mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > 20_000:
+    if not mappings.exists():
+        return
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    has_much = pages * os.sysconf("SC_PAGE_SIZE") > _MOST_MEMORY
+    if has_much or mappings.read_bytes().count(b"\n") > _MOST_MAPPINGS:
         jax.clear_caches()
         gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)  # else glibc keeps what was freed
 
 
 @pytest.fixture(scope="session")

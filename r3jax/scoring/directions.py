@@ -89,6 +89,8 @@ def nearest_seen(
     return best
 
 
+# Jitted: a thousand operations are then traced once for a size, not once for every program.
+@functools.partial(jax.jit, static_argnames=("num_bins", "keep_nearest"))
 def _scan(
     visited: UInt32[Array, "W n"],
     direction: Float[Array, "3 n"],

@@ -18,6 +18,8 @@ from r3jax.mapping.update import integrate
 from tests.audit.room import round_poses, write_recording
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
+pytestmark = pytest.mark.full
+
 WISHES = Wishes(voxel_size=0.1, folds=4)
 NUM = 8
 
@@ -154,6 +156,7 @@ MUTANTS = [
 ]
 
 
+@pytest.mark.mutant
 def test_laws_hold_without_a_fault():
     modules = load(CHAIN)
     law_statistics(modules)

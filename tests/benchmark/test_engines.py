@@ -35,6 +35,7 @@ def assert_same_records(root, expected_root, expected_cells=None):
     assert list(map(without_clock, found)) == list(map(without_clock, expected))
 
 
+@pytest.mark.full
 def test_two_processes_of_which_one_is_killed_give_the_same_records(finished, room, tmp_path):
     cells = make_cells(room, tmp_path, seeds=(0, 1))
     bad = broken(dataclasses.replace(cells[0], seed=2))
@@ -60,6 +61,7 @@ def test_two_processes_of_which_one_is_killed_give_the_same_records(finished, ro
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.full
 def test_a_cell_that_fails_does_not_stop_the_others(finished, room, tmp_path):
     good, other = make_cells(room, tmp_path, seeds=(0, 1))
     events = []

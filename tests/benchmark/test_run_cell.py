@@ -80,6 +80,7 @@ def test_each_snapshot_leaves_a_record_of_the_schema(finished):
     assert all(not snapshots_left(root, cell) for cell in cells)
 
 
+@pytest.mark.full
 def test_what_is_done_is_not_done_again(finished, monkeypatch):
     root, cells = finished
 
@@ -92,6 +93,7 @@ def test_what_is_done_is_not_done_again(finished, monkeypatch):
     run_cell(cells[0], root)
 
 
+@pytest.mark.full
 def test_a_snapshot_that_is_asked_for_later_takes_the_exploration_that_is_there(
     finished, room, tmp_path, monkeypatch
 ):
@@ -106,6 +108,7 @@ def test_a_snapshot_that_is_asked_for_later_takes_the_exploration_that_is_there(
     assert records["metres:100"]["metrics"] == records["views:3"]["metrics"]
 
 
+@pytest.mark.full
 def test_a_snapshot_sees_the_views_up_to_it_and_no_others(finished, room, tmp_path):
     """What a cell says of its second view is what a cell ends with that has no third."""
     root, cells = finished

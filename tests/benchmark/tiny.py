@@ -1,4 +1,4 @@
-"""A benchmark so small that its cells take seconds: a box room, three views of 32 pixels."""
+"""A benchmark so small that its cells take seconds: a box room, three views of 48 pixels."""
 
 import dataclasses
 import sys
@@ -19,11 +19,11 @@ CONDITIONS = Conditions(
     budget="views:3",
     snapshots=("views:2", "views:3"),
     clock="model",
-    resolution=32,
+    resolution=48,
     fov=90.0,
     voxel_size=0.1,
-    map_capacity=1 << 13,
-    train_resolution=32,
+    map_capacity=1 << 14,
+    train_resolution=48,
     iterations=30,
     gaussians=200,
     capacity=400,

@@ -5,6 +5,8 @@ import pytest
 
 import r3jax
 
+pytestmark = pytest.mark.full
+
 KEY_FRAMES = [20, pytest.param(300, marks=pytest.mark.measured)]
 
 

@@ -13,6 +13,8 @@ from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.greedy import draw_positions
 from r3jax.planning.travel import plan_travel
 
+pytestmark = pytest.mark.full
+
 HOUSE = np.array([[0.0, 0.0, 0.0], [12.0, 12.0, 5.0]])  # 62 x 62 x 27 = 104k cells
 
 

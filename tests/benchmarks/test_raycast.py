@@ -1,9 +1,12 @@
 """A 512x512 RGB-D frame of a furnished house with 146 000 textured triangles: at most 150 ms."""
 
 import numpy as np
+import pytest
 
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast import RaycastSimulator
+
+pytestmark = pytest.mark.full
 
 
 def test_frame_of_the_house(benchmark, shared):

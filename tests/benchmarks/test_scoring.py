@@ -8,6 +8,8 @@ import r3jax
 from r3jax.planning.policy import make_policy
 from r3jax.scoring.batch import score_positions, score_views
 
+pytestmark = pytest.mark.full
+
 
 def test_voxel_renderability_and_panorama(benchmark, explored, scoring):
     """Target: 8 ms together."""

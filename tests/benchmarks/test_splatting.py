@@ -14,6 +14,8 @@ from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.render import render
 from r3jax.splatting.scene import GaussianScene
 
+pytestmark = pytest.mark.full
+
 ROOM = np.array([6.0, 4.5, 2.7])
 """Length, width, height [m]."""
 

@@ -55,6 +55,7 @@ def audited(captures, tmp_path_factory):
     return out
 
 
+@pytest.mark.full
 def test_an_audit_leaves_a_page_clouds_cameras_and_numbers(audited):
     names = {path.name for path in audited.iterdir()}
     assert names == {
@@ -73,6 +74,7 @@ def test_an_audit_leaves_a_page_clouds_cameras_and_numbers(audited):
         assert word in page
 
 
+@pytest.mark.full
 def test_the_suggested_views_are_a_capture_that_our_reader_opens(audited):
     record = json.loads((audited / "audit.json").read_text())
     images = read_transforms(audited / "suggested_transforms.json")
@@ -81,12 +83,14 @@ def test_the_suggested_views_are_a_capture_that_our_reader_opens(audited):
     assert (images.lenses[0].width, images.lenses[0].height) == (LENS.width, LENS.height)
 
 
+@pytest.mark.full
 def test_the_same_words_give_the_same_numbers(captures, audited, tmp_path):
     assert audit(captures / "recording", tmp_path / "again", "--voxel-size", "0.15") == 0
     for name in ("audit.json", "suggested_transforms.json", "voxels.ply"):
         assert (tmp_path / "again" / name).read_bytes() == (audited / name).read_bytes()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["nerfstudio", "nerfstudio/transforms.json", "colmap"])
 def test_other_formats_are_audited(captures, tmp_path, name, capsys):
     words = [] if name == "colmap" else ["--voxel-size", "0.15"]
@@ -102,6 +106,7 @@ def test_other_formats_are_audited(captures, tmp_path, name, capsys):
     assert (positions < (3.0 if name == "colmap" else 1.0) * np.array([4.0, 3.0, 2.4])).all()
 
 
+@pytest.mark.full
 def test_a_given_path_is_judged_frame_by_frame(captures, tmp_path, capsys):
     poses = np.stack([pose_at([1.5, 1.5, 1.2], t) for t in ([4, 1, 1], [2, 3, 1], [0, 0, 2])])
     write_camera_path(tmp_path / "path.json", poses, LENS.camera)

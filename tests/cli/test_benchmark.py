@@ -54,6 +54,7 @@ def test_every_cell_and_snapshot_has_its_line(finished):
         assert (finished / record["run"] / "run.json").exists()
 
 
+@pytest.mark.full
 def test_the_same_words_again_do_nothing_and_show_the_table(room, finished, monkeypatch, capsys):
     before = (finished / CELLS).read_bytes()
     monkeypatch.setattr(running, "run_cell", lambda *a, **k: pytest.fail("done a second time"))
@@ -65,6 +66,7 @@ def test_the_same_words_again_do_nothing_and_show_the_table(room, finished, monk
         assert word in captured.out
 
 
+@pytest.mark.full
 def test_another_setting_makes_another_cell_beside_the_first(room, finished, capsys):
     before = read(finished)
     assert benchmark(room, finished, policies="random", snapshots="views:2", iterations=20) == 0

@@ -24,6 +24,7 @@ def runs(room, tmp_path_factory):
     return out
 
 
+@pytest.mark.full
 def test_a_run_that_is_good_enough_says_so(runs):
     run = read_run(runs / "box")
     assert len(run.rows) == 5
@@ -35,6 +36,7 @@ def test_a_run_that_is_good_enough_says_so(runs):
     assert "all but the worst tenth (p10):" in page
 
 
+@pytest.mark.full
 def test_going_on_takes_another_goal(runs, capsys):
     words = ["explore", "--resume", str(runs / "box"), "--until", "psnr:99", "--budget", "views:6"]
     assert main(words) == 0
@@ -44,6 +46,7 @@ def test_going_on_takes_another_goal(runs, capsys):
     assert run.header.config["until"] == "psnr:99"
 
 
+@pytest.mark.full
 def test_a_forecast_is_told_view_by_view(runs, tmp_path, capsys):
     plot = tmp_path / "forecast.png"
     assert main(["forecast", str(runs / "box"), "--plot", str(plot)]) == 0
@@ -55,6 +58,7 @@ def test_a_forecast_is_told_view_by_view(runs, tmp_path, capsys):
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.full
 def test_a_calibration_of_ones_own(runs, tmp_path, capsys):
     path = tmp_path / "mine.json"
     write_calibration(path, default_calibration())
@@ -84,6 +88,7 @@ def test_what_cannot_work_is_told(words, reason, capsys, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.full
 def test_a_file_that_is_no_calibration_is_told(runs, tmp_path, capsys):
     path = tmp_path / "mine.json"
     path.write_text("[]")

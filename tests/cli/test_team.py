@@ -37,6 +37,7 @@ def pair(room, tmp_path_factory):
     return out / "pair"
 
 
+@pytest.mark.full
 def test_every_camera_leaves_a_run_that_replays(pair, capsys):
     for number in ("0", "1"):
         assert main(["replay", str(pair / number)]) == 0
@@ -44,6 +45,7 @@ def test_every_camera_leaves_a_run_that_replays(pair, capsys):
         assert (pair / number / "report" / "report.html").exists()
 
 
+@pytest.mark.full
 def test_the_cameras_start_apart_with_their_own_lenses(pair):
     first, second = (read_run(pair / number) for number in ("0", "1"))
     assert first.camera.fx < second.camera.fx
@@ -51,6 +53,7 @@ def test_the_cameras_start_apart_with_their_own_lenses(pair):
     assert np.linalg.norm(gap) == pytest.approx(APART, abs=1e-5)
 
 
+@pytest.mark.full
 def test_one_data_set_holds_the_frames_of_all(pair):
     frames = json.loads((pair / "transforms.json").read_text())["frames"]
     assert len(frames) == 2 * VIEWS
@@ -63,6 +66,7 @@ def test_one_data_set_holds_the_frames_of_all(pair):
     assert len(lines) == 2 * VIEWS
 
 
+@pytest.mark.full
 def test_a_team_goes_on(pair, room, tmp_path, capsys):
     budget = ("--budget", f"views:{VIEWS + 1}")
     assert team(room, tmp_path, "--name", "long", *budget) == 0
@@ -73,6 +77,7 @@ def test_a_team_goes_on(pair, room, tmp_path, capsys):
         assert (tmp_path / "pair" / name).read_bytes() == (tmp_path / "long" / name).read_bytes()
 
 
+@pytest.mark.full
 def test_two_processes_do_not_write_one_team(room, pair, tmp_path, capsys):
     with lock_folder(pair):
         assert main(["team", "--resume", str(pair)]) == 2
@@ -99,6 +104,7 @@ def test_what_cannot_fly_is_refused(room, tmp_path, capsys, words, message):
     assert not (tmp_path / "pair").exists()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("command", "message"),
     [

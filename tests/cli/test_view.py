@@ -104,6 +104,7 @@ def test_a_folder_that_holds_something_is_told(path, tmp_path, capsys):
     assert "something is there already" in say(["view", path, "--export", tmp_path], capsys)
 
 
+@pytest.mark.full
 def test_pictures_are_written_without_viser_and_the_run_stays_as_it_is(
     path, tmp_path, capsys, monkeypatch
 ):
@@ -131,6 +132,7 @@ def test_a_page_is_shown_until_it_is_interrupted(path, capsys, monkeypatch):
     assert shown.out == ""
 
 
+@pytest.mark.full
 def test_ctrl_c_ends_the_page_while_it_works_out_its_first_answer(path, tmp_path):
     """For which it has to compile: half a minute that Ctrl-C used to wait for."""
     pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")

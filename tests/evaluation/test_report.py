@@ -61,6 +61,7 @@ def reported(tmp_path_factory):
     return run, result, page
 
 
+@pytest.mark.full
 def test_the_page_stands_alone(reported):
     run, _, page = reported
     text = page.read_text()
@@ -72,6 +73,7 @@ def test_the_page_stands_alone(reported):
     assert len(files) == 7
 
 
+@pytest.mark.full
 def test_the_page_tells_the_runs_own_numbers(reported):
     run, _, page = reported
     text = page.read_text()
@@ -85,6 +87,7 @@ def test_the_page_tells_the_runs_own_numbers(reported):
     assert "<box>" not in text
 
 
+@pytest.mark.full
 def test_the_page_forecasts_what_a_model_would_be_worth(reported):
     """The last of the curve's points is a forecast of the map that the run ended with."""
     run, result, page = reported
@@ -94,6 +97,7 @@ def test_the_page_forecasts_what_a_model_would_be_worth(reported):
     assert said in page.read_text()
 
 
+@pytest.mark.full
 def test_views_are_explained_as_they_were_chosen(reported):
     """Wander decides by chance: what counts is what the views that it chose promised."""
     run, _, page = reported
@@ -129,6 +133,7 @@ def test_the_bars_of_a_view_are_its_shares():
     style.to_png(reasons_figure(utility[:1]))  # the start alone can be drawn
 
 
+@pytest.mark.full
 def test_a_run_that_cannot_be_explained_has_a_report_all_the_same(reported, tmp_path):
     run, result, _ = reported
     shutil.copytree(run.path, tmp_path / "merged")
@@ -149,6 +154,7 @@ def test_a_run_without_views_has_no_report(tmp_path):
     assert summary(run)["views"] == "0"
 
 
+@pytest.mark.full
 def test_a_run_that_was_cut_off_can_be_reported(reported, tmp_path):
     run, result, _ = reported
     rows = (run.path / "trace.jsonl").read_text().splitlines(keepends=True)
@@ -183,6 +189,7 @@ def test_timings_that_are_damaged_do_not_hurt(tmp_path):
     assert [stage.total for stage in stage_times(read_run(tmp_path / "run"))] == [2.0]
 
 
+@pytest.mark.full
 def test_memory_is_counted_as_the_map_counts_it(reported):
     run, result, _ = reported
     assert map_row_bytes(run) == result.state.map_state.bytes_per_row

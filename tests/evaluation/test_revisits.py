@@ -39,6 +39,7 @@ def share_seen_before(recording) -> np.ndarray:
     return np.asarray(shares)
 
 
+@pytest.mark.full
 def test_renderability_rises_where_the_path_returns_to_seen_places(lounge):
     recording, reports, _ = lounge
     before = np.array([report.renderability for report in reports])

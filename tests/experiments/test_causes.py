@@ -9,6 +9,8 @@ from tests.box_room import write_room
 from tests.cli.small_runs import explore
 from tests.evaluation.records import record
 
+pytestmark = pytest.mark.full
+
 
 def test_means_are_over_the_views_of_a_part_and_the_seeds():
     records = [record("ours-pano", scene, seed) for scene in ("flat", "office") for seed in (0, 1)]

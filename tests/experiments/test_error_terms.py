@@ -24,6 +24,8 @@ from r3jax.scoring.voxels import voxels_of
 from tests.benchmark.tiny import CONDITIONS, make_cells
 from tests.box_room import write_room
 
+pytestmark = pytest.mark.full
+
 CONFIG = ScoringConfig(max_range=5.0)
 LOOKS = [
     ((-1.5, -1.0, 0.2), (1.0, 0.5, 0.0)),

@@ -14,6 +14,8 @@ from r3jax.scoring.voxels import voxels_of
 from tests.evaluation.records import record
 from tests.planning.known_hall import CAMERA, SCORING, known
 
+pytestmark = pytest.mark.full
+
 ASKING = np.array([[1.0, 0.9, 1.2], [2.0, 0.8, 1.4], [1.2, 1.8, 1.0]])
 NUM = 4
 PSNR = {"first": 18.0, "every second": 19.0, "in hindsight": 19.5, "all": 20.0}

@@ -11,6 +11,8 @@ from experiments import missions, planner_latency, planner_memory
 from experiments.artefacts import Origin, markdown_table, write_csv
 from experiments.missions import Options, Size, bucket_of, fly, size_of
 
+pytestmark = pytest.mark.full
+
 VIEWS = 4
 
 

@@ -12,7 +12,7 @@ from experiments import suite, sweep
 from experiments.artefacts import Origin
 from experiments.settings import known_settings
 from experiments.sweep import Options
-from experiments.sweep_choice import Trial, choose
+from experiments.sweep_choice import Trial, choose, leave_one_out
 from experiments.sweep_page import Sweep, setting_figure, write_page
 from r3jax.benchmark.conditions import Conditions
 from r3jax.benchmark.engines.local import run_here
@@ -21,7 +21,6 @@ from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
 from tests.benchmark.tiny import CONDITIONS, SETTINGS
 from tests.box_room import write_room
 from tests.evaluation.records import record
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 KNOWN = known_settings(Conditions())
 LAMBDA1 = KNOWN["policy.lambda1"]
@@ -47,9 +46,8 @@ def trial(value, level, seeds=(0, 1), scenes=("loft", "kitchen")):
 DEFAULT = {LAMBDA1.name: 16.0}
 
 
-def law_best(modules: Modules) -> None:
+def test_the_best_is_chosen_by_gain_over_the_default():
     """The arg max, with the intervals of its views and seeds, in whatever order records come."""
-    choose = modules["sweep_choice"].choose
     trials = [trial(4.0, (0.0, 1.0)), trial(16.0, (0.0, 0.0)), trial(64.0, (-1.0, 1.5))]
     choice = choose(trials, DEFAULT)
     assert (choice.best, choice.default) == (0, 1)
@@ -66,14 +64,12 @@ def law_best(modules: Modules) -> None:
     assert choice.is_better  # the difference is the same in every view
     assert choice.chosen == 0
     assert choice.gains[1].value == choice.gains[1].high == 0.0
-    turn = modules["sweep_choice"].Trial
-    turned = [turn(t.point, t.records[::-1] if t is trials[0] else t.records) for t in trials]
+    turned = [Trial(t.point, t.records[::-1] if t is trials[0] else t.records) for t in trials]
     assert choose(turned, DEFAULT) == choice
 
 
-def law_doubt(modules: Modules) -> None:
+def test_a_gain_that_may_be_chance_is_not_chosen():
     """A gain in some views and a loss in others is within the interval; so is no gain at all."""
-    choose = modules["sweep_choice"].choose
     base = trial(16.0, (0.0,), seeds=(0,), scenes=("loft",))
     noise = np.random.default_rng(0).normal(0.0, 3.0, 12)
     noise += 0.1 - noise.mean()
@@ -90,9 +86,8 @@ def law_doubt(modules: Modules) -> None:
     assert not same.is_better
 
 
-def law_left_out(modules: Modules) -> None:
+def test_every_scene_is_left_out_in_turn():
     """A scene is judged by the choice of the others, worked out by hand."""
-    leave_one_out = modules["sweep_choice"].leave_one_out
     scenes = ("loft", "kitchen", "library")
     trials = [
         trial(4.0, (9.0, 0.0, 0.0), scenes=scenes),  # the loft's own favorite
@@ -104,28 +99,6 @@ def law_left_out(modules: Modules) -> None:
     assert abs(found["loft"].gain.value + 2.0) < 1e-9
     assert abs(found["kitchen"].gain.value) < 1e-9
     assert leave_one_out([trial(16.0, (0.0,), scenes=("loft",))], 0) == ()
-
-
-CHAIN = ("experiments.sweep_choice",)
-MUTANTS = [
-    Mutant("sweep_choice", "np.argmax([mean", "np.argmin([mean", law_best),
-    Mutant("sweep_choice", "(found, scores[base])", "(scores[base], found)", law_best),
-    Mutant("sweep_choice", 'key=lambda record: record["seed"]', "key=lambda record: 0",
-           law_best),
-    Mutant("sweep_choice", "self.gains[self.best].low >", "self.gains[self.best].value >",
-           law_doubt),
-    Mutant("sweep_choice", "np.delete(table, i, axis=1)", "table", law_left_out),
-]  # fmt: skip
-
-
-def test_the_laws_hold_without_a_fault():
-    for law in (law_best, law_doubt, law_left_out):
-        law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
 
 
 def test_a_default_that_was_not_tried_is_refused():

@@ -15,7 +15,6 @@ from experiments.sweep_space import (
     with_default,
 )
 from r3jax.benchmark.conditions import Conditions
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 KNOWN = known_settings(Conditions())
 
@@ -48,56 +47,31 @@ def test_random_points_are_in_range_distinct_and_the_same_for_the_same_seed(coun
     assert random_points(axes, count, seed + 1) != points
 
 
-def law_scale(modules: Modules) -> None:
+def test_a_logarithmic_range_is_drawn_evenly_over_decades():
     """Half of the draws lie below the middle of their scale."""
-    space = modules["sweep_space"]
     for scale, middle in ((":log", 100.0), ("", 5000.5)):
-        axes = space.parse_axes([f"lambda1=1..10000{scale}"], KNOWN)
-        drawn = [point["policy.lambda1"] for point in space.random_points(axes, 400, 0)]
+        axes = parse_axes([f"lambda1=1..10000{scale}"], KNOWN)
+        drawn = [point["policy.lambda1"] for point in random_points(axes, 400, 0)]
         assert abs(np.mean(np.array(drawn) < middle) - 0.5) < 0.1  # four sigma
 
 
-def law_whole(modules: Modules) -> None:
+def test_whole_numbers_are_drawn_evenly_ends_included():
     """Of a range of whole numbers, all are as likely, the ends too."""
-    (axis,) = modules["sweep_space"].parse_axes(["num_bins=3..6"], KNOWN)
+    (axis,) = parse_axes(["num_bins=3..6"], KNOWN)
     rng = np.random.default_rng(0)
     found, counts = np.unique([axis.draw(rng) for _ in range(800)], return_counts=True)
     assert found.tolist() == [3, 4, 5, 6]
     assert np.all(np.abs(counts - 200) < 60)
 
 
-def law_points(modules: Modules) -> None:
+def test_points_differ_repeat_and_cover_the_grid():
     """Every point once, and more points begin with the same ones."""
-    space = modules["sweep_space"]
-    axes = space.parse_axes(["num_bins=3..5", "kappa=box,one"], KNOWN)
-    grid = space.grid_points(space.parse_axes(["num_bins=3,4,5", "kappa=box,one"], KNOWN))
-    points = space.random_points(axes, 6, 1)
+    axes = parse_axes(["num_bins=3..5", "kappa=box,one"], KNOWN)
+    grid = grid_points(parse_axes(["num_bins=3,4,5", "kappa=box,one"], KNOWN))
+    points = random_points(axes, 6, 1)
     assert len(grid) == 6
     assert sorted(map(str, points)) == sorted(map(str, grid))
-    assert space.random_points(axes, 3, 1) == points[:3]
-
-
-LAWS = (law_scale, law_whole, law_points)
-CHAIN = ("experiments.sweep_space",)
-MUTANTS = [
-    Mutant("sweep_space", "math.exp(rng.uniform(math.log(low), math.log(high)))",
-           "float(rng.uniform(low, high))", law_scale),
-    Mutant("sweep_space", "0.5 if is_whole", "0.0 if is_whole", law_whole),
-    Mutant("sweep_space", "found.setdefault(tuple(point.values()), point)",
-           "found[(len(found),)] = point", law_points),
-    Mutant("sweep_space", "default_rng(seed)", "default_rng(seed + count)", law_points),
-    Mutant("sweep_space", "itertools.product(*values)", "zip(*values)", law_points),
-]  # fmt: skip
-
-
-def test_the_laws_hold_without_a_fault():
-    for law in LAWS:
-        law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
+    assert random_points(axes, 3, 1) == points[:3]
 
 
 def test_more_points_than_there_are_cannot_be_drawn():

@@ -19,7 +19,7 @@ from r3jax.trace.writer import RunWriter
 from tests.exploration.toys import BoxRoom
 from tests.trace.runs import make_header
 
-CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=4)
+CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=4)
 SCORING = ScoringConfig(zbuffer_size=32, panorama_size=32)
 
 

@@ -25,7 +25,7 @@ from tests.exploration.toys import UPPER, BoxRoom, Wander
 from tests.trace.runs import make_header
 
 CONFIG = ExplorationConfig(
-    voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=4, checkpoint_every=3
+    voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=4, checkpoint_every=3
 )
 
 
@@ -246,6 +246,7 @@ def test_the_table_grows_before_it_is_full_and_loses_nothing():
     assert float(jnp.sum(reference.count)) == float(jnp.sum(grown.count))
 
 
+@pytest.mark.full
 def test_a_table_that_may_not_grow_counts_what_it_loses(tmp_path):
     fixed = replace(CONFIG, capacity=1 << 9, allow_growth=False)
     result = run_in(tmp_path / "run", budget="views:2", config=fixed)

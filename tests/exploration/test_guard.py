@@ -16,7 +16,7 @@ from r3jax.planning.policy import make_policy, policy_names
 from tests.exploration.toys import BoxRoom, Wander
 from tests.tiers import quick_and_full
 
-CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=4)
+CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=4)
 
 
 def reachable(*roots):

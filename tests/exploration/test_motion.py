@@ -20,7 +20,7 @@ from r3jax.planning.policy import make_policy
 from r3jax.trace.reader import read_run
 from tests.exploration.toys import BoxRoom
 
-CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=4)
+CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=4)
 
 
 def mission(motion: Motion, budget: str, simulator: BoxRoom | None = None):

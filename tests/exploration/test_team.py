@@ -33,7 +33,6 @@ from tests.exploration.killed_run import CONFIG, SCORING, small_policy
 from tests.exploration.test_guard import Cheat
 from tests.exploration.toys import BoxRoom, Wander
 from tests.mutants import Modules, Mutant, assert_caught, each, load
-from tests.tiers import quick_and_full
 
 WIDE = Camera.from_fov(32, 32, 100.0)
 VIEWS = 5
@@ -81,7 +80,8 @@ def of_one_camera(members, frames):
     return map_state, grid
 
 
-@pytest.mark.parametrize("name", quick_and_full(["wander", "ours-pano"], ["wander"]))
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["wander", "ours-pano"])
 def test_a_team_of_one_is_the_camera_alone(name):
     policy = Wander() if name == "wander" else small_policy(name)
     alone = explore(BoxRoom(), policy, budget=f"views:{VIEWS}", seed=3, config=CONFIG)
@@ -365,6 +365,7 @@ MUTANTS = [
 ]
 
 
+@pytest.mark.mutant
 def test_the_laws_hold_on_a_fresh_copy():
     modules = load(CHAIN)
     merged(modules)

@@ -228,6 +228,7 @@ MUTANTS = [
 ]  # fmt: skip
 
 
+@pytest.mark.mutant
 def test_laws_hold_without_a_fault():
     modules = load(CHAIN)
     for law in (law_frames, law_edges, law_range):

@@ -403,6 +403,7 @@ def test_shut_in_all_candidates_are_the_robots_own_place():
     assert info.outcome is Outcome.NO_CANDIDATE
 
 
+@pytest.mark.full
 def test_what_was_observed_counts_in_the_decision_even_if_the_map_grew_since():
     """Seen square on three times, the wall promises less: also to a map with other rows."""
     chooser = ActiveGS(CONFIG)

@@ -19,6 +19,8 @@ from r3jax.planning.policies.active_gs.confidence import aligned, no_sightings, 
 from r3jax.planning.policies.active_gs.normals import pixel_normals
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
+pytestmark = pytest.mark.full
+
 CAMERA = Camera.from_fov(128, 12, 80.0)  # wide enough for pairs of pixels one and two apart
 VOXEL, CAPACITY, RANGE = 0.1, 1 << 12, 5.0
 FOCAL = 64.0 / np.tan(np.deg2rad(40.0))

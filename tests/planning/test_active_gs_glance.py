@@ -14,6 +14,8 @@ from r3jax.scoring.sighting import looked_at
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.test_active_gs_confidence import RANGE, frames, maps
 
+pytestmark = pytest.mark.full
+
 CHAIN = ("r3jax.planning.policies.active_gs.glance",)
 REACH = jnp.float32(RANGE)
 

@@ -16,6 +16,8 @@ from r3jax.planning.policies.cover import Cover
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning import walls
 
+pytestmark = pytest.mark.full
+
 LATTICE = fibonacci_lattice(64)
 NUM = 6  # pixels, in one row
 

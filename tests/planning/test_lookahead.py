@@ -79,10 +79,12 @@ def law_paths(modules: Modules) -> None:
     assert [p.rate for p in found] == sorted((p.rate for p in found), reverse=True)
 
 
+@pytest.mark.full
 def test_a_beam_with_room_for_all_finds_the_best_path():
     law_paths({"lookahead": real})
 
 
+@pytest.mark.full
 def test_a_narrow_beam_keeps_its_promise():
     """Not the best path, perhaps, but its rate is true, and views never add less than nothing."""
     outlook = outlook_of(dataclasses.replace(CONFIG, horizon=3, beam=2, branching=5))
@@ -200,6 +202,7 @@ MUTANTS = [
 ]
 
 
+@pytest.mark.mutant
 def test_laws_hold_without_a_fault():
     modules = load(CHAIN)
     for law in (law_paths, law_one_view, law_motion, law_apart):

@@ -92,6 +92,7 @@ def test_no_pose_is_taken_twice():
     law_each_once({"next_views": real})
 
 
+@pytest.mark.full
 @given(st.integers(0, 300))
 @settings(max_examples=5)
 def test_lazy_choice_is_that_of_scoring_all_again(seed):
@@ -120,6 +121,7 @@ def test_a_batch_of_one_is_the_next_best_view():
     assert views.utility[0] == scores.max()
 
 
+@pytest.mark.full
 def test_without_poses_free_space_is_searched_in_all_directions():
     state, grid = for_scoring()
     safe = safe_mask()
@@ -166,6 +168,7 @@ MUTANTS = [
 ]
 
 
+@pytest.mark.mutant
 def test_the_law_holds_without_a_fault():
     law_greedy(load(CHAIN))
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +18,8 @@ from r3jax.scoring.utility import view_utility
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 from tests.scoring.test_foresight import CAMERA, CONFIG, poses_of, seen_map
+
+pytestmark = pytest.mark.full
 
 CHAIN = ("r3jax.planning.promised",)
 WORLD = OccupancyGrid(

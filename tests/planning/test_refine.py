@@ -159,6 +159,7 @@ def law_whatever_climbs(modules: Modules, seed: int = 0, motion: Motion = MOTION
             law_safe(modules, seed, motion)
 
 
+@pytest.mark.full
 @given(seeds, st.sampled_from(list(MOTIONS)))
 @settings(max_examples=12)
 def test_where_a_climb_ends_is_checked(seed, motion_name):
@@ -177,6 +178,7 @@ def law_gains(modules: Modules) -> None:
     assert np.median(gains) > 0.1
 
 
+@pytest.mark.full
 def test_climbing_gains():
     law_gains({"refine": real})
 
@@ -192,6 +194,7 @@ def test_turning_alone_gains_and_stays():
     assert (found["utility"] / before).max() > 1.05
 
 
+@pytest.mark.full
 def test_climbs_compile_once():
     where = situation_of(MOTIONS["free"])
     refined({"refine": real}, where, candidates(where, 0))
@@ -269,6 +272,7 @@ def test_decisions_with_refinement(name):
         )
 
 
+@pytest.mark.full
 def test_views_are_scored_for_a_demand():
     """U of a demand: lambda1 times the cells, and the gain."""
     where = situation_of(MOTIONS["free"])
@@ -321,6 +325,7 @@ MUTANTS = [
 ]  # fmt: skip
 
 
+@pytest.mark.mutant
 def test_laws_hold_without_a_fault():
     modules = load(CHAIN)
     for law in (over_motions(law_never_worse), over_motions(law_whatever_climbs), law_gains):

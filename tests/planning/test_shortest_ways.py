@@ -4,6 +4,7 @@ import itertools
 from unittest import mock
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
@@ -50,6 +51,7 @@ def law_costs_are_scipys(modules):
         assert_costs_are_scipys(fresh.shortest_ways)
 
 
+@pytest.mark.full
 def test_costs_are_scipys():
     assert_costs_are_scipys(shortest_ways)
     law_costs_are_scipys(load(("r3jax.planning.shortest_ways",)))

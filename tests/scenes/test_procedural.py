@@ -14,6 +14,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from r3jax.scenes import procedural
 from r3jax.simulators.world import World
+from tests.tiers import quick_and_full
 
 NAMES = (
     "flat",
@@ -29,17 +30,31 @@ NAMES = (
 CELL, MARGIN = 0.2, 0.3  # the coarse grid and the robot's radius [m]
 
 
+class BuiltOnDemand(dict):
+    """What a function makes of a name, made once."""
+
+    def __init__(self, build):
+        super().__init__()
+        self._build = build
+
+    def __missing__(self, name):
+        self[name] = self._build(name)
+        return self[name]
+
+
 @pytest.fixture(scope="session")
 def worlds() -> dict[str, World]:
-    return {name: procedural.build(name) for name in NAMES}
+    return BuiltOnDemand(procedural.build)
 
 
 @pytest.fixture(scope="session")
 def meshes(worlds) -> dict[str, trimesh.Trimesh]:
-    return {n: trimesh.Trimesh(w.vertices, w.faces, process=False) for n, w in worlds.items()}
+    return BuiltOnDemand(
+        lambda n: trimesh.Trimesh(worlds[n].vertices, worlds[n].faces, process=False)
+    )
 
 
-@pytest.fixture(params=NAMES)
+@pytest.fixture(params=quick_and_full(NAMES, ["flat"]))
 def name(request) -> str:
     return request.param
 
@@ -71,9 +86,10 @@ def test_another_process_builds_the_same_bytes(worlds):
     assert done.stdout.decode().strip() == worlds["flat"].content_hash
 
 
+@pytest.mark.full
 def test_a_second_build_is_equal_and_scenes_differ(worlds):
     assert procedural.build("office").content_hash == worlds["office"].content_hash
-    assert len({w.content_hash for w in worlds.values()}) == len(NAMES)
+    assert len({w.content_hash for w in map(worlds.__getitem__, NAMES)}) == len(NAMES)
 
 
 def test_the_mesh_is_sound(worlds, name):
@@ -203,14 +219,17 @@ def test_texels_are_even_where_one_looks(worlds, views, name):
     assert np.mean((seen > 180) & (seen < 700)) >= 0.85
 
 
+@pytest.mark.full
 def test_materials_depend_on_the_view_and_defeat_the_sensor(worlds):
-    has = lambda test: sum(any(test(m) for m in w.materials) for w in worlds.values())
+    has = lambda test: sum(
+        any(test(m) for m in w.materials) for w in map(worlds.__getitem__, NAMES)
+    )
     assert has(lambda m: m.specular >= 0.3) == 9
     assert has(lambda m: m.is_hole and m.emission > 0.5) == 9  # windows
     assert has(lambda m: m.mirror >= 0.8) >= 6
     assert has(lambda m: 0.02 <= m.mirror <= 0.2) == 9  # glossy floors and worktops
     assert any(m.is_hole and m.mirror > 0.3 for m in worlds["office"].materials)  # glass walls
-    assert all(len(w.lamps) >= 3 for w in worlds.values())
+    assert all(len(w.lamps) >= 3 for w in map(worlds.__getitem__, NAMES))
 
 
 def test_every_surface_has_detail_at_several_scales(worlds, name):

@@ -30,6 +30,7 @@ def test_there_are_nine_embedded_scenes_each_with_a_line_about_it():
     assert len(set(lines)) == 9
 
 
+@pytest.mark.full
 def test_an_embedded_scene_opens():
     name = registry.scene_names()[0]
     simulator = registry.open_scene(name, camera=CAMERA, seed=2)

@@ -31,6 +31,8 @@ from r3jax.scoring.voxels import voxels_of
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.scoring.test_foresight import CAMERA, CAPACITY, poses_of, seen_map
 
+pytestmark = pytest.mark.full
+
 NUM = 3  # standpoints; one shape: one compile
 FOCAL = jnp.float32(26.0)  # of who asks, not that of the views
 CONFIG = ScoringConfig(max_range=2.5, panorama_size=64, panorama_bins=40)
@@ -315,6 +317,7 @@ MUTANTS = [
 ]  # fmt: skip
 
 
+@pytest.mark.mutant
 def test_laws_hold_without_a_fault():
     modules = load(CHAIN)
     for law in (law_oracle, law_worths, law_facility_location, law_once):

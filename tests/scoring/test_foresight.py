@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -153,6 +154,7 @@ MUTANTS = [
 ]
 
 
+@pytest.mark.mutant
 def test_laws_hold_without_a_fault():
     modules = load(CHAIN)
     for law in (law_value, law_order, law_observation, law_hidden):

@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,6 +16,8 @@ from r3jax.scoring.foresight import foresee_near
 from r3jax.scoring.near import near
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.known_hall import CAMERA, EYE, SCORING, for_scoring
+
+pytestmark = pytest.mark.full
 
 CHAIN = ("r3jax.scoring.kept",)
 NUM = 6

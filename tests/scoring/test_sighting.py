@@ -14,6 +14,7 @@ from r3jax.mapping.update import integrate, integrate_points
 from r3jax.scoring import sighting as real
 from r3jax.scoring.sighting import look
 from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.tiers import quick_and_full
 
 WIDTH, HEIGHT, CAPACITY, VOXEL = 24, 18, 2048, 0.05  # one shape: one compile
 CAMERA = Camera(WIDTH, HEIGHT, 20.0, 22.0, 11.0, 9.5)
@@ -160,7 +161,7 @@ def test_behind_glass_a_voxel_is_seen_unless_another_hides_it():
     law_holes({"sighting": real})
 
 
-@pytest.mark.parametrize("allow_growth", [True, False])
+@pytest.mark.parametrize("allow_growth", quick_and_full([True, False], [False]))
 def test_look_integrates_marks_and_grows(allow_growth):
     frame = frame_of()
     small = empty_map(64, VOXEL)
@@ -199,6 +200,7 @@ MUTANTS = [
 ]
 
 
+@pytest.mark.mutant
 def test_law_holds_without_a_fault():
     law_seen(load(CHAIN))
 

@@ -22,6 +22,8 @@ from r3jax.scoring.utility import utility_of_view
 from r3jax.scoring.voxels import voxels_of
 from tests.mutants import Modules, Mutant, assert_caught, each
 
+pytestmark = pytest.mark.full
+
 VOXEL, CAPACITY = 0.1, 1 << 11  # one shape: one compile
 CAMERA = Camera(96, 72, 90.0, 84.0, 45.0, 37.5)
 SCORING = ScoringConfig(max_range=2.4, zbuffer_size=96, lambda1=4.0)

@@ -25,6 +25,7 @@ from tests.conftest import shared_path
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.simulators.fake_habitat import NOISE, FakeHabitat
 from tests.simulators.habitat_golden import Golden, load_house, load_simple_room
+from tests.tiers import quick_and_full
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
 
@@ -71,7 +72,9 @@ def no_library(name):
     raise OSError(f"there is no {name}")
 
 
-@pytest.fixture(scope="module", params=[load_house, load_simple_room])
+@pytest.fixture(
+    scope="module", params=quick_and_full([load_house, load_simple_room], [load_simple_room])
+)
 def golden(request, shared):
     return request.param(shared)
 

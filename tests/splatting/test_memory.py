@@ -42,6 +42,7 @@ def bytes_compiled(config: TrainConfig) -> int:
     return held - account.alias_size_in_bytes + account.temp_size_in_bytes - images
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("backend", "sh_degree"), [("numba", 0), ("numba", 3), ("xla", 3)])
 def test_the_estimate_covers_what_is_compiled_and_is_not_far_off(backend, sh_degree):
     config = config_of(sh_degree=sh_degree, backend=backend)

@@ -17,6 +17,7 @@ from r3jax.splatting.train import fit, scene_extent
 from r3jax.splatting.training_config import TrainConfig
 from r3jax.splatting.views import Views
 from tests.splatting.ball import NUM_VIEWS, ball_views, config
+from tests.tiers import quick_and_full
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def assert_same_bits(a, b) -> None:
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-@pytest.mark.parametrize("strategy", ["vanilla", "mcmc"])
+@pytest.mark.parametrize("strategy", quick_and_full(["vanilla", "mcmc"], ["vanilla"]))
 def test_psnr_rises_within_the_capacity(views, strategy):
     settings = config(strategy=strategy, iterations=160, reset_every=1000, refine_until=100)
     seen = []
@@ -51,6 +52,7 @@ def test_the_same_input_gives_the_same_bits_and_another_seed_others(views):
     assert np.any(first.scene.means != other.scene.means)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("strategy", ["vanilla", "mcmc"])
 def test_a_budget_that_is_too_small_costs_nothing_but_time(views, strategy):
     tight = RasterConfig(backend="numba", max_intersections=64)
@@ -85,6 +87,7 @@ def test_higher_harmonics_wait_for_their_turn(views):
     assert np.any(late.scene.sh[:, 1:])
 
 
+@pytest.mark.full
 def test_several_views_a_step_average_their_gradients(views):
     """A step of all views equals gradient descent on the mean loss: the order is irrelevant."""
     losses = [
@@ -149,6 +152,7 @@ def test_ctrl_c_ends_early_and_the_old_handler_is_back(views):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.full
 def test_backgrounds_differ(views):
     losses = [
         fit(views, config(iterations=1, background=name)).history.loss[0]

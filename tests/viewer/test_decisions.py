@@ -10,6 +10,8 @@ from r3jax.planning.policy import make_policy
 from r3jax.trace.errors import RunError
 from r3jax.viewer.decisions import decide_again, offer_segments
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def plan(run):

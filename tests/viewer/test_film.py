@@ -18,6 +18,8 @@ from r3jax.viewer.timeline import Timeline
 from r3jax.viewer.video import ENCODERS, write_video
 from tests.viewer.conftest import VIEWS
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def exported(run, tmp_path_factory):

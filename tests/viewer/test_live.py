@@ -20,6 +20,8 @@ from tests.box_room import write_room
 from tests.cli.small_runs import explore as explore_by_words
 from tests.viewer.conftest import VIEWS
 
+pytestmark = pytest.mark.full
+
 PATIENCE = 60.0
 
 

@@ -10,6 +10,8 @@ from r3jax.splatting.scene import GaussianScene
 from r3jax.viewer.look import TERMS, Surroundings, glance_from, look_from
 from r3jax.viewer.timeline import Timeline
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def around(run):

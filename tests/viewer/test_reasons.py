@@ -15,6 +15,8 @@ from r3jax.viewer.panel import reason_html
 from r3jax.viewer.story import RecordedStory
 from tests.viewer.conftest import VIEWS
 
+pytestmark = pytest.mark.full
+
 CAPACITY = 16
 
 

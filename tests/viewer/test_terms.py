@@ -12,6 +12,8 @@ from r3jax.scoring.voxels import voxels_of
 from r3jax.viewer.terms import probe_positions, surface_terms
 from r3jax.viewer.timeline import Timeline
 
+pytestmark = pytest.mark.full
+
 FIELDS = ("value", "bias", "noise", "resolution")
 
 

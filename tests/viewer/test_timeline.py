@@ -11,6 +11,8 @@ from r3jax.trace.reader import read_run
 from r3jax.viewer.timeline import Timeline
 from tests.viewer.conftest import VIEWS
 
+pytestmark = pytest.mark.full
+
 
 def content(map_state) -> dict:
     """Voxels by key: rows may stand in another order."""

@@ -110,6 +110,7 @@ def test_solid_clouds_agree(seed):
     assert_gradients_agree(seed, safe, scene, camera, pose, jnp.zeros((COUNT, 2)))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "degree", [0, *(pytest.param(degree, marks=pytest.mark.slow) for degree in (1, 2))]
 )

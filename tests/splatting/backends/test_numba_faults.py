@@ -284,6 +284,7 @@ MUTANTS = [
 ]
 
 
+@pytest.mark.mutant
 @pytest.mark.parametrize("law", [images_agree, gradients_agree, lists_are_tight])
 def test_the_laws_hold(law):
     law(load(CHAIN))

@@ -109,6 +109,7 @@ def test_solid_clouds_agree(seed):
     assert_agrees(xla.rasterise, seed, solid(seed), *view(*SIZE))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("size", [(1, 1), (17, 33)])
 def test_sizes_of_the_image(size):
     assert_images_agree(xla.rasterise, random_cloud(4, COUNT), *view(*size))
@@ -121,6 +122,7 @@ def test_gaussians_larger_than_the_image():
     assert_agrees(xla.rasterise, 5, scene, camera, pose)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("batch", "chunk"),
     [
@@ -189,6 +191,7 @@ def test_what_is_not_a_number_is_not_drawn(seed, name):
         assert np.isfinite(leaf).all()
 
 
+@pytest.mark.full
 def test_vmap_and_scan_equal_one_view_after_the_other():
     scene, (camera, _) = random_cloud(6, COUNT), view(*SIZE)
     eyes = np.array([[2.0, -0.7, 0.5], [-1.5, 1.0, 0.3], [0.2, 1.8, 0.9]])
