@@ -8,9 +8,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# The tests keep what they compiled here. The demo keeps it where the commands do by default: the
-# first command after it finds what it needs.
-test benchmark: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
+# One compile cache for all targets, and the commands' own: the first command after the demo finds
+# what it needs.
+export JAX_COMPILATION_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/r3jax/jax
 
 .PHONY: setup demo test test-all test-added mutants stress lint docs benchmark clean
 

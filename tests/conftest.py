@@ -17,7 +17,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 _cache = os.environ.get("JAX_COMPILATION_CACHE_DIR")
 if _cache:
     jax.config.update("jax_compilation_cache_dir", _cache)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 _QUICK_COMPILER = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 """XLA's older emitters, in one thread (there are two test processes): a third less time for a
@@ -56,7 +56,7 @@ def shared_path(*parts: str) -> Path:
 
 
 _MOST_MAPPINGS = 20_000
-_MOST_MEMORY = 1_700 << 20
+_MOST_MEMORY = 1_400 << 20
 """Of a test process before it forgets what it has compiled [bytes]."""
 
 

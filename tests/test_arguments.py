@@ -158,6 +158,7 @@ def scores(T):
     }
 
 
+@pytest.mark.full
 def test_under_jit_a_pose_that_is_not_rigid_gives_nan_and_any_other_a_number():
     poses = {**BAD_POSES, **GOOD_POSES}
     found = jax.jit(jax.vmap(scores))(np.stack(list(poses.values())))

@@ -6,6 +6,9 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import pytest
+
+pytestmark = pytest.mark.full
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 

@@ -78,7 +78,7 @@ def _(options: Explore) -> None:
     elif options.scene is None:
         raise ValueError("give a --scene, or --resume RUN; `r3jax info` lists the scenes")
     else:
-        check_scene(options.scene)
+        check_scene(options.scene, options.scale)
         policy = options.policy or DEFAULT_POLICY
         name = options.name or default_name(options, options.scene, policy)
         _check_free(options.out / name, options.overwrite)
@@ -101,7 +101,7 @@ def _(options: Team) -> None:
         return
     if options.scene is None:
         raise ValueError("give a --scene, or --resume TEAM; `r3jax info` lists the scenes")
-    check_scene(options.scene)
+    check_scene(options.scene, options.scale)
     if not options.meet_every >= 0.0:
         raise ValueError(f"--meet-every must be a time >= 0 [s], got {options.meet_every}")
     for single in singles_of(options):

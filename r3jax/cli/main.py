@@ -111,8 +111,6 @@ def _run(command: object) -> int:
 
 def _keep_compilations() -> None:
     """Lets the second start find what the first one compiled, unless JAX is told otherwise."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(base / "r3jax" / "jax")
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(base / "r3jax" / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -51,12 +51,27 @@ def split_name(spec: str) -> tuple[str, str]:
     return "embedded", spec
 
 
-def check_scene(spec: str) -> None:
+def check_scale(spec: str, scale: float | int) -> None:
+    """Refuses a scale for a scene that has its own.
+
+    Raises:
+        ValueError: it is not a mesh file.
+    """
+    kind, _ = split_name(spec)
+    if scale == 1.0 or kind == "mesh":
+        return
+    if kind == "habitat":
+        raise ValueError(f"scale={scale!r}: Habitat scales nothing, apply it to the mesh file")
+    raise ValueError(f"scale={scale!r} is for mesh files (mesh:<file>); {spec!r} has metres")
+
+
+def check_scene(spec: str, scale: float | int = 1.0) -> None:
     """Refuses a scene that cannot be opened, as far as its name and the disk tell.
 
     Raises:
-        ValueError: the scene is unknown, or its file is missing.
+        ValueError: the scene is unknown, its file is missing, or it takes no scale.
     """
+    check_scale(spec, scale)
     kind, rest = split_name(spec)
     if kind == "mesh" and not Path(rest).is_file():
         raise ValueError(f"no such mesh file: {rest} (give a GLB, glTF, PLY or OBJ file)")

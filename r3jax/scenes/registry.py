@@ -6,7 +6,7 @@ import numpy as np
 
 from r3jax.geometry.cameras import Camera
 from r3jax.scenes import procedural, replica
-from r3jax.scenes.names import OUTSIDE, habitat_file, outside_scenes, split_name
+from r3jax.scenes.names import OUTSIDE, check_scale, habitat_file, outside_scenes, split_name
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.habitat import HabitatSimulator
 from r3jax.simulators.habitat_stage import read_stage
@@ -49,8 +49,7 @@ def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> Wo
     kind, rest = split_name(spec)
     if kind == "mesh":
         return load_world(rest, up, scale)
-    if scale != 1.0:
-        raise ValueError(f"scale={scale!r} is for mesh files (mesh:<file>); {spec!r} has metres")
+    check_scale(spec, scale)
     if kind == "habitat":
         return load_world(read_stage(habitat_file(rest)).mesh, up)
     if up not in (None, "z"):
@@ -92,8 +91,7 @@ def open_scene(
     kind, rest = split_name(spec)
     simulator: Simulator
     if kind == "habitat":
-        if scale != 1.0:
-            raise ValueError(f"scale={scale!r}: Habitat scales nothing, apply it to the mesh file")
+        check_scale(spec, scale)
         simulator = HabitatSimulator(
             habitat_file(rest),
             camera,

@@ -112,12 +112,12 @@ def read_scene(path: Path | str) -> GaussianScene:
     try:
         check_regular(path)
         with open(path, "rb") as file:
-            _check_hash(file)
             byte_order, elements = _read_header(path, file)
             vertex, before = _find_vertices(path, elements)
             num_rest = _count_rest(path, {name for name, _ in vertex.fields})
             read = _read_text if byte_order == "=" else _read_binary
             table = read(path, file, byte_order, vertex, before)
+            _check_hash(file)  # last: what is wrong with a file says more than that something is
     except FileNotFoundError:
         raise SceneFileError(path, "the file is missing") from None
     except OSError as error:
@@ -147,11 +147,12 @@ def _scene_fields(num_rest: int) -> list[str]:
 
 
 def _check_hash(file: BinaryIO) -> None:
-    """Compares the file with the hash in its header, if there is one; rewinds it.
+    """Compares the file with the hash in its header, if there is one.
 
     Raises:
         ForeignFileError: it is not what was written.
     """
+    file.seek(0)
     head = file.read(1 << 16)
     found = _HASH.search(head[: head.find(b"end_header") + 1])
     if found is not None:
@@ -160,7 +161,6 @@ def _check_hash(file: BinaryIO) -> None:
             digest.update(block)
         if digest.hexdigest() != found[1].decode():
             raise ForeignFileError("it was damaged or changed: its SHA-256 is of another content")
-    file.seek(0)
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:

@@ -24,7 +24,7 @@ CHANGES = {
 CONDITION_CHANGES = {
     "budget": "views:4",
     "clock": "wall",
-    "resolution": 33,
+    "resolution": 49,
     "fov": 80.0,
     "noise": 0.0,
     "max_range": 4.0,

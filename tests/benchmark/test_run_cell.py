@@ -59,6 +59,7 @@ def assert_follows(value, schema):
         assert value is None if schema is None else type(value) is schema
 
 
+@pytest.mark.full
 def test_each_snapshot_leaves_a_record_of_the_schema(finished):
     root, cells = finished
     records = read_records(root)
@@ -120,6 +121,7 @@ def test_a_snapshot_sees_the_views_up_to_it_and_no_others(finished, room, tmp_pa
         assert record[name] == long[name]
 
 
+@pytest.mark.full
 def test_steps_within_a_snapshot_arrived_in_time(finished):
     root, cells = finished
     run = read_run(paths_of(root, cells[0]).run)
@@ -179,6 +181,7 @@ def test_a_snapshot_that_fails_leaves_the_others_and_a_reason(room, tmp_path, ca
     assert "ViewsError" in paths_of(tmp_path, cell).error.read_text()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("damage", ["a later version", "an image that is missing"])
 def test_a_recorded_exploration_is_never_deleted(finished, room, tmp_path, damage):
     (cell,) = make_cells(room, tmp_path)

@@ -56,6 +56,7 @@ def test_renderability_rises_where_the_path_returns_to_seen_places(lounge):
     assert before[familiar].mean() > before[strange].mean() + 0.15
 
 
+@pytest.mark.full
 def test_voxels_add_up(lounge):
     recording, reports, state = lounge
     assert len(reports) == len(recording) == 48
@@ -66,6 +67,7 @@ def test_voxels_add_up(lounge):
     assert reports[-1].metres == pytest.approx(length)
 
 
+@pytest.mark.full
 def test_the_figure_is_a_picture(lounge):
     recording, reports, _ = lounge
     assert to_png(revisit_figure(recording, reports)).startswith(b"\x89PNG")

@@ -14,6 +14,8 @@ from r3jax.geometry.cameras import Camera
 from r3jax.planning.policy import policy_names
 from r3jax.scenes.registry import open_scene
 
+pytestmark = pytest.mark.full
+
 POOL, FIRST, NUM = 12, 2, 6
 
 

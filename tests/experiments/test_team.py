@@ -4,6 +4,8 @@ import pytest
 
 from experiments.team import CREWS, SIZES, Size, fly, page, time_rows, time_to
 
+pytestmark = pytest.mark.full
+
 
 def record(crew, seed, known):
     """A flight by hand: a view every second."""

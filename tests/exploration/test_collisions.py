@@ -35,6 +35,7 @@ def assert_no_collision(world, segments) -> None:
     assert world.clearance(points.reshape(-1, 3)).min() >= CLEARANCE
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("scene", "policy"), [("flat", "ours-pano")])
 def test_no_run_touches_the_mesh(scene, policy):
     world, segments, result = fly(scene, policy, views=16)
@@ -43,6 +44,7 @@ def test_no_run_touches_the_mesh(scene, policy):
     assert_no_collision(world, segments)
 
 
+@pytest.mark.full
 def test_the_check_itself_finds_a_collision():
     world = open_scene("flat", camera=Camera.from_fov(16, 16, 60.0), noise=0.0)
     start = world.start_pose[:3, 3]

@@ -23,6 +23,8 @@ from tests.exploration.toys import UPPER, BoxRoom
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.trace.runs import make_header
 
+pytestmark = pytest.mark.full
+
 VIEWS = 10
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=1)
 CHAIN = ("r3jax.planning.decision", "r3jax.exploration.hindsight")

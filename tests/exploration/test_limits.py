@@ -113,6 +113,7 @@ def test_the_hall_has_walls_and_pillars():
     assert depth[95, 47] < 1.6  # the floor, 1.5 m below, at 45 degrees
 
 
+@pytest.mark.full
 def test_a_short_run_in_a_small_hall(tmp_path):
     """The same code at a size for every day; memory still settles, so it is not asked."""
     policy = small_policy("ours-pano")

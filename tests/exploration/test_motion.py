@@ -78,6 +78,7 @@ def ground_run(tmp_path_factory):
     return out / "flat-ours-pano-ground-seed0"
 
 
+@pytest.mark.full
 def test_a_ground_robot_stays_level_at_its_height(ground_run):
     rows = read_run(ground_run).rows
     assert len(rows) == 8
@@ -92,12 +93,14 @@ def test_a_ground_robot_stays_level_at_its_height(ground_run):
     assert rows[-1].radians > 1.0
 
 
+@pytest.mark.full
 def test_its_views_can_be_explained_in_hindsight(ground_run):
     reasons = list(explain_run(read_run(ground_run)))
     assert reasons[0] is None
     assert all(reason.totals.sum() > 0.0 for reason in reasons[1:])
 
 
+@pytest.mark.full
 def test_resume_and_fork_keep_the_motion(ground_run):
     wanted = replace(MOTIONS["ground"], speed=0.4)
     assert motion_of_record(read_run(ground_run).header.policy["settings"]["motion"]) == wanted

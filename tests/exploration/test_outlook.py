@@ -110,6 +110,7 @@ def reached(whole):
     return [forecast_map(*state, run.camera).value("mean") for state in states_of(run)]
 
 
+@pytest.mark.full
 def test_a_run_ends_when_its_forecast_says_so(whole, reached, tmp_path):
     """It is asked every third view; the views before are those of the run without a goal."""
     goal = reached[5] - 0.01

@@ -209,6 +209,7 @@ def law_nobody_knows_more_or_less(meet_every: float, seed: int = 1, team=real_te
     assert [n for n, _ in order[:2]] == [0, 1]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("meet_every", [0.0, 0.9])
 def test_nobody_knows_more_or_less_than_was_told(meet_every):
     law_nobody_knows_more_or_less(meet_every)

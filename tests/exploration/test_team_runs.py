@@ -18,6 +18,8 @@ from tests.exploration.test_team import WIDE, room
 from tests.exploration.toys import LOWER, UPPER, Wander
 from tests.trace.runs import make_header
 
+pytestmark = pytest.mark.full
+
 VIEWS, MEET_EVERY = 4, 1.5
 
 

@@ -189,7 +189,9 @@ def test_what_cannot_be_exported_is_said_in_a_line(run, tmp_path, capsys):
     (copy / "trace.jsonl").write_text("")
     assert main(["export", str(copy), *words]) == USER_ERROR
     lines = capsys.readouterr().err.splitlines()
-    assert ["run.json" in lines[0], "000001.png" in lines[1], "no views" in lines[2]] == [True] * 3
+    assert ["no such folder" in lines[0], "000001.png" in lines[1], "no views" in lines[2]] == [
+        True
+    ] * 3
     assert not (tmp_path / "out").exists()
 
 

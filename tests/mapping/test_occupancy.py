@@ -24,6 +24,7 @@ from r3jax.mapping.occupancy import (
     mark_free_ball,
     world_to_cell,
 )
+from tests.tiers import quick_and_full
 
 SIZE = 128  # blocks of 2 x 2 pixels
 CAMERA = Camera.from_fov(SIZE, SIZE, 60.0)
@@ -117,7 +118,7 @@ def grid():
     return empty_grid(ROOM + np.array([[-0.03], [0.0]]), CELL)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", quick_and_full(range(4), [0]))
 def test_hits_are_the_cells_of_the_measured_points(grid, seed):
     frame, _ = random_scene(seed)
     cell = (hit_points(frame) - np.asarray(grid.origin, np.float64)) / CELL
@@ -133,7 +134,7 @@ def test_hits_are_the_cells_of_the_measured_points(grid, seed):
     assert nearest.max() <= 0.5 * CELL + 1e-4
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", quick_and_full(range(4), [0]))
 def test_free_space_in_front_of_everything_has_no_gap(grid, seed):
     """A cell that lies wholly in view, in range and well before every surface becomes free."""
     frame, _ = random_scene(seed)
@@ -143,7 +144,7 @@ def test_free_space_in_front_of_everything_has_no_gap(grid, seed):
     assert np.all(np.asarray(update(grid, frame).free)[is_clear])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", quick_and_full(range(4), [0]))
 def test_nothing_is_cleared_that_no_ray_has_passed(grid, seed):
     frame, _ = random_scene(seed)
     seen, z, _, high, _ = depth_behind(frame, subsamples(grid, 7), spread=0)
@@ -153,7 +154,7 @@ def test_nothing_is_cleared_that_no_ray_has_passed(grid, seed):
     assert not np.any(free & ~any_ray)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", quick_and_full(range(4), [0]))
 def test_no_surface_that_was_measured_is_ever_cleared(grid, seed):
     """Looking at the scene from everywhere, grazing its walls, carves nothing away."""
     _, boxes = random_scene(seed)

@@ -23,6 +23,8 @@ from r3jax.scoring.pixels import PixelView
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, pose_at, two_rooms
 
+pytestmark = pytest.mark.full
+
 KEY = jax.random.key(5)
 CAMERA = Camera.from_fov(32, 32)
 NUM, AIMED = 60, 30

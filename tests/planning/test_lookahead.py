@@ -106,6 +106,7 @@ def law_one_view(modules: Modules) -> None:
     assert found[0].rate == pytest.approx(rate.max())
 
 
+@pytest.mark.full
 def test_a_horizon_of_one_is_the_next_best_view():
     law_one_view({"lookahead": real})
 
@@ -130,6 +131,7 @@ def law_motion(modules: Modules) -> None:
         assert path.seconds == pytest.approx(seconds, abs=0.01)
 
 
+@pytest.mark.full
 def test_a_carrier_takes_its_time():
     law_motion({"lookahead": real})
 

@@ -37,7 +37,6 @@ from r3jax.scoring.near import near
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import center, known_flat
 from tests.planning.walls import SEEN_FROM, VOXEL, box, wall
-from tests.tiers import quick_and_full
 
 NUM, REFINED = 12, 3  # one shape: one compile
 CAMERA = Camera.from_fov(48, 48, 60.0)
@@ -242,9 +241,8 @@ def test_a_climb_comes_near_the_best_of_a_dense_grid():
     assert found["utility"][0] > 0.95 * best
 
 
-@pytest.mark.parametrize(
-    "name", quick_and_full(["ours", "ours-pano", "ours-demand", "ours-ahead"], ["ours-pano"])
-)
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["ours", "ours-pano", "ours-demand", "ours-ahead"])
 def test_decisions_with_refinement(name):
     """The choice is one of the candidates, and what it was worth before is no more than after."""
     state, grid = known_flat()

@@ -177,6 +177,7 @@ def test_look_integrates_marks_and_grows(allow_growth):
     assert float(after.count.sum()) == float(plain.count.sum())
 
 
+@pytest.mark.full
 def test_look_lets_edges_in_if_told():
     frame = frame_of()
     after = look(empty_map(64, VOXEL), frame, REACH, drop_edges=False)

@@ -37,6 +37,7 @@ def agreement(name: str, num_places: int) -> np.ndarray:
     return np.mean(scores, axis=0)
 
 
+@pytest.mark.full
 def test_visible_voxels_agree_with_rays_on_the_mesh():
     score, precision, recall = agreement("gallery", num_places=6)
     assert score >= 0.95

@@ -216,6 +216,7 @@ def test_a_closed_cupboard_is_not_free_inside():
     assert not ((found > cupboard[0]) & (found < cupboard[1])).all(axis=1).any()
 
 
+@pytest.mark.full
 def test_an_embedded_scene_keeps_the_margin_by_another_program_s_measure():
     world = open_world("kitchen")
     found = GroundTruth(RaycastSimulator(world, SMALL)).free_positions((1.0, 1.0, 0.75), 0.3)

@@ -29,6 +29,7 @@ def house(shared):
     return golden, load_world(golden.mesh)
 
 
+@pytest.mark.full
 def test_the_house_looks_as_in_habitat(house):
     golden, world = house
     simulator = RaycastSimulator(world, golden.camera, max_range=None, lighting=False)

@@ -186,7 +186,9 @@ def _saved(folder):
     return {path.name for path in folder.glob("checkpoints/[0-9]*") if path.name.isdigit()}
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kills", [pytest.param(2, marks=pytest.mark.full), pytest.param(30, marks=pytest.mark.slow)]
+)
 def test_a_training_survives_kills_at_random_moments(views, tmp_path, kills):
     rng, steps = random.Random(kills), []
     for _ in range(kills):

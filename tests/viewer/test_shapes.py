@@ -65,6 +65,7 @@ def test_a_frustum_is_tied_to_its_camera_and_its_tick_is_above_it():
     assert segments[8, 1, 2] > top + 0.05
 
 
+@pytest.mark.full
 def test_the_path_goes_through_every_view_in_order(run):
     rows = run.rows
     segments, colors = path_segments(rows, len(rows))
@@ -77,6 +78,7 @@ def test_the_path_goes_through_every_view_in_order(run):
     assert len(path_segments(rows[:1], len(rows))[0]) == 0
 
 
+@pytest.mark.full
 def test_the_path_of_a_part_is_a_part_of_the_path(run):
     whole, colors = path_segments(run.rows, len(run.rows))
     part, early = path_segments(run.rows[:3], len(run.rows))
@@ -84,6 +86,7 @@ def test_the_path_of_a_part_is_a_part_of_the_path(run):
     np.testing.assert_array_equal(early, colors[: len(part)])
 
 
+@pytest.mark.full
 def test_recorded_points_are_pixels_of_the_frames(run):
     points, colors = recorded_points(run, 100)
     assert len(points) == len(colors) == 100

@@ -17,6 +17,8 @@ from r3jax.splatting.backends.numba import bridge
 from r3jax.splatting.config import RasterConfig
 from tests.splatting.clouds import random_cloud, view
 
+pytestmark = pytest.mark.full
+
 COUNT, SIZE = 600, (70, 52)  # more than one block of Gaussians
 CONFIG = RasterConfig(backend="numba", max_intersections=1 << 14)
 

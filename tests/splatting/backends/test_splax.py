@@ -24,6 +24,8 @@ from r3jax.splatting.projection import ProjectedGaussians, rotation_rows
 from r3jax.splatting.scene import GaussianScene
 from tests.splatting.clouds import random_cloud, view
 
+pytestmark = pytest.mark.full
+
 COUNT, SIZE = 60, (40, 22)
 CONFIG = RasterConfig()
 

@@ -97,6 +97,7 @@ def assert_clouds_agree(modules: Modules) -> None:
 seeds = st.integers(0, 10_000)
 
 
+@pytest.mark.full
 @settings(max_examples=8)
 @given(seeds)
 def test_images_and_gradients_agree(seed):
