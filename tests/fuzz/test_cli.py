@@ -62,7 +62,7 @@ COMMANDS = (
     ),
     ("benchmark", "--scenes", "flat", "--policies", "random", "--budget", "views:3", "--jobs", "0"),
     ("replay", "run"),
-    ("merge", "run", "run", "--out", "out"),
+    ("merge", "run", "twin", "--out", "out"),
     ("export", "run", "--format", "colmap", "--out", "out"),
     ("audit", "recording", "--out", "out", "--voxel-size", "0.1"),
     ("audit", "run", "--path", "recording", "--views", "3"),
@@ -119,6 +119,7 @@ def seeds() -> list[Files]:
         scene["hash"] = load_world(Path(name) / "room.obj").content_hash
     header = header_to_json(make_header(scene=scene, policy=policy, config=vars(CONFIG)))
     files["run/run.json"] = header.encode()
+    files |= {f"twin{k.removeprefix('run')}": v for k, v in files.items() if k.startswith("run/")}
     return [files | {"words.json": json.dumps(words).encode()} for words in COMMANDS]
 
 
