@@ -173,6 +173,7 @@ def test_a_cell_that_is_killed_again_and_again_ends_in_the_same_record(finished,
     assert list(map(without_clock, read_records(tmp_path))) == list(map(without_clock, expected))
 
 
+@pytest.mark.full
 def test_a_snapshot_that_fails_leaves_the_others_and_a_reason(room, tmp_path, capsys):
     (cell,) = make_cells(room, tmp_path, snapshots=("views:1", "views:2"))
     with pytest.raises(CellError, match="views:1: ViewsError: one view only"):

@@ -128,6 +128,7 @@ def test_a_run_ends_when_its_forecast_says_so(whole, reached, tmp_path):
     assert read_run(tmp_path / "run").end.outcome == "forecast"
 
 
+@pytest.mark.full
 def test_a_run_that_was_cut_off_ends_at_the_same_view(whole, reached, tmp_path):
     config = dataclasses.replace(CONFIG, until=f"psnr:{reached[5] - 0.01}", until_every=3)
     go(tmp_path / "run", 4, config)

@@ -273,6 +273,7 @@ def test_two_cameras_do_not_turn_to_the_same_thing():
     assert first == second  # they would have
 
 
+@pytest.mark.full
 def test_a_member_that_is_done_leaves_the_others_flying():
     members = wanderers()
     members[0].policy.last_step = 1

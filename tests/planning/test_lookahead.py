@@ -152,6 +152,7 @@ def test_choices_lie_apart():
     law_apart({"lookahead": real})
 
 
+@pytest.mark.full
 def test_no_way_no_path():
     outlook = dataclasses.replace(outlook_of(WIDE), lengths=np.full(len(PLACES), np.inf))
     assert real.search(outlook) == []

@@ -104,6 +104,7 @@ def test_images_and_gradients_agree(seed):
     assert_agrees(xla.rasterise, seed, random_cloud(seed, COUNT), *view(*SIZE))
 
 
+@pytest.mark.full
 @settings(max_examples=6)
 @given(seeds)
 def test_solid_clouds_agree(seed):
