@@ -119,6 +119,7 @@ def write_checkpoint(path: Path, tables: Tables) -> None:
             writing.rename(path)
             sync_folder(path.parent)
         except (ValueError, RuntimeError) as error:  # how Orbax's storage reports a full disk
+            time.sleep(_STRAGGLING)  # its other threads may still be writing
             _clear_leftovers(path.parent)
             is_full = "RESOURCE_EXHAUSTED" in str(error) or "No space left" in str(error)
             reason = os.strerror(errno.ENOSPC) if is_full else " ".join(str(error).split())[:300]
