@@ -39,7 +39,7 @@ _ORBAX = "_CHECKPOINT_METADATA"
 """A file in every checkpoint, by which its folder is known."""
 
 _STRAGGLING = 0.5
-"""After an error the other arrays' reports come in within this time [s]."""
+"""After an error Orbax's other threads write and report no longer than this [s]."""
 
 _DIGITS = 6
 _WRITING, _DISCARDED = ".writing-", ".discarded-"
@@ -109,24 +109,22 @@ def write_checkpoint(path: Path, tables: Tables) -> None:
     import orbax.checkpoint as ocp
 
     writing = path.with_name(f"{_WRITING}{path.name}")
-    with _quiet():
-        try:
-            with ocp.PyTreeCheckpointer() as checkpointer:
-                checkpointer.save(writing.resolve(), dict(tables), force=True)
-            _write_hashes(writing)
-            if _is_checkpoint(path):
-                discard(path)
-            writing.rename(path)
-            sync_folder(path.parent)
-        except (ValueError, RuntimeError) as error:  # how Orbax's storage reports a full disk
-            time.sleep(_STRAGGLING)  # its other threads may still be writing
-            _clear_leftovers(path.parent)
-            is_full = "RESOURCE_EXHAUSTED" in str(error) or "No space left" in str(error)
-            reason = os.strerror(errno.ENOSPC) if is_full else " ".join(str(error).split())[:300]
-            raise OSError(errno.ENOSPC if is_full else errno.EIO, reason, str(path)) from error
-        except OSError:
-            _clear_leftovers(path.parent)
-            raise
+    try:
+        with _quiet(), ocp.PyTreeCheckpointer() as checkpointer:
+            checkpointer.save(writing.resolve(), dict(tables), force=True)
+        _write_hashes(writing)
+        if _is_checkpoint(path):
+            discard(path)
+        writing.rename(path)
+        sync_folder(path.parent)
+    except (ValueError, RuntimeError) as error:  # how Orbax's storage reports a full disk
+        _clear_leftovers(path.parent)
+        is_full = "RESOURCE_EXHAUSTED" in str(error) or "No space left" in str(error)
+        reason = os.strerror(errno.ENOSPC) if is_full else " ".join(str(error).split())[:300]
+        raise OSError(errno.ENOSPC if is_full else errno.EIO, reason, str(path)) from error
+    except OSError:
+        _clear_leftovers(path.parent)
+        raise
 
 
 def _write_hashes(folder: Path) -> None:
@@ -186,7 +184,10 @@ def _check_hashes(folder: Path) -> None:
 
 @contextmanager
 def _quiet() -> Generator[None]:
-    """Keeps Orbax from printing tracebacks of an error that it also raises."""
+    """Keeps Orbax from printing tracebacks of an error that it also raises.
+
+    An error leaves it when Orbax's other threads have ended: nobody writes any more.
+    """
     log, hook = logging.getLogger("absl"), sys.unraisablehook
     level = log.level
     log.setLevel(logging.CRITICAL + 1)  # every thread of Orbax logs a traceback
