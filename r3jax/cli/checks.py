@@ -113,7 +113,7 @@ def _(options: Team) -> None:
 @_check.register
 def _(options: Benchmark) -> None:
     for scene in words(options.scenes):
-        check_scene(scene)
+        check_scene(scene, options.scale)
     for policy in words(options.policies):
         check_policy(policy)
     for budget in (options.budget, *words(options.snapshots or "")):
