@@ -7,6 +7,7 @@ from r3jax.exploration import explore
 from r3jax.planning.policy import policy_names
 from tests.exploration.killed_run import CONFIG, small_policy
 from tests.exploration.toys import BoxRoom
+from tests.tiers import quick_and_full
 
 
 class HoleyRoom(BoxRoom):
@@ -20,16 +21,16 @@ class HoleyRoom(BoxRoom):
 
 
 SCORERS = ("ours", "ours-pano", "ours-demand", "active-gs", "cover")
-"""One of each way to score; the others score like one of these, and are left out."""
+"""One of each way to score; the others score like one of these, and run outside the gate."""
+
+OTHERS = [name for name in policy_names() if name not in SCORERS]
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=marks)
-        for name in policy_names()
-        for marks in [() if name == "ours" else pytest.mark.full]
-        if name in SCORERS
+        *quick_and_full(SCORERS, ["ours"]),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS),
     ],
 )
 def test_the_loop_makes_no_nan(name):
