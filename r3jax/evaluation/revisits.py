@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r3jax.evaluation import style
+from r3jax.exploration.config import check_voxel_size
 from r3jax.formats.recordings import Recording
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.scoring.renderability import renderability
@@ -49,11 +50,7 @@ def follow_recording(
     Raises:
         ValueError: voxels that are no size, or larger than a fifth of the range.
     """
-    if voxel_size > 0.2 * max_range:
-        raise ValueError(
-            f"voxel_size must be at most a fifth of the range of {max_range:g} m, got "
-            f"{voxel_size:g}"
-        )
+    check_voxel_size(voxel_size, max_range)
     score = jax.jit(renderability)
     state = empty_map(voxel_size=voxel_size)
     metres = 0.0

@@ -16,6 +16,23 @@ LARGEST_DEPTH = (BEYOND_RANGE - 1) / DEPTH_STEPS_PER_METRE
 """What lies farther is recorded as beyond the range [m]."""
 
 
+def check_voxel_size(voxel_size: float, max_range: float) -> None:
+    """Refuses voxels so large that a map of them tells nothing.
+
+    Args:
+        voxel_size: edge of a voxel [m].
+        max_range: of the depth sensor [m].
+
+    Raises:
+        ValueError: they are larger than a fifth of the range.
+    """
+    if voxel_size > 0.2 * max_range:
+        raise ValueError(
+            f"voxel_size must be at most a fifth of the range of {max_range:g} m, got "
+            f"{voxel_size:g}"
+        )
+
+
 @dataclass(frozen=True)
 class ExplorationConfig:
     """What the loop itself decides; the policy has its own settings."""
@@ -81,11 +98,7 @@ class ExplorationConfig:
                 f"max_range must be at most {LARGEST_DEPTH:.1f} m, which a depth image can hold, "
                 f"got {self.max_range:g}"
             )
-        if self.voxel_size > 0.2 * self.max_range:
-            raise ValueError(
-                f"voxel_size must be at most a fifth of the range of {self.max_range:g} m, got "
-                f"{self.voxel_size:g}"
-            )
+        check_voxel_size(self.voxel_size, self.max_range)
 
     def __post_init__(self) -> None:
         """Refuses what cannot work."""
