@@ -61,9 +61,9 @@ def run_view(options: View) -> int:
         if options.video:
             raise UserError("--video belongs to --export FOLDER")
         with open_viewer(options, run, console) as viewer:
-            console.say(f"view      {viewer.url}")
-            console.say("Ctrl-C ends it")
             with contextlib.suppress(KeyboardInterrupt):
+                console.say(f"view      {viewer.url}")
+                console.say("Ctrl-C ends it")  # from here on, and not only once this waits
                 until_interrupted()
             end_at_once()
     except (RunError, FormatError, ValueError, OSError, ImportError) as error:
