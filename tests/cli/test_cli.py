@@ -15,7 +15,7 @@ from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.box_room import write_room
-from tests.cli.small_runs import explore
+from tests.cli.small_runs import explore, main_without_report
 from tests.trace.runs import make_header, make_view
 
 
@@ -28,7 +28,7 @@ def room(tmp_path_factory):
 def run_folder(room, tmp_path_factory):
     """One finished run."""
     out = tmp_path_factory.mktemp("runs")
-    assert explore(room, out) == 0
+    assert explore(room, out, report=True) == 0
     return out / "box"
 
 
@@ -129,6 +129,7 @@ def test_a_folder_that_is_neither_run_nor_recording_is_said_so(tmp_path, capsys)
     assert "no such folder" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monkeypatch, capsys):
     real, count = RaycastSimulator.render, iter(range(10))
 
@@ -138,7 +139,7 @@ def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monke
         return real(self, T_world_camera)
 
     monkeypatch.setattr(RaycastSimulator, "render", render)
-    assert explore(room, tmp_path) == 130
+    assert explore(room, tmp_path, report=True) == 130
     errors = capsys.readouterr().err
     assert "interrupted" in errors
     assert f"r3jax explore --resume {tmp_path / 'box'}" in errors
@@ -159,7 +160,7 @@ def test_ctrl_c_names_what_goes_on_at_any_moment(room, tmp_path, monkeypatch, ca
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last == f"r3jax: interrupted; go on with `r3jax explore --resume '{folder / 'box'}'`"
     monkeypatch.undo()
-    assert main(["explore", "--resume", str(folder / "box")]) == 0
+    assert main_without_report(["explore", "--resume", str(folder / "box")]) == 0
     assert len(read_run(folder / "box").rows) == 1
 
 

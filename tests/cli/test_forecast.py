@@ -8,7 +8,7 @@ from r3jax.cli.main import main
 from r3jax.forecast.calibration import default_calibration, write_calibration
 from r3jax.trace.reader import read_run
 from tests.box_room import write_room
-from tests.cli.small_runs import explore
+from tests.cli.small_runs import explore, main_without_report
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def room(tmp_path_factory):
 def runs(room, tmp_path_factory):
     """`box` ended by its forecast after five of nine views: any forecast is more than -99 dB."""
     out = tmp_path_factory.mktemp("runs")
-    assert explore(room, out, "--budget", "views:9", "--until", "psnr:-99@p10") == 0
+    assert explore(room, out, "--budget", "views:9", "--until", "psnr:-99@p10", report=True) == 0
     return out
 
 
@@ -39,7 +39,7 @@ def test_a_run_that_is_good_enough_says_so(runs):
 @pytest.mark.full
 def test_going_on_takes_another_goal(runs, capsys):
     words = ["explore", "--resume", str(runs / "box"), "--until", "psnr:99", "--budget", "views:6"]
-    assert main(words) == 0
+    assert main_without_report(words) == 0
     assert "budget: 6 views" in capsys.readouterr().err
     run = read_run(runs / "box")
     assert len(run.rows) == 6

@@ -75,6 +75,7 @@ def test_an_odd_world_is_refused_in_a_line_and_leaves_no_folder(tmp_path):
     assert list(out.rglob("*")) == []
 
 
+@pytest.mark.full
 def test_a_recorded_run_opens_its_scene_at_its_scale(tmp_path):
     meters = write_room(tmp_path / "room.ply")
     path = tmp_path / "millimeters.ply"

@@ -13,7 +13,7 @@ from r3jax.exploration.replay import rebuild
 from r3jax.mapping.join import grow, merge
 from r3jax.trace.reader import read_run
 from tests.box_room import write_room
-from tests.cli.small_runs import explore
+from tests.cli.small_runs import explore, main_without_report
 
 pytestmark = pytest.mark.full
 
@@ -55,14 +55,14 @@ def test_a_resumed_run_is_the_whole_run(runs, part, capsys):
 
 def test_without_another_budget_a_finished_run_stays_as_it_is(part):
     before = (part / "trace.jsonl").read_bytes()
-    assert main(["explore", "--resume", str(part)]) == 0
+    assert main_without_report(["explore", "--resume", str(part)]) == 0
     assert (part / "trace.jsonl").read_bytes() == before
 
 
 def test_a_fork_keeps_the_first_views_and_goes_its_own_way(runs, tmp_path):
     words = ["--at", "2", "--out", str(tmp_path), "--budget", f"views:{VIEWS}"]
     fork = ["explore", "--fork", str(runs / "whole"), *words]
-    assert main([*fork, "--policy", "uniform", "--candidates", "20"]) == 0
+    assert main_without_report([*fork, "--policy", "uniform", "--candidates", "20"]) == 0
     run = read_run(tmp_path / "whole-uniform-from2")
     assert len(run.rows) == VIEWS
     before, after = poses_of(runs / "whole"), poses_of(run.path)
@@ -75,7 +75,7 @@ def test_a_fork_keeps_the_first_views_and_goes_its_own_way(runs, tmp_path):
 
 def test_a_fork_by_the_same_policy_repeats_the_run(runs, tmp_path):
     words = ["--at", "3", "--out", str(tmp_path), "--name", "same"]
-    assert main(["explore", "--fork", str(runs / "whole"), *words]) == 0
+    assert main_without_report(["explore", "--fork", str(runs / "whole"), *words]) == 0
     trace = (tmp_path / "same" / "trace.jsonl").read_bytes()
     assert trace == (runs / "whole" / "trace.jsonl").read_bytes()
 
@@ -83,10 +83,15 @@ def test_a_fork_by_the_same_policy_repeats_the_run(runs, tmp_path):
 def test_a_fork_that_is_cut_off_goes_on(runs, tmp_path):
     words = ["--at", "2", "--out", str(tmp_path), "--policy", "uniform", "--candidates", "20"]
     fork = ["explore", "--fork", str(runs / "whole"), *words]
-    assert main([*fork, "--name", "long", "--budget", f"views:{VIEWS}"]) == 0
-    assert main([*fork, "--name", "short", "--budget", "views:3"]) == 0
+    assert main_without_report([*fork, "--name", "long", "--budget", f"views:{VIEWS}"]) == 0
+    assert main_without_report([*fork, "--name", "short", "--budget", "views:3"]) == 0
     shutil.rmtree(tmp_path / "short" / "checkpoints")
-    assert main(["explore", "--resume", str(tmp_path / "short"), "--budget", f"views:{VIEWS}"]) == 0
+    assert (
+        main_without_report(
+            ["explore", "--resume", str(tmp_path / "short"), "--budget", f"views:{VIEWS}"]
+        )
+        == 0
+    )
     trace = (tmp_path / "short" / "trace.jsonl").read_bytes()
     assert trace == (tmp_path / "long" / "trace.jsonl").read_bytes()
 
@@ -107,7 +112,7 @@ def test_a_fork_that_is_cut_off_goes_on(runs, tmp_path):
 )
 def test_a_mistake_is_named_and_changes_nothing(part, capsys, words, message):
     before = {p: p.read_bytes() for p in part.rglob("*") if p.is_file() and p.name != "lock"}
-    assert main(["explore", *(word.format(part=part) for word in words)]) == 2
+    assert main_without_report(["explore", *(word.format(part=part) for word in words)]) == 2
     assert message in capsys.readouterr().err
     after = {p: p.read_bytes() for p in part.rglob("*") if p.is_file() and p.name != "lock"}
     assert after == before
@@ -118,7 +123,7 @@ def test_another_scene_under_the_same_name_is_noticed(room, part, capsys):
     header["scene"]["hash"] = "0" * 64
     del header["seal"]
     (part / "run.json").write_text(json.dumps(header))
-    assert main(["explore", "--resume", str(part)]) == 2
+    assert main_without_report(["explore", "--resume", str(part)]) == 2
     assert "is not the one that the run was recorded in" in capsys.readouterr().err
 
 
@@ -127,7 +132,7 @@ def test_other_versions_are_told(part, capsys):
     header["packages"]["jax"] = "0.1"
     del header["seal"]
     (part / "run.json").write_text(json.dumps(header))
-    assert main(["explore", "--resume", str(part)]) == 0
+    assert main_without_report(["explore", "--resume", str(part)]) == 0
     assert "begun with other versions (jax 0.1 -> " in capsys.readouterr().err
 
 
@@ -147,7 +152,7 @@ def test_a_read_only_run_can_be_read_and_replayed_but_not_gone_on_with(read_only
     assert main(["info", str(read_only)]) == 0
     assert main(["replay", str(read_only)]) == 0
     capsys.readouterr()
-    assert main(["explore", "--resume", str(read_only), "--budget", "views:4"]) == 2
+    assert main_without_report(["explore", "--resume", str(read_only), "--budget", "views:4"]) == 2
     assert "cannot go on with the run (Read-only file system)" in capsys.readouterr().err
 
 
@@ -207,17 +212,17 @@ def test_resuming_repairs_the_last_map(runs, part, capsys):
     largest.write_bytes(data)
     assert main(["replay", str(part)]) == 2
     assert "resuming the run makes it anew" in capsys.readouterr().err
-    assert main(["explore", "--resume", str(part)]) == 0
+    assert main_without_report(["explore", "--resume", str(part)]) == 0
     jax.tree.map(np.testing.assert_array_equal, read_run(part).load_checkpoint(2), whole)
 
 
 def test_a_merged_run_is_forked_not_resumed(runs, tmp_path, capsys):
     out = tmp_path / "both"
     assert main(["merge", str(runs / "part"), str(runs / "other"), "--out", str(out)]) == 0
-    assert main(["explore", "--resume", str(out)]) == 2
+    assert main_without_report(["explore", "--resume", str(out)]) == 2
     assert "fork it with --fork and --at" in capsys.readouterr().err
     words = ["--at", "6", "--budget", "views:7", "--policy", "random", "--candidates", "20"]
-    assert main(["explore", "--fork", str(out), *words, "--out", str(tmp_path)]) == 0
+    assert main_without_report(["explore", "--fork", str(out), *words, "--out", str(tmp_path)]) == 0
     assert len(read_run(tmp_path / "both-random-from6").rows) == 7
 
 
@@ -234,10 +239,10 @@ def test_a_merged_run_merges_again(runs, tmp_path):
 
 def test_a_fork_that_was_cut_off_while_it_took_views_over_is_refused(runs, tmp_path, capsys):
     words = ["--at", "3", "--out", str(tmp_path), "--name", "fork", "--budget", "views:3"]
-    assert main(["explore", "--fork", str(runs / "part"), *words]) == 0
+    assert main_without_report(["explore", "--fork", str(runs / "part"), *words]) == 0
     trace = tmp_path / "fork" / "trace.jsonl"
     trace.write_bytes(b"".join(trace.read_bytes().splitlines(keepends=True)[:2]))
-    assert main(["explore", "--resume", str(tmp_path / "fork")]) == 2
+    assert main_without_report(["explore", "--resume", str(tmp_path / "fork")]) == 2
     assert "it had 2 of the 3 views that it takes over from" in capsys.readouterr().err
 
 

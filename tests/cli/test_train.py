@@ -75,6 +75,7 @@ def test_a_training_leaves_model_record_and_curve(models):
     assert (folder / "points.ply").stat().st_size > 15 * scene.capacity
 
 
+@pytest.mark.full
 def test_the_hint_names_a_command_that_judges_the_model(recording, tmp_path, capsys):
     assert train(recording, tmp_path, name="second") == 0
     hint = capsys.readouterr().err.splitlines()[-1].split()

@@ -217,6 +217,7 @@ def test_memory_is_in_megabytes_from_zero():
     assert_drawn_inside(figure)
 
 
+@pytest.mark.full
 def test_many_methods_fit():
     named = [{**c, "settings": {"pool_size": 9}} for c in benchmark(("active-gs",))]
     for scenes in (("flat",), ("flat", "house", "office", "gallery", "lounge")):

@@ -39,6 +39,7 @@ def test_every_position_is_drawn_in_its_turn():
     assert figure.axes[-1].get_ylabel() == "order of acquisition"
 
 
+@pytest.mark.full
 def test_all_panels_share_one_box():
     for box in ((LOW, HIGH), None):
         figure = positions_figure(paths(5), box)

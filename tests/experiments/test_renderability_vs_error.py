@@ -147,6 +147,7 @@ def written(flat, tmp_path_factory):
     return folder
 
 
+@pytest.mark.full
 def test_tables_hold_every_scene_and_term(written):
     page = (written / "renderability_vs_error.md").read_text()
     for scene in ("flat", "office"):

@@ -18,6 +18,7 @@ from r3jax.geometry.cameras import pose_along
 from r3jax.planning.motion import MOTIONS, Motion, motion_of_record
 from r3jax.planning.policy import make_policy
 from r3jax.trace.reader import read_run
+from tests.cli.small_runs import main_without_report
 from tests.exploration.toys import BoxRoom
 
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=4)
@@ -74,7 +75,10 @@ def ground_run(tmp_path_factory):
     """Eight views of the embedded flat by a robot on wheels."""
     out = tmp_path_factory.mktemp("runs")
     words = "--scene flat --motion ground --speed 0.4 --resolution 96 --clock model --candidates 30"
-    assert main(["explore", *words.split(), "--budget", "views:8", "--out", str(out)]) == 0
+    assert (
+        main_without_report(["explore", *words.split(), "--budget", "views:8", "--out", str(out)])
+        == 0
+    )
     return out / "flat-ours-pano-ground-seed0"
 
 
@@ -104,10 +108,10 @@ def test_its_views_can_be_explained_in_hindsight(ground_run):
 def test_resume_and_fork_keep_the_motion(ground_run):
     wanted = replace(MOTIONS["ground"], speed=0.4)
     assert motion_of_record(read_run(ground_run).header.policy["settings"]["motion"]) == wanted
-    assert main(["explore", "--resume", str(ground_run), "--budget", "views:9"]) == 0
+    assert main_without_report(["explore", "--resume", str(ground_run), "--budget", "views:9"]) == 0
     out = ground_run.parent
     words = ["--fork", str(ground_run), "--at", "3", "--policy", "frontier", "--budget", "views:5"]
-    assert main(["explore", *words, "--name", "forked", "--out", str(out)]) == 0
+    assert main_without_report(["explore", *words, "--name", "forked", "--out", str(out)]) == 0
     forked = json.loads((out / "forked" / "run.json").read_text())
     assert motion_of_record(forked["policy"]["settings"]["motion"]) == wanted
     for path, views in ((ground_run, 9), (out / "forked", 5)):
@@ -117,6 +121,7 @@ def test_resume_and_fork_keep_the_motion(ground_run):
         assert np.abs([row.pose[2, 2] for row in rows]).max() < 1e-7
 
 
+@pytest.mark.full
 def test_the_command_line_says_what_cannot_work(tmp_path, capsys):
     words = ["explore", "--scene", "flat", "--resolution", "32", "--out", str(tmp_path)]
     for wrong, says in (

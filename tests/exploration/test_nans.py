@@ -29,7 +29,7 @@ OTHERS = [name for name in policy_names() if name not in SCORERS]
 @pytest.mark.parametrize(
     "name",
     [
-        *quick_and_full(SCORERS, ["ours"]),
+        *quick_and_full(SCORERS, []),
         *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS),
     ],
 )

@@ -137,12 +137,14 @@ def test_a_run_that_was_cut_off_ends_at_the_same_view(whole, reached, tmp_path):
     assert [row.sha256 for row in result.rows] == [row.sha256 for row in whole[0].rows[:6]]
 
 
+@pytest.mark.full
 def test_a_goal_too_high_leaves_the_budget_in_charge(whole, tmp_path):
     result = go(tmp_path / "run", 4, dataclasses.replace(CONFIG, until="psnr:99", until_every=1))
     assert result.reason is StopReason.BUDGET
     assert [row.sha256 for row in result.rows] == [row.sha256 for row in whole[0].rows[:4]]
 
 
+@pytest.mark.full
 def test_an_outlook_watches_a_replay(whole, reached):
     """Three forecasts of nine views; every state is passed on."""
     run = read_run(whole[1])

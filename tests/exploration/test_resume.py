@@ -98,6 +98,7 @@ def test_a_run_in_two_parts_is_the_run_in_one(tmp_path, whole, name):
     assert_same_run(tmp_path / "run", whole(name))
 
 
+@pytest.mark.full
 def test_who_takes_over_knows_the_way_that_another_policy_came(tmp_path, whole):
     shutil.copytree(whole("ours-pano"), tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints")
@@ -171,6 +172,7 @@ def test_damage_costs_time_and_nothing_else(tmp_path, whole, how):
     assert all(name.isdigit() for name in names)
 
 
+@pytest.mark.full
 def test_a_state_comes_back_from_its_tables(whole):
     """What is not an array comes from the first state, arrays keep shape and type."""
     for name in ("ours-pano", "active-gs", "active-gamer", "frontier", "uniform", "wander"):

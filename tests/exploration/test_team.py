@@ -221,6 +221,7 @@ def law_everyone_draws_for_itself(team=real_team) -> None:
     assert first != second
 
 
+@pytest.mark.full
 def test_everyone_draws_for_itself():
     law_everyone_draws_for_itself()
 
@@ -293,6 +294,7 @@ def test_no_member_looks_from_where_it_is_not(look):
     assert len(members[1].simulator.rendered) == 1
 
 
+@pytest.mark.full
 def test_an_interrupt_ends_all_and_all_meet():
     members = wanderers()
     render = members[1].simulator.render

@@ -90,10 +90,12 @@ def _size(state):
     return state.capacity, float(state.voxel_size), CONFIG.num_bins
 
 
+@pytest.mark.full
 def test_more_views_promise_more(known):
     law_of_more(load(CHAIN), known)
 
 
+@pytest.mark.full
 def test_a_forecast_is_the_mixture_of_its_views(known):
     law_of_the_mixture(load(CHAIN), known)
 
@@ -131,6 +133,7 @@ def test_nothing_known_forecasts_nothing():
     assert forecast_map(state, grid, room.camera).value("mean") == -np.inf
 
 
+@pytest.mark.full
 def test_a_sweep_of_places_compiles_once(known):
     camera, states = known
     forecast_map(*states[4], camera)

@@ -209,6 +209,7 @@ def test_any_view_becomes_an_allowed_one(seed):
     law_obeyed({"limits": limits_module}, seed)
 
 
+@pytest.mark.full
 @given(seed=st.integers(0, 1000))
 def test_any_place_has_its_allowed_axes(seed):
     law_axes({"limits": limits_module}, seed)

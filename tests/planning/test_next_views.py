@@ -84,6 +84,7 @@ def law_lazy(modules: Modules) -> None:
     assert sum(scored[1:]) < 2 * NUM
 
 
+@pytest.mark.full
 def test_only_what_may_win_is_scored_again():
     law_lazy({"next_views": real})
 

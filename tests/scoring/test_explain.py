@@ -201,6 +201,7 @@ def known():
     return state, grid, room.camera
 
 
+@pytest.mark.full
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1.0, 16.0]))
 def test_the_totals_are_the_utility_of_the_same_view(known, seed, lambda1):
     state, grid, camera = known

@@ -95,6 +95,7 @@ def test_positions_are_the_nodes_that_a_flood_reaches(pieces, margin):
     assert_free_space_is_the_flooded_one(furnished(pieces), margin)
 
 
+@pytest.mark.full
 @settings(max_examples=3)
 @given(furniture)
 def test_positions_keep_the_margin_and_stay_reachable_on_a_finer_grid(pieces):

@@ -40,6 +40,7 @@ def test_the_house_looks_as_in_habitat(house):
     assert difference.max() <= 4.0
 
 
+@pytest.mark.full
 def test_without_smooth_edges_the_house_is_nearer_still(house):
     golden, world = house
     simulator = RaycastSimulator(
@@ -55,6 +56,7 @@ def test_the_house_is_turned_upright(house):
     np.testing.assert_allclose(world.bounds, [[-9.5, -5.7, 0.0], [9.5, 5.7, 3.0]], atol=0.01)
 
 
+@pytest.mark.full
 def test_the_start_in_the_house_is_in_a_room(house):
     _, world = house
     simulator = RaycastSimulator(world, Camera.from_fov(64, 64, 60.0))

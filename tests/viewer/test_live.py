@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 
 import r3jax.viewer.live as live
-from r3jax.cli.main import main
 from r3jax.cli.setup import plan_of_run, simulator_of_run
 from r3jax.exploration.loop import explore
 from r3jax.trace.reader import read_run
@@ -18,6 +17,7 @@ from r3jax.viewer.server import close_server, open_server
 from r3jax.viewer.story import LiveStory
 from tests.box_room import write_room
 from tests.cli.small_runs import explore as explore_by_words
+from tests.cli.small_runs import main_without_report
 from tests.viewer.conftest import VIEWS
 
 pytestmark = pytest.mark.full
@@ -115,7 +115,7 @@ def test_the_command_writes_the_same_bytes_live_and_goes_on_live(run, tmp_path, 
     assert "live      http://127.0.0.1:" in capsys.readouterr().err
     path = tmp_path / "box"
     resume = ["explore", "--resume", str(path), "--budget", f"views:{VIEWS}", *words]
-    assert main(resume) == 0
+    assert main_without_report(resume) == 0
     assert (path / "trace.jsonl").read_bytes() == (run.path / "trace.jsonl").read_bytes()
     for step in range(VIEWS):
         name = f"frames/{step:06d}.png"

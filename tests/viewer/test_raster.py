@@ -44,6 +44,7 @@ def layer_of(triples, seed: int, **more) -> Squares:
     return Squares(np.array(triples, np.float64).reshape(-1, 3), colors, **more)
 
 
+@pytest.mark.full
 @given(points, points)
 def test_the_nearest_square_wins_every_pixel(first, second):
     layers = [layer_of(first, 1, edge=0.2), layer_of(second, 2, edge=0.05, least=3.0, lift=0.1)]

@@ -117,6 +117,7 @@ def test_sizes_of_the_image(size):
     assert_images_agree(xla.rasterise, random_cloud(4, COUNT), *view(*size))
 
 
+@pytest.mark.full
 def test_gaussians_larger_than_the_image():
     """And a camera in the middle of the cloud, where many lie behind or beside it."""
     scene, (camera, pose) = random_cloud(5, COUNT), view(*SIZE, distance=0.3)
@@ -162,6 +163,7 @@ def test_overflow_is_counted():
     assert (int(found.num_intersections), int(found.overflow)) == (needed, 5)
 
 
+@pytest.mark.full
 def test_one_gaussian_and_none_in_sight():
     scene, (camera, pose) = random_cloud(1, 1), view(*SIZE)
     centered = dataclasses.replace(scene, means=jnp.zeros((1, 3)), opacity_logits=jnp.ones(1))
@@ -213,6 +215,7 @@ def test_vmap_and_scan_equal_one_view_after_the_other():
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * np.abs(b).max())
 
 
+@pytest.mark.full
 def test_memory_does_not_grow_with_the_layers():
     """Autodiff through the loop would keep alpha and more for each pair of pixel and Gaussian."""
     count, edge = 20_000, 128
