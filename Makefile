@@ -47,6 +47,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+	$(BIN)/codespell r3jax tests experiments examples docs README.md
 
 # The pages, into build/site; a reference that leads nowhere fails.
 docs: setup

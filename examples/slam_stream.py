@@ -14,17 +14,10 @@ import numpy as np
 from numpy import ndarray as Array
 
 import r3jax
-from r3jax.mapping.occupancy import mark_free_ball
-from r3jax.planning.policy import make_policy
-from r3jax.scenes.registry import open_scene
-from r3jax.scoring.sighting import look
-from r3jax.simulators.base import Simulator
-
-integrate_depth = jax.jit(r3jax.integrate_depth)
 
 
-def slam(world: Simulator) -> Generator[tuple[Array, Array, list[Array]], Array, None]:
-    """Yields colours, depth [mm] and the poses of all views so far; is sent where to go next."""
+def slam(world) -> Generator[tuple[Array, Array, list[Array]], Array, None]:
+    """Yields colors, depth [mm] and the poses of all views so far; is sent where to go next."""
     true, believed = [world.start_pose], [world.start_pose]
     while True:
         frame = world.render(true[-1])
@@ -39,28 +32,26 @@ def slam(world: Simulator) -> Generator[tuple[Array, Array, list[Array]], Array,
 
 def main(views: int = 8, size: int = 128) -> list[r3jax.Frame]:
     """Explores the flat together with a SLAM system; returns the frames that are in the map."""
-    world = open_scene("flat", camera=r3jax.Camera.from_fov(size, size))
-    m, grid = nothing = r3jax.empty_map(capacity=1 << 14), r3jax.empty_grid(world.bounds)
-    policy = make_policy("ours-pano", num_candidates=40, num_frontier=12)
-    start, *keys = jax.random.split(jax.random.key(0), views + 1)
-    state = policy.init(world.camera, grid, key=start)
-    frames: list[r3jax.Frame] = []
-    stream = slam(world)
+    world = r3jax.open_scene("flat", camera=r3jax.Camera.from_fov(size, size))
+    policy = r3jax.make_policy("ours-pano", num_candidates=40, num_frontier=12)
+    config = r3jax.MappingConfig(capacity=1 << 14)  # the table grows by itself
+    begin = lambda: r3jax.start(
+        world.camera, world.bounds, policy, starts=[world.start_pose], config=config
+    )
+    planner, frames, stream = begin(), [], slam(world)
     rgb, depth, poses = next(stream)
-    for view in range(views):
+    for view, key in enumerate(jax.random.split(jax.random.key(0), views)):
         new = r3jax.Frame.from_arrays(rgb, depth, poses[view], world.camera, depth_scale=0.001)
         to_add, frames = [new], [*frames, new]
         if np.abs(np.stack([f.T_world_camera for f in frames]) - poses).max() > 1e-3:
             # What a voxel has seen cannot be moved: keep the key frames, and map them again.
             pairs = zip(frames, poses, strict=True)
             frames = [dataclasses.replace(f, T_world_camera=pose) for f, pose in pairs]
-            to_add, (m, grid) = frames, nothing
+            to_add, planner = frames, begin()
         for frame in to_add:
-            m = look(m, frame, max_range=5.0)  # the table doubles by itself before it is full
-            vouched = 0.5 if frame is frames[0] else 0.3  # round the start, round the robot [m]
-            grid = mark_free_ball(integrate_depth(grid, frame, 5.0), frame.position, vouched)
-        state = policy.observe(state, m, frames[-1])
-        goal, state, info = policy.decide(state, m, grid, poses[view], key=keys[view])
+            planner = r3jax.observe(planner, frame)
+        goal, planner, info = r3jax.decide(planner, poses[view], key)
+        m = planner.map_state
         print(f"view {view}: {len(to_add)} frame(s) mapped, {int(m.num_occupied)} voxels", end="")
         print(f" in {m.capacity} rows; {info.outcome.value}, {goal.length if goal else 0:.2f} m")
         if goal is None:

@@ -20,7 +20,7 @@ import tyro
 from matplotlib.figure import Figure
 from scipy import stats
 
-from experiments.artefacts import (
+from experiments.artifacts import (
     Origin,
     command_line,
     markdown_table,
@@ -28,14 +28,14 @@ from experiments.artefacts import (
     write_figure,
     write_markdown,
 )
-from r3jax.audit.audit import audit
-from r3jax.audit.colors import COLOR_OF_CAUSE
-from r3jax.audit.source import source_of
-from r3jax.audit.survey import Wishes
-from r3jax.benchmark.record import machine, source_commit
+from r3jax.apps.audit.audit import audit
+from r3jax.apps.audit.colors import COLOR_OF_CAUSE
+from r3jax.apps.audit.source import source_of
+from r3jax.apps.audit.survey import Wishes
+from r3jax.apps.benchmark.record import machine, source_commit
+from r3jax.apps.report import style
 from r3jax.cli.captures import Capture, open_capture
-from r3jax.evaluation import style
-from r3jax.evaluation.judge import judge
+from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.statistics import partial_spearman, spearman
 from r3jax.files import write_atomic
 from r3jax.splatting.train import fit
@@ -154,7 +154,7 @@ def fold_rows(
     config = TrainConfig(iterations=options.iterations, num_gaussians=options.gaussians)
     scene = fit(views.take(others), config).scene
     test = views.take(held_out)
-    judgment = judge(scene, test, numbers=held_out.tolist())
+    judgment = evaluate(scene, test, numbers=held_out.tolist())
     near = nearness(poses, held_out, others)
     rows: list[dict[str, Any]] = []
     for i, number in enumerate(held_out.tolist()):

@@ -3,7 +3,7 @@
     python -m experiments.causes --size small --scenes flat office
 
 For all policies by one measure, U = lambda1 U_G + U_R (`scoring.explain`), whatever they chose by,
-on what was known before each view. The runs are those of `experiments.beyond`. Causes that one
+on what was known before each view. The runs are those of `experiments.extensions`. Causes that one
 policy can tell apart and another cannot matter as much as they take up here.
 """
 
@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.artefacts import Origin, markdown_table, write_csv, write_markdown
-from experiments.beyond import Options, requests_of
+from experiments.artifacts import Origin, markdown_table, write_csv, write_markdown
+from experiments.extensions import Options, requests_of
 from experiments.suite import Records, by_method_and_scene, origin, run_requests
-from r3jax.evaluation.equal_terms import snapshots_of, with_short_names
-from r3jax.exploration.hindsight import explain_run
+from r3jax.evaluation.comparison import snapshots_of, with_short_names
+from r3jax.exploration.explain_run import explain_run
 from r3jax.scoring.explain import CAUSES
 from r3jax.trace.reader import read_run
 

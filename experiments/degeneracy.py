@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.artefacts import (
+from experiments.artifacts import (
     Origin,
     markdown_table,
     write_csv,
@@ -22,8 +22,8 @@ from experiments.artefacts import (
     write_markdown,
 )
 from experiments.suite import Options, Records, origin, run_suite
-from r3jax.evaluation.equal_terms import method_name, methods_of, snapshots_of, with_short_names
-from r3jax.evaluation.positions_figure import positions_figure
+from r3jax.apps.report.positions_figure import positions_figure
+from r3jax.evaluation.comparison import method_name, methods_of, snapshots_of, with_short_names
 from r3jax.trace.reader import read_run
 
 NAME = "degeneracy"

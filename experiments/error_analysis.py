@@ -15,7 +15,7 @@ from experiments import error_statistics
 from experiments.error_statistics import Draws, draw, mean_over_models
 from experiments.error_terms import KAPPAS, PRODUCTS, column, columns_of, on_seen
 from experiments.suite import Records
-from r3jax.evaluation.equal_terms import (
+from r3jax.evaluation.comparison import (
     check_equal_terms,
     method_name,
     scenes_of,

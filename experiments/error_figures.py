@@ -19,8 +19,8 @@ from experiments.error_analysis import (
     snapshots_of_models,
 )
 from experiments.error_terms import KAPPAS, PRODUCTS, column
-from r3jax.evaluation import style
-from r3jax.evaluation.policy_style import OKABE_ITO, legend_below
+from r3jax.apps.benchmark.results.policy_style import OKABE_ITO, legend_below
+from r3jax.apps.report import style
 from r3jax.evaluation.statistics import Estimate
 
 TITLES = {SCORE: "renderability R", COVERAGE: "coverage", COVER: "COVER"}

@@ -21,24 +21,23 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from experiments.seen_pixels import recorded, seen_pixels
-from r3jax.benchmark.conditions import Conditions, snapshot_slug
-from r3jax.benchmark.judging import JudgingViews, judging_path, read_judging_views
+from r3jax.apps.benchmark.conditions import Conditions, snapshot_slug
+from r3jax.apps.benchmark.judging import JudgingViews, judging_path, read_judging_views
+from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.images import psnr
-from r3jax.evaluation.judge import judge
 from r3jax.evaluation.maps import map_of
 from r3jax.files import write_atomic
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
 from r3jax.planning.policies.cover import SeenBins, coverage_of_pixels
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import Forms, ScoringConfig
 from r3jax.scoring.renderability import Renderability, score_voxels
-from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import voxels_in_pixels
-from r3jax.scoring.voxels import voxels_of
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.trace.reader import read_run
+from r3jax.visibility.depth_buffer import voxels_in_pixels
+from r3jax.visibility.views import pinhole_view
 
 VERSION = 1
 """Raised when what was computed by an older version of this file must not be taken over."""
@@ -94,13 +93,13 @@ def expect(
 ) -> Expected:
     """Every prediction of one view, pixel by pixel as `renderability_image` has it."""
     view = pinhole_view(camera, T_world_camera, config)
-    seen, row = voxels_in_pixels(voxels_of(state, config.delta), view, config)
+    seen, row = voxels_in_pixels(state, view, config)
     shape, position = row.shape, T_world_camera[:3, 3]
     hit = seen.present.astype(jnp.float32)
     bins = SeenBins(seen.visited.reshape(-1, *shape), seen.num_bins)
     offset = (position[:, None] - seen.center).reshape(3, *shape)
     coverage = jnp.mean(hit)
-    scored = [score_voxels(seen, position, camera.focal, kappa) for kappa in KAPPAS]
+    scored = [score_voxels(seen, position, camera.focal, Forms(kappa)) for kappa in KAPPAS]
     return Expected(
         terms=jnp.stack([_product_means(scores) for scores in scored]),
         cover=coverage * coverage_of_pixels(bins, offset, hit.reshape(shape)),
@@ -154,7 +153,7 @@ def error_columns(
     views, seen_by = judging.views, recorded(frames)
     far = jnp.asarray(sensing["max_range"], jnp.float32)
     edge = jnp.asarray(sensing["voxel_size"], jnp.float32)
-    judgment = judge(scene, views)
+    judgment = evaluate(scene, views)
     share, error = [], []
     for i, render in enumerate(judgment.renders):
         view = views.view(i)

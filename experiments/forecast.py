@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from experiments.artefacts import (
+from experiments.artifacts import (
     joint_origin,
     markdown_table,
     write_csv,
@@ -27,13 +27,20 @@ from experiments.artefacts import (
     write_markdown,
 )
 from experiments.suite import Options, run_suite
-from r3jax.benchmark.record import machine, source_commit
-from r3jax.evaluation import style
-from r3jax.evaluation.equal_terms import method_name, view_values
+from r3jax.apps.benchmark.record import machine, source_commit
+from r3jax.apps.forecast.calibration import write_calibration
+from r3jax.apps.forecast.forecast import forecast_map
+from r3jax.apps.forecast.psnr import (
+    STATISTICS,
+    Calibration,
+    errors_of,
+    fit,
+    leave_one_out,
+    statistic,
+)
+from r3jax.apps.report import style
+from r3jax.evaluation.comparison import method_name, view_values
 from r3jax.exploration.replay import config_of, states_of
-from r3jax.forecast.calibration import write_calibration
-from r3jax.forecast.forecast import forecast_map
-from r3jax.forecast.psnr import STATISTICS, Calibration, errors_of, fit, leave_one_out, statistic
 from r3jax.trace.reader import read_run
 
 NAME = "forecast"

@@ -20,15 +20,15 @@ from r3jax.mapping.occupancy import (
     world_to_cell,
 )
 from r3jax.mapping.state import empty_map
+from r3jax.mapping.update import integrate_growing
 from r3jax.planning.candidates import host_generator, poses_along, random_directions
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.policies.active_gamer import ActiveGamer, empty_share
-from r3jax.planning.policy import make_policy
+from r3jax.planning.registry import make_policy
 from r3jax.planning.situation import Situation
 from r3jax.planning.travel import plan_travel
 from r3jax.scoring.pixels import score_pixels
-from r3jax.scoring.sighting import look
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.free_space import GroundTruth
 
@@ -106,7 +106,7 @@ def choose(
             totals[chosen] = -np.inf
             best = int(np.argmax(totals))
         frame = simulator.render(poses[best])
-        map_state = look(map_state, frame, config.max_range)
+        map_state = integrate_growing(map_state, frame, config.max_range)
         grid = _integrate_depth(grid, frame, config.max_range)
         grid = _mark_free_ball(grid, frame.position, config.body_radius)
         state = policy.observe(state, map_state, frame)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from r3jax.evaluation.policy_style import legend_below, looks_of
+from r3jax.apps.benchmark.results.policy_style import legend_below, looks_of
 
 
 def pool_figure(rows: list[dict[str, Any]]) -> Figure:

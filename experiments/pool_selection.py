@@ -7,7 +7,7 @@ cost. A policy scores the whole pool, the best pose is taken, its frame joins th
 Vanilla 3DGS is then trained from scratch on each choice and judged on the scene's test views.
 
 The pool comes from the ground truth, the same for all; pictures come only from poses that were
-chosen. What is left out has no score of a pose: `frontier`, and `ours-pano`, `ours-demand` and
+chosen. What is left out has no score of a pose: `frontier`, and `ours-pano` and
 `ours-ahead`, which turn poses and so would have another pool. `active-gamer` is its gain, the empty
 pixels, without its lattice.
 """
@@ -23,7 +23,7 @@ from typing import Any, Literal
 import jax
 import tyro
 
-from experiments.artefacts import (
+from experiments.artifacts import (
     markdown_table,
     origin_of,
     write_csv,
@@ -33,15 +33,15 @@ from experiments.artefacts import (
 from experiments.pool_choice import SCORED, choose, pool_of
 from experiments.pool_figure import pool_figure
 from experiments.pool_table import gain_rows, mean_rows, result_rows
-from r3jax.benchmark.record import machine, source_commit
-from r3jax.evaluation.judge import judge
+from r3jax.apps.benchmark.record import machine, source_commit
+from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.scores import summarize
 from r3jax.evaluation.test_views import load_view_set, render_view_set
 from r3jax.files import write_atomic
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.scenes.registry import open_scene
 from r3jax.simulators.free_space import GroundTruth
+from r3jax.simulators.scenes.registry import open_scene
 from r3jax.splatting import train
 from r3jax.splatting.training_config import TrainConfig
 from r3jax.splatting.views import Views, load_views
@@ -225,7 +225,7 @@ def _train_and_judge(frames: list[Frame], tests: Views, choice: Choice) -> dict[
         seed=choice.seed,
     )
     scene = train.fit(load_views(frames, size.train_resolution), config).scene
-    rows = judge(scene, tests, config.raster).rows
+    rows = evaluate(scene, tests, config.raster).rows
     found = {s.metric.name: s for s in summarize(rows)}
     psnr = found["psnr"]
     return {

@@ -5,8 +5,8 @@
 
 After every few views of a recorded run each policy decides twice, from the same map with the same
 key: as it is, and with its best candidates refined. What both views are worth is worked out anew by
-`r3jax.view_utility`, for all policies: a choice by another measure than U (that of `ours-demand`,
-the paths of `ours-ahead`) need not gain in it. Decisions are made twice and the second is timed, so
+`r3jax.view_utility`, for all policies: a choice by another measure than U (the paths
+of `ours-ahead`) need not gain in it. Decisions are made twice and the second is timed, so
 that compiling does not count.
 """
 
@@ -21,13 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments.artefacts import Origin, command_line, markdown_table, write_csv, write_markdown
-from r3jax.benchmark.record import machine, source_commit
+from experiments.artifacts import Origin, command_line, markdown_table, write_csv, write_markdown
+from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.exploration.replay import planner_config_of, states_of
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.decision import look_round
-from r3jax.planning.policy import Decision, make_policy
+from r3jax.planning.decision import prepare_decision
+from r3jax.planning.policy import Decision
+from r3jax.planning.registry import make_policy
 from r3jax.scoring.utility import view_utility
 from r3jax.trace.reader import Run, read_run
 
@@ -116,7 +117,7 @@ def compared(
         decision, _, _ = decide()
         milliseconds = 1e3 * (time.perf_counter() - begin)
         config, state = policies[who].config, states[who]
-        _, _, masked = look_round(state, map_state, grid, pose, config)
+        _, _, masked = prepare_decision(state, map_state, grid, pose, config)
         worth = exact(map_state, masked, state.camera, decision, config)
         row |= {f"{word}_utility": worth, f"{word}_ms": round(milliseconds, 2)}
     return row | {"gain": row["refined_utility"] / max(row["plain_utility"], 1e-9) - 1.0}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.artefacts import (
+from experiments.artifacts import (
     Origin,
     markdown_table,
     write_csv,
@@ -42,8 +42,8 @@ from experiments.error_figures import (
 )
 from experiments.error_terms import PRODUCTS, SMALLEST_SHARE, column
 from experiments.suite import Options, origin, run_suite
-from r3jax.benchmark.record import source_commit
-from r3jax.evaluation.table_parts import notes
+from r3jax.apps.benchmark.record import source_commit
+from r3jax.apps.benchmark.results.table_parts import notes
 
 NAME = "renderability_vs_error"
 

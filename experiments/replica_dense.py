@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import Literal
 
-from experiments.artefacts import Origin, write_markdown
+from experiments.artifacts import Origin, write_markdown
 from experiments.suite import Options, Records, origin, run_suite
-from r3jax.evaluation.equal_terms import methods_of, snapshots_of
-from r3jax.evaluation.table_formats import to_csv, to_latex, to_markdown
-from r3jax.evaluation.table_parts import Table
-from r3jax.evaluation.tables import difference_table, quality_table, tail_table
+from r3jax.apps.benchmark.results.table_formats import to_csv, to_latex, to_markdown
+from r3jax.apps.benchmark.results.table_parts import Table
+from r3jax.apps.benchmark.results.tables import difference_table, quality_table, tail_table
+from r3jax.evaluation.comparison import methods_of, snapshots_of
 from r3jax.files import write_atomic
 
 REFERENCE = "ours-pano"

@@ -20,10 +20,10 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, Literal
 
-from r3jax.benchmark.cells import Cell
-from r3jax.benchmark.conditions import OWN_OF_LOOP, OWN_OF_TRAINER, Conditions
+from r3jax.apps.benchmark.cells import Cell
+from r3jax.apps.benchmark.conditions import OWN_OF_LOOP, OWN_OF_TRAINER, Conditions
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.planning.config import PlannerConfig
+from r3jax.planning.lookahead import AheadConfig
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.training_config import TrainConfig
 
@@ -111,8 +111,8 @@ def known_settings(conditions: Conditions) -> dict[str, Setting]:
         _setting(name, Conditions, "conditions", field, getattr(conditions, field))
         for name, field in _OF_CONDITIONS.items()
     ]
-    for name, default in _defaults(PlannerConfig).items():
-        found.append(_setting(f"policy.{name}", PlannerConfig, "policy", name, default))
+    for name, default in _defaults(AheadConfig).items():
+        found.append(_setting(f"policy.{name}", AheadConfig, "policy", name, default))
     for name, default in (_defaults(ScoringConfig) | {"max_range": conditions.max_range}).items():
         # This is how `Conditions.policy` tells them from those of the planner.
         field = f"scoring.{name}"
@@ -143,7 +143,12 @@ def _setting(name: str, config: type, part: Part, field: str, default: Value) ->
 
 @functools.cache
 def sentences_of(config: type) -> dict[str, str]:
-    """The first sentence below each field of a class, by the field's name."""
+    """The first sentence below each field of a class, inherited ones too, by the field's name."""
+    bases = [base for base in reversed(config.__mro__) if base.__module__.startswith("r3jax")]
+    return {name: text for base in bases for name, text in _own_sentences(base).items()}
+
+
+def _own_sentences(config: type) -> dict[str, str]:
     (tree,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
     assert isinstance(tree, ast.ClassDef)
     found = {}

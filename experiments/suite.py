@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from experiments.artefacts import Origin, joint_origin
-from r3jax.benchmark.cells import Cell
-from r3jax.benchmark.conditions import Conditions
-from r3jax.benchmark.engines.events import Event
-from r3jax.benchmark.engines.local import run_in_processes
-from r3jax.benchmark.engines.slurm import run_on_cluster
-from r3jax.benchmark.plan import Request, cells_left, make_plan
-from r3jax.benchmark.record import collect, read_records
-from r3jax.evaluation.equal_terms import method_name, methods_of, scenes_of
-from r3jax.planning.policy import policy_names
-from r3jax.scenes.registry import scene_names
+from experiments.artifacts import Origin, joint_origin
+from r3jax.apps.benchmark.cells import Cell
+from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.engines.events import Event
+from r3jax.apps.benchmark.engines.local import run_in_processes
+from r3jax.apps.benchmark.engines.slurm import run_on_cluster
+from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
+from r3jax.apps.benchmark.record import collect, read_records
+from r3jax.evaluation.comparison import method_name, methods_of, scenes_of
+from r3jax.planning.registry import policy_names
+from r3jax.simulators.scenes.registry import scene_names
 
 T = TypeVar("T")
 

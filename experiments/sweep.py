@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from experiments.artefacts import markdown_table
+from experiments.artifacts import markdown_table
 from experiments.settings import known_settings, with_settings
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import origin, request_of, run_cells
@@ -30,10 +30,10 @@ from experiments.sweep_space import (
     random_points,
     with_default,
 )
-from r3jax.benchmark.cells import Cell
-from r3jax.benchmark.plan import Request, make_plan
-from r3jax.benchmark.record import read_records
-from r3jax.scenes.registry import scene_names
+from r3jax.apps.benchmark.cells import Cell
+from r3jax.apps.benchmark.plan import Request, make_plan
+from r3jax.apps.benchmark.record import read_records
+from r3jax.simulators.scenes.registry import scene_names
 
 NAME = "sweep"
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.suite import Records
 from experiments.sweep_space import Point
-from r3jax.evaluation.equal_terms import scenes_of, view_values
+from r3jax.evaluation.comparison import scenes_of, view_values
 from r3jax.evaluation.statistics import Estimate, Scores, mean_over_scenes, paired_difference
 
 METRIC = "psnr"

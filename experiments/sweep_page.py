@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.artefacts import (
+from experiments.artifacts import (
     Origin,
     markdown_table,
     write_csv,
@@ -18,10 +18,10 @@ from experiments.artefacts import (
 from experiments.settings import Setting, Value
 from experiments.sweep_choice import Choice, Trial, choose, leave_one_out
 from experiments.sweep_space import Point
-from r3jax.evaluation.benchmark_figures import sweep_figure
-from r3jax.evaluation.equal_terms import scenes_of
+from r3jax.apps.benchmark.results.benchmark_figures import sweep_figure
+from r3jax.apps.benchmark.results.table_parts import FEWEST_SEEDS
+from r3jax.evaluation.comparison import scenes_of
 from r3jax.evaluation.statistics import Estimate
-from r3jax.evaluation.table_parts import FEWEST_SEEDS
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,15 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from experiments.artefacts import markdown_table, origin_of, write_csv, write_markdown
-from r3jax.benchmark.record import machine, source_commit
+from experiments.artifacts import markdown_table, origin_of, write_csv, write_markdown
+from r3jax.apps.benchmark.record import machine, source_commit
+from r3jax.apps.team.team import Member, explore_team
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.team import Member, explore_team
 from r3jax.files import write_atomic
 from r3jax.geometry.cameras import Camera
-from r3jax.planning.policy import make_policy
-from r3jax.scenes.registry import open_scene
+from r3jax.planning.registry import make_policy
 from r3jax.simulators.base import Simulator
+from r3jax.simulators.scenes.registry import open_scene
 from r3jax.simulators.start import level_pose, places_beside
 
 NAME = "team"

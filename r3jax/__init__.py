@@ -4,9 +4,14 @@ An open implementation of R3-RECON (arXiv 2601.07484), written from the paper. A
 keeps what was seen, from where and how consistently; closed forms answer in milliseconds how well
 any view could be rendered.
 
-    m = r3jax.empty_map()
-    m = r3jax.integrate(m, frame)
+    m = r3jax.integrate(r3jax.empty_map(), frame)
     s = r3jax.renderability(m, camera, T_world_camera)
+
+Where to look next, beside a robot or a SLAM system:
+
+    planner = r3jax.start(camera, bounds)
+    planner = r3jax.observe(planner, frame)
+    decision, planner, info = r3jax.decide(planner, frame.T_world_camera, key)
 """
 
 import lazy_loader

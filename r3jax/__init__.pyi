@@ -1,11 +1,18 @@
+from .evaluation.evaluate import Evaluation, evaluate
+from .exploration.loop import Result, explore
 from .frame import Frame
 from .geometry.cameras import Camera, look_at, pose_along
+from .mapping.config import MappingConfig
 from .mapping.join import grow, merge
 from .mapping.lookup import lookup
 from .mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth
 from .mapping.state import MapState, empty_map
 from .mapping.update import integrate, integrate_points
+from .planning.greedy import GreedyPolicy
 from .planning.next_views import NextViews, next_views
+from .planning.planner import Planner, decide, observe, start
+from .planning.policy import Decision
+from .planning.registry import make_policy, register_policy
 from .scoring.config import ScoringConfig
 from .scoring.explain import Explanation, explain_view
 from .scoring.panorama import Panorama, panorama
@@ -16,6 +23,7 @@ from .scoring.renderability import (
     voxel_renderability,
 )
 from .scoring.utility import ViewUtility, view_utility
+from .simulators.scenes.registry import open_scene
 from .splatting.config import RasterConfig
 from .splatting.ply import read_scene, write_scene
 from .splatting.render import Rendering, render
@@ -28,24 +36,33 @@ __version__: str
 
 __all__ = [
     "Camera",
+    "Decision",
+    "Evaluation",
     "Explanation",
     "FitResult",
     "Frame",
     "GaussianScene",
+    "GreedyPolicy",
     "MapState",
+    "MappingConfig",
     "NextViews",
     "OccupancyGrid",
     "Panorama",
+    "Planner",
     "RasterConfig",
     "Renderability",
     "Rendering",
+    "Result",
     "ScoringConfig",
     "TrainConfig",
     "ViewUtility",
     "Views",
+    "decide",
     "empty_grid",
     "empty_map",
+    "evaluate",
     "explain_view",
+    "explore",
     "fit",
     "grow",
     "integrate",
@@ -54,14 +71,19 @@ __all__ = [
     "load_views",
     "look_at",
     "lookup",
+    "make_policy",
     "merge",
     "next_views",
+    "observe",
+    "open_scene",
     "panorama",
     "pose_along",
     "read_scene",
+    "register_policy",
     "render",
     "renderability",
     "renderability_image",
+    "start",
     "view_utility",
     "voxel_renderability",
     "write_scene",

@@ -64,7 +64,7 @@ def _from_dlpack(name: str, value: Any) -> np.ndarray | Array:
 
 
 def color_image(rgb: Any) -> Float[Array, "H W 3"]:
-    """Colours in [0, 1] from 8-bit ones, or from floats that are so already.
+    """Colors in [0, 1] from 8-bit ones, or from floats that are so already.
 
     Raises:
         ValueError: another shape, no pixels, whole numbers of another size.
@@ -97,7 +97,7 @@ def _hint(shape: tuple[int, ...]) -> str:
 
 
 def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float[Array, "..."]:
-    """z-depth [m]: from metres, or from steps of so many metres.
+    """z-depth [m]: from meters, or from steps of so many meters.
 
     Raises:
         ValueError: whole numbers without a unit, a unit that cannot be one, no numbers.
@@ -111,14 +111,14 @@ def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float
         if is_whole:
             raise ValueError(
                 f"depth is {array.dtype}: say how many metres one step is, depth_scale=0.001 for "
-                "millimetres"
+                "millimeters"
             )
         return jnp.asarray(_float32(array))
     scale = float(metres_per_step)
     if not 0.0 < scale < np.inf or (is_whole and scale >= 1.0):
         raise ValueError(
             "depth_scale is how many metres one step of the depth is, such as 0.001 for "
-            f"millimetres, got {scale:g}"
+            f"millimeters, got {scale:g}"
         )
     if isinstance(array, np.ndarray):
         return jnp.asarray((array.astype(np.float64) * scale).astype(np.float32))

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from r3jax.files import sync_folder, write_atomic
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_type
-from r3jax.foreign.files import check_tree, read_bytes
-from r3jax.foreign.json_text import parse_json
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_type
+from r3jax.formats.validation.files import check_tree, read_bytes
+from r3jax.formats.validation.json_text import parse_json
 
 Tables = Mapping[str, Mapping[str, np.ndarray]]
 """Named arrays, by table."""

@@ -8,8 +8,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from r3jax.arguments import one
 from r3jax.arrays import color_image, depth_image, own_matrix, pinhole_camera
+from r3jax.geometry.arguments import one
 from r3jax.geometry.cameras import Camera, is_rigid, is_traced, rigid_error
 
 FAR = 50.0
@@ -56,13 +56,13 @@ class Frame(eqx.Module):
 
     Raises:
         ValueError: shapes that do not fit the camera, integer images (divide by 255 first),
-            colours outside [0, 1] or not finite, depth that is NaN or negative, a pose that is
+            colors outside [0, 1] or not finite, depth that is NaN or negative, a pose that is
             not finite or not rigid, a median depth of more than 50 m (without `far`). Values are
             checked where they are known (outside jit).
     """
 
     rgb: Float[Array, "H W 3"]
-    """Colour in [0, 1]."""
+    """Color in [0, 1]."""
 
     depth: Float[Array, "H W"]
     """z-depth [m]. 0: no measurement. inf: nothing within the sensor's range."""
@@ -107,20 +107,20 @@ class Frame(eqx.Module):
             frame = r3jax.Frame.from_arrays(tensor, depth_mm, pose, K, depth_scale=0.001)
 
         Args:
-            rgb: colours, [H, W, 3]: uint8, or floats in [0, 1].
+            rgb: colors, [H, W, 3]: uint8, or floats in [0, 1].
             depth: z-depth, [H, W], not the length of the ray; 0 means no measurement and inf
-                that nothing lies within the sensor's range. Metres, or steps of `depth_scale`.
+                that nothing lies within the sensor's range. Meters, or steps of `depth_scale`.
             T_world_camera: camera-to-world pose, [4, 4]; OpenCV axes (x right, y down, z
                 forward), world z up [m].
             camera: a `Camera`, or the 3x3 matrix of a pinhole for images of this size.
-            depth_scale: metres per step of the depth, 0.001 for millimetres. None: metres, which
+            depth_scale: meters per step of the depth, 0.001 for millimeters. None: meters, which
                 only floats can be.
             pixel_center: where the matrix has the center of the upper left pixel [px]: 0 in
                 OpenCV and ROS, 0.5 in COLMAP and nerfstudio. A `Camera` has it at 0.5.
             far: the median depth may exceed 50 m; otherwise that is taken for a wrong unit.
 
         Raises:
-            ValueError: what `Frame` refuses; colours or depth of a type or shape that cannot be
+            ValueError: what `Frame` refuses; colors or depth of a type or shape that cannot be
                 meant, whole numbers as depth without `depth_scale`, a matrix of other images.
             TypeError: what is not an array, or cannot be handed over.
         """
@@ -158,7 +158,7 @@ class Frame(eqx.Module):
             if not jnp.issubdtype(array.dtype, jnp.floating):
                 raise ValueError(
                     f"{name} must be float32, got {array.dtype}: convert it first "
-                    "(8-bit colour / 255, depth to metres)"
+                    "(8-bit color / 255, depth to metres)"
                 )
 
     def _check_values(self) -> None:
@@ -179,7 +179,7 @@ class Frame(eqx.Module):
 
     @property
     def position(self) -> Float[Array, " 3"]:
-        """Camera centre in the world [m]."""
+        """Camera center in the world [m]."""
         return self.T_world_camera[:3, 3]
 
 

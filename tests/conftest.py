@@ -25,6 +25,33 @@ program that is compiled to run once. A flag that XLA does not know ends the pro
 set for the version that these were measured with alone."""
 
 
+_LEFT_TO_TEST_ALL = (
+    "apps", "experiments", "notebooks",
+    "cli/test_evaluate.py", "cli/test_odd_worlds.py", "cli/test_train.py",
+    "evaluation/test_test_views.py",
+    "exploration/test_guard.py", "exploration/test_motion.py",
+    "mapping/test_scans.py",
+    "planning/test_active_gamer.py", "planning/test_motions_of_policies.py",
+    "planning/test_next_views.py", "planning/test_unseen.py",
+    "scoring/test_explain.py", "scoring/test_leaks.py", "scoring/test_pixels.py",
+    "scoring/test_simulated.py",
+    "simulators/scenes/test_procedural.py", "simulators/test_free_space.py",
+    "simulators/test_habitat.py", "simulators/test_start.py",
+    "splatting/backends", "splatting/test_density.py", "splatting/test_mcmc.py",
+    "splatting/test_train_checkpoints.py",
+)  # fmt: skip
+"""Whole folders and files that `make test` leaves out: what is built on the method, and the finer
+points of it. Single tests elsewhere are marked `full` themselves."""
+
+
+def pytest_collection_modifyitems(items):
+    """Marks what is left to `make test-all`, before pytest selects by markers."""
+    left = tuple(str(Path(__file__).parent / name) for name in _LEFT_TO_TEST_ALL)
+    for item in items:
+        if str(item.path).startswith(left) and not item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.full)
+
+
 def is_measured(config: pytest.Config) -> bool:
     """True with --benchmark-enable; `benchmark_disable` is always set, by our defaults."""
     return bool(config.getoption("benchmark_enable", default=False))

@@ -41,7 +41,7 @@ class Unwilling(Foreign):
 
 
 def images(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """8-bit colours, and depth in whole millimetres with holes."""
+    """8-bit colors, and depth in whole millimeters with holes."""
     random = np.random.default_rng(seed)
     rgb = random.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     depth = random.integers(0, 5000, (HEIGHT, WIDTH), dtype=np.uint16)
@@ -89,7 +89,7 @@ def test_a_matrix_projects_as_in_opencv(row, column, z):
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("kind", [np.asarray, Foreign])
-def test_floats_are_colours_from_0_to_1_and_metres(dtype, kind):
+def test_floats_are_colors_from_0_to_1_and_metres(dtype, kind):
     rgb, depth = (RGB / 255).astype(dtype), (STEPS / 1000).astype(dtype)
     frame = Frame.from_arrays(kind(rgb), kind(depth), POSE, CAMERA)
     np.testing.assert_array_equal(frame.rgb, rgb.astype(np.float32))
@@ -141,10 +141,10 @@ BAD = {
     "planar": ({"rgb": RGB.transpose(2, 0, 1)}, r"got \(3, 6, 8\): channels come last.*\(1, 2, 0"),
     "alpha": ({"rgb": np.zeros((6, 8, 4), np.uint8)}, r"got \(6, 8, 4\): leave out alpha"),
     "batch": ({"rgb": RGB[None]}, r"got \(1, 6, 8, 3\): leave out the axis of the batch"),
-    "grey": ({"rgb": RGB[..., 0]}, r"rgb must have shape \[H, W, 3\], got \(6, 8\)$"),
-    "16-bit colours": ({"rgb": RGB.astype(np.uint16)}, "rgb must be uint8 .* got uint16"),
-    "colours to 255": ({"rgb": RGB.astype(np.float32)}, r"rgb must lie in \[0, 1\].* to 2\d\d"),
-    "colours NaN": ({"rgb": np.full((6, 8, 3), np.nan)}, r"rgb must lie in \[0, 1\].* nan"),
+    "gray": ({"rgb": RGB[..., 0]}, r"rgb must have shape \[H, W, 3\], got \(6, 8\)$"),
+    "16-bit colors": ({"rgb": RGB.astype(np.uint16)}, "rgb must be uint8 .* got uint16"),
+    "colors to 255": ({"rgb": RGB.astype(np.float32)}, r"rgb must lie in \[0, 1\].* to 2\d\d"),
+    "colors NaN": ({"rgb": np.full((6, 8, 3), np.nan)}, r"rgb must lie in \[0, 1\].* nan"),
     "no pixels": ({"rgb": RGB[:0], "depth": STEPS[:0]}, r"no pixels: its shape is \(0, 8, 3\)"),
     "no columns": ({"rgb": RGB[:, :0], "camera": K}, r"no pixels: its shape is \(6, 0, 3\)"),
     "depth of another size": ({"depth": STEPS[:3]}, r"depth has shape \(3, 8\)"),

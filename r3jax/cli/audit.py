@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.audit import sentences
-from r3jax.audit.audit import Audit, audit
-from r3jax.audit.camera_paths import CameraPath, is_camera_path, read_camera_path
-from r3jax.audit.ground_plan import letter
-from r3jax.audit.outputs import suggested_poses, write_outputs
-from r3jax.audit.report import write_report
-from r3jax.audit.source import source_of
-from r3jax.audit.survey import Wishes
+from r3jax.apps.audit import sentences
+from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.camera_paths import CameraPath, is_camera_path, read_camera_path
+from r3jax.apps.audit.ground_plan import letter
+from r3jax.apps.audit.outputs import suggested_poses, write_outputs
+from r3jax.apps.audit.report import write_report
+from r3jax.apps.audit.source import source_of
+from r3jax.apps.audit.survey import Wishes
 from r3jax.cli.captures import open_capture
 from r3jax.cli.console import Console, Table
 from r3jax.cli.errors import UserError, one_line

@@ -8,13 +8,13 @@ from typing import Any
 
 import jax
 
-from r3jax.benchmark.cells import Cell
-from r3jax.benchmark.conditions import Conditions, parse_settings
-from r3jax.benchmark.engines.events import Event, Report
-from r3jax.benchmark.engines.local import run_here, run_in_processes, visible_gpus
-from r3jax.benchmark.engines.slurm import run_on_cluster
-from r3jax.benchmark.plan import Request, cells_left, make_plan
-from r3jax.benchmark.record import collect, read_records
+from r3jax.apps.benchmark.cells import Cell
+from r3jax.apps.benchmark.conditions import Conditions, parse_settings
+from r3jax.apps.benchmark.engines.events import Event, Report
+from r3jax.apps.benchmark.engines.local import run_here, run_in_processes, visible_gpus
+from r3jax.apps.benchmark.engines.slurm import run_on_cluster
+from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
+from r3jax.apps.benchmark.record import collect, read_records
 from r3jax.cli.checks import seeds_of, words
 from r3jax.cli.console import BarColumn, Console, SpinnerColumn, TaskID, TextColumn, progress_bar
 from r3jax.cli.errors import UserError, one_line

@@ -6,9 +6,11 @@ the keyboard should be told at once. Nothing here imports JAX.
 
 import dataclasses
 import functools
+import sys
 from pathlib import Path
 from typing import Any
 
+from r3jax.apps.forecast.goal import parse_goal
 from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
 from r3jax.cli.options import (
     Audit,
@@ -29,7 +31,7 @@ from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.planning.motion import Motion, make_motion
 from r3jax.planning.policies import check_policy
-from r3jax.scenes.names import check_scene
+from r3jax.simulators.scenes.names import check_scene
 
 DEFAULT_POLICY = "ours-pano"
 DEFAULT_BUDGET = "views:100"
@@ -83,7 +85,7 @@ def _(options: Explore) -> None:
         name = options.name or default_name(options, options.scene, policy)
         _check_free(options.out / name, options.overwrite)
     if options.policy is not None:
-        check_policy(options.policy)
+        _check_policy(options.policy)
     if options.budget is not None:
         parse_budget(options.budget)
     loop_of_options(options)
@@ -105,7 +107,7 @@ def _(options: Team) -> None:
     if not options.meet_every >= 0.0:
         raise ValueError(f"--meet-every must be a time >= 0 [s], got {options.meet_every}")
     for single in singles_of(options):
-        check_policy(single.policy or DEFAULT_POLICY)
+        _check_policy(single.policy or DEFAULT_POLICY)
         loop_of_options(single)
     _check_free(team_folder(options, options.scene) / "0", options.overwrite)
 
@@ -115,7 +117,7 @@ def _(options: Benchmark) -> None:
     for scene in words(options.scenes):
         check_scene(scene, options.scale)
     for policy in words(options.policies):
-        check_policy(policy)
+        _check_policy(policy)
     for budget in (options.budget, *words(options.snapshots or "")):
         parse_budget(budget)
     seeds_of(options)
@@ -173,6 +175,18 @@ def _(options: Merge) -> None:
         _check_run(path)
 
 
+def _check_policy(name: str) -> None:
+    """Refuses a policy that is not there; a class may be in the folder that the user is in.
+
+    Raises:
+        ValueError: as `check_policy`.
+    """
+    here = str(Path.cwd())
+    if ":" in name and here not in sys.path:
+        sys.path.insert(0, here)
+    check_policy(name)
+
+
 def loop_of_options(options: Explore) -> ExplorationConfig:
     """What the loop of a new run is told.
 
@@ -183,6 +197,8 @@ def loop_of_options(options: Explore) -> ExplorationConfig:
         raise ValueError(f"--resolution must lie between 16 and 4096, got {options.resolution}")
     if not 0 <= options.seed < 1 << 32:
         raise ValueError(f"--seed must lie between 0 and 2^32 - 1, got {options.seed}")
+    if options.until is not None:
+        parse_goal(options.until)
     config = ExplorationConfig(
         voxel_size=options.voxel_size,
         cell_size=options.cell_size,
@@ -215,7 +231,8 @@ def default_name(options: Explore, scene: str, policy: str) -> str:
     if kind == "habitat" and colon:
         stem = f"habitat-{stem.removesuffix('.stage_config')}"
     motion = "" if options.motion == "free" else f"-{options.motion}"
-    return f"{stem}-{policy}{motion}-seed{options.seed}"
+    own = policy.rpartition(":")[2]  # of package.module:Class
+    return f"{stem}-{own}{motion}-seed{options.seed}"
 
 
 def team_folder(options: Team, scene: str) -> Path:

@@ -10,6 +10,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.apps.report import style
+from r3jax.apps.report.contact_sheet import SheetView, contact_sheet
+from r3jax.apps.report.report import write_report
 from r3jax.cli.captures import Capture, open_capture
 from r3jax.cli.console import (
     BarColumn,
@@ -32,16 +35,13 @@ from r3jax.cli.selection import (
     frames_of,
     mapped_views,
 )
-from r3jax.evaluation import style
-from r3jax.evaluation.contact_sheet import SheetView, contact_sheet
-from r3jax.evaluation.judge import Judgment, judge
+from r3jax.evaluation.evaluate import Evaluation, evaluate
 from r3jax.evaluation.lpips import load_lpips
 from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
-from r3jax.evaluation.report import write_report
 from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
 from r3jax.files import write_atomic
-from r3jax.foreign.json_text import sealed
 from r3jax.formats.errors import FormatError
+from r3jax.formats.validation.json_text import sealed
 from r3jax.mapping.state import MapState
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.ply import read_scene
@@ -60,7 +60,7 @@ class Outcome:
     test: TestSet
     num_gaussians: int
     views: Views
-    judgment: Judgment
+    judgment: Evaluation
     summaries: tuple[Summary, ...]
 
     state: MapState | None
@@ -111,7 +111,7 @@ def _evaluate(options: Evaluate, capture: Capture) -> Outcome:
             expected = expected_renderability(state, test.frames())
     with _bar(progress) as bar:
         task = bar.add_task("", total=len(views))
-        judgment = judge(
+        judgment = evaluate(
             scene,
             views,
             RasterConfig(backend=options.backend),

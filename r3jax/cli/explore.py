@@ -6,6 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from r3jax.apps.forecast.goal import parse_goal
+from r3jax.apps.forecast.stopping import stopping_rule
+from r3jax.apps.report.report import write_report
 from r3jax.cli.checks import default_name
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line, resumable, resume_command
@@ -17,12 +20,10 @@ from r3jax.cli.setup import (
     header_of,
     plan_of_options,
     plan_of_run,
-    policy_fields,
     policy_of_options,
     simulator_of_options,
     simulator_of_run,
 )
-from r3jax.evaluation.report import write_report
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.loop import Result, explore
 from r3jax.exploration.state import StopReason
@@ -32,7 +33,7 @@ from r3jax.planning.limits import begin_at
 from r3jax.planning.motion import motion_of
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RunError
-from r3jax.trace.header import package_versions
+from r3jax.trace.header import package_versions, policy_fields
 from r3jax.trace.reader import Run, read_run
 from r3jax.trace.rows import StepRow
 from r3jax.trace.writer import RunWriter
@@ -98,6 +99,7 @@ def run_explore(options: Explore) -> int:
                 recorder=recorder,
                 resume=expedition.recorded,
                 decided_from=expedition.decided_from,
+                is_enough=stopping_rule(plan.config, expedition.simulator.camera),
                 on_step=on_step,
                 on_stage=progress.on_stage,
             )
@@ -118,8 +120,8 @@ def _open_page(options: Explore, stack: contextlib.ExitStack) -> Callable[[Exped
         UserError: viser is not installed, or the port is in use.
     """
     check_viser()
-    from r3jax.viewer.live import open_live
-    from r3jax.viewer.server import close_server, open_server
+    from r3jax.apps.viewer.live import open_live
+    from r3jax.apps.viewer.server import close_server, open_server
 
     try:
         server = open_server("127.0.0.1", options.port)
@@ -230,6 +232,7 @@ def _with_limits(plan: Plan, options: Explore) -> Plan:
     if options.budget is not None:
         plan = dataclasses.replace(plan, budget=parse_budget(options.budget))
     if options.until is not None:
+        parse_goal(options.until)
         config = dataclasses.replace(plan.config, until=options.until)
         plan = dataclasses.replace(plan, config=config)
     return plan

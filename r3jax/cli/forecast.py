@@ -2,15 +2,15 @@
 
 from collections import deque
 
+from r3jax.apps.forecast.calibration import default_calibration, read_calibration
+from r3jax.apps.forecast.outlook import Outlook
+from r3jax.apps.report.outlook_figure import LEVEL, outlook_figure, outlook_lines
+from r3jax.apps.report.style import to_png
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Forecast
-from r3jax.evaluation.outlook import LEVEL, outlook_figure, outlook_lines
-from r3jax.evaluation.style import to_png
-from r3jax.exploration.outlook import Outlook
 from r3jax.exploration.replay import states_of
 from r3jax.files import write_atomic
-from r3jax.forecast.calibration import default_calibration, read_calibration
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import read_run
 

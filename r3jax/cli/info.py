@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from r3jax.apps.report.summary import stage_times, summary
 from r3jax.cli.console import Console, Table
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Info
-from r3jax.evaluation.summary import stage_times, summary
 from r3jax.files import write_atomic
 from r3jax.formats.errors import FormatError
 from r3jax.formats.recordings import is_recording, read_recording
@@ -38,13 +38,13 @@ def run_info(options: Info) -> int:
 
 
 def _show_inventory(console: Console) -> None:
-    from r3jax.planning import policy
-    from r3jax.scenes import registry
+    from r3jax.planning.registry import describe, policy_names
+    from r3jax.simulators.scenes import registry
     from r3jax.trace.header import package_versions
 
     scenes = {name: registry.describe(name) for name in registry.scene_names()}
     scenes |= registry.outside_scenes()
-    policies = {name: policy.describe(name) for name in policy.policy_names()}
+    policies = {name: describe(name) for name in policy_names()}
     for title, entries in (
         ("Scenes", scenes),
         ("Policies", policies),
@@ -81,8 +81,8 @@ def _show_run(console: Console, path: Path) -> None:
 
 
 def _show_recording(console: Console, options: Info, path: Path) -> None:
-    from r3jax.evaluation.revisits import FrameReport, follow_recording, revisit_figure
-    from r3jax.evaluation.style import to_png
+    from r3jax.apps.report.revisits import FrameReport, follow_recording, revisit_figure
+    from r3jax.apps.report.style import to_png
 
     recording = read_recording(path, options.up)
     camera = recording.camera

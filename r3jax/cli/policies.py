@@ -2,7 +2,7 @@
 
 from r3jax.cli.console import Console, Table, Text
 from r3jax.cli.options import Policies
-from r3jax.planning.policy import describe, policy_names, source_of
+from r3jax.planning.registry import describe, policy_names, source_of
 
 
 def run_policies(options: Policies) -> int:

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
+from r3jax.apps.benchmark.results.table_parts import Entry, Table
+from r3jax.apps.benchmark.results.tables import quality_table
 from r3jax.cli.console import Console, Text
 from r3jax.cli.console import Table as RichTable
-from r3jax.evaluation.equal_terms import snapshots_of
-from r3jax.evaluation.table_parts import Entry, Table
-from r3jax.evaluation.tables import quality_table
+from r3jax.evaluation.comparison import snapshots_of
 
 _MARKS = {1: "bold", 2: "italic"}
 

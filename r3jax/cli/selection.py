@@ -10,11 +10,11 @@ import numpy as np
 from r3jax.cli.captures import Capture, open_capture
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import Evaluate
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_type
-from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json, unsealed
-from r3jax.foreign.versions import check_version
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_type
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json, unsealed
+from r3jax.formats.validation.versions import check_version
 from r3jax.frame import Frame
 
 _MAX_BYTES = 64 << 20

@@ -12,17 +12,18 @@ from r3jax.cli.checks import DEFAULT_BUDGET, DEFAULT_POLICY, loop_of_options, mo
 from r3jax.cli.options import Explore
 from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.replay import config_of, planner_config_of
+from r3jax.exploration.replay import config_of, planner_config_of, policy_key
 from r3jax.exploration.step import check_world
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.motion import Motion
-from r3jax.planning.policy import Policy, make_policy
-from r3jax.scenes.registry import open_scene, scene_hash
+from r3jax.planning.policy import Policy
+from r3jax.planning.registry import make_policy
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
+from r3jax.simulators.scenes.registry import open_scene, scene_hash
 from r3jax.trace.errors import RunError
-from r3jax.trace.header import RunHeader, camera_fields, package_versions, settings_of
+from r3jax.trace.header import RunHeader, camera_fields, package_versions, policy_fields
 from r3jax.trace.reader import Run
 
 
@@ -86,7 +87,7 @@ def plan_of_run(run: Run) -> Plan:
     """
     header = run.header
     try:
-        policy = make_policy(header.policy["name"], **vars(planner_config_of(run)))
+        policy = make_policy(policy_key(run), **vars(planner_config_of(run)))
         return Plan(parse_budget(header.budget), config_of(run), policy)
     except RunError:
         raise
@@ -168,11 +169,6 @@ def header_of(options: Explore, plan: Plan, simulator: Simulator) -> RunHeader:
         bounds=np.asarray(simulator.bounds).tolist(),
         packages=package_versions(),
     )
-
-
-def policy_fields(policy: Policy) -> dict[str, Any]:
-    """A policy as a header names it."""
-    return {"name": policy.name, "settings": settings_of(policy)}
 
 
 def _start_pose(start: Any) -> np.ndarray | None:

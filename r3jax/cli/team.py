@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from r3jax.apps.report.report import Progress, write_report
+from r3jax.apps.team.team import Member, TeamResult, TeamView, explore_team
 from r3jax.cli.checks import singles_of, team_folder
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line, resumable, resume_command
@@ -21,9 +23,7 @@ from r3jax.cli.setup import (
     simulator_of_options,
     simulator_of_run,
 )
-from r3jax.evaluation.report import Progress, write_report
 from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.team import Member, TeamResult, TeamView, explore_team
 from r3jax.files import lock_folder, write_atomic
 from r3jax.formats.pointcloud import voxel_points, write_points
 from r3jax.formats.transforms import write_team_transforms, write_transforms

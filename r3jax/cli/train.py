@@ -16,9 +16,9 @@ from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one
 from r3jax.cli.options import Train
 from r3jax.cli.selection import RECORD_FORMAT
 from r3jax.files import lock_folder, write_atomic
-from r3jax.foreign.json_text import sealed
 from r3jax.formats.errors import FormatError
 from r3jax.formats.pointcloud import write_points
+from r3jax.formats.validation.json_text import sealed
 from r3jax.splatting import train
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.harmonics import C0

@@ -12,6 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.apps.viewer.decisions import Offer, decide_again
+from r3jax.apps.viewer.film import export_film
+from r3jax.apps.viewer.glb import world_glb
+from r3jax.apps.viewer.known import scoring_of, title_of
+from r3jax.apps.viewer.shapes import recorded_points
+from r3jax.apps.viewer.video import load_av
 from r3jax.cli.captures import Capture
 from r3jax.cli.console import (
     BarColumn,
@@ -28,19 +34,13 @@ from r3jax.cli.selection import find_training
 from r3jax.cli.setup import plan_of_run, ways_to_open
 from r3jax.exploration.replay import config_of
 from r3jax.formats.errors import FormatError
-from r3jax.scenes.registry import open_scene, scene_hash
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.scenes.registry import open_scene, scene_hash
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run, read_run
-from r3jax.viewer.decisions import Offer, decide_again
-from r3jax.viewer.film import export_film
-from r3jax.viewer.glb import world_glb
-from r3jax.viewer.known import scoring_of, title_of
-from r3jax.viewer.shapes import recorded_points
-from r3jax.viewer.video import load_av
 
 
 def run_view(options: View) -> int:
@@ -105,11 +105,11 @@ def open_viewer(options: View, run: Run, console: Console) -> Generator[Viewer]:
         ValueError, OSError: the port is in use, the address is not this machine's.
     """
     check_viser()
-    from r3jax.viewer.answers import Extras
-    from r3jax.viewer.app import App
-    from r3jax.viewer.server import LOOPBACK, close_server, open_server, url_of
-    from r3jax.viewer.story import RecordedStory
-    from r3jax.viewer.surface import Sources
+    from r3jax.apps.viewer.answers import Extras
+    from r3jax.apps.viewer.app import App
+    from r3jax.apps.viewer.server import LOOPBACK, close_server, open_server, url_of
+    from r3jax.apps.viewer.story import RecordedStory
+    from r3jax.apps.viewer.surface import Sources
 
     server = open_server(options.host, options.port, options.allow)
     try:
@@ -215,7 +215,7 @@ class Scene:
     @functools.cached_property
     def _simulator(self) -> Simulator | None:
         """For small pictures without noise and without a limit of range."""
-        from r3jax.viewer.answers import picture_camera
+        from r3jax.apps.viewer.answers import picture_camera
 
         scene = self._run.header.scene
         try:

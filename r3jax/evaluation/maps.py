@@ -6,8 +6,8 @@ import numpy as np
 
 from r3jax.frame import Frame
 from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.update import integrate_growing
 from r3jax.scoring.renderability import renderability, renderability_image
-from r3jax.scoring.sighting import look
 
 
 def map_of(
@@ -32,7 +32,7 @@ def map_of(
     """
     state = empty_map(voxel_size=voxel_size, num_bins=num_bins)
     for frame in frames:
-        state = look(state, frame, max_range, drop_edges=drop_edges)
+        state = integrate_growing(state, frame, max_range, drop_edges=drop_edges)
     return state
 
 

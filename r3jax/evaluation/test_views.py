@@ -21,11 +21,11 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from r3jax.files import write_atomic
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_fields
-from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json
-from r3jax.foreign.versions import VersionError, check_version
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_fields
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json
+from r3jax.formats.validation.versions import VersionError, check_version
 from r3jax.frame import Frame
 from r3jax.geometry.axis_views import LOOKS, poses_at
 from r3jax.geometry.cameras import Camera
@@ -47,7 +47,7 @@ _KINDS = {
 }
 _MAX_BYTES = 64 << 20
 _FARTHEST = 1e6
-"""From the origin [m]; beyond that tenths of millimetres are no whole 64-bit numbers."""
+"""From the origin [m]; beyond that tenths of millimeters are no whole 64-bit numbers."""
 
 _LEAST_SEEN = 0.5
 """A view with less surface than this share of the picture is left out."""
@@ -103,7 +103,7 @@ class ViewSet:
     """Views at most; None: all of the lattice."""
 
     positions: np.ndarray
-    """Camera centre of each view [V, 3] [m] float64, multiples of 0.1 mm."""
+    """Camera center of each view [V, 3] [m] float64, multiples of 0.1 mm."""
 
     looks: tuple[str, ...]
     """Viewing direction of each view: "+x", "-x", ... [V]."""
@@ -257,7 +257,7 @@ _AGAIN = "delete the file and it is computed again"
 def _evenly(positions: np.ndarray, spacing: Sequence[float | int], count: int) -> np.ndarray:
     """Indices of `count` of the positions [P, 3], in order: evenly spaced along a Morton curve.
 
-    Neighbours along the curve are neighbours in space, so that each region keeps its share.
+    Neighbors along the curve are neighbors in space, so that each region keeps its share.
     """
     if count >= len(positions):
         return np.arange(len(positions))

@@ -1,4 +1,4 @@
-"""How long a run may last: views, seconds of the mission clock, or metres."""
+"""How long a run may last: views, seconds of the mission clock, or meters."""
 
 import math
 from dataclasses import dataclass

@@ -76,7 +76,7 @@ def timed(
 ) -> tuple[T, float]:
     """Calls a pure function and measures it, compile time left out.
 
-    Compiling is an artefact of this software (and absent on the second run, thanks to the
+    Compiling is an artifact of this software (and absent on the second run, thanks to the
     persistent cache), so it must not eat a mission's budget. If anything was compiled during
     the call, the call is made again and the second one is timed: the function is pure, so the
     result is the same.

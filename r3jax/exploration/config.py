@@ -4,13 +4,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from r3jax.forecast.goal import parse_goal
+from r3jax.mapping.config import MappingConfig
 from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 
 ClockName = Literal["wall", "model"]
-
-MAX_CAPACITY = 1 << 27
-"""Rows of a map: 5 GB."""
 
 LARGEST_DEPTH = (BEYOND_RANGE - 1) / DEPTH_STEPS_PER_METRE
 """What lies farther is recorded as beyond the range [m]."""
@@ -34,35 +31,8 @@ def check_voxel_size(voxel_size: float, max_range: float) -> None:
 
 
 @dataclass(frozen=True)
-class ExplorationConfig:
-    """What the loop itself decides; the policy has its own settings."""
-
-    voxel_size: float = 0.05
-    """Edge of a voxel of the map [m]."""
-
-    num_bins: int = 64
-    """Direction bins per voxel."""
-
-    capacity: int = 1 << 17
-    """Rows of the map at the start; a power of two."""
-
-    allow_growth: bool = True
-    """Double the table before it is 70 % full. If not, what finds no row is counted."""
-
-    drop_edges: bool = True
-    """Keep pixels on depth edges, whose color mixes two surfaces, out of the map."""
-
-    cell_size: float = 0.2
-    """Edge of a cell of the coarse grid [m]."""
-
-    max_range: float = 5.0
-    """Range of the depth sensor [m]."""
-
-    body_radius: float = 0.3
-    """Where the camera has been, this ball is free [m]."""
-
-    start_radius: float = 0.5
-    """The ball round the start that the operator vouches for [m]."""
+class ExplorationConfig(MappingConfig):
+    """What the loop itself decides, mapping included; the policy has its own settings."""
 
     speed: float = 1.0
     """Flight speed [m/s] where the policy's motion has none; turning takes no time then."""
@@ -80,8 +50,9 @@ class ExplorationConfig:
     """So many views in a row without moving end the run: the policy is stuck."""
 
     until: str | None = None
-    """The run ends when the forecast says so: `psnr:25` for the mean of all views of the free
-    space, `psnr:20@p10` for all but the worst tenth; None: the budget alone ends it."""
+    """Goal that ends the run, as text (see `apps.forecast.stopping`): `psnr:25` for the mean of all
+    views of the free space, `psnr:20@p10` for all but the worst tenth; None: the budget alone ends
+    it."""
 
     until_every: int = 5
     """Views from one look at the forecast to the next; it takes most of a second."""
@@ -102,24 +73,11 @@ class ExplorationConfig:
 
     def __post_init__(self) -> None:
         """Refuses what cannot work."""
-        if self.until is not None:
-            parse_goal(self.until)
-        for name in ("voxel_size", "cell_size", "max_range", "speed"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("voxel_size", "cell_size"):
-            if not 1e-3 <= getattr(self, name) <= 1e3:
-                raise ValueError(
-                    f"{name} must lie between 0.001 and 1000 m, got {getattr(self, name)}"
-                )
-        for name in (
-            "num_bins", "num_probes", "checkpoint_every", "max_still_views", "until_every"
-        ):  # fmt: skip
+        super().__post_init__()
+        if not 0.0 < self.speed < math.inf:
+            raise ValueError(f"speed must be positive, got {self.speed}")
+        for name in ("num_probes", "checkpoint_every", "max_still_views", "until_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.capacity < 2 or self.capacity & (self.capacity - 1):
-            raise ValueError(f"capacity must be a power of two >= 2, got {self.capacity}")
-        if self.capacity > MAX_CAPACITY:
-            raise ValueError(f"capacity must be at most {MAX_CAPACITY}, got {self.capacity}")
         if self.clock not in ("wall", "model"):
             raise ValueError(f"clock must be `wall` or `model`, got {self.clock!r}")

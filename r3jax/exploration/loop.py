@@ -45,6 +45,7 @@ def explore(
     recorder: RunWriter | None = None,
     resume: Run | None = None,
     decided_from: int = 0,
+    is_enough: Callable[[LoopState], str | None] | None = None,
     on_step: Callable[[StepRow], None] | None = None,
     on_stage: Callable[[str], None] | None = None,
 ) -> Result:
@@ -61,6 +62,8 @@ def explore(
             the model clock the result is the one of a run that was never cut off, bit for bit.
         decided_from: the first of the recorded views that this policy chose. Of those before it
             is shown the frames, but not asked what it would have decided.
+        is_enough: asked every `config.until_every` views; the reason why no further view is needed
+            ends the run, None lets it go on. Must come with `config.until`, which records it.
         on_step: called with the row of every view.
         on_stage: called with the name of what happens next.
 
@@ -69,11 +72,18 @@ def explore(
         refuses to be written end the run too; what was recorded before is complete.
 
     Raises:
-        ValueError: a budget that is not understood, a start outside the scene's box.
+        ValueError: a budget that is not understood, a start outside the scene's box, a goal in the
+            config without an `is_enough` that judges it.
         RunError: a recorded frame that is needed to go on is missing or broken.
         OracleReadError: something beside the loop asked the simulator for a picture.
     """
     config = config or ExplorationConfig()
+    if (config.until is None) != (is_enough is None):
+        raise ValueError(
+            f"config.until is {config.until!r}, is_enough is "
+            f"{'given' if is_enough else 'not given'}: r3jax.apps.forecast.stopping.stopping_rule "
+            "makes the one of the other"
+        )
     budget = parse_budget(budget) if isinstance(budget, str) else budget
     init_key, key = jax.random.split(jax.random.key(seed))
     mission = Mission(
@@ -83,7 +93,8 @@ def explore(
         key,
         config,
         make_clock(config.clock),
-        on_stage or (lambda stage: None),
+        is_enough,
+        on_stage=on_stage or (lambda stage: None),
     )
     state = start_state(mission, init_key)
     rows: list[StepRow] = []

@@ -2,20 +2,20 @@
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import jax
 import numpy as np
 
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.step import add_to_grid, first_grid
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.planning.config import PlannerConfig
+from r3jax.planning.config import FORMER_SETTINGS, PlannerConfig
 from r3jax.planning.motion import motion_of_record
+from r3jax.planning.planner import add_frame, first_grid
+from r3jax.planning.registry import config_class
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.sighting import look
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run, read_run
 
@@ -46,6 +46,24 @@ def config_of(run: Run) -> ExplorationConfig:
         raise RunError(run.path / "run.json", f"a setting of the loop: {error}") from None
 
 
+def policy_key(run: Run) -> str:
+    """What `make_policy` knows a run's policy by: its name, or its class if it is a plug-in.
+
+    Raises:
+        KeyError: the header does not say.
+    """
+    policy = run.header.policy
+    return str(policy.get("class") or policy["name"])
+
+
+def _config_class(run: Run) -> type[PlannerConfig]:
+    """The settings of a run's policy; those that all share if the policy is not to be had."""
+    try:
+        return config_class(policy_key(run))
+    except ValueError:  # retired, or of a package that is not installed here
+        return PlannerConfig
+
+
 def planner_config_of(run: Run) -> PlannerConfig:
     """The settings of the policy that a run was made with.
 
@@ -56,7 +74,10 @@ def planner_config_of(run: Run) -> PlannerConfig:
         settings = dict(run.header.policy["settings"])
         scoring = ScoringConfig(**settings.pop("scoring", {}))
         motion = motion_of_record(settings.pop("motion", None))
-        return PlannerConfig(scoring=scoring, motion=motion, **settings)
+        kind = _config_class(run)
+        own = {field.name for field in fields(kind)}
+        settings = {k: v for k, v in settings.items() if k in own or k not in FORMER_SETTINGS}
+        return kind(scoring=scoring, motion=motion, **settings)
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(run.path / "run.json", f"a setting of the policy: {error}") from None
 
@@ -77,7 +98,7 @@ def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, Oc
     map_state, grid = _nothing_known(runs)
     for run in runs:
         for frame in _frames(run, views):
-            map_state, grid = after_frame(map_state, grid, frame, config)
+            map_state, grid = add_frame(map_state, grid, frame, config)
     return map_state, grid
 
 
@@ -113,7 +134,7 @@ def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
     map_state, grid = _nothing_known(runs)
     steps = [(row.seconds, n, row.step) for n, run in enumerate(runs) for row in run.rows]
     for _, number, step in sorted(steps):
-        map_state, grid = after_frame(map_state, grid, runs[number].frame(step), config)
+        map_state, grid = add_frame(map_state, grid, runs[number].frame(step), config)
     return map_state, grid
 
 
@@ -126,22 +147,8 @@ def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
     config = config_of(run)
     map_state, grid = _nothing_known([run])
     for frame in _frames(run, None):
-        map_state, grid = after_frame(map_state, grid, frame, config)
+        map_state, grid = add_frame(map_state, grid, frame, config)
         yield map_state, grid
-
-
-def after_frame(
-    map_state: MapState, grid: OccupancyGrid, frame: Frame, config: ExplorationConfig
-) -> tuple[MapState, OccupancyGrid]:
-    """The map and the grid that have seen one frame more, as the loop would have them."""
-    map_state = look(
-        map_state,
-        frame,
-        config.max_range,
-        allow_growth=config.allow_growth,
-        drop_edges=config.drop_edges,
-    )
-    return map_state, add_to_grid(grid, frame, config)
 
 
 def grid_before(runs: Sequence[Run]) -> OccupancyGrid:

@@ -4,7 +4,7 @@ Rows and frames alone rebuild the state, from the first view if need be; a check
 time. So a checkpoint that is missing, damaged or of another version costs time, not the run.
 """
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,16 +16,15 @@ from r3jax.trace.checkpoints import Tables, map_tables
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
-_TREES = {"map_state": "map", "grid": "grid", "policy_state": "policy"}
-"""Fields of the state that have a table of their own; all others are in the table `loop`."""
+_LOOP = tuple(field.name for field in fields(LoopState) if field.name != "planner")
+"""Fields of the state in the table `loop`; what the planner holds has tables of its own."""
 
 
 def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
     """The state as a checkpoint holds it."""
     tables = map_tables(state.map_state, state.grid)
     tables["policy"] = named_arrays(state.policy_state)
-    rest = [field.name for field in fields(LoopState) if field.name not in _TREES]
-    return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in rest}}
+    return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in _LOOP}}
 
 
 def state_of(tables: Tables, like: LoopState) -> LoopState:
@@ -44,15 +43,14 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
     arrays = dict(tables["map"])
     if int(arrays.pop("num_bins", -1)) != like.map_state.num_bins:
         raise ValueError("the checkpoint's map has other direction bins than the run")
-    rest = {field.name: getattr(like, field.name) for field in fields(LoopState)}
-    for name in _TREES:
-        del rest[name]
-    return LoopState(
+    rest = {name: getattr(like, name) for name in _LOOP}
+    planner = replace(
+        like.planner,
         map_state=fill(like.map_state, arrays),
         grid=fill(like.grid, tables["grid"]),
         policy_state=fill(like.policy_state, tables.get("policy", {})),
-        **fill(rest, tables["loop"]),
     )
+    return LoopState(planner=planner, **fill(rest, tables["loop"]))
 
 
 def continued(run: Run, mission: Mission, start: LoopState, *, decided_from: int = 0) -> LoopState:
@@ -70,8 +68,8 @@ def continued(run: Run, mission: Mission, start: LoopState, *, decided_from: int
     state = _newest(run, start)
     for row in run.rows[state.views :]:
         mission.on_stage("map")
-        decide = row.step >= decided_from
-        state = relive(state, mission, row, run.frame(row.step), decide=decide)
+        decides = row.step >= decided_from
+        state = relive(state, mission, row, run.frame(row.step), decides=decides)
     return state
 
 

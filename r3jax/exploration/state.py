@@ -15,6 +15,7 @@ from r3jax.exploration.guard import GuardedSimulator
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Policy
 from r3jax.trace.rows import StepRow
 
@@ -54,11 +55,8 @@ class LoopState:
     views: int
     """Frames in the map."""
 
-    map_state: MapState
-    grid: OccupancyGrid
-
-    policy_state: Any
-    """What the policy remembers."""
+    planner: Planner
+    """What is known, and what the policy remembers."""
 
     T_world_camera: np.ndarray
     """Pose of the last view (before the first: the start pose), [4, 4] float64."""
@@ -74,6 +72,21 @@ class LoopState:
 
     still_views: int = 0
     """Views in a row that were taken without moving."""
+
+    @property
+    def map_state(self) -> MapState:
+        """The planner's map."""
+        return self.planner.map_state
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The planner's grid."""
+        return self.planner.grid
+
+    @property
+    def policy_state(self) -> Any:
+        """What the policy remembers."""
+        return self.planner.policy_state
 
 
 @dataclass(frozen=True)
@@ -107,5 +120,8 @@ class Mission:
     key: jax.Array
     config: ExplorationConfig
     clock: Clock
+    is_enough: Callable[[LoopState], str | None] | None = None
+    """Asked every `config.until_every` views: why no further view is needed, or None."""
+
     on_stage: Callable[[str], None] = lambda stage: None
     """Told what happens next: `forecast`, `plan`, `render`, `map`, `measure`, `record`."""

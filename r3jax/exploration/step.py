@@ -9,43 +9,29 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from r3jax.exploration.clock import timed
-from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
-from r3jax.forecast.forecast import forecast_map
-from r3jax.forecast.goal import parse_goal
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import angle_between
-from r3jax.mapping.occupancy import (
-    MAX_CELLS,
-    OccupancyGrid,
-    empty_grid,
-    integrate_depth,
-    mark_free_ball,
-)
-from r3jax.mapping.state import empty_map
+from r3jax.mapping.occupancy import MAX_CELLS
 from r3jax.planning.limits import begin_at
 from r3jax.planning.motion import motion_of
+from r3jax.planning.planner import decide, follow, observe, start
 from r3jax.planning.policy import Decision, PlanInfo
-from r3jax.scoring.sighting import look
 from r3jax.trace.images import frame_hash, stored_form
 from r3jax.trace.rows import StepRow, make_choice
 
 _LEAST_EXTENT = 1.0
-"""Smaller worlds have no place with half a metre free all round [m]."""
+"""Smaller worlds have no place with half a meter free all round [m]."""
 
 _LEAST_HEIGHT = 0.1
 """Thinner ones are surfaces [m]."""
 
 _LEAST_HOUSE, _LARGEST_HOUSE = 2.0, 500.0
 """Extents that what is explored usually has [m]."""
-
-_integrate_depth = jax.jit(integrate_depth)
-_mark_free_ball = jax.jit(mark_free_ball)
 
 
 def start_state(
@@ -72,10 +58,15 @@ def start_state(
         )
     check_world(simulator.bounds, config.cell_size)
     pose = begin_at(motion_of(mission.policy), pose)
-    grid = first_grid(np.stack([lower, upper]), [pose, *other_starts], config)
-    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
-    policy_state = mission.policy.init(simulator.camera, grid, key=init_key)
-    return LoopState(0, map_state, grid, policy_state, pose)
+    planner = start(
+        simulator.camera,
+        np.stack([lower, upper]),
+        mission.policy,
+        starts=[pose, *other_starts],
+        config=config,
+        key=init_key,
+    )
+    return LoopState(0, planner, pose)
 
 
 def check_world(bounds: np.ndarray, cell_size: float) -> None:
@@ -109,29 +100,6 @@ def check_world(bounds: np.ndarray, cell_size: float) -> None:
         )
 
 
-def first_grid(
-    bounds: np.ndarray, starts: Iterable[np.ndarray], config: ExplorationConfig
-) -> OccupancyGrid:
-    """The grid before the first view: the ball round each start is free, all else unexplored.
-
-    Args:
-        bounds: box of the world, [2, 3] [m].
-        starts: start poses, [4, 4] each; several cameras may start at several places.
-        config: size of the cells and of the ball.
-    """
-    grid = empty_grid(bounds, config.cell_size)
-    for pose in starts:
-        position = jnp.asarray(pose[:3, 3], dtype=jnp.float32)
-        grid = _mark_free_ball(grid, position, config.start_radius)
-    return grid
-
-
-def add_to_grid(grid: OccupancyGrid, frame: Frame, config: ExplorationConfig) -> OccupancyGrid:
-    """The grid after a frame: what its rays went through, and where the camera stands."""
-    grid = _integrate_depth(grid, frame, config.max_range)
-    return _mark_free_ball(grid, frame.position, config.body_radius)
-
-
 def step(
     state: LoopState, mission: Mission, *, exchange: float = 0.0
 ) -> tuple[LoopState, View | Stop]:
@@ -158,17 +126,11 @@ def step(
         return state, stop
     mission.on_stage("plan")
     key = jax.random.fold_in(mission.key, state.views)
-    (decision, policy_state, info), measured = timed(
-        mission.policy.decide,
-        state.policy_state,
-        state.map_state,
-        state.grid,
-        state.T_world_camera,
-        key=key,
-        repeat_compiled=mission.clock.measures,
+    (decision, planner, info), measured = timed(
+        decide, state.planner, state.T_world_camera, key, repeat_compiled=mission.clock.measures
     )
     stages = {"plan": measured} | {f"plan.{k}": v for k, v in info.stage_seconds.items()}
-    state = replace(state, policy_state=policy_state)
+    state = replace(state, planner=planner)
     if decision is None:
         return state, _no_decision(state, mission, info)
     planning = mission.clock.charge("planning", measured)
@@ -192,7 +154,7 @@ def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
     """The policy's reason, in words."""
     return Stop(
         StopReason(info.outcome.value),
-        f"after {state.views} views the policy {mission.policy.name!r} drew "
+        f"after {state.views} views the policy {state.planner.policy.name!r} drew "
         f"{info.num_candidates} candidates, {info.num_reachable} of them reachable through "
         "known free space",
     )
@@ -214,21 +176,11 @@ def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float)
 
 def _good_enough(state: LoopState, mission: Mission) -> Stop | None:
     """Why no further view is needed; asked beside the mission, not on its clock."""
-    config = mission.config
-    if config.until is None or state.views % config.until_every:
+    if mission.is_enough is None or state.views % mission.config.until_every:
         return None
     mission.on_stage("forecast")
-    goal, camera = parse_goal(config.until), mission.simulator.camera
-    forecast = forecast_map(state.map_state, state.grid, camera, max_range=config.max_range)
-    if not goal.reached(forecast):
-        return None
-    low, high = forecast.interval(goal.statistic)
-    return Stop(
-        StopReason.FORECAST,
-        f"{state.views} views: the forecast of the PSNR of free-space views "
-        f"({goal.statistic}) is {forecast.value(goal.statistic):.1f} dB, "
-        f"{low:.1f} to {high:.1f} in four of five places; {goal} was asked for",
-    )
+    reason = mission.is_enough(state)
+    return None if reason is None else Stop(StopReason.FORECAST, reason)
 
 
 def _look(
@@ -253,8 +205,9 @@ def _look(
     stages = stages | {"render": rendered - begin}
 
     mission.on_stage("map")
-    state, mapping_stages = _map_frame(state, mission, frame)
-    mapping = mission.clock.charge("mapping", sum(mapping_stages.values()))
+    planner, measured = timed(observe, state.planner, frame, repeat_compiled=mission.clock.measures)
+    state = replace(state, planner=planner)
+    mapping = mission.clock.charge("mapping", measured)
     length = 0.0 if choice is None else choice[0].length
     flight = 0.0 if choice is None else _flight(choice[0], mission)
     charged = before | {"mapping": mapping, "flight": flight}
@@ -279,12 +232,12 @@ def _look(
         charged=charged,
         coverage=coverage,
     )
-    stages = stages | mapping_stages | {"measure": time.perf_counter() - begin}
+    stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
     return state, View(row, frame, stages)
 
 
 def relive(
-    state: LoopState, mission: Mission, row: StepRow, frame: Frame, *, decide: bool = True
+    state: LoopState, mission: Mission, row: StepRow, frame: Frame, *, decides: bool = True
 ) -> LoopState:
     """The state after a view that was recorded: as `step` leaves it, without the simulator.
 
@@ -293,19 +246,18 @@ def relive(
         mission: what the run was asked for.
         row: what the trace says of the view.
         frame: its frame, read back.
-        decide: ask the policy again, for what it remembers of its decision. Policies are pure:
+        decides: ask the policy again, for what it remembers of its decision. Policies are pure:
             the same state and key give the same decision. False for a policy that did not
-            choose this view: it is told the way.
+            choose this view: it is told the path.
     """
     if row.choice is not None:
-        now = state.policy_state, state.map_state, state.grid, state.T_world_camera
-        if decide:
+        if decides:
             key = jax.random.fold_in(mission.key, state.views)
-            _, policy_state, _ = mission.policy.decide(*now, key=key)
+            _, planner, _ = decide(state.planner, state.T_world_camera, key)
         else:
-            policy_state = mission.policy.follow(*now, row.choice.waypoints)
-        state = replace(state, policy_state=policy_state)
-    state, _ = _map_frame(state, mission, frame)
+            planner = follow(state.planner, state.T_world_camera, row.choice.waypoints)
+        state = replace(state, planner=planner)
+    state = replace(state, planner=observe(state.planner, frame))
     return _arrive(state, frame, 0.0 if row.choice is None else row.choice.length, row.charged)
 
 
@@ -324,27 +276,3 @@ def _arrive(state: LoopState, frame: Frame, length: float, charged: dict[str, fl
         radians=state.radians + angle_between(state.T_world_camera, pose),
         still_views=state.still_views + 1 if length < 0.01 else 0,
     )
-
-
-def _map_frame(
-    state: LoopState, mission: Mission, frame: Frame
-) -> tuple[LoopState, dict[str, float]]:
-    """The frame joins the map and the grid, and the policy is told."""
-    config, repeat = mission.config, mission.clock.measures
-    map_state, integrating = timed(
-        look,
-        state.map_state,
-        frame,
-        config.max_range,
-        allow_growth=config.allow_growth,
-        drop_edges=config.drop_edges,
-        repeat_compiled=repeat,
-    )
-
-    grid, gridding = timed(add_to_grid, state.grid, frame, config, repeat_compiled=repeat)
-    policy_state, observing = timed(
-        mission.policy.observe, state.policy_state, map_state, frame, repeat_compiled=repeat
-    )
-    state = replace(state, map_state=map_state, grid=grid, policy_state=policy_state)
-    stages = {"map.voxels": integrating, "map.grid": gridding, "map.policy": observing}
-    return state, stages

@@ -1,7 +1,7 @@
 """Posed images: what a transforms.json or a COLMAP model says of a capture.
 
 Poses and points stay in the capture's own coordinates: nothing is turned, centered or scaled. A
-COLMAP model without known positions is not in metres, and its world may be upside down.
+COLMAP model without known positions is not in meters, and its world may be upside down.
 
 Shape symbols: n images; m points; t observations.
 """
@@ -14,9 +14,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.foreign.images import image_pixels, image_size
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
+from r3jax.formats.validation.images import image_pixels, image_size
 from r3jax.frame import Frame
 
 IMAGE_FORMATS = ("PNG", "JPEG")
@@ -33,7 +33,7 @@ class SparsePoints:
     """Positions in the capture's coordinates, [m, 3] float64."""
 
     rgb: np.ndarray
-    """Colours, [m, 3] uint8."""
+    """Colors, [m, 3] uint8."""
 
     seen_point: np.ndarray
     """Of every observation the index of its point, [t] int64, ascending."""

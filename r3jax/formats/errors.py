@@ -4,7 +4,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from r3jax.foreign.errors import ForeignFileError
+from r3jax.formats.validation.errors import ForeignFileError
 
 
 class FormatError(ValueError):

@@ -4,7 +4,7 @@
     colmap         images/ depth/ points.ply sparse/0/{cameras,images,points3D}.bin
     colmap-text    the same with .txt
 
-Poses are the run's own: metres, z up, nothing turned, centered or scaled. Depth images are
+Poses are the run's own: meters, z up, nothing turned, centered or scaled. Depth images are
 copies: uint16 in steps of 0.2 mm. COLMAP has no place for depth; it lies beside the images.
 """
 

@@ -8,7 +8,7 @@ a pinhole; distortion is kept as data and never applied.
 import math
 from dataclasses import dataclass
 
-from r3jax.foreign.errors import ForeignFileError
+from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import Camera
 
 _SHARED_FOCAL, _TWO_FOCALS = "f cx cy", "fx fy cx cy"

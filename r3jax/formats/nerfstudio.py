@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_fields, check_type
-from r3jax.foreign.files import read_bytes
-from r3jax.foreign.images import image_size
-from r3jax.foreign.json_text import parse_json
-from r3jax.foreign.names import below
 from r3jax.formats.captures import IMAGE_FORMATS, DepthUnit, PosedImages
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.poses import mend_pose
 from r3jax.formats.transforms import OPENGL_FROM_OPENCV
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_fields, check_type
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.images import image_size
+from r3jax.formats.validation.json_text import parse_json
+from r3jax.formats.validation.names import below
 
 _MAX_BYTES = 256 << 20
 """A frame takes a kilobyte."""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.foreign.files import read_bytes
 from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.validation.files import read_bytes
 
 _MAX_TEXT = 64 << 20
 """A pose takes some hundred bytes."""

@@ -1,4 +1,4 @@
-"""Reads the points of a PLY: positions and colours, of whatever program wrote it.
+"""Reads the points of a PLY: positions and colors, of whatever program wrote it.
 
 Shape symbols: n points.
 """
@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.files import read_bytes
 from r3jax.formats.errors import naming
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import read_bytes
 
 _MAX_BYTES = 4 << 30
 """Scans of buildings are no larger."""
@@ -37,8 +37,8 @@ _KINDS = {
 
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
-_GREY = 128
-"""Of points without a colour."""
+_GRAY = 128
+"""Of points without a color."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class _Vertices:
 
 
 def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [n, 3] float64 and colours [n, 3] uint8 of the vertices; grey where there are none.
+    """Positions [n, 3] float64 and colors [n, 3] uint8 of the vertices; gray where there are none.
 
     The file may be binary of either byte order or text. Other properties are skipped, and other
     elements behind the vertices too.
@@ -153,7 +153,7 @@ def _colors(table: np.ndarray) -> np.ndarray:
     """[n, 3] uint8; fractions are of 1."""
     names = ("red", "green", "blue")
     if not all(name in (table.dtype.names or ()) for name in names):
-        return np.full((len(table), 3), _GREY, np.uint8)
+        return np.full((len(table), 3), _GRAY, np.uint8)
     rgb = np.stack([table[name].astype(np.float64) for name in names], axis=1)
     scale = 255.0 if table.dtype["red"].kind == "f" else 1.0
     return np.rint(np.nan_to_num(rgb) * scale).clip(0, 255).astype(np.uint8)

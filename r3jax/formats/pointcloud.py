@@ -1,4 +1,4 @@
-"""Writes coloured points as a binary PLY: what 3DGS starts from."""
+"""Writes colored points as a binary PLY: what 3DGS starts from."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +12,7 @@ from r3jax.mapping.state import MapState
 
 
 def voxel_points(map_state: MapState) -> tuple[np.ndarray, np.ndarray]:
-    """Centers [m] and mean colours of the occupied voxels: [n, 3] float32 and [n, 3] uint8."""
+    """Centers [m] and mean colors of the occupied voxels: [n, 3] float32 and [n, 3] uint8."""
     occupied = np.asarray(map_state.occupied)
     index = jnp.stack(unpack(map_state.key[0], map_state.key[1]))
     centers = np.asarray(voxel_center(index, map_state.voxel_size)).T[occupied]

@@ -1,7 +1,7 @@
 """Reads an RGB-D recording: a folder of images, depth images and poses.
 
     images/*.png     8-bit RGB (or anything Pillow turns into RGB)
-    depth/*.png      uint16, millimetres, 0 = no measurement
+    depth/*.png      uint16, millimeters, 0 = no measurement
     K.txt            3x3 intrinsics, OpenCV's convention: pixel centers at whole numbers
     poses.txt        one camera-to-world matrix per line, 16 numbers row by row, OpenCV axes
 
@@ -16,10 +16,10 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.foreign.images import image_pixels, image_size
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.numbers import read_numbers
 from r3jax.formats.poses import mend_pose
+from r3jax.formats.validation.images import image_pixels, image_size
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 

@@ -1,11 +1,11 @@
 """Reads a scene of the Replica-SLAM renderings (NICE-SLAM, Zhu et al. 2022).
 
     results/frame000000.jpg    8-bit RGB
-    results/depth000000.png    uint16, `scale` steps a metre (6553.5), 0 = no measurement
+    results/depth000000.png    uint16, `scale` steps a meter (6553.5), 0 = no measurement
     traj.txt                   a camera-to-world matrix per line, 16 numbers row by row, OpenCV axes
     cam_params.json            {"camera": {w, h, fx, fy, cx, cy, scale}}; here or one folder above
 
-The world is Replica's own: metres, z up.
+The world is Replica's own: meters, z up.
 """
 
 from pathlib import Path
@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_fields
-from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json
 from r3jax.formats.captures import DepthUnit, PosedImages
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.numbers import read_numbers
 from r3jax.formats.poses import mend_pose
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_fields
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json
 
 _MAX_JSON = 1 << 20
 """A camera takes some hundred bytes."""

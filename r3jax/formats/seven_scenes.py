@@ -1,7 +1,7 @@
 """Reads a sequence of the 7-Scenes data set (Shotton et al. 2013).
 
     frame-000000.color.png    8-bit RGB, 640x480; or .color.jpg, as some hand it on
-    frame-000000.depth.png    uint16, millimetres; 0 and 65535 are no measurement
+    frame-000000.depth.png    uint16, millimeters; 0 and 65535 are no measurement
     frame-000000.pose.txt     a 4x4 camera-to-world matrix, OpenCV axes
 
 The data set names one camera for both images: focal length 585 px, principal point (320, 240).

@@ -1,8 +1,8 @@
 """transforms.json: the recorded frames as a data set that 3DGS trainers read.
 
-nerfstudio's convention: OpenGL camera axes (x right, y up, z backward), camera to world, metres,
+nerfstudio's convention: OpenGL camera axes (x right, y up, z backward), camera to world, meters,
 world z up, pixel centers at +0.5. Depth images are uint16; one step is
-`depth_unit_scale_factor` metres; 0 is no measurement and `depth_beyond_range_value` means that
+`depth_unit_scale_factor` meters; 0 is no measurement and `depth_beyond_range_value` means that
 nothing lies within the sensor's range.
 """
 

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.images import image_size
-from r3jax.foreign.names import below
 from r3jax.formats.captures import IMAGE_FORMATS, DepthUnit, PosedImages
 from r3jax.formats.colmap.model import rotation_of
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.numbers import read_lines, read_numbers, to_floats
 from r3jax.formats.poses import MAX_DISTANCE
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.images import image_size
+from r3jax.formats.validation.names import below
 
 _MAX_GAP = 0.02
 """Pictures and poses farther apart than this do not belong together [s]."""

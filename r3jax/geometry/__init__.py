@@ -1,1 +1,1 @@
-"""Pure maths: cameras, directions, voxels. Imports nothing of r3jax."""
+"""Pure math: cameras, directions, voxels. Imports nothing of r3jax."""

@@ -1,7 +1,7 @@
 """The pinhole camera and its pose.
 
-World: right-handed, z up, metres. Camera: OpenCV axes (x right, y down, z forward). A pose is
-the 4x4 matrix `T_world_camera` that takes points from the camera to the world. Pixel centres
+World: right-handed, z up, meters. Camera: OpenCV axes (x right, y down, z forward). A pose is
+the 4x4 matrix `T_world_camera` that takes points from the camera to the world. Pixel centers
 lie at +0.5.
 
 Shape symbols: H, W image size; n points.
@@ -63,7 +63,7 @@ class Camera(eqx.Module):
 
     @staticmethod
     def from_fov(width: int, height: int, horizontal_fov_deg: float | int = 60.0) -> "Camera":
-        """A camera with square pixels, centred, with the given horizontal field of view [deg]."""
+        """A camera with square pixels, centered, with the given horizontal field of view [deg]."""
         if not 0.0 < horizontal_fov_deg < 180.0:
             raise ValueError(
                 f"horizontal_fov_deg must lie between 0 and 180, got {horizontal_fov_deg}"
@@ -104,7 +104,7 @@ def project(
 
 
 def pixel_rays(camera: Camera) -> Float[Array, "H W 3"]:
-    """Rays through the pixel centres in the camera's frame, scaled to z = 1 (not to length 1)."""
+    """Rays through the pixel centers in the camera's frame, scaled to z = 1 (not to length 1)."""
     u = (jnp.arange(camera.width, dtype=jnp.float32) + 0.5 - camera.cx) / camera.fx
     v = (jnp.arange(camera.height, dtype=jnp.float32) + 0.5 - camera.cy) / camera.fy
     shape = (camera.height, camera.width)
@@ -147,7 +147,7 @@ def pose_along(
     is then the world's x axis.
 
     Args:
-        position: camera centre in the world [m].
+        position: camera center in the world [m].
         direction: viewing direction in the world, any length but 0.
 
     Returns:

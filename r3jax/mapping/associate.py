@@ -40,7 +40,7 @@ class Groups(eqx.Module):
     """True for one point of each touched voxel."""
 
     rgb_sum: Float[Array, "P 4"]
-    """Sum of the colours of the voxel's points, and their number; at leaders only."""
+    """Sum of the colors of the voxel's points, and their number; at leaders only."""
 
 
 def group_by_voxel(
@@ -49,11 +49,11 @@ def group_by_voxel(
     valid: Bool[Array, " P"],
     voxel_size: Float[Array, ""],
 ) -> Groups:
-    """Groups points by voxel and averages their colours, so that texture is not noise.
+    """Groups points by voxel and averages their colors, so that texture is not noise.
 
     Args:
         points_world: points [m].
-        rgb: their colours.
+        rgb: their colors.
         valid: False for points to ignore.
         voxel_size: edge of a voxel [m].
     """
@@ -61,7 +61,7 @@ def group_by_voxel(
     low, high = pack(x, y, z)
     leader = _leaders(low, high, _torus_slot(x, y, z), valid)
     num = points_world.shape[1]
-    # Always zero, but only known once the leaders are: XLA would otherwise lay out the colours
+    # Always zero, but only known once the leaders are: XLA would otherwise lay out the colors
     # first, and scratch memory above 32 MB costs more in page faults than all the arithmetic.
     zero = jnp.minimum(leader[0], 0).astype(rgb.dtype)
     rows = jnp.concatenate([rgb, jnp.ones((num, 1), dtype=rgb.dtype)], axis=1) + zero
@@ -80,7 +80,7 @@ def group_means(groups: Groups, values: Float[Array, "P k"]) -> Float[Array, "P 
 def points_of_pixels(frame: Frame, depth: Float[Array, "H W"]) -> Float[Array, "3 P"]:
     """Points of all pixels in the world [m], row by row, coordinates first.
 
-    The long axis last keeps the arithmetic in one vectorised loop; [H, W, 3] takes 3 ms more.
+    The long axis last keeps the arithmetic in one vectorized loop; [H, W, 3] takes 3 ms more.
     """
     camera, T = frame.camera, frame.T_world_camera
     u = (jnp.arange(camera.width, dtype=jnp.float32) + 0.5 - camera.cx) / camera.fx
@@ -130,7 +130,7 @@ def _leaders(
 
 
 def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Bool[Array, "H W"]:
-    """Pixels on depth edges, whose colour mixes foreground and background.
+    """Pixels on depth edges, whose color mixes foreground and background.
 
     An edge is a step of more than a voxel between neighbors that is no slope: the pixel also
     strays by more than a voxel from where its neighbors on both sides say that a plane runs. A

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from r3jax.arguments import checked
+from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import is_traced
 from r3jax.mapping.state import MapState, a_map, empty_map
 from r3jax.mapping.table import find_or_insert
@@ -46,18 +46,32 @@ class Statistics(eqx.Module):
     """Best resolution [px/m]."""
 
 
-def join(state: MapState, new: Statistics) -> MapState:
-    """Merges statistics into the map (arXiv 2601.07484, Algorithms 1 and 2).
+Moments = tuple[Float[Array, " M"], Float[Array, "3 M"], Float[Array, " M"]]
+"""Observations, mean RGB, and sum of squared deviations, per voxel."""
 
-    Bins unite, the best resolution wins, and the moments follow Chan, Golub & LeVeque (1983):
+
+def combine_moments(a: Moments, b: Moments) -> Moments:
+    """Merges the moments of two sets of observations (Chan, Golub & LeVeque 1983).
 
         d    = mean_b - mean_a
         n    = n_a + n_b
         mean = mean_a + d n_b / n
         M2   = M2_a + M2_b + |d|^2 n_a n_b / n
 
-    For a single observation (n_b = 1, M2_b = 0) this is Welford's update, the paper's
-    Algorithm 2. The result does not depend on the order of joins beyond rounding.
+    For a single observation (n_b = 1, M2_b = 0) this is Welford's update, Algorithm 2 of
+    arXiv 2601.07484. The result does not depend on the order beyond rounding.
+    """
+    (n_a, mean_a, m2_a), (n_b, mean_b, m2_b) = a, b
+    n = n_a + n_b
+    weight = n_b / jnp.maximum(n, 1.0)
+    d = mean_b - mean_a
+    return n, mean_a + d * weight[None, :], m2_a + m2_b + jnp.sum(d * d, axis=0) * n_a * weight
+
+
+def join(state: MapState, new: Statistics) -> MapState:
+    """Merges statistics into the map (arXiv 2601.07484, Algorithms 1 and 2).
+
+    Bins unite, the best resolution wins, and moments are combined.
     """
     key, row = find_or_insert(state.key, new.key, new.valid)
     at: Callable[[Array], Array] = lambda x: x.at[..., row].get(mode="fill", fill_value=0)
@@ -65,30 +79,20 @@ def join(state: MapState, new: Statistics) -> MapState:
     def put(x: Array, value: Array) -> Array:
         return x.at[..., row].set(value, mode="drop")  # rows are distinct
 
-    n_a, mean_a = at(state.count), at(state.mean)
-    n = n_a + new.count
-    weight = new.count / jnp.maximum(n, 1.0)
-    d = new.mean - mean_a
-    m2 = at(state.m2) + new.m2 + jnp.sum(d * d, axis=0) * n_a * weight
+    before = at(state.count), at(state.mean), at(state.m2)
+    count, mean, m2 = combine_moments(before, (new.count, new.mean, new.m2))
     is_lost = new.valid & (row >= state.capacity)
     return MapState(
         key=key,
         visited=put(state.visited, at(state.visited) | new.visited),
-        count=put(state.count, n),
-        mean=put(state.mean, mean_a + d * weight[None, :]),
+        count=put(state.count, count),
+        mean=put(state.mean, mean),
         m2=put(state.m2, m2),
         resolution=put(state.resolution, jnp.maximum(at(state.resolution), new.resolution)),
         voxel_size=state.voxel_size,
         dropped=state.dropped + jnp.sum(is_lost, dtype=jnp.int32),
         num_bins=state.num_bins,
     )
-
-
-def bin_words(bins: Int[Array, " M"], num_words: int) -> UInt32[Array, "W M"]:
-    """One bit per direction bin, as words of 32."""
-    word = jnp.arange(num_words, dtype=jnp.int32)[:, None]
-    bit = jnp.uint32(1) << (bins % 32).astype(jnp.uint32)
-    return jnp.where(word == (bins // 32)[None, :], bit[None, :], jnp.uint32(0))
 
 
 @jax.jit

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from r3jax.arguments import checked, points_of_3
+from r3jax.geometry.arguments import checked, points_of_3
 from r3jax.geometry.voxels import pack, voxel_index
 from r3jax.mapping.state import MapState, a_map
 from r3jax.mapping.table import find

@@ -7,7 +7,7 @@ The model, per cell and frame (log-odds as in Active-GS, Jin et al. 2025):
     pass  - step: at least half of the cell was seen through, and no point of the frame lies in it
     else    0, and the sum is clipped to +-4.5
 
-One look decides (a cell at 5 m gets 1.4 > ln 4). *Seen through* is asked of the centres of the
+One look decides (a cell at 5 m gets 1.4 > ln 4). *Seen through* is asked of the centers of the
 cell's eight octants. Such a point passes if it lies in the picture, within range, and before
 the nearest measurement of its block of pixels (about one degree wide), short of it by a quarter
 of a cell. Asking the cells, not walking the rays, leaves no gaps far away, lets no ray that only
@@ -28,8 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.arguments import checked, one
 from r3jax.frame import Frame, a_frame
+from r3jax.geometry.arguments import checked, one
 from r3jax.geometry.cameras import Camera, invert_pose, pixel_rays, sound
 
 FREE_LOG_ODDS = -1.3862944
@@ -45,7 +45,7 @@ STEP = 2.8
 """Log-odds step of a look from distance 0."""
 
 STEP_DECAY = 0.1
-"""Share of the step lost per metre [1/m]."""
+"""Share of the step lost per meter [1/m]."""
 
 VOUCHED_LOG_ODDS = -1.5
 """What `mark_free_ball` sets: free, but a single hit within range undoes it."""
@@ -54,10 +54,10 @@ BLOCKS_ACROSS = 64
 """Blocks per image row: 8 pixels of a 512-pixel row, 9 cm at 5 m with 60 degrees of view."""
 
 _OCTANTS = tuple((x, y, z) for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25))
-"""Centres of a cell's octants, from its centre, in cells."""
+"""Centers of a cell's octants, from its center, in cells."""
 
 MAX_CELLS = 50_000_000
-"""More than this is a mistake in the bounds (a scene in millimetres), not a grid."""
+"""More than this is a mistake in the bounds (a scene in millimeters), not a grid."""
 
 
 class OccupancyGrid(eqx.Module):
@@ -137,7 +137,7 @@ def world_to_cell(grid: OccupancyGrid, points_world: Float[Array, "*n 3"]) -> In
 
 
 def cell_centers(grid: OccupancyGrid, cells: Int[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Centre of each cell in the world [m]."""
+    """Center of each cell in the world [m]."""
     origin = grid.origin.reshape((1,) * (cells.ndim - 1) + (3,))
     return origin + (cells.astype(jnp.float32) + 0.5) * grid.cell_size
 
@@ -158,19 +158,19 @@ def log_odds_at(
 
 
 def frontier(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
-    """Free cells with an unexplored face neighbour: where known space ends."""
+    """Free cells with an unexplored face neighbor: where known space ends."""
     return grid.free & _has_face_neighbor(grid.unexplored)
 
 
 def frontier_unexplored(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
-    """Unexplored cells with a free face neighbour: the first layer of the unknown."""
+    """Unexplored cells with a free face neighbor: the first layer of the unknown."""
     return grid.unexplored & _has_face_neighbor(grid.free)
 
 
 def mark_free_ball(
     grid: OccupancyGrid, center: Float[Array, " 3"], radius: float | Float[Array, ""]
 ) -> OccupancyGrid:
-    """Marks the cells whose centre lies in a ball as free, on the caller's word.
+    """Marks the cells whose center lies in a ball as free, on the caller's word.
 
     For space that no picture shows: the ball round the start, which the simulator promises to
     be free, and the robot's own body. A cell that was measured to be occupied stays so, and a
@@ -178,7 +178,7 @@ def mark_free_ball(
 
     Args:
         grid: the grid.
-        center: centre of the ball in the world [m].
+        center: center of the ball in the world [m].
         radius: its radius [m].
     """
     is_in_ball = _distance(grid, center) <= jnp.asarray(radius, dtype=jnp.float32)
@@ -198,7 +198,7 @@ def integrate_depth(
         grid: the grid before the frame.
         frame: depth 0 says nothing about its ray; a depth that is `inf` or farther than
             `max_range` says that its ray is free up to `max_range`.
-        max_range: range of the sensor, straight from the camera's centre [m].
+        max_range: range of the sensor, straight from the camera's center [m].
 
     Returns:
         The grid after the frame. Measurements outside the grid are ignored. Where the frame's
@@ -212,7 +212,7 @@ def integrate_depth(
     reach = jnp.asarray(max_range, dtype=jnp.float32)
     hit = _hit_cells(grid, frame, reach)
     passed = _passed_cells(grid, frame, reach) & ~hit
-    # A point within range may lie in a cell whose centre is not: its step is that of the range.
+    # A point within range may lie in a cell whose center is not: its step is that of the range.
     distance = jnp.minimum(_distance(grid, frame.position), reach)
     step = STEP * jnp.clip(1.0 - STEP_DECAY * distance, 0.0, 1.0)
     change = jnp.where(hit, step, jnp.where(passed, -step, 0.0))
@@ -244,7 +244,7 @@ def _hit_cells(
 
 
 def _ray_slopes(camera: Camera) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
-    """Slopes x / z and y / z of the rays through the pixel centres."""
+    """Slopes x / z and y / z of the rays through the pixel centers."""
     rays = pixel_rays(camera)
     return rays[..., 0], rays[..., 1]
 
@@ -252,7 +252,7 @@ def _ray_slopes(camera: Camera) -> tuple[Float[Array, "H W"], Float[Array, "H W"
 def _passed_cells(
     grid: OccupancyGrid, frame: Frame, max_range: Float[Array, ""]
 ) -> Bool[Array, "X Y Z"]:
-    """Cells of which at least four octants' centres were seen through."""
+    """Cells of which at least four octants' centers were seen through."""
     camera = frame.camera
     T_camera_world = invert_pose(frame.T_world_camera)
     R = T_camera_world[:3, :3]
@@ -313,12 +313,12 @@ def _inside(grid: OccupancyGrid, index: Int[Array, "*n 3"]) -> Bool[Array, "*n"]
 
 
 def _distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X Y Z"]:
-    """Distance from a point to every cell's centre [m]."""
+    """Distance from a point to every cell's center [m]."""
     return jnp.sqrt(squared_distance(grid, point))
 
 
 def squared_distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X Y Z"]:
-    """Squared distance from a point to every cell's centre [m^2]."""
+    """Squared distance from a point to every cell's center [m^2]."""
     x, y, z = (
         jnp.square(
             grid.origin[axis]
@@ -331,7 +331,7 @@ def squared_distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Ar
 
 
 def _has_face_neighbor(mask: Bool[Array, "X Y Z"]) -> Bool[Array, "X Y Z"]:
-    """Cells with a face neighbour in the mask; beyond the grid there is none."""
+    """Cells with a face neighbor in the mask; beyond the grid there is none."""
     padded = jnp.pad(mask, 1)
     return (
         padded[:-2, 1:-1, 1:-1]

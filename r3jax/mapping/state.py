@@ -1,19 +1,21 @@
 """The direction-aware voxel map: what has been seen, from where, and how consistently.
 
 The map is a fixed-capacity hash table; row `i` describes one occupied voxel. Arrays keep the
-long axis last, which is what XLA vectorises on a CPU.
+long axis last, which is what XLA vectorizes on a CPU.
 
 Shape symbols used throughout the package:
     N  capacity of the table       M  observations of one frame
     B  direction bins              W  32-bit words that hold B bits
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from r3jax.arguments import one
-from r3jax.geometry.voxels import EMPTY_WORD
+from r3jax.geometry.arguments import one
+from r3jax.geometry.voxels import EMPTY_WORD, unpack, voxel_center
 
 
 class MapState(eqx.Module):
@@ -59,6 +61,38 @@ class MapState(eqx.Module):
     def occupied(self) -> Bool[Array, " N"]:
         """True for rows that describe a voxel."""
         return self.key[1] != jnp.uint32(EMPTY_WORD)
+
+    @property
+    def present(self) -> Bool[Array, " N"]:
+        """True for rows that describe a voxel that was seen; of rows that were taken, a part."""
+        return self.count > 0.0
+
+    @property
+    def center(self) -> Float[Array, "3 N"]:
+        """Centers of the voxels [m]; meaningless where there is none."""
+        return voxel_center(jnp.stack(unpack(self.key[0], self.key[1])), self.voxel_size)
+
+    def center_of(self, row: Int[Array, " n"]) -> Float[Array, "3 n"]:
+        """Centers of the voxels in some rows [m]."""
+        low, high = self.key[0, row], self.key[1, row]
+        return voxel_center(jnp.stack(unpack(low, high)), self.voxel_size)
+
+    def take(self, row: Int[Array, " n"], valid: Bool[Array, " n"]) -> "MapState":
+        """Gathers some rows, to be scored: a map in which nothing can be looked up by its key.
+
+        Args:
+            row: which rows.
+            valid: False where there shall be no voxel.
+        """
+        return replace(
+            self,
+            key=self.key[:, row],
+            visited=self.visited[:, row],
+            count=jnp.where(valid, self.count[row], 0.0),
+            mean=self.mean[:, row],
+            m2=self.m2[row],
+            resolution=self.resolution[row],
+        )
 
     @property
     def num_occupied(self) -> Int[Array, ""]:

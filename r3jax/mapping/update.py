@@ -3,6 +3,8 @@
 Shape symbols: P points of a frame; M observations that join at once; H W image size.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,11 +12,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from r3jax.arguments import checked
 from r3jax.frame import Frame, a_frame
+from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import is_traced, sound
-from r3jax.geometry.numerics import safe_norm
-from r3jax.geometry.sphere import nearest_bin
+from r3jax.geometry.compaction import positions_of_set
 from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.associate import (
     Groups,
@@ -23,9 +24,12 @@ from r3jax.mapping.associate import (
     group_means,
     points_of_pixels,
 )
-from r3jax.mapping.compact import positions_of_set
-from r3jax.mapping.join import CHUNK, Statistics, bin_words, join
+from r3jax.mapping.join import CHUNK, Statistics, grow, join
+from r3jax.mapping.seen import evidence_of_view, mark_seen
 from r3jax.mapping.state import MapState, a_map
+
+_MAX_LOAD = 0.7
+"""The table grows before more than this share of its rows is in use."""
 
 
 def observe_voxels(
@@ -36,20 +40,17 @@ def observe_voxels(
     camera_position: Float[Array, " 3"] | Float[Array, "3 M"],
     focal: Float[Array, ""],
 ) -> Statistics:
-    """One observation of each voxel from a camera: direction bin, distance, mean colour."""
+    """Makes one observation of each voxel from a camera: direction bin, resolution, mean color."""
     center = voxel_center(jnp.stack(unpack(key[0], key[1])), state.voxel_size)
-    position = camera_position if camera_position.ndim == 2 else camera_position[:, None]
-    offset = position - center
-    distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
-    bins = nearest_bin(offset / distance[None, :], state.num_bins)
+    words, resolution = evidence_of_view(state, center, camera_position, focal)
     return Statistics(
         key=key,
         valid=valid,
         count=valid.astype(jnp.float32),
         mean=jnp.where(valid[None, :], rgb, 0.0),
         m2=jnp.zeros(valid.shape, dtype=jnp.float32),
-        visited=bin_words(bins, state.visited.shape[0]),
-        resolution=focal / distance,
+        visited=words,
+        resolution=resolution,
     )
 
 
@@ -86,9 +87,10 @@ def integrate_groups(
     return jax.lax.fori_loop(0, (num_voxels + (size - 1)) // size, join_chunk, state)
 
 
-def _integrate(
+def integrate_pixels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
+    """Adds the frame's measured pixels to the map: the part of `integrate` that counts colors."""
     depth = frame.depth
     factor = sound(frame.camera, frame.T_world_camera)
     is_measured = (depth > 0.0) & jnp.isfinite(depth) & (depth <= max_range) & (factor > 0.0)
@@ -104,6 +106,12 @@ def _integrate(
     return eqx.tree_at(lambda m: m.voxel_size, after, factor * after.voxel_size)
 
 
+def _integrate(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    return mark_seen(integrate_pixels(state, frame, max_range, drop_edges), frame, max_range)
+
+
 _integrate_jitted = jax.jit(_integrate)
 _integrate_donating = jax.jit(_integrate, donate_argnums=0)
 
@@ -117,10 +125,13 @@ def integrate(
     *,
     donate: bool = False,
 ) -> MapState:
-    """One posed RGB-D frame joins the map: one observation per voxel that it touches.
+    """Adds a posed RGB-D frame to the map: what its pixels touch, and what it looked at.
 
-    Pixels on depth edges take no part: their color mixes two surfaces. Compiled on first use
-    for each image size and capacity. `MapState.dropped` counts what found no row.
+    Each voxel that a pixel falls into gets one observation. Every voxel in view that nothing
+    measured hides counts as seen from here, too, pixel or not (`mapping.seen`): without that a
+    planner takes the same view of a ceiling twenty times. Pixels on depth edges take no part: their
+    color mixes two surfaces. Compiled on first use for each image size and capacity.
+    `MapState.dropped` counts what found no row; `integrate_growing` makes room instead.
 
     A pose that is not rigid cannot come from outside jit; under jit such a frame adds nothing, and
     the edge of the voxels becomes NaN, and so every score from then on.
@@ -128,7 +139,7 @@ def integrate(
     Args:
         state: the map before the frame.
         frame: the frame. Depth 0 (no measurement) and inf (out of range) are ignored.
-        max_range: measurements beyond this z-depth are ignored [m].
+        max_range: measurements beyond this z-depth are ignored, and so are voxels farther away [m].
         drop_edges: False lets pixels on depth edges in.
         donate: True updates the table in place: `state` must not be used again. The cost then
             does not grow with the capacity, where a copy of a million rows takes 15 ms.
@@ -143,6 +154,54 @@ def integrate(
     max_range = jnp.asarray(max_range, dtype=jnp.float32)
     update = _integrate_donating if donate else _integrate_jitted
     return update(state, frame, max_range, jnp.asarray(drop_edges))
+
+
+def integrate_growing(
+    state: MapState,
+    frame: Frame,
+    max_range: float = np.inf,
+    *,
+    allow_growth: bool = True,
+    drop_edges: bool = True,
+) -> MapState:
+    """Adds a frame as `integrate` does, and doubles the table before it is 70 % full.
+
+    Not to be called under jit: shapes change.
+
+    Args:
+        state: the map before the frame.
+        frame: the frame.
+        max_range: as in `integrate` [m].
+        allow_growth: False keeps the capacity; what finds no row is counted in `dropped`.
+        drop_edges: False lets pixels on depth edges in.
+    """
+    if not allow_growth:
+        return integrate(state, frame, max_range, drop_edges)
+    return update_growing(lambda now: integrate(now, frame, max_range, drop_edges), state)
+
+
+def update_growing(
+    update: Callable[[MapState], MapState], state: MapState, most_rows: int | None = None
+) -> MapState:
+    """Updates a map, in a table twice as large for as long as the update overfills it.
+
+    Args:
+        update: a pure function that adds to a map.
+        state: the map before.
+        most_rows: the table becomes no larger; None: as large as it needs to be.
+
+    Raises:
+        ValueError: it would become larger.
+    """
+    after = update(state)
+    while int(after.num_occupied) > _MAX_LOAD * after.capacity or int(after.dropped) > int(
+        state.dropped
+    ):
+        if most_rows is not None and state.capacity >= most_rows:
+            raise ValueError(f"the map would need more than {most_rows} rows")
+        state = grow(state, 2 * state.capacity)
+        after = update(state)
+    return after
 
 
 @jax.jit
@@ -178,9 +237,9 @@ def integrate_points(
 
     One call is one look: a voxel gets one observation, however many points fall into it. A LiDAR
     has rays instead of pixels: its `focal` is one over the angle between neighboring rays [1/rad],
-    which gives points per metre where a camera gives pixels per metre. While it turns, it may move:
+    which gives points per meter where a camera gives pixels per meter. While it turns, it may move:
     each point may have its own sensor position, and a voxel is seen from the mean of its points'.
-    So cut a long recording into scans; a colourless scanner's intensity, three times, will do.
+    So cut a long recording into scans; a colorless scanner's intensity, three times, will do.
 
     Arrays of NumPy and JAX are welcome; shapes and values are checked here. Compiled on first use
     for each number of points and capacity: pad scans to one length, and mask the padding out.
@@ -188,13 +247,13 @@ def integrate_points(
     Args:
         state: the map before.
         points_world: points [m], world, [P, 3].
-        rgb: their colours in [0, 1], [P, 3].
+        rgb: their colors in [0, 1], [P, 3].
         camera_position: where the camera or scanner was [m]: [3], or [P, 3] for each point.
         focal: focal length [px]; with 1.0 the resolution is the paper's 1 / distance.
         valid: False for padding, whatever stands there, [P] bool. None: every point counts.
 
     Raises:
-        ValueError: shapes that do not fit; values that are not finite or colours outside [0, 1]
+        ValueError: shapes that do not fit; values that are not finite or colors outside [0, 1]
             (where they are known, that is outside jit).
     """
     points_world, rgb = jnp.asarray(points_world, dtype=jnp.float32), jnp.asarray(rgb)

@@ -1,7 +1,7 @@
 """Where the next view could be taken from. On the host: NumPy.
 
 Positions lie in cells where the robot may stop (`Travel.goals`), away from the cell's faces: at
-most a quarter of a cell from its centre.
+most a quarter of a cell from its center.
 
 Shape symbols: X Y Z cells along the axes; n candidates; c places to choose from; p places chosen.
 """
@@ -12,16 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.spatial import KDTree
 
 from r3jax.geometry.cameras import pose_along
 from r3jax.planning.travel import Travel, segment_is_inside
 
 JITTER = 0.25
-"""Positions lie at most this far from their cell's centre, along each axis [cells]."""
-
-_MOST_PLACES = 4096
-"""Standpoints are chosen from so many cells at most: a house has ten times as many."""
+"""Positions lie at most this far from their cell's center, along each axis [cells]."""
 
 _NEIGHBORS = 256
 """A region of interest is looked at from one of this many nearest cells."""
@@ -41,7 +37,7 @@ def host_generator(key: Array) -> np.random.Generator:
 def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -> np.ndarray:
     """`num` positions uniform over the safe, reachable cells within `radius` of the robot.
 
-    The cells are those with their centre within the radius, and the robot's own (if it is known
+    The cells are those with their center within the radius, and the robot's own (if it is known
     to be free). Several positions may share a cell. If the robot's own cell does not keep the
     safety margin, the only position in it is the present one.
 
@@ -82,7 +78,7 @@ def region_of_interest(
         key: source of randomness.
 
     Returns:
-        Positions and the targets' centres, [n, 3] float64 each [m], n <= num.
+        Positions and the targets' centers, [n, 3] float64 each [m], n <= num.
     """
     rng = host_generator(key)
     goals = np.argwhere(targets)
@@ -141,32 +137,6 @@ def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.7
     cells = np.unique(np.floor(points / travel.cell_size + 1e-3).astype(np.int64), axis=0)
     cells = cells[np.all(cells < np.array(shape), axis=1)]
     return travel.stops(cells[travel.goals[tuple(cells.T)]])
-
-
-def standpoints(
-    travel: Travel, num: int, candidates: np.ndarray, reach: float, *, key: Array
-) -> np.ndarray:
-    """`num` positions where the robot may stop, spread out: from where surfaces will be looked at.
-
-    Args:
-        travel: where the robot may stop.
-        num: positions wanted.
-        candidates: places that matter, [n, 3] [m], n >= 1.
-        reach: positions lie at most this far from the nearest of them, as far as a cell goes [m].
-        key: source of randomness.
-
-    Returns:
-        [num, 3] float64 [m]; with fewer cells they repeat. The candidates, repeated, if there is
-        no such cell.
-    """
-    rng = host_generator(key)
-    cells = travel.stops(rng.permutation(np.argwhere(travel.goals)))
-    if len(cells):
-        distance, _ = KDTree(candidates).query(cells)
-        cells = cells[np.asarray(distance) <= reach][:_MOST_PLACES]
-    places = candidates if len(cells) == 0 else cells[spread(cells, num)]
-    places = places[np.arange(num) % len(places)]
-    return places if len(cells) == 0 else _jitter(places, travel.cell_size, rng)
 
 
 def spread(places: np.ndarray, num: int) -> np.ndarray:

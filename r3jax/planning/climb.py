@@ -16,12 +16,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera
-from r3jax.scoring.batch import deal
+from r3jax.mapping.state import MapState
+from r3jax.scoring.batch import map_over_devices
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.demand import Demand
-from r3jax.scoring.soft import Softness, Surroundings, soft_utility, surroundings_of
-from r3jax.scoring.voxels import Voxels
+from r3jax.scoring.surrogate import Softness, Surrogate, soft_utility, surrogate_of
 
 with warnings.catch_warnings():
     # It says on import that it is no longer developed; it does what is asked of it here.
@@ -57,7 +56,7 @@ class Starts(eqx.Module):
 class _Hill(eqx.Module):
     """What one climb needs to know."""
 
-    around: Surroundings
+    around: Surrogate
     camera: Camera
     origin: Float[Array, " 5"]
     """The start's numbers."""
@@ -67,11 +66,10 @@ class _Hill(eqx.Module):
 
 
 def climb(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
-    demand: Demand | None,
     starts: Starts,
     *,
     moves: bool = True,
@@ -79,51 +77,47 @@ def climb(
     """Where climbs end: positions [m], azimuths and elevations [rad]. Not to be called under jit.
 
     Args:
-        voxels: what is known; `scoring.near.near` gathers it.
+        voxels: what is known; `scoring.gather.gather_in_range` gathers it.
         cells: unexplored space, the same.
         camera: of the views.
         config: settings of the utility.
-        demand: as in `panorama_of`, for these voxels.
         starts: with fields of shape [C, ...].
         moves: False: turns only, whatever the boxes and elevations are.
     """
     run = _move if moves else _turn
-    return deal(functools.partial(run, voxels, cells, camera, config, demand), starts)
+    return map_over_devices(functools.partial(run, voxels, cells, camera, config), starts)
 
 
 @jax.jit
 def _move(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
-    demand: Demand | None,
     starts: Starts,
 ) -> Float[Array, "C 5"]:
-    look = functools.partial(_hill_of, voxels, cells, camera, config, demand, moves=True)
+    look = functools.partial(_hill_of, voxels, cells, camera, config, moves=True)
     # One after the other: for some starts in an office, XLA's code for all at once never ended.
     return jax.lax.map(lambda start: _climb_in_box(look(start), start), starts)
 
 
 @jax.jit
 def _turn(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
-    demand: Demand | None,
     starts: Starts,
 ) -> Float[Array, "C 5"]:
-    look = functools.partial(_hill_of, voxels, cells, camera, config, demand, moves=False)
+    look = functools.partial(_hill_of, voxels, cells, camera, config, moves=False)
     return jax.lax.map(lambda start: _climb_by_turning(look(start)), starts)
 
 
 def _hill_of(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
-    demand: Demand | None,
     start: Starts,
     *,
     moves: bool,
@@ -131,9 +125,7 @@ def _hill_of(
     pose, softness = start.T_world_camera, Softness()
     position = pose[:3, 3]
     low, high = (start.low, start.high) if moves else (position, position)
-    around = surroundings_of(
-        voxels, cells, camera, pose, low, high, config, softness, demand, moves=moves
-    )
+    around = surrogate_of(voxels, cells, camera, pose, low, high, config, softness, moves=moves)
     # As in `Limits`: the azimuth of the image's level axis means something straight up, too.
     azimuth = jnp.arctan2(pose[0, 0], -pose[1, 0])
     elevation = jnp.arctan2(pose[2, 2], jnp.hypot(pose[0, 2], pose[1, 2]))

@@ -9,8 +9,11 @@ from r3jax.scoring.config import ScoringConfig
 MAX_CANDIDATES = 1_000_000
 """More are no longer a choice within seconds, and their scores no longer fit into memory."""
 
-MAX_STANDPOINTS = 256
-"""A row of answers for every voxel, and a piece of compiled code, is kept for each."""
+FORMER_SETTINGS = {
+    "num_standpoints": 16, "horizon": 4, "num_spread": 40, "beam": 4, "branching": 6,
+    "view_seconds": 4.0,
+}  # fmt: skip
+"""Settings of one policy that older runs of all policies recorded, with their defaults then."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class PlannerConfig:
     num_frontier: int = 30
     """How many of the candidates are aimed at the reachable frontier instead of being local.
 
-    Local candidates alone keep the robot in a room that is done: whatever lies half a metre
+    Local candidates alone keep the robot in a room that is done: whatever lies half a meter
     away looks as well known as the rest, and no utility tells it that there is a door behind
     its back. 30 of 100 is the share of Active-GS, whose candidates the paper takes over; 0 is
     the paper's text to the letter. They compete on equal terms, path length included."""
@@ -38,15 +41,11 @@ class PlannerConfig:
     lambda2: float = 0.5
     """Weight of a candidate's share of the path lengths against its share of the utility."""
 
-    num_standpoints: int = 16
-    """Places in reachable free space from which `ours-demand` has surfaces looked at. Each takes
-    two thirds of a candidate's time, and some of every candidate's."""
-
     safety_margin: float = 0.3
-    """A path keeps its cells' centres this far from anything not known to be free [m]."""
+    """A path keeps its cells' centers this far from anything not known to be free [m]."""
 
     refine: int = 0
-    """So many of the best candidates of `ours`, `ours-pano`, `ours-demand` and `ours-ahead` climb
+    """So many of the best candidates of `ours`, `ours-pano` and `ours-ahead` climb
     the utility by its gradient (`planning.refine`); 0: none."""
 
     refine_radius: float = 0.4
@@ -57,22 +56,6 @@ class PlannerConfig:
 
     scoring: ScoringConfig = field(default_factory=ScoringConfig)
     """Settings of the utilities, lambda1 among them."""
-
-    horizon: int = 4
-    """Views of the paths that `ours-ahead` compares."""
-
-    num_spread: int = 40
-    """How many of the candidates of `ours-ahead` are spread over all reachable space."""
-
-    beam: int = 4
-    """Paths that `ours-ahead` keeps for every further view."""
-
-    branching: int = 6
-    """Places that `ours-ahead` tries for the next view of each path."""
-
-    view_seconds: float = 4.0
-    """What `ours-ahead` counts for a view, beside the way to it [s]. With 1 it saves metres, looks
-    at what is near once more, and 60 views of an office come out 1 dB worse."""
 
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""
@@ -90,15 +73,7 @@ class PlannerConfig:
                 f"refine must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.refine}"
             )
-        if not 1 <= self.num_standpoints <= MAX_STANDPOINTS:
-            raise ValueError(
-                f"num_standpoints must lie between 1 and {MAX_STANDPOINTS}, "
-                f"got {self.num_standpoints}"
-            )
-        for name, least in (("horizon", 1), ("num_spread", 0), ("beam", 1), ("branching", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        for name in ("radius", "refine_radius", "lambda2", "safety_margin", "view_seconds"):
+        for name in ("radius", "refine_radius", "lambda2", "safety_margin"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} must be a finite number >= 0, got {value}")

@@ -74,7 +74,7 @@ def initial_state(
     return PlannerState(camera, nowhere, looks, start_height, memory)
 
 
-def look_round(
+def prepare_decision(
     state: PlannerState,
     map_state: MapState,
     grid: OccupancyGrid,
@@ -125,7 +125,7 @@ def follow_way(
     config: PlannerConfig,
 ) -> PlannerState:
     """The memory of a robot that goes a way which its policy did not choose."""
-    state, travel, _ = look_round(state, map_state, grid, T_world_camera, config)
+    state, travel, _ = prepare_decision(state, map_state, grid, T_world_camera, config)
     return _with_way(state, travel, waypoints)
 
 
@@ -151,9 +151,9 @@ def explain_way(
 
     Returns:
         The memory with the way counted in, and the utility by cause; of the unexplored cells those
-        count that decisions are scored on (`look_round`).
+        count that decisions are scored on (`prepare_decision`).
     """
-    state, travel, scoring_grid = look_round(state, map_state, grid, T_world_camera, config)
+    state, travel, scoring_grid = prepare_decision(state, map_state, grid, T_world_camera, config)
     pose = jnp.asarray(T_chosen, dtype=jnp.float32)
     explanation = explain_view(map_state, scoring_grid, state.camera, pose, config.scoring)
     return _with_way(state, travel, waypoints), explanation
@@ -170,7 +170,7 @@ def no_decision(
     return None, info
 
 
-def settle(
+def select_best(
     state: PlannerState,
     travel: Travel,
     poses: np.ndarray,

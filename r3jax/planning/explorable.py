@@ -18,7 +18,7 @@ def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarr
     """Unexplored cells that connect, through unexplored cells, to space the robot can enter.
 
     A region of unexplored cells (connected over faces) counts as a whole if one of its cells
-    has a face neighbour in the *known-free reachable space*: the free cells that connect over
+    has a face neighbor in the *known-free reachable space*: the free cells that connect over
     faces to a cell of `reached`.
 
     Args:

@@ -27,10 +27,10 @@ from r3jax.planning.decision import (
     Stopwatch,
     follow_way,
     initial_state,
-    look_round,
     net_utility,
     no_decision,
-    settle,
+    prepare_decision,
+    select_best,
 )
 from r3jax.planning.limits import Limits
 from r3jax.planning.policy import Decision, PlanInfo
@@ -71,6 +71,9 @@ class GreedyPolicy(ABC):
     source: ClassVar[str]
     """Where the rule comes from."""
 
+    Config: ClassVar[type[PlannerConfig]] = PlannerConfig
+    """Its settings."""
+
     climbs: ClassVar[bool] = False
     """True where `utility` is that of `scoring.utility`, and `total` the net of it: `decide` then
     refines the best candidates if the settings ask for it."""
@@ -88,12 +91,6 @@ class GreedyPolicy(ABC):
         self, situation: Situation, poses: np.ndarray, *, key: Array
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """The candidates, turned if the policy turns them, and `utility` [C] among others."""
-
-    def standpoints(
-        self, situation: Situation, positions: np.ndarray, *, key: Array
-    ) -> np.ndarray | None:
-        """From where the utility asks for surfaces [S, 3] [m] (`scoring.demand`); None: it is U."""
-        del situation, positions, key
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """`total` of each candidate, from `utility` and `path` [C]: U_view."""
@@ -130,7 +127,9 @@ class GreedyPolicy(ABC):
         stopwatch = Stopwatch()
         draw_key, score_key = jax.random.split(key)
         with stopwatch.part("travel"):
-            state, travel, masked = look_round(state, map_state, grid, T_world_camera, self.config)
+            state, travel, masked = prepare_decision(
+                state, map_state, grid, T_world_camera, self.config
+            )
         pose = np.asarray(T_world_camera, dtype=np.float64)
         limits = Limits(self.config.motion, pose, travel.heights)
         with stopwatch.part("candidates"):
@@ -143,21 +142,22 @@ class GreedyPolicy(ABC):
                 return decision, replace(state, memory=drawn.memory), info
             situation = replace(situation, memory=drawn.memory, notes=drawn.notes)
         with stopwatch.part("scoring"):
-            poses, utilities = self.score(situation, limits.obeyed(drawn.poses), key=score_key)
-            poses = limits.obeyed(poses)
+            poses, utilities = self.score(
+                situation, limits.project_to_feasible(drawn.poses), key=score_key
+            )
+            poses = limits.project_to_feasible(poses)
         with stopwatch.part("travel"):
             lengths = travel.lengths(poses[:, :3, 3])
             utilities = utilities | {"path": limits.path_costs(lengths, poses)}
         if self.climbs and self.config.refine:
             with stopwatch.part("refining"):
-                asked = self.standpoints(situation, poses[:, :3, 3], key=score_key)
                 first = (utilities["utility"], utilities["path"])
                 weigh = partial(net_utility, lambda2=self.config.lambda2, among=first)
-                poses, utilities = refine_best(
-                    situation, poses, utilities, self.config, weigh, asked
-                )
+                poses, utilities = refine_best(situation, poses, utilities, self.config, weigh)
         utilities = utilities | {"total": self.weigh(utilities)}
-        best, decision, state, info = settle(state, travel, poses, utilities, limits, stopwatch)
+        best, decision, state, info = select_best(
+            state, travel, poses, utilities, limits, stopwatch
+        )
         memory = self.conclude(situation, poses, utilities, best)
         return decision, replace(state, memory=memory), info
 

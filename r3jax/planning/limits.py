@@ -31,7 +31,7 @@ class Limits:
     heights: tuple[float, float] = UNLIMITED
     """Lowest and highest place of the camera [m], world."""
 
-    def obeyed(self, poses: np.ndarray) -> np.ndarray:
+    def project_to_feasible(self, poses: np.ndarray) -> np.ndarray:
         """The allowed poses nearest to poses [C, 4, 4]: those that are allowed are left as is."""
         positions = self.at_height(poses[:, :3, 3])
         wanted = _angles_of(poses)
@@ -83,7 +83,7 @@ class Limits:
         """Costs of the ways to poses [C, 4, 4], from their lengths [C] [m].
 
         Returns:
-            Metres, [C]: a turn costs what could be gone meanwhile.
+            Meters, [C]: a turn costs what could be gone meanwhile.
         """
         if self.motion.speed is None or self.motion.turn_rate is None:
             return lengths
@@ -136,7 +136,7 @@ def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
     check_height(height, (low, high))
     standing = replace(motion, turn_per_meter=None)  # nobody came from anywhere
     pose = np.asarray(T_world_camera, dtype=np.float64)
-    return Limits(standing, pose).obeyed(pose[None])[0]
+    return Limits(standing, pose).project_to_feasible(pose[None])[0]
 
 
 def check_height(height: float, heights: tuple[float, float]) -> None:

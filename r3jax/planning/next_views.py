@@ -17,7 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from r3jax.arguments import a_camera, checked
+from r3jax.geometry.arguments import a_camera, checked
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, centers_on_host
 from r3jax.mapping.state import MapState, a_map
@@ -25,11 +25,10 @@ from r3jax.planning.candidates import best_views, spread
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.travel import safe_cells
-from r3jax.scoring.batch import keep_positions_near, score_kept_near, score_views_near
+from r3jax.scoring.batch import cache_positions_near, score_cached_near, score_views_near
 from r3jax.scoring.cells import Cells
-from r3jax.scoring.foresight import foresee_near
-from r3jax.scoring.near import near
-from r3jax.scoring.voxels import Voxels
+from r3jax.scoring.gather import gather_in_range
+from r3jax.scoring.simulated import simulate_view_near
 
 _AT_ONCE = 8
 """Bounds that are renewed together: two shapes of candidates compile, C and this."""
@@ -45,7 +44,7 @@ class NextViews(eqx.Module):
     """lambda1 U_G + U_R of each, as if those before it had been taken; never rising."""
 
 
-Ask = Callable[[Voxels, Cells, np.ndarray], tuple[np.ndarray, np.ndarray]]
+Ask = Callable[[MapState, Cells, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From voxels, cells and numbers of candidates [m] to their poses [m, 4, 4], turned where they may
 turn, and the utility of each [m]."""
 
@@ -88,7 +87,7 @@ def next_views(
     positions = _positions_in(grid, safe, config) if checked is None else checked[:, :3, 3]
     known_grid = mask_unexplorable(grid, safe) if safe.any() else grid
     places = jnp.asarray(positions, dtype=jnp.float32)
-    voxels, cells, _ = near(state, known_grid, places, config.scoring)
+    voxels, cells, _ = gather_in_range(state, known_grid, places, config.scoring)
     if checked is None:
         ask, first = _score_turned(voxels, cells, positions, camera, config)
     else:
@@ -123,7 +122,7 @@ def _checked(poses: ArrayLike, k: int) -> np.ndarray:
 
 
 def _score_as_given(poses: np.ndarray, camera: Camera, config: PlannerConfig) -> Ask:
-    def ask(voxels: Voxels, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def ask(voxels: MapState, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         T = jnp.asarray(poses[ids], dtype=jnp.float32)
         scores = score_views_near(voxels, cells, camera, T, config.scoring)
         return poses[ids], np.asarray(scores.total, dtype=np.float64)
@@ -132,15 +131,15 @@ def _score_as_given(poses: np.ndarray, camera: Camera, config: PlannerConfig) ->
 
 
 def _score_turned(
-    voxels: Voxels, cells: Cells, positions: np.ndarray, camera: Camera, config: PlannerConfig
+    voxels: MapState, cells: Cells, positions: np.ndarray, camera: Camera, config: PlannerConfig
 ) -> tuple[Ask, tuple[np.ndarray, np.ndarray]]:
     start, scoring = (voxels, cells), config.scoring
     places = jnp.asarray(positions, dtype=jnp.float32)
-    panorama, kept = keep_positions_near(*start, camera, places, scoring)
+    panorama, kept = cache_positions_near(*start, camera, places, scoring)
 
-    def ask(voxels: Voxels, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def ask(voxels: MapState, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         some, after = jnp.asarray(ids), (voxels, cells)
-        again = score_kept_near(kept.at(some), start, after, camera, places[some], scoring)
+        again = score_cached_near(kept.at(some), start, after, camera, places[some], scoring)
         return best_views(positions[ids], again)
 
     return ask, best_views(positions, panorama)
@@ -149,7 +148,7 @@ def _score_turned(
 def _lazy_greedy(
     ask: Ask,
     first: tuple[np.ndarray, np.ndarray],
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     left: np.ndarray,
@@ -177,4 +176,4 @@ def _lazy_greedy(
         left[best] -= 1
         is_new[:] = False
         T = jnp.asarray(poses[best], dtype=jnp.float32)
-        voxels, cells = foresee_near(voxels, cells, camera, T, config.scoring)
+        voxels, cells = simulate_view_near(voxels, cells, camera, T, config.scoring)

@@ -1,9 +1,7 @@
-"""The plug point of the loop: what a policy is asked, what it answers, and which ones exist."""
+"""The plug point of the loop: what a policy is asked, and what it answers. Types only."""
 
 import enum
-import importlib
-import inspect
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,8 +11,6 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.config import PlannerConfig
-from r3jax.planning.policies import HOMES, check_policy
 
 
 class Outcome(enum.Enum):
@@ -38,7 +34,7 @@ class Decision:
     """The chosen pose, [4, 4] float64."""
 
     waypoints: np.ndarray
-    """Path of the camera centre [m], [K, 3]; first the present position, last the chosen one."""
+    """Path of the camera center [m], [K, 3]; first the present position, last the chosen one."""
 
     length: float
     """Length of that path [m]."""
@@ -113,53 +109,3 @@ class Policy(Protocol):
             waypoints: the way to the next one, [K, 3] [m].
         """
         ...
-
-
-def policy_names() -> tuple[str, ...]:
-    """Names that `make_policy` knows."""
-    return tuple(HOMES)
-
-
-def describe(name: str) -> str:
-    """What a policy does, in one line.
-
-    Raises:
-        ValueError: no policy has that name.
-    """
-    return inspect.cleandoc(_policy_class(name).__doc__).splitlines()[0]
-
-
-def source_of(name: str) -> str:
-    """Where a policy's rule comes from, in a phrase.
-
-    Raises:
-        ValueError: no policy has that name.
-    """
-    return _policy_class(name).source
-
-
-def make_policy(name: str, **settings: Any) -> Policy:
-    """A policy by name.
-
-    Args:
-        name: one of `policy_names()`.
-        **settings: fields of `planning.config.PlannerConfig` that differ from their defaults.
-
-    Raises:
-        ValueError: no policy has that name, no setting has that name, or a value is impossible.
-    """
-    policy_class = _policy_class(name)
-    known = [field.name for field in fields(PlannerConfig)]
-    unknown = [setting for setting in settings if setting not in known]
-    if unknown:
-        raise ValueError(
-            f"policy {name!r} has no setting {', '.join(unknown)}; known: {', '.join(known)}"
-        )
-    return policy_class(PlannerConfig(**settings))
-
-
-def _policy_class(name: str) -> Any:
-    """Imported late: the policies import this module."""
-    check_policy(name)
-    module, _, kind = HOMES[name].rpartition(".")
-    return getattr(importlib.import_module(f"r3jax.planning.policies.{module}"), kind)

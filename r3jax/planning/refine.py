@@ -19,8 +19,8 @@ from r3jax.planning.climb import Starts, climb
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.free_box import free_box
 from r3jax.planning.situation import Situation
-from r3jax.scoring.batch import demand_from, score_views_near
-from r3jax.scoring.near import near
+from r3jax.scoring.batch import score_views_near
+from r3jax.scoring.gather import gather_in_range
 
 Weigh = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """From utilities and paths [K] what views are worth net of the way, by a measure that other
@@ -36,7 +36,6 @@ def refine_best(
     utilities: dict[str, np.ndarray],
     config: PlannerConfig,
     weigh: Weigh,
-    standpoints: np.ndarray | None = None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Replaces the best few candidates by what lies up the slope, where that is better.
 
@@ -46,7 +45,6 @@ def refine_best(
         utilities: [C] each; `utility` and `path` among them.
         config: how many, how far.
         weigh: by what they are the best.
-        standpoints: as in `scoring.batch.score_positions`.
 
     Returns:
         Candidates and utilities; of those replaced, utilities rise by what the exact utility says
@@ -60,18 +58,19 @@ def refine_best(
     low, high = (np.stack(corners) for corners in zip(*boxes, strict=True))
     scoring, camera = config.scoring, situation.camera
     corners = jnp.asarray(np.concatenate([low, high]), dtype=jnp.float32)
-    voxels, cells, _ = near(situation.map_state, situation.scoring_grid, corners, scoring)
-    demand = None if standpoints is None else demand_from(voxels, camera, standpoints, scoring)
+    voxels, cells, _ = gather_in_range(
+        situation.map_state, situation.scoring_grid, corners, scoring
+    )
     elevations = np.tile(np.radians(limits.motion.elevations), (len(starts), 1))
     fields = (jnp.asarray(x, dtype=jnp.float32) for x in (starts, low, high, elevations))
     moves = bool(np.any(high - low > _STILL))
-    ends = climb(voxels, cells, camera, scoring, demand, Starts(*fields), moves=moves)
+    ends = climb(voxels, cells, camera, scoring, Starts(*fields), moves=moves)
     numbers = np.asarray(ends, dtype=np.float64)
     # float32 rounds: the box is kept to the last bit here, and the directions below.
     positions = np.clip(numbers[:, :3], low, high)
-    climbed = limits.obeyed(poses_along(positions, _directions(*numbers[:, 3:].T)))
+    climbed = limits.project_to_feasible(poses_along(positions, _directions(*numbers[:, 3:].T)))
     both = jnp.asarray(np.concatenate([starts, climbed]), dtype=jnp.float32)
-    exact = score_views_near(voxels, cells, camera, both, scoring, demand)
+    exact = score_views_near(voxels, cells, camera, both, scoring)
     gains = {
         name: np.diff(np.asarray(values, np.float64).reshape(2, -1), axis=0)[0]
         for name, values in (

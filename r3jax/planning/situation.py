@@ -20,7 +20,7 @@ class Situation:
     """As it is; for travel."""
 
     scoring_grid: OccupancyGrid
-    """Without unexplored cells that are not worth a look (`look_round`); for utilities."""
+    """Without unexplored cells that are not worth a look (`prepare_decision`); for utilities."""
 
     travel: Travel
     """Where the robot can go from here."""

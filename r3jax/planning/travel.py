@@ -1,8 +1,8 @@
 """Path lengths and waypoints over known free space. On the host: NumPy and Numba.
 
-A cell is *safe* if the ball of the safety margin round its centre touches known free cells only;
+A cell is *safe* if the ball of the safety margin round its center touches known free cells only;
 unknown space is an obstacle. With 0.2 m cells and 0.3 m margin these are the cells whose 26
-neighbours are free, so that every point of a path keeps at least one cell's width from
+neighbors are free, so that every point of a path keeps at least one cell's width from
 anything that is not known to be free. The cell in which the robot stands is always usable.
 
 Paths run over the 26-connected graph of usable cells. A diagonal step needs every cell of the
@@ -20,10 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.planning.carrier_cells import cells_over_matter, layers_between
 from r3jax.planning.limits import check_height
 from r3jax.planning.motion import UNLIMITED
-from r3jax.planning.shortest_ways import shortest_ways
+from r3jax.planning.robot_cells import cells_over_matter, layers_between
+from r3jax.planning.shortest_paths import shortest_paths
 
 _BORDER = 1e-3
 """A segment that passes a corner closer than this counts as touching it [cells]."""
@@ -61,7 +61,7 @@ class Travel:
     """Cells that paths may cross: the safe ones, the robot's own, [X, Y, Z] bool."""
 
     cost: np.ndarray
-    """Length of the shortest way between the centres of the robot's cell and of each cell [m],
+    """Length of the shortest way between the centers of the robot's cell and of each cell [m],
     [X, Y, Z] float64; inf where there is none."""
 
     previous: np.ndarray
@@ -93,7 +93,7 @@ class Travel:
         return int(x), int(y), int(z)
 
     def centers(self, cells: np.ndarray) -> np.ndarray:
-        """Centres [m] of cells given by index, [n, 3]."""
+        """Centers [m] of cells given by index, [n, 3]."""
         return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
 
     def stops(self, cells: np.ndarray) -> np.ndarray:
@@ -113,7 +113,7 @@ class Travel:
     def lengths(self, positions: np.ndarray) -> np.ndarray:
         """Path lengths [m] to positions [n, 3]; inf where there is no way.
 
-        The straight line where it is safe, else the way over the cells' centres: no shorter
+        The straight line where it is safe, else the way over the cells' centers: no shorter
         than what `path` returns.
         """
         return np.array([self._length(position) for position in positions])
@@ -162,7 +162,7 @@ class Travel:
             if self._sees(points[here], points[last]):
                 kept.append(last)
                 break
-            ahead = here + 1  # neighbours on the way always see each other
+            ahead = here + 1  # neighbors on the way always see each other
             while ahead + 1 < last and self._sees(points[here], points[ahead + 1]):
                 ahead += 1
             kept.append(ahead)
@@ -231,7 +231,7 @@ def plan_travel(
         if trail is not None:
             usable |= trail & ~np.asarray(grid.occupied)
         usable[cell] = True
-    cost, previous = shortest_ways(usable, (cell[0], cell[1], cell[2]) if is_inside else None)
+    cost, previous = shortest_paths(usable, (cell[0], cell[1], cell[2]) if is_inside else None)
     return Travel(
         start=start,
         start_cell=(cell[0], cell[1], cell[2]),
@@ -247,7 +247,7 @@ def plan_travel(
 
 
 def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
-    """Cells round whose centre a ball of radius `margin` [m] touches free cells only.
+    """Cells round whose center a ball of radius `margin` [m] touches free cells only.
 
     Args:
         free: cells known to be free, [X, Y, Z] bool; beyond the array nothing is.

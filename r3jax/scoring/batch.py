@@ -3,7 +3,7 @@
 XLA runs the loops of one score on one core; on a CPU the candidates are therefore dealt out to as
 many threads as the process may use. Where there are several devices, they share the candidates.
 
-Shape symbols: C candidates; S standpoints; n voxels; c cells; B bins of the panorama.
+Shape symbols: C candidates; n voxels; c cells; B bins of the panorama.
 """
 
 import functools
@@ -23,19 +23,17 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.demand import Demand, asked_from, joined
-from r3jax.scoring.kept import (
-    Changes,
-    Kept,
-    changes_between,
-    keep_panorama,
-    panorama_again,
-)
-from r3jax.scoring.near import near
+from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama import Panorama, panorama_of
+from r3jax.scoring.panorama_cache import (
+    Changes,
+    PanoramaCache,
+    cached_panorama,
+    changes_between,
+    panorama_from_cache,
+)
 from r3jax.scoring.sharding import Candidates, padded_to, score_on_devices
 from r3jax.scoring.utility import ViewUtility, utility_of_view
-from r3jax.scoring.voxels import Voxels
 
 Scores = TypeVar("Scores")
 
@@ -49,7 +47,7 @@ def score_views(
 ) -> ViewUtility:
     """`view_utility` of every pose; fields of shape [C]. Not to be called under jit."""
     poses = jnp.asarray(poses, dtype=jnp.float32)
-    voxels, cells, _ = near(state, grid, poses[:, :3, 3], config)
+    voxels, cells, _ = gather_in_range(state, grid, poses[:, :3, 3], config)
     return score_views_near(voxels, cells, camera, poses, config)
 
 
@@ -60,7 +58,6 @@ def score_positions(
     positions: Float[Array | np.ndarray, "C 3"],
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
-    standpoints: Float[Array | np.ndarray, "S 3"] | None = None,
 ) -> Panorama:
     """`panorama` of every position; fields of shape [C, ...]. Not to be called under jit.
 
@@ -72,58 +69,53 @@ def score_positions(
         config: settings.
         allowed: per position the axes that its best direction is taken from, at least one of
             the B of the panorama; None: all.
-        standpoints: if given, voxels count by what seeing them would add for whoever looks from
-            there [m] (`scoring.demand`), not by what they lack.
     """
     positions = jnp.asarray(positions, dtype=jnp.float32)
-    voxels, cells, _ = near(state, grid, positions, config)
-    demand = None if standpoints is None else demand_from(voxels, camera, standpoints, config)
-    return score_positions_near(voxels, cells, camera, positions, config, allowed, demand)
+    voxels, cells, _ = gather_in_range(state, grid, positions, config)
+    return score_positions_near(voxels, cells, camera, positions, config, allowed)
 
 
 def score_views_near(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     poses: Float[Array, "C 4 4"],
     config: ScoringConfig,
-    demand: Demand | None = None,
 ) -> ViewUtility:
-    """`score_views` of voxels and cells that `near` gathered, and of a demand for them if given."""
-    return deal(functools.partial(_score_views, voxels, cells, camera, config, demand), poses)
+    """`score_views` of voxels and cells that `near` gathered."""
+    return map_over_devices(functools.partial(_score_views, voxels, cells, camera, config), poses)
 
 
 def score_positions_near(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     positions: Float[Array, "C 3"],
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
-    demand: Demand | None = None,
 ) -> Panorama:
     """`score_positions` of voxels and cells that `near` gathered."""
-    score = functools.partial(_score_positions, voxels, cells, camera, config, demand)
-    return deal(score, (positions, _all_if_none(allowed, positions, config)))
+    score = functools.partial(_score_positions, voxels, cells, camera, config)
+    return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)))
 
 
-def keep_positions_near(
-    voxels: Voxels,
+def cache_positions_near(
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     positions: Float[Array, "C 3"],
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
-) -> tuple[Panorama, Kept]:
-    """`score_positions_near`, and what `score_kept_near` needs to do it again."""
-    score = functools.partial(_keep_positions, voxels, cells, camera, config)
-    return deal(score, (positions, _all_if_none(allowed, positions, config)))
+) -> tuple[Panorama, PanoramaCache]:
+    """`score_positions_near`, and what `score_cached_near` needs to do it again."""
+    score = functools.partial(_cache_positions, voxels, cells, camera, config)
+    return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)))
 
 
-def score_kept_near(
-    kept: Kept,
-    before: tuple[Voxels, Cells],
-    after: tuple[Voxels, Cells],
+def score_cached_near(
+    kept: PanoramaCache,
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
     camera: Camera,
     positions: Float[Array, "C 3"],
     config: ScoringConfig,
@@ -131,8 +123,8 @@ def score_kept_near(
 ) -> Panorama:
     """`score_positions_near` after imagined views, from what was kept before them."""
     changes = _changes_between(before, after)
-    score = functools.partial(_score_kept, changes, camera, config)
-    return deal(score, (kept, positions, _all_if_none(allowed, positions, config)))
+    score = functools.partial(_score_cached, changes, camera, config)
+    return map_over_devices(score, (kept, positions, _all_if_none(allowed, positions, config)))
 
 
 def _all_if_none(
@@ -146,42 +138,28 @@ def _all_if_none(
     return jnp.asarray(allowed)
 
 
-def demand_from(
-    voxels: Voxels,
-    camera: Camera,
-    standpoints: Float[Array | np.ndarray, "S 3"],
-    config: ScoringConfig,
-) -> Demand:
-    """`demand_of` with the standpoints [m] dealt out. Not to be called under jit."""
-    places = jnp.asarray(standpoints, dtype=jnp.float32)
-    cover, size = deal(functools.partial(_ask, voxels, camera.focal, config), places)
-    return _joined(places, cover, size, camera.focal)
-
-
 @jax.jit
 def _score_views(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
-    demand: Demand | None,
     poses: Float[Array, "C 4 4"],
 ) -> ViewUtility:
-    score = functools.partial(utility_of_view, voxels, cells, camera, config=config, demand=demand)
+    score = functools.partial(utility_of_view, voxels, cells, camera, config=config)
     return jax.lax.map(score, poses)
 
 
 @jax.jit
 def _score_positions(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
-    demand: Demand | None,
     places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
 ) -> Panorama:
     def score(place: tuple[Float[Array, " 3"], Bool[Array, " B"]]) -> Panorama:
-        return panorama_of(voxels, cells, camera, place[0], config, place[1], demand)
+        return panorama_of(voxels, cells, camera, place[0], config, place[1])
 
     return jax.lax.map(score, places)
 
@@ -190,44 +168,31 @@ _changes_between = jax.jit(changes_between)
 
 
 @jax.jit
-def _keep_positions(
-    voxels: Voxels,
+def _cache_positions(
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
     places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
-) -> tuple[Panorama, Kept]:
+) -> tuple[Panorama, PanoramaCache]:
     return jax.lax.map(
-        lambda at: keep_panorama(voxels, cells, camera, at[0], config, at[1]), places
+        lambda at: cached_panorama(voxels, cells, camera, at[0], config, at[1]), places
     )
 
 
 @jax.jit
-def _score_kept(
+def _score_cached(
     changes: Changes,
     camera: Camera,
     config: ScoringConfig,
-    places: tuple[Kept, Float[Array, "C 3"], Bool[Array, "C B"]],
+    places: tuple[PanoramaCache, Float[Array, "C 3"], Bool[Array, "C B"]],
 ) -> Panorama:
     return jax.lax.map(
-        lambda at: panorama_again(at[0], changes, camera, at[1], config, at[2]), places
+        lambda at: panorama_from_cache(at[0], changes, camera, at[1], config, at[2]), places
     )
 
 
-@jax.jit
-def _ask(
-    voxels: Voxels,
-    focal: Float[Array, ""],
-    config: ScoringConfig,
-    standpoints: Float[Array, "S 3"],
-) -> tuple[Float[Array, "S n"], Float[Array, " S"]]:
-    return jax.lax.map(functools.partial(asked_from, voxels, focal, config), standpoints)
-
-
-_joined = jax.jit(joined)
-
-
-def deal(
+def map_over_devices(
     score: "functools.partial[Scores]",
     candidates: Candidates,
     devices: Sequence[Any] | None = None,

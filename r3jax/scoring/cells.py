@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.scoring.chunks import Carry, Selection, for_selected, narrow, select
-from r3jax.scoring.lack import sum_by_direction
-from r3jax.scoring.views import Placement, View
-from r3jax.scoring.visibility import DepthBuffer, is_visible
+from r3jax.scoring.deficit import sum_by_direction
+from r3jax.visibility.depth_buffer import DepthBuffer, is_visible
+from r3jax.visibility.selection import Carry, Selection, for_selected, narrow, select
+from r3jax.visibility.views import Placement, View
 
 
 class Cells(eqx.Module):

@@ -29,7 +29,7 @@ def seen_directions(
                  projected on the tangent plane at r; else 0
 
     Only signs of the tangent coordinates matter for the box, so the axes up x r and
-    r x (up x r) are left unnormalised. The bins are looped over, the voxels vectorised: the
+    r x (up x r) are left unnormalized. The bins are looped over, the voxels vectorized: the
     arithmetic, some 20 operations per bin and voxel, is all the cost.
 
     Args:

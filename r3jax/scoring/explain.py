@@ -15,17 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.arguments import a_camera, a_pose, checked
+from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.cells import cells_of, visible_cells
-from r3jax.scoring.chunks import Selection, for_selected
-from r3jax.scoring.config import ScoringConfig, scoring_settings
+from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
 from r3jax.scoring.renderability import score_voxels
-from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import seen_in
-from r3jax.scoring.voxels import Voxels, voxels_of
+from r3jax.visibility.depth_buffer import seen_in
+from r3jax.visibility.selection import Selection, for_selected
+from r3jax.visibility.views import pinhole_view
 
 CAUSES = ("never seen", "too oblique", "inconsistent", "too far")
 """What a utility comes from: unexplored cells, then the factors bias, noise and resolution."""
@@ -76,12 +75,11 @@ def explain_view(
         config: lambda1, range, and settings of the closed forms.
     """
     config = ScoringConfig() if config is None else config
-    voxels, cells = voxels_of(state, config.delta), cells_of(grid)
     view = pinhole_view(camera, T_world_camera, config)
-    buffer, visible = seen_in(voxels, view, config)
-    unseen = visible_cells(cells, view, buffer).mask
+    buffer, visible = seen_in(state, view, config)
+    unseen = visible_cells(cells_of(grid), view, buffer).mask
     position = T_world_camera[:3, 3]
-    shares, rendering = _divide_visible(voxels, visible, position, camera.focal, config.kappa)
+    shares, rendering = _divide_visible(state, visible, position, camera.focal, config.forms)
     exploration = config.lambda1 * jnp.sum(unseen, dtype=jnp.float32)
     factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
     return Explanation(
@@ -93,18 +91,18 @@ def explain_view(
 
 
 def _divide_visible(
-    voxels: Voxels,
+    voxels: MapState,
     visible: Selection,
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    kappa: str,
+    forms: Forms,
 ) -> _Sums:
     """What the visible voxels lack, by cause; summed in the order in which U_R is."""
     num = visible.num
 
     def add(index: Int[Array, " K"], valid: Bool[Array, " K"], sums: _Sums) -> _Sums:
         shares, totals = sums
-        terms = score_voxels(voxels.take(index, valid), position, focal, kappa)
+        terms = score_voxels(voxels.take(index, valid), position, focal, forms)
         factors = jnp.stack([terms.bias, terms.noise, terms.resolution])
         part = jnp.where(valid[None, :], divide_lack(1.0 - terms.value, factors), 0.0)
         target = jnp.where(valid, index, num)  # out of range on purpose: dropped

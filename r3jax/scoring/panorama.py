@@ -8,19 +8,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from r3jax.arguments import a_camera, a_point, checked
+from r3jax.geometry.arguments import a_camera, a_point, checked
 from r3jax.geometry.cameras import Camera, pose_along, sound
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_cells
-from r3jax.scoring.chunks import Selection
 from r3jax.scoring.config import ScoringConfig, scoring_settings
-from r3jax.scoring.demand import Demand, gain_by_direction
-from r3jax.scoring.lack import lack_by_direction
-from r3jax.scoring.views import panorama_view
-from r3jax.scoring.visibility import seen_in
-from r3jax.scoring.voxels import Voxels, voxels_of
+from r3jax.scoring.deficit import deficit_per_bin
+from r3jax.visibility.depth_buffer import seen_in
+from r3jax.visibility.selection import Selection
+from r3jax.visibility.views import panorama_view
 
 
 class Panorama(eqx.Module):
@@ -63,20 +61,18 @@ def panorama(
         config: settings.
     """
     config = ScoringConfig() if config is None else config
-    voxels = voxels_of(state, config.delta)
-    scores = panorama_of(voxels, cells_of(grid), camera, position, config)
+    scores = panorama_of(state, cells_of(grid), camera, position, config)
     factor = sound(camera, scores.T_world_camera, state.voxel_size, grid.cell_size)
     return jax.tree.map(lambda part: factor * part, scores)
 
 
 def panorama_of(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     position: Float[Array, " 3"],
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
-    demand: Demand | None = None,
 ) -> Panorama:
     """`panorama` of voxels and cells that are already at hand.
 
@@ -87,32 +83,26 @@ def panorama_of(
         position: camera center [m].
         config: settings.
         allowed: axes q_k that the best direction is taken from, at least one; None: all.
-        demand: for these voxels; if given, a voxel counts by what seeing it would add
-            (`scoring.demand`), not by what it lacks.
     """
     view = panorama_view(position, config)
     buffer, visible = seen_in(voxels, view, config)
     seen = visible_cells(cells, view, buffer)
-    bins = bins_of_seen(voxels, visible, cells, seen, position, camera.focal, config, demand)
+    bins = bins_of_seen(voxels, visible, cells, seen, position, camera.focal, config)
     return panorama_of_bins(bins, camera, position, config, allowed)
 
 
 def bins_of_seen(
-    voxels: Voxels,
+    voxels: MapState,
     visible: Selection,
     cells: Cells,
     seen: Selection,
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
     config: ScoringConfig,
-    demand: Demand | None = None,
 ) -> Float[Array, " B"]:
     """`Panorama.bin_scores` of the `visible` voxels and the cells that are `seen`."""
     num_bins = config.panorama_bins
-    if demand is None:
-        bins = lack_by_direction(voxels, visible, position, focal, config.kappa, num_bins)
-    else:
-        bins = gain_by_direction(voxels, visible, demand, position, focal, num_bins)
+    bins = deficit_per_bin(voxels, visible, position, focal, config.forms, num_bins)
     return bins + config.lambda1 * unexplored_by_direction(cells, seen, position, num_bins)
 
 

@@ -19,13 +19,12 @@ from jaxtyping import Array, Bool, Float
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.batch import deal
+from r3jax.scoring.batch import map_over_devices
 from r3jax.scoring.cells import Cells, over_visible
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.near import near
-from r3jax.scoring.views import PinholeView, Placement, pinhole_view
-from r3jax.scoring.visibility import DepthBuffer, candidates_of, depth_buffer
-from r3jax.scoring.voxels import Voxels
+from r3jax.scoring.gather import gather_in_range
+from r3jax.visibility.depth_buffer import DepthBuffer, candidates_of, depth_buffer
+from r3jax.visibility.views import PinholeView, Placement, pinhole_view
 
 
 class PixelView(eqx.Module):
@@ -84,16 +83,18 @@ def score_pixels(
     poses = jnp.asarray(poses, dtype=jnp.float32)
     far = jnp.asarray(config.max_range if reach is None else reach, dtype=jnp.float32)
     reaching = eqx.tree_at(lambda c: c.max_range, config, far)
-    voxels, cells, index = near(state, grid, poses[:, :3, 3], reaching)
+    voxels, cells, index = gather_in_range(state, grid, poses[:, :3, 3], reaching)
     last = state.capacity - 1
     rows = jax.tree.map(lambda x: jnp.asarray(x)[..., jnp.minimum(index, last)], rows)
-    return deal(functools.partial(_score, value, voxels, cells, camera, config, rows, far), poses)
+    return map_over_devices(
+        functools.partial(_score, value, voxels, cells, camera, config, rows, far), poses
+    )
 
 
 @functools.partial(jax.jit, static_argnames="value")
 def _score(
     value: Value,
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     config: ScoringConfig,
@@ -108,7 +109,7 @@ def _score(
 
 
 def pixel_view(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     T_world_camera: Float[Array, "4 4"],

@@ -16,16 +16,15 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.arguments import a_camera, a_point, a_pose, checked
+from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked
 from r3jax.geometry.cameras import Camera, is_traced, sound
 from r3jax.geometry.numerics import safe_norm, safe_power
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.chunks import for_selected, select
-from r3jax.scoring.config import ScoringConfig, scoring_settings
+from r3jax.scoring.config import PAPER, Forms, ScoringConfig, scoring_settings
 from r3jax.scoring.directions import seen_directions
-from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import voxels_in_pixels
-from r3jax.scoring.voxels import Voxels, voxels_of
+from r3jax.visibility.depth_buffer import voxels_in_pixels
+from r3jax.visibility.selection import for_selected, select
+from r3jax.visibility.views import pinhole_view
 
 
 class Renderability(eqx.Module):
@@ -50,11 +49,25 @@ class Renderability(eqx.Module):
     """R = b eps gamma, in [0, 1]; 0 for voxels never seen."""
 
 
+def consistency(
+    count: Float[Array, " n"], m2: Float[Array, " n"], form: str = "trace"
+) -> Float[Array, " n"]:
+    """delta: how consistent the colors of a voxel are, in [0, 1].
+
+    `trace` is Algorithm 2 of arXiv 2601.07484, 1 - sqrt(2 / 1.5) sqrt(tr(M) / (n - 1));
+    `pairwise` is its text, one minus the mean squared difference over pairs, which equals
+    1 - 2 tr(M) / (n - 1). Both are clipped to [0, 1], and are 1 for n <= 1.
+    """
+    variance = m2 / jnp.maximum(count - 1.0, 1.0)
+    spread = 2.0 * variance if form == "pairwise" else jnp.sqrt(2.0 / 1.5 * variance)
+    return jnp.where(count > 1.0, jnp.clip(1.0 - spread, 0.0, 1.0), 1.0)
+
+
 def score_voxels(
-    voxels: Voxels,
+    voxels: MapState,
     camera_position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    kappa: str = "box",
+    forms: Forms = PAPER,
 ) -> Renderability:
     """The terms of every voxel as seen from one camera position.
 
@@ -62,23 +75,24 @@ def score_voxels(
         voxels: what is known of them.
         camera_position: center of the camera that asks [m].
         focal: its focal length [px], in the unit used when the map was made.
-        kappa: `box`, or `one` to leave the box test out.
+        forms: of kappa and delta.
     """
+    delta = consistency(voxels.count, voxels.m2, forms.delta)
     offset = camera_position[:, None] - voxels.center
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     direction = offset / distance[None, :]
     cosine, inside = seen_directions(voxels.visited, direction, voxels.num_bins)
-    is_one = (inside > 0.0) | (kappa == "one")
+    is_one = (inside > 0.0) | (forms.kappa == "one")
     kappa_value = jnp.where(is_one, 1.0, 2.0)
     bias = jnp.where(is_one, cosine, cosine * cosine)
-    noise = safe_power(voxels.delta, kappa_value * (1.0 - bias))
+    noise = safe_power(delta, kappa_value * (1.0 - bias))
     ratio = jnp.minimum(voxels.resolution * distance / focal, 1.0)
-    resolution = safe_power(ratio, 1.0 - voxels.delta * bias)
+    resolution = safe_power(ratio, 1.0 - delta * bias)
     blank: Callable[[Array], Array] = lambda term: jnp.where(voxels.present, term, 0.0)
     return Renderability(
         kappa=kappa_value,
         bias=blank(bias),
-        delta=voxels.delta,
+        delta=delta,
         noise=blank(noise),
         resolution=blank(resolution),
         value=blank(bias * noise * resolution),
@@ -87,7 +101,7 @@ def score_voxels(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
 def _score_present(
-    voxels: Voxels, camera_position: Float[Array, " 3"], focal: Float[Array, ""], kappa: str
+    voxels: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
     """`score_voxels`, at a cost that follows the voxels present and not the capacity."""
     num = voxels.present.shape[0]
@@ -95,7 +109,7 @@ def _score_present(
     def score(
         index: Int[Array, " K"], valid: Bool[Array, " K"], terms: Renderability
     ) -> Renderability:
-        part = score_voxels(voxels.take(index, valid), camera_position, focal, kappa)
+        part = score_voxels(voxels.take(index, valid), camera_position, focal, forms)
         target = jnp.where(valid, index, num)
         return jax.tree.map(lambda all, new: all.at[target].set(new, mode="drop"), terms, part)
 
@@ -107,19 +121,19 @@ def _score_present(
 
 @_score_present.defjvp
 def _score_present_jvp(
-    kappa: str,
-    primals: tuple[Voxels, Float[Array, " 3"], Float[Array, ""]],
+    forms: Forms,
+    primals: tuple[MapState, Float[Array, " 3"], Float[Array, ""]],
     tangents: tuple[Any, ...],
 ) -> tuple[Renderability, Renderability]:
     # A loop of unknown length has no reverse mode; the dense form has.
-    return jax.jvp(functools.partial(score_voxels, kappa=kappa), primals, tangents)
+    return jax.jvp(functools.partial(score_voxels, forms=forms), primals, tangents)
 
 
-@functools.partial(jax.jit, static_argnames="kappa")
+@functools.partial(jax.jit, static_argnames="forms")
 def _voxel_renderability(
-    state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], kappa: str
+    state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
-    terms = _score_present(voxels_of(state), camera_position, focal, kappa)
+    terms = _score_present(state, camera_position, focal, forms)
     positive = jnp.stack([focal, state.voxel_size])
     is_sound = jnp.all(jnp.isfinite(camera_position)) & jnp.all(jnp.isfinite(positive))
     factor = jnp.where(is_sound & jnp.all(positive > 0.0), 1.0, jnp.nan)
@@ -154,7 +168,7 @@ def voxel_renderability(
         raise ValueError(f"kappa must be 'box' or 'one', got {kappa!r}")
     if not is_traced(focal) and not 0.0 < float(focal) < np.inf:
         raise ValueError(f"focal must be positive and finite [px], got {float(focal)}")
-    return _voxel_renderability(state, position, focal, kappa)
+    return _voxel_renderability(state, position, focal, Forms(kappa))
 
 
 class TermImages(eqx.Module):
@@ -190,8 +204,8 @@ def term_images(
     """
     config = ScoringConfig() if config is None else config
     view = pinhole_view(camera, T_world_camera, config)
-    seen, row = voxels_in_pixels(voxels_of(state, config.delta), view, config)
-    terms = score_voxels(seen, T_world_camera[:3, 3], camera.focal, config.kappa)
+    seen, row = voxels_in_pixels(state, view, config)
+    terms = score_voxels(seen, T_world_camera[:3, 3], camera.focal, config.forms)
     factor = sound(camera, T_world_camera, state.voxel_size)
     image: Callable[[Array], Array] = lambda term: factor * term.reshape(row.shape)
     return TermImages(

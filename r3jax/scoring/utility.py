@@ -4,17 +4,15 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Bool, Float
 
-from r3jax.arguments import a_camera, a_pose, checked
+from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_cells
 from r3jax.scoring.config import ScoringConfig, scoring_settings
-from r3jax.scoring.demand import Demand, gain_by_direction
-from r3jax.scoring.lack import lack_by_direction
-from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer, seen_in
-from r3jax.scoring.voxels import Voxels, voxels_of
+from r3jax.scoring.deficit import deficit_per_bin
+from r3jax.visibility.depth_buffer import candidates_of, depth_buffer, seen_in
+from r3jax.visibility.views import pinhole_view
 
 
 class ViewUtility(eqx.Module):
@@ -45,32 +43,24 @@ def view_utility(
     Written for one pose; `jax.vmap` it over many, or use `scoring.batch.score_views`.
     """
     config = ScoringConfig() if config is None else config
-    voxels = voxels_of(state, config.delta)
-    utility = utility_of_view(voxels, cells_of(grid), camera, T_world_camera, config)
+    utility = utility_of_view(state, cells_of(grid), camera, T_world_camera, config)
     factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
     return jax.tree.map(lambda part: factor * part, utility)
 
 
 def utility_of_view(
-    voxels: Voxels,
+    voxels: MapState,
     cells: Cells,
     camera: Camera,
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
-    demand: Demand | None = None,
 ) -> ViewUtility:
-    """`view_utility` of voxels and cells that are already at hand.
-
-    With a demand for these voxels, `rendering` is what seeing them would add (`scoring.demand`).
-    """
+    """`view_utility` of voxels and cells that are already at hand."""
     view = pinhole_view(camera, T_world_camera, config)
     buffer, visible = seen_in(voxels, view, config)
     position = T_world_camera[:3, 3]
     focal = camera.focal
-    if demand is None:
-        rendering = lack_by_direction(voxels, visible, position, focal, config.kappa, 1)[0]
-    else:
-        rendering = gain_by_direction(voxels, visible, demand, position, focal, 1)[0]
+    rendering = deficit_per_bin(voxels, visible, position, focal, config.forms, 1)[0]
     seen = visible_cells(cells, view, buffer)
     exploration = unexplored_by_direction(cells, seen, position, 1)[0]
     return ViewUtility(exploration, rendering, config.lambda1 * exploration + rendering)
@@ -85,7 +75,6 @@ def visible_unexplored(
     config: ScoringConfig,
 ) -> Bool[Array, "X Y Z"]:
     """The cells that U_G of a view counts."""
-    voxels, cells = voxels_of(state, config.delta), cells_of(grid)
     view = pinhole_view(camera, T_world_camera, config)
-    buffer = depth_buffer(voxels, candidates_of(voxels, view), view, config)
-    return visible_cells(cells, view, buffer).mask.reshape(grid.log_odds.shape)
+    buffer = depth_buffer(state, candidates_of(state, view), view, config)
+    return visible_cells(cells_of(grid), view, buffer).mask.reshape(grid.log_odds.shape)

@@ -13,7 +13,7 @@ _NEIGHBORS = 12
 class SurfaceDistance:
     """Answers how far points are from the nearest surface.
 
-    Large triangles are cut into pieces, so that a search tree over the pieces' centres finds the
+    Large triangles are cut into pieces, so that a search tree over the pieces' centers finds the
     few that can be nearest; the distance to these is exact.
     """
 

@@ -1,8 +1,8 @@
 """What the referee may know of a world: its free space, and pictures from anywhere.
 
-The free space is sampled by nodes a tenth of a metre apart. A node is free if every surface is at
+The free space is sampled by nodes a tenth of a meter apart. A node is free if every surface is at
 least the margin away; the nodes that a camera can reach are those connected to its start. Two
-neighbours that are free have no surface between them, as their distance is below the margin: the
+neighbors that are free have no surface between them, as their distance is below the margin: the
 space behind walls, inside furniture and outside a closed house stays out.
 
 Shape symbols: I J K nodes along the axes; n points; V views.
@@ -67,7 +67,7 @@ class GroundTruth:
 
     @property
     def scene_hash(self) -> str:
-        """SHA-256 of what is shown: geometry, colours, lamps."""
+        """SHA-256 of what is shown: geometry, colors, lamps."""
         return self._scene_hash
 
     @functools.cached_property
@@ -150,7 +150,7 @@ class GroundTruth:
     def _free_nodes(self, nodes: "_Nodes", margin: float) -> np.ndarray:
         """Which nodes keep the margin, [I, J, K] bool.
 
-        Blocks of nodes are decided by bounds on their centre's distance; those that are not are
+        Blocks of nodes are decided by bounds on their center's distance; those that are not are
         halved; single nodes that the bounds leave open are measured exactly.
         """
         least = margin - _TOLERANCE
@@ -227,7 +227,7 @@ def _reached(is_free: np.ndarray, nodes: _Nodes, start: np.ndarray) -> np.ndarra
 
 
 class _Surface:
-    """A mesh cut so small that the distance to a piece's centre nearly tells that to the mesh."""
+    """A mesh cut so small that the distance to a piece's center nearly tells that to the mesh."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         corners = vertices[faces].astype(np.float64)
@@ -241,7 +241,7 @@ class _Surface:
     def bounds(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Least and greatest distance [n] that each of `points` [n, 3] may have [m]."""
         to_center, nearest = self._tree.query(points)
-        # No piece reaches farther from its centre than the radius.
+        # No piece reaches farther from its center than the radius.
         return to_center - self._radius, point_triangle(points, self._pieces[nearest])
 
     def keeps(self, points: np.ndarray, margin: float) -> np.ndarray:

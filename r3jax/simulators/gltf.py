@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_type
-from r3jax.foreign.files import check_regular
-from r3jax.foreign.json_text import parse_json
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_type
+from r3jax.formats.validation.files import check_regular
+from r3jax.formats.validation.json_text import parse_json
 
 _MAX_JSON = 256 << 20
 """Larger trees are cut off, and refused as such [bytes]."""
@@ -152,7 +152,7 @@ def num_lines(tree: dict[str, Any]) -> int:
 
 
 def texture_transforms(tree: dict[str, Any]) -> dict[str, np.ndarray]:
-    """How each material of a glTF file moves the texture coordinates of its base colour.
+    """How each material of a glTF file moves the texture coordinates of its base color.
 
     The extension is defined by the Khronos group: uv' = translation * rotation * scale * uv, in
     glTF's own coordinates, where v grows downwards.

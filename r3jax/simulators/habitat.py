@@ -7,10 +7,10 @@ Habitat-Sim is not on the Python package index, so there is no extra for it; it 
 or, where these packages do not fit (r3jax needs Python 3.11 and NumPy 2), from source:
 https://github.com/facebookresearch/habitat-sim. No display is needed, and no GPU.
 
-Surfaces are shown in their stored colours, without lights. Three of Habitat's ways matter here:
+Surfaces are shown in their stored colors, without lights. Three of Habitat's ways matter here:
 faces are seen from their front only; lines are drawn, which no ray meets; and a mesh without a
 material (any PLY, so also Replica's) is shown dark and tinted by a default material, a mean of 84
-of 255 off, though its depth is right. Of a PLY the colours are therefore the ray caster's, as
+of 255 off, though its depth is right. Of a PLY the colors are therefore the ray caster's, as
 stored in the file; for Replica the ray caster alone (`replica:<name>`) shows the same faster.
 
 Range and noise are ours, as those of the ray caster: depth beyond `max_range` is inf, and
@@ -81,8 +81,8 @@ class HabitatSimulator:
             seed: of the search for a start.
             gpu_device_id: CUDA device whose renderer is used, -1 for any; None: see
                 `default_gpu_device`.
-            mesh_colors: take the colours from the mesh file by ray casting, the depth alone from
-                Habitat; None: for a PLY, whose vertex colours Habitat shows dark.
+            mesh_colors: take the colors from the mesh file by ray casting, the depth alone from
+                Habitat; None: for a PLY, whose vertex colors Habitat shows dark.
 
         Raises:
             ImportError: Habitat-Sim is not installed; says how to get it.
@@ -133,7 +133,7 @@ class HabitatSimulator:
         """`T_world_camera` at the start, [4, 4] float64; searched for when first asked for.
 
         Raises:
-            ValueError: no place has half a metre free all round, or Habitat shows another place
+            ValueError: no place has half a meter free all round, or Habitat shows another place
                 there than the mesh file has, so that it cannot be said what is free.
         """
         pose = self._mesh.start_pose
@@ -224,7 +224,7 @@ class _Habitat:
             self._simulator = habitat_sim.Simulator(habitat_sim.Configuration(settings, [agent]))
 
     def observe(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [H, W, 3] uint8 and z-depth [H, W] float32 from a place in Habitat's world.
+        """Colors [H, W, 3] uint8 and z-depth [H, W] float32 from a place in Habitat's world.
 
         The arrays may be Habitat's own: the next call may change them.
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_type
-from r3jax.foreign.files import check_regular, read_bytes
-from r3jax.foreign.json_text import parse_json
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_type
+from r3jax.formats.validation.files import check_regular, read_bytes
+from r3jax.formats.validation.json_text import parse_json
 from r3jax.simulators.habitat_poses import BARE_GLB, habitat_from_axes
 
 _CONFIG = ".stage_config.json"

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.files import check_regular
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular
 from r3jax.simulators.gltf import check_claims, num_lines, read_tree, texture_transforms
 
 SUFFIXES = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")

@@ -1,7 +1,7 @@
 """Mesh files as worlds: GLB, glTF, PLY, OBJ, STL and OFF.
 
 glTF is y-up by its standard and is turned to z-up, (x, y, z) -> (x, -z, y); other formats are
-taken as z-up unless told otherwise. Colours are used as stored, as Habitat does without lights.
+taken as z-up unless told otherwise. Colors are used as stored, as Habitat does without lights.
 Transparency is ignored: a surface is there or it is not.
 
 Shape symbols: V vertices; F faces.
@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
+from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.simulators.mesh_files import GLTF_SUFFIXES, MeshFile
 from r3jax.simulators.world import Material, World
 
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _PLAIN = Material(color=(0.7, 0.7, 0.7))
-"""What a surface without any colour looks like."""
+"""What a surface without any color looks like."""
 
 _MAX_EXTENT = 1e5
-"""Worlds larger than this are not in metres [m]."""
+"""Worlds larger than this are not in meters [m]."""
 
 _MAX_UV = 1e6
 """Texture coordinates beyond this have no fraction left that could choose a texel."""
@@ -43,17 +43,17 @@ class _Part:
 def load_world(path: str | Path, up: str | None = None, scale: float | int = 1.0) -> World:
     """Reads a mesh file.
 
-    Textures, vertex colours, face colours, plain colours and mixtures of them are kept; the nodes
+    Textures, vertex colors, face colors, plain colors and mixtures of them are kept; the nodes
     of a scene graph are put in their places; polygons become triangles; texture coordinates
     outside [0, 1] repeat the texture.
 
     Args:
         path: the file.
         up: the file's vertical axis, "y" or "z"; None: y for glTF, z for everything else.
-        scale: metres in a unit of the file: 0.001 for one in millimeters.
+        scale: meters in a unit of the file: 0.001 for one in millimeters.
 
     Returns:
-        The world, z up, in metres, named `mesh:<path>`.
+        The world, z up, in meters, named `mesh:<path>`.
 
     Raises:
         ValueError: the file is missing or cannot be read, holds no mesh or only points, has
@@ -151,7 +151,7 @@ def _part_of(file: MeshFile, T: np.ndarray, name: str) -> _Part | None:
 def _appearance(
     file: MeshFile, mesh: Any, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray | None, Material]:
-    """Texture coordinates and colours per corner, and the material."""
+    """Texture coordinates and colors per corner, and the material."""
     visual = mesh.visual
     no_uv = np.zeros((len(faces), 3, 2), np.float32)
     kind = getattr(visual, "kind", None)
@@ -181,7 +181,7 @@ def _material(file: MeshFile, source: Any, *, has_uv: bool) -> Material:
     else:
         image, factor = getattr(source, "image", None), getattr(source, "diffuse", None)
         if image is not None and has_uv:
-            # Exporters write any diffuse colour beside a texture; viewers show the texture.
+            # Exporters write any diffuse color beside a texture; viewers show the texture.
             factor = None
     texture = None
     if image is not None and has_uv:
@@ -193,7 +193,7 @@ def _material(file: MeshFile, source: Any, *, has_uv: bool) -> Material:
 
 
 def _as_unit(colors: np.ndarray) -> np.ndarray:
-    """Colours [n, 3 or 4] of any type as float32 [n, 3] in [0, 1]."""
+    """Colors [n, 3 or 4] of any type as float32 [n, 3] in [0, 1]."""
     colors = np.asarray(colors)[:, :3]
     if colors.shape[1] != 3:
         raise ForeignFileError(f"colors of {colors.shape[1]} channels: expected 3 or 4")

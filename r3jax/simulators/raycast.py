@@ -1,8 +1,8 @@
 """A simulator that casts rays into a textured triangle mesh.
 
-One ray through each pixel's centre gives depth and colour. Where neighbouring pixels show
-different faces in different colours, more rays inside the pixel smooth the edge: elsewhere the
-texture filter already does. A mirror's share of the colour comes from one reflected ray.
+One ray through each pixel's center gives depth and color. Where neighboring pixels show
+different faces in different colors, more rays inside the pixel smooth the edge: elsewhere the
+texture filter already does. A mirror's share of the color comes from one reflected ray.
 
 Shape symbols: H W image size; n rays; F faces.
 """
@@ -27,7 +27,7 @@ from r3jax.simulators.world import World
 _SUBPIXELS = np.array([[0.125, 0.375], [-0.375, 0.125], [-0.125, -0.375], [0.375, -0.125]])
 
 _EDGE_CONTRAST = 12.0 / 255.0
-"""Neighbours that differ by less in every channel get no more rays: with a third of this, half as
+"""Neighbors that differ by less in every channel get no more rays: with a third of this, half as
 many rays again gain 0.2 dB at 40 dB."""
 
 
@@ -52,11 +52,11 @@ class RaycastSimulator:
             world: what is there.
             camera: intrinsics; None: 512x512 pixels, 60 degrees.
             max_range: z-depth beyond which the depth sensor sees nothing [m]; None: unlimited.
-                Colours have no such limit.
+                Colors have no such limit.
             start_pose: `T_world_camera` at the start; None: the world's own, or a search.
             cull_back_faces: look through faces seen from behind, as Habitat does.
             supersample: extra rays in a pixel on an edge, 0 to 4.
-            lighting: False shows every surface in its own colour: no lamps, no mirrors.
+            lighting: False shows every surface in its own color: no lamps, no mirrors.
             seed: of the search for a start.
 
         Raises:
@@ -101,7 +101,7 @@ class RaycastSimulator:
         """`T_world_camera` at the start, [4, 4] float64; searched for when first asked for.
 
         Raises:
-            ValueError: no place in the mesh has half a metre free all round.
+            ValueError: no place in the mesh has half a meter free all round.
         """
         if self._start is None:
             self._start = start.find_start(self._bounds, self._scene, self._distance, self._seed)
@@ -173,7 +173,7 @@ class RaycastSimulator:
         return SurfaceDistance(self.world.vertices, self.world.faces)
 
     def _pixel_directions(self) -> np.ndarray:
-        """Rays through the pixel centres with z = 1, row by row, [H * W, 3] float32."""
+        """Rays through the pixel centers with z = 1, row by row, [H * W, 3] float32."""
         camera = self._camera
         x = (np.arange(camera.width) + 0.5 - float(camera.cx)) / float(camera.fx)
         y = (np.arange(camera.height) + 0.5 - float(camera.cy)) / float(camera.fy)
@@ -210,11 +210,11 @@ class RaycastSimulator:
         return jnp.asarray((T[:3, :2].T / focal).astype(np.float32))
 
     def _look(self, T: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, Hits]:
-        """Colours [n, 3] and hits of rays `directions` [n, 3] from the camera."""
+        """Colors [n, 3] and hits of rays `directions` [n, 3] from the camera."""
         steps = self._pixel_steps(T)
         origin = T[None, :3, 3].astype(np.float32)
         parts: list[tuple[Hits, jax.Array]] = []
-        # While embree works on one chunk, the kernel colours the one before it.
+        # While embree works on one chunk, the kernel colors the one before it.
         for begin in range(0, len(directions), shading.CHUNK):
             chunk = directions[begin : begin + shading.CHUNK]
             hits = self._scene.cast(
@@ -247,7 +247,7 @@ class RaycastSimulator:
         incoming, path = directions[rays], hits.distance[rays]
         along = np.einsum("ij,ij->i", normal, incoming)
         outgoing = incoming - 2.0 * along[:, None] * normal
-        # Off the mirror by a tenth of a millimetre, to the side that the ray came from.
+        # Off the mirror by a tenth of a millimeter, to the side that the ray came from.
         side = -np.sign(along)[:, None] * normal * np.float32(1e-4)
         points = origin + path[:, None] * incoming + side
         onward = self._scene.cast(points, outgoing, cull_back_faces=self._cull)
@@ -270,8 +270,8 @@ class RaycastSimulator:
         """Averages pixels on visible edges over more rays, in place.
 
         Args:
-            image: colours of the pixel centres [H, W, 3].
-            face: faces at the pixel centres [H, W].
+            image: colors of the pixel centers [H, W, 3].
+            face: faces at the pixel centers [H, W].
             directions: their rays, row by row [H * W, 3].
             T: `T_world_camera`.
         """
@@ -295,7 +295,7 @@ def _depth_limit(max_range: float | int | None) -> np.float32:
 
 
 def _is_edge(image: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """True where a pixel and one beside it show different faces in different colours, [H, W]."""
+    """True where a pixel and one beside it show different faces in different colors, [H, W]."""
     is_edge = np.zeros(face.shape, dtype=bool)
     for low, high in (
         (np.s_[:, :-1], np.s_[:, 1:]),

@@ -1,6 +1,6 @@
-"""Colours of ray hits: textures, lamps, highlights. One jitted kernel over chunks of rays.
+"""Colors of ray hits: textures, lamps, highlights. One jitted kernel over chunks of rays.
 
-The colour c of a hit with surface colour a (texture x material colour x vertex colour), normal n
+The color c of a hit with surface color a (texture x material color x vertex color), normal n
 turned towards the viewer, lamps i at distance d_i in direction l_i with half vector h_i
 (Blinn, "Models of light reflection", 1977) is
 
@@ -106,7 +106,7 @@ def _texture_color(
     texel: Float[Array, "2 n"],
     moves: tuple[Float[Array, "2 n"], Float[Array, "2 n"]],
 ) -> Float[Array, "3 n"]:
-    """Filtered texture colours in [0, 1]."""
+    """Filtered texture colors in [0, 1]."""
     size = _rows(surface.sizes, texture).T  # [2, n]
     lengths = [jnp.sqrt(move[0] ** 2 + move[1] ** 2) for move in moves]
     is_first_longer = lengths[0] >= lengths[1]
@@ -157,7 +157,7 @@ def _wrapped_pair(
     x: Float[Array, " n"], size: Int[Array, " n"]
 ) -> tuple[list[Int[Array, " n"]], Float[Array, " n"]]:
     """The two texels next to x of a texture that repeats, and the second one's weight."""
-    # In floating point: integer remainders do not vectorise, and cost more than the fetches.
+    # In floating point: integer remainders do not vectorize, and cost more than the fetches.
     limit = size.astype(jnp.float32)
     low = jnp.floor(x)
     first = low - limit * jnp.floor(low / limit)
@@ -207,7 +207,7 @@ def _lit(
 
 @jax.jit
 def shade(surface: Surface, rays: Rays, pixel_steps: Float[Array, "2 3"]) -> Float[Array, "3 n"]:
-    """Colours of a chunk of hits, in [0, 1]; black where nothing was hit.
+    """Colors of a chunk of hits, in [0, 1]; black where nothing was hit.
 
     Args:
         surface: the world's tables.
@@ -247,7 +247,7 @@ def start_shading(
     path_before: np.ndarray | None = None,
     mirror: np.ndarray | None = None,
 ) -> Float[Array, "3 chunk"]:
-    """Colours of at most CHUNK hits, of which the first n columns count.
+    """Colors of at most CHUNK hits, of which the first n columns count.
 
     Returns at once: the kernel runs in the background until the result is read.
 

@@ -25,10 +25,10 @@ class Surface(eqx.Module):
     of the texel coordinates [1/m] (6); unit normal (3); index of the material (1)."""
 
     corner_colors: Float[Array, "F_or_1 9"]
-    """Vertex colours; one row of ones where the world has none."""
+    """Vertex colors; one row of ones where the world has none."""
 
     materials: Float[Array, "K 8"]
-    """Colour (3), specular, shininess, emission, index of the texture (-1: none), 0."""
+    """Color (3), specular, shininess, emission, index of the texture (-1: none), 0."""
 
     texels: UInt32[Array, " S"]
     """See `TextureAtlas`."""
@@ -40,10 +40,10 @@ class Surface(eqx.Module):
     """First texel of each level."""
 
     lamps: Float[Array, "L 7"]
-    """Position (3), colour (3), reach; black ones fill up to a multiple of 8."""
+    """Position (3), color (3), reach; black ones fill up to a multiple of 8."""
 
     ambient: Float[Array, ""]
-    """Share of the surface colour that shows without any lamp."""
+    """Share of the surface color that shows without any lamp."""
 
 
 def build_surface(world: World, *, lighting: bool) -> Surface:
@@ -51,7 +51,7 @@ def build_surface(world: World, *, lighting: bool) -> Surface:
 
     Args:
         world: triangles and materials.
-        lighting: False leaves out lamps, highlights and emission: every surface shows its colour.
+        lighting: False leaves out lamps, highlights and emission: every surface shows its color.
     """
     images, texture_of = _unique_textures(world)
     atlas = build_atlas(images)

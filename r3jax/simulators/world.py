@@ -11,14 +11,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface looks. Colours are what the camera records (sRGB-encoded) in [0, 1]."""
+    """How a surface looks. Colors are what the camera records (sRGB-encoded) in [0, 1]."""
 
     texture: np.ndarray | None = None
     """Texels [h, w, 3] uint8, row 0 at v = 1 (glTF's images have row 0 at v = 0: flip v once,
     at loading). None: plain `color`."""
 
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Multiplies the texture (and the vertex colours)."""
+    """Multiplies the texture (and the vertex colors)."""
 
     specular: float = 0.0
     """Strength of the lamps' highlights, 0 matte .. 1: the view-dependent term."""
@@ -27,13 +27,13 @@ class Material:
     """Blinn-Phong exponent of the highlights."""
 
     mirror: float = 0.0
-    """Share of the colour that comes from the reflected ray, 0 .. 1."""
+    """Share of the color that comes from the reflected ray, 0 .. 1."""
 
     emission: float = 0.0
-    """Share of the colour that ignores the lamps, 0 .. 1: screens, lamp shades."""
+    """Share of the color that ignores the lamps, 0 .. 1: screens, lamp shades."""
 
     is_hole: bool = False
-    """A surface on which the depth sensor fails (window glass): depth 0, the colour is kept."""
+    """A surface on which the depth sensor fails (window glass): depth 0, the color is kept."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class World:
-    """A textured triangle mesh with a start pose. z up, metres."""
+    """A textured triangle mesh with a start pose. z up, meters."""
 
     name: str
     """How the command line names it."""
@@ -73,16 +73,16 @@ class World:
     """Texture coordinates per corner, [F, 3, 2] float32; v = 0 is the texture's last row."""
 
     face_color: np.ndarray | None = None
-    """Vertex colours per corner in [0, 1], [F, 3, 3] float32; None: white."""
+    """Vertex colors per corner in [0, 1], [F, 3, 3] float32; None: white."""
 
     lamps: tuple[Lamp, ...] = ()
-    """Point lights; none: every surface shows its own colour (flat shading)."""
+    """Point lights; none: every surface shows its own color (flat shading)."""
 
     ambient: float = 1.0
-    """Share of the surface colour that shows without any lamp."""
+    """Share of the surface color that shows without any lamp."""
 
     start_position: np.ndarray | None = None
-    """Camera centre at the start, [3] [m]; None: the simulator looks for a free place."""
+    """Camera center at the start, [3] [m]; None: the simulator looks for a free place."""
 
     start_yaw: float = 0.0
     """Heading at the start: angle of the viewing direction from the world's x axis [rad]."""
@@ -100,7 +100,7 @@ class World:
 
     @property
     def content_hash(self) -> str:
-        """SHA-256 over geometry, colours and materials: two equal worlds look the same."""
+        """SHA-256 over geometry, colors and materials: two equal worlds look the same."""
         digest = hashlib.sha256()
         for array in (self.vertices, self.faces, self.face_material, self.face_uv):
             digest.update(np.ascontiguousarray(array).tobytes())

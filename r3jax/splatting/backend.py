@@ -1,6 +1,10 @@
-"""What a rasteriser backend takes and gives, and which one serves where."""
+"""What a rasterizer backend takes and gives, and which one serves where."""
 
+import functools
 import importlib.util
+import re
+import warnings
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -32,7 +36,7 @@ class Composite(eqx.Module):
 
 
 @runtime_checkable
-class Rasterise(Protocol):
+class Rasterize(Protocol):
     """A backend: differentiable by the scene, the pose, the intrinsics and `center_offsets`."""
 
     def __call__(
@@ -47,8 +51,31 @@ class Rasterise(Protocol):
         ...
 
 
-def find_backend(name: str) -> Rasterise:
-    """The backend of that name; `auto` takes the fastest that runs on this machine.
+WRITTEN_FOR = (0, 3)
+"""Version of XLA's foreign function interface whose structs the numba bridge reads by offset."""
+
+
+@functools.cache
+def ffi_version() -> tuple[int, int]:
+    """Reads major and minor version of the interface from the header that jaxlib ships.
+
+    Returns:
+        The version; (-1, -1) if the header does not say.
+    """
+    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
+    text = header.read_text(encoding="utf-8") if header.is_file() else ""
+    found = [
+        re.search(rf"^#define XLA_FFI_API_{part} (\d+)$", text, re.MULTILINE)
+        for part in ("MAJOR", "MINOR")
+    ]
+    major, minor = (-1 if match is None else int(match[1]) for match in found)
+    return major, minor
+
+
+def find_backend(name: str) -> Rasterize:
+    """Finds the backend of a name; `auto` takes the fastest that runs on this machine.
+
+    `numba` becomes `xla`, with a warning, where its bridge does not know XLA's interface.
 
     Raises:
         ValueError: there is no such backend.
@@ -56,19 +83,28 @@ def find_backend(name: str) -> Rasterise:
     """
     if name == "auto":
         name = _fastest()
+    if name == "numba" and (version := ffi_version()) != WRITTEN_FOR:
+        warnings.warn(
+            "the numba rasterizer reads XLA's structs as they are in version "
+            f"{'.'.join(map(str, WRITTEN_FOR))} of its foreign function interface; this jaxlib has "
+            f"{'.'.join(map(str, version))}: rendering with backend='xla', which is slower",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        name = "xla"
     if name == "numba":
-        from r3jax.splatting.backends.numba import rasterise
+        from r3jax.splatting.backends.numba import rasterize
     elif name == "xla":
-        from r3jax.splatting.backends.xla import rasterise
+        from r3jax.splatting.backends.xla import rasterize
     elif name == "splax":
-        from r3jax.splatting.backends.splax import rasterise
+        from r3jax.splatting.backends.splax import rasterize
     elif name == "reference":
-        from r3jax.splatting.reference import rasterise
+        from r3jax.splatting.reference import rasterize
     else:
         raise ValueError(
-            f"there is no rasteriser backend {name!r}: choose auto, numba, xla, splax or reference"
+            f"there is no rasterizer backend {name!r}: choose auto, numba, xla, splax or reference"
         )
-    return rasterise
+    return rasterize
 
 
 def _fastest() -> str:

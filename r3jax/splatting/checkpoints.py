@@ -13,10 +13,10 @@ import numpy as np
 
 from r3jax.checkpoints import discard, make_folder, numbered, read_arrays, write_checkpoint
 from r3jax.files import lock_folder, write_atomic
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json
-from r3jax.foreign.versions import check_version
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json
+from r3jax.formats.validation.versions import check_version
 from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.train_step import TrainState
 from r3jax.splatting.training_config import TrainConfig

@@ -1,4 +1,4 @@
-"""Settings of the rasteriser, and the constants that every backend shares."""
+"""Settings of the rasterizer, and the constants that every backend shares."""
 
 from typing import Literal
 
@@ -30,7 +30,7 @@ Backend = Literal["auto", "numba", "xla", "splax", "reference"]
 
 
 class RasterConfig(eqx.Module):
-    """How to rasterise; all of it structure: another value compiles anew."""
+    """How to rasterize; all of it structure: another value compiles anew."""
 
     backend: Backend = eqx.field(static=True, default="auto")
     """`numba` on CPUs, `splax` on NVIDIA GPUs where it is installed, `xla` everywhere else;

@@ -14,10 +14,10 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.arguments import checked
 from r3jax.files import write_atomic
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.files import check_regular
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular
+from r3jax.geometry.arguments import checked
 from r3jax.splatting.errors import SceneFileError
 from r3jax.splatting.scene import GaussianScene, a_scene
 

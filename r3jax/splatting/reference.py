@@ -1,4 +1,4 @@
-"""The readable rasteriser: every pixel meets every Gaussian. The oracle of all backends."""
+"""The readable rasterizer: every pixel meets every Gaussian. The oracle of all backends."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from r3jax.splatting.projection import ProjectedGaussians, project_gaussians
 from r3jax.splatting.scene import GaussianScene
 
 
-def rasterise(
+def rasterize(
     scene: GaussianScene,
     camera: Camera,
     T_world_camera: Float[Array, "4 4"],

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from r3jax.arguments import a_camera, a_point, a_pose, checked, one, or_none
+from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked, one, or_none
 from r3jax.geometry.cameras import Camera, is_traced, sound
 from r3jax.splatting.backend import Composite, find_backend
 from r3jax.splatting.config import RasterConfig, fitting_budget
@@ -78,13 +78,13 @@ def render(
     background = jnp.zeros(3) if background is None else background
     if center_offsets is None:
         center_offsets = jnp.zeros((scene.capacity, 2))
-    rasterise = find_backend(config.backend)
-    composite = rasterise(scene, camera, T_world_camera, center_offsets, config)
+    rasterize = find_backend(config.backend)
+    composite = rasterize(scene, camera, T_world_camera, center_offsets, config)
     is_open = config.max_intersections is None and not is_traced(composite.overflow)
     while is_open and int(composite.overflow) > 0:
         budget = fitting_budget(int(composite.num_intersections))
         config = dataclasses.replace(config, max_intersections=budget)
-        composite = rasterise(scene, camera, T_world_camera, center_offsets, config)
+        composite = rasterize(scene, camera, T_world_camera, center_offsets, config)
     return _finish(composite, background, sound(camera, T_world_camera))
 
 

@@ -1,4 +1,4 @@
-"""The radiance field: a cloud of 3D Gaussians with view-dependent colour.
+"""The radiance field: a cloud of 3D Gaussians with view-dependent color.
 
 Shape symbols used in splatting/: n Gaussians, k harmonics per color channel (1, 4, 9 or 16), H, W
 image size.
@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from r3jax.arguments import one
+from r3jax.geometry.arguments import one
 
 DEAD_LOGIT = -100.0
 """Opacity logit of an unused row: its opacity rounds to 0, and so does every gradient."""

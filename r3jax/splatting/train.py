@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r3jax.arguments import checked, one, or_none
+from r3jax.geometry.arguments import checked, one, or_none
 from r3jax.splatting.checkpoints import (
     begin_checkpoints,
     only_training,
@@ -25,7 +25,7 @@ from r3jax.splatting.checkpoints import (
 )
 from r3jax.splatting.config import fitting_budget
 from r3jax.splatting.errors import TrainingDiverged
-from r3jax.splatting.initialise import initialise
+from r3jax.splatting.initialize import initialize
 from r3jax.splatting.memory import check_memory
 from r3jax.splatting.scene import GaussianScene, a_scene, empty_scene
 from r3jax.splatting.train_step import (
@@ -201,7 +201,7 @@ def _first_scene(views: Views, config: TrainConfig, scene: GaussianScene | None)
     """The given scene, or one from the views, with the wanted number of rows."""
     if scene is None:
         key = jax.random.key(config.seed)
-        return initialise(views, config.num_gaussians, config.rows, config.sh_degree, key=key)
+        return initialize(views, config.num_gaussians, config.rows, config.sh_degree, key=key)
     if scene.sh_degree != config.sh_degree:
         raise ValueError(
             f"the scene has harmonics of degree {scene.sh_degree}, the config says "

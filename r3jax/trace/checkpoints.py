@@ -23,7 +23,7 @@ from r3jax.checkpoints import (
     read_arrays,
     write_checkpoint,
 )
-from r3jax.foreign.errors import ForeignFileError
+from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError

@@ -11,15 +11,17 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import build, check_type
-from r3jax.foreign.files import read_bytes
-from r3jax.foreign.images import MAX_PIXELS
-from r3jax.foreign.json_text import parse_json, sealed, unsealed
-from r3jax.foreign.names import check_relative
-from r3jax.foreign.versions import VersionError, check_version
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import build, check_type
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.images import MAX_PIXELS
+from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
+from r3jax.formats.validation.names import check_relative
+from r3jax.formats.validation.versions import VersionError, check_version
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.motion import Motion
+from r3jax.planning.policies import HOMES
+from r3jax.planning.policy import Policy
 from r3jax.trace.errors import RunError
 
 FORMAT = "r3jax-run"
@@ -111,6 +113,14 @@ def plain_settings(settings: Any) -> Any:
     if isinstance(settings, dict):
         return {str(name): plain_settings(value) for name, value in settings.items()}
     return np.asarray(settings).tolist()
+
+
+def policy_fields(policy: Policy) -> dict[str, Any]:
+    """Describes a policy as a header does: its name, its settings, and the class of a plug-in."""
+    fields = {"name": policy.name, "settings": settings_of(policy)}
+    if policy.name not in HOMES:  # its class finds it again
+        fields["class"] = f"{type(policy).__module__}:{type(policy).__qualname__}"
+    return fields
 
 
 def settings_of(policy: object) -> dict[str, Any]:

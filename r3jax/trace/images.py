@@ -13,8 +13,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.images import image_pixels
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.images import image_pixels
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
@@ -26,7 +26,7 @@ _PNG_LEVEL = 2
 
 
 def to_integers(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Colour [H, W, 3] uint8 and depth [H, W] uint16 in steps of 0.2 mm."""
+    """Color [H, W, 3] uint8 and depth [H, W] uint16 in steps of 0.2 mm."""
     rgb = np.rint(np.asarray(frame.rgb) * np.float32(255.0)).astype(np.uint8)
     depth = np.asarray(frame.depth)
     finite = np.where(np.isfinite(depth), depth, 0.0)
@@ -51,7 +51,7 @@ def from_integers(
 
 
 def stored_form(frame: Frame) -> Frame:
-    """The frame as it will be read back: rounded to 8-bit colour and 0.2 mm of depth."""
+    """The frame as it will be read back: rounded to 8-bit color and 0.2 mm of depth."""
     rgb, depth = to_integers(frame)
     return from_integers(rgb, depth, np.asarray(frame.T_world_camera), frame.camera)
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import check_type
-from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import parse_json, unsealed
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_type
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json, unsealed
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -56,7 +56,7 @@ class Run:
         return f"{self.end.outcome}: {self.end.message}"
 
     def image_path(self, step: int) -> Path:
-        """Where the colour image of a view lies."""
+        """Where the color image of a view lies."""
         return self.path / "frames" / f"{step:06d}.png"
 
     def depth_path(self, step: int) -> Path:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.fields import build
-from r3jax.foreign.json_text import parse_json, sealed, unsealed
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import build
+from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
 from r3jax.geometry.cameras import rigid_error
 from r3jax.planning.policy import Decision, PlanInfo
 
@@ -29,7 +29,7 @@ class Choice:
     """Its utility."""
 
     waypoints: np.ndarray
-    """Path of the camera centre [m], [K, 3]."""
+    """Path of the camera center [m], [K, 3]."""
 
     length: float
     """Length of that path [m]."""

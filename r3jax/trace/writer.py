@@ -17,9 +17,9 @@ from r3jax.files import (
     sync_folder,
     write_atomic,
 )
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.files import read_bytes
-from r3jax.foreign.json_text import sealed
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import sealed
 from r3jax.frame import Frame
 from r3jax.trace.checkpoints import CheckpointWriter
 from r3jax.trace.errors import RecordingStopped, RunError

@@ -9,9 +9,9 @@ import pytest
 
 import r3jax
 from r3jax.mapping.occupancy import mark_free_ball
-from r3jax.scenes import procedural
-from r3jax.scenes.registry import open_scene
 from r3jax.scoring.config import ScoringConfig
+from r3jax.simulators.scenes import procedural
+from r3jax.simulators.scenes.registry import open_scene
 from tests.conftest import is_measured
 
 VOXELS, EDGE = 60_000, 512

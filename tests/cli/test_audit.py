@@ -6,14 +6,14 @@ import json
 import numpy as np
 import pytest
 
-from r3jax.audit import seen
-from r3jax.audit.camera_paths import write_camera_path
-from r3jax.audit.survey import Wishes
+from r3jax.apps.audit import seen
+from r3jax.apps.audit.camera_paths import write_camera_path
+from r3jax.apps.audit.survey import Wishes
 from r3jax.cli import audit as command
 from r3jax.cli.captures import open_capture
 from r3jax.cli.main import main
 from r3jax.formats.nerfstudio import read_transforms
-from tests.audit.room import (
+from tests.apps.audit.room import (
     LENS,
     pose_at,
     round_poses,

@@ -5,8 +5,8 @@ import os
 
 import pytest
 
-from r3jax.benchmark import run_cell as running
-from r3jax.benchmark.record import CELLS
+from r3jax.apps.benchmark import run_cell as running
+from r3jax.apps.benchmark.record import CELLS
 from r3jax.cli.main import main
 from tests.box_room import write_room
 
@@ -81,14 +81,14 @@ def test_another_setting_makes_another_cell_beside_the_first(room, finished, cap
 
 @pytest.mark.full
 def test_a_cell_that_fails_is_named_and_the_exit_code_says_so(room, tmp_path, capsys, monkeypatch):
-    judge = running.judge
+    evaluate = running.evaluate
 
     def judge_one(*args, **kwargs):
         if len(list(tmp_path.glob("cells/*/snapshot-*.json"))) == 1:
             raise ArithmeticError("a bad day")
-        return judge(*args, **kwargs)
+        return evaluate(*args, **kwargs)
 
-    monkeypatch.setattr(running, "judge", judge_one)
+    monkeypatch.setattr(running, "evaluate", judge_one)
     assert benchmark(room, tmp_path) == 1
     error = capsys.readouterr().err
     assert "failed   room-frontier-seed0-" in error

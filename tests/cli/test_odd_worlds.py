@@ -11,7 +11,7 @@ import trimesh
 
 from r3jax.cli.main import main
 from r3jax.cli.setup import simulator_of_run
-from r3jax.scenes.registry import open_scene, scene_hash
+from r3jax.simulators.scenes.registry import open_scene, scene_hash
 from r3jax.trace.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore

@@ -3,7 +3,7 @@
 import pytest
 
 from r3jax.cli.main import main
-from r3jax.planning.policy import describe, policy_names, source_of
+from r3jax.planning.registry import describe, policy_names, source_of
 
 
 @pytest.fixture

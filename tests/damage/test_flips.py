@@ -12,13 +12,13 @@ import jax
 import numpy as np
 import pytest
 
+from r3jax.apps.report.model_report import read_judged_model
 from r3jax.cli.captures import open_capture
 from r3jax.cli.errors import UserError
 from r3jax.cli.main import main
 from r3jax.cli.options import Evaluate
 from r3jax.cli.selection import find_training
 from r3jax.cli.setup import plan_of_run, simulator_of_run
-from r3jax.evaluation.model_report import read_judged_model
 from r3jax.exploration import explore
 from r3jax.exploration.resume import state_tables
 from r3jax.splatting.checkpoints import read_checkpoint, settings_record

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from r3jax.benchmark.record import read_records
+from r3jax.apps.benchmark.record import read_records
 from r3jax.trace.reader import read_run
 from tests.box_room import write_room
 

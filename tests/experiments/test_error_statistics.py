@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from experiments.error_statistics import Draws
-from r3jax.evaluation.areas import sparsification
+from r3jax.apps.benchmark.results.areas import sparsification
 from r3jax.evaluation.statistics import partial_spearman
 from tests.mutants import Mutant, assert_caught, each, load
 

@@ -11,17 +11,16 @@ import pytest
 import r3jax
 from experiments import error_terms
 from experiments.error_terms import KAPPAS, PRODUCTS, column, columns_of, on_seen
-from r3jax.benchmark.record import read_records
-from r3jax.benchmark.run_cell import run_cell
+from r3jax.apps.benchmark.record import read_records
+from r3jax.apps.benchmark.run_cell import run_cell
 from r3jax.evaluation.maps import map_of
 from r3jax.geometry.cameras import pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.scenes.registry import open_scene
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.views import pinhole_view
-from r3jax.scoring.visibility import candidates_of, depth_buffer
-from r3jax.scoring.voxels import voxels_of
-from tests.benchmark.tiny import CONDITIONS, make_cells
+from r3jax.simulators.scenes.registry import open_scene
+from r3jax.visibility.depth_buffer import candidates_of, depth_buffer
+from r3jax.visibility.views import pinhole_view
+from tests.apps.benchmark.tiny import CONDITIONS, make_cells
 from tests.box_room import write_room
 
 pytestmark = pytest.mark.full
@@ -106,7 +105,7 @@ def test_terms_against_float64(state, poses, columns):
 @jax.jit
 def _shown(state, T):
     """The map's row that each pixel shows, and the rows' centers."""
-    voxels = voxels_of(state)
+    voxels = state
     view = pinhole_view(CONDITIONS.camera, T, CONFIG)
     return depth_buffer(voxels, candidates_of(voxels, view), view, CONFIG).item, voxels.center
 

@@ -7,8 +7,8 @@ import pytest
 
 from experiments import forecast as experiment
 from experiments.forecast import Known, error_row, read_views, write_page
-from r3jax.forecast.calibration import read_calibration
-from r3jax.forecast.psnr import STATISTICS
+from r3jax.apps.forecast.calibration import read_calibration
+from r3jax.apps.forecast.psnr import STATISTICS
 
 
 def known_views(offsets=(0.0, 0.5, -0.5)) -> Known:
@@ -87,7 +87,9 @@ def test_the_package_holds_the_small_calibration():
     root = experiment.Options().out
     views = read_views(root / "renderability_vs_error" / "small" / "views.csv")
     mine = views.calibration()
-    packaged = read_calibration(root.parents[1] / "r3jax" / "forecast" / "calibration.json")
+    packaged = read_calibration(
+        root.parents[1] / "r3jax" / "apps" / "forecast" / "calibration.json"
+    )
     assert packaged.source == mine.source
     np.testing.assert_allclose(packaged.model.location, mine.model.location, rtol=1e-6)
     np.testing.assert_allclose(packaged.errors["p10"], mine.errors["p10"], atol=1e-3)

@@ -11,8 +11,8 @@ from experiments.pool_choice import SCORED, choose, pool_of
 from experiments.pool_selection import Options
 from experiments.pool_table import gain_rows, mean_rows, result_rows
 from r3jax.geometry.cameras import Camera
-from r3jax.planning.policy import policy_names
-from r3jax.scenes.registry import open_scene
+from r3jax.planning.registry import policy_names
+from r3jax.simulators.scenes.registry import open_scene
 
 pytestmark = pytest.mark.full
 
@@ -94,7 +94,7 @@ def test_unexplored_cells_can_be_left_out(flat, poses, monkeypatch):
 
 
 def test_what_has_no_score_is_refused():
-    turning = {"ours-pano", "ours-demand", "ours-ahead"}
+    turning = {"ours-pano", "ours-ahead"}
     assert set(policy_names()) - set(SCORED) == turning | {"frontier"}
     with pytest.raises(ValueError, match=r"frontier cannot choose.*unseen-depth"):
         Options(policies=("ours", "frontier"))

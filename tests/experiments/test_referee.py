@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 
 from experiments import degeneracy, quality_over_budget, replica_dense
-from experiments.artefacts import Origin
+from experiments.artifacts import Origin
 from experiments.suite import Options, request_of
-from r3jax.planning.policy import policy_names
+from r3jax.planning.registry import policy_names
 from r3jax.trace.writer import RunWriter
 from tests.evaluation.records import record
 from tests.trace.runs import make_header, make_view

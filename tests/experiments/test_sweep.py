@@ -9,16 +9,16 @@ import tyro
 from PIL import Image
 
 from experiments import suite, sweep
-from experiments.artefacts import Origin
+from experiments.artifacts import Origin
 from experiments.settings import known_settings
 from experiments.sweep import Options
 from experiments.sweep_choice import Trial, choose, leave_one_out
 from experiments.sweep_page import Sweep, setting_figure, write_page
-from r3jax.benchmark.conditions import Conditions
-from r3jax.benchmark.engines.local import run_here
-from r3jax.benchmark.plan import Request
+from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.engines.local import run_here
+from r3jax.apps.benchmark.plan import Request
 from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
-from tests.benchmark.tiny import CONDITIONS, SETTINGS
+from tests.apps.benchmark.tiny import CONDITIONS, SETTINGS
 from tests.box_room import write_room
 from tests.evaluation.records import record
 

@@ -12,7 +12,8 @@ import jax
 
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.planning.policy import Policy, make_policy
+from r3jax.planning.policy import Policy
+from r3jax.planning.registry import make_policy
 from r3jax.scoring.config import ScoringConfig
 from r3jax.trace.header import camera_fields
 from r3jax.trace.writer import RunWriter

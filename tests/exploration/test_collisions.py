@@ -6,9 +6,9 @@ import pytest
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
-from r3jax.planning.policy import make_policy, policy_names
-from r3jax.scenes import procedural
-from r3jax.scenes.registry import open_scene
+from r3jax.planning.registry import make_policy, policy_names
+from r3jax.simulators.scenes import procedural
+from r3jax.simulators.scenes.registry import open_scene
 
 CONFIG = ExplorationConfig(clock="model", num_probes=1)
 CLEARANCE = 0.25

@@ -16,8 +16,8 @@ import pytest
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
-from r3jax.planning.policy import make_policy
-from r3jax.scenes.registry import open_scene
+from r3jax.planning.registry import make_policy
+from r3jax.simulators.scenes.registry import open_scene
 
 GOLDENS = Path(__file__).with_name("decisions.npz")
 SCENES = ("flat", "apartment")

@@ -17,7 +17,7 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import StopReason
 from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import empty_map
-from r3jax.scoring.sighting import look
+from r3jax.mapping.update import integrate_growing
 from r3jax.trace import checkpoints
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
@@ -82,7 +82,7 @@ def test_replaying_the_files_rebuilds_map_and_grid_bit_for_bit(recorded):
     start = jnp.asarray(simulator.start_pose[:3, 3], jnp.float32)
     grid = ball(grid, start, CONFIG.start_radius)
     for frame in run.frames():
-        map_state = look(map_state, frame, CONFIG.max_range)
+        map_state = integrate_growing(map_state, frame, CONFIG.max_range)
         grid = ball(add_to_grid(grid, frame, CONFIG.max_range), frame.position, CONFIG.body_radius)
     assert_trees_equal(map_state, result.state.map_state)
     assert_trees_equal(grid, result.state.grid)
@@ -141,8 +141,8 @@ def test_only_planning_mapping_and_flight_are_on_the_wall_clock(monkeypatch):
     monkeypatch.setattr(clock.time, "perf_counter", lambda: float(next(ticks)))
     config = replace(CONFIG, clock="wall")
     result = explore(BoxRoom(), Wander(), budget="views:4", config=config)
-    # Every timed call lasts one tick: one for planning, three for map, grid and policy.
-    expected = 4 * 3.0 + 3 * 1.0 + result.state.metres / config.speed
+    # Every timed call lasts one tick: one for planning, one for mapping.
+    expected = 4 * 1.0 + 3 * 1.0 + result.state.metres / config.speed
     assert result.state.seconds == pytest.approx(expected)
 
 

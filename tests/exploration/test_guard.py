@@ -12,7 +12,7 @@ import pytest
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator, OracleReadError
-from r3jax.planning.policy import make_policy, policy_names
+from r3jax.planning.registry import make_policy, policy_names
 from tests.exploration.toys import BoxRoom, Wander
 from tests.tiers import quick_and_full
 

@@ -24,7 +24,8 @@ import pytest
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.planning.policy import Policy, make_policy
+from r3jax.planning.policy import Policy
+from r3jax.planning.registry import make_policy
 from r3jax.scoring.config import ScoringConfig
 from r3jax.trace.header import camera_fields
 from r3jax.trace.reader import read_run

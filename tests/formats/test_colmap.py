@@ -189,7 +189,7 @@ DAMAGES = {
     "absolute": (replaced("images.txt", "a/first", "/etc/first"), "absolute path"),
     "short": (replaced("images.txt", " 3 a/first.png", ""), "line 5: an image takes 10 words"),
     "keypoints": (replaced("images.txt", " -1\n", "\n"), "line 3: keypoints take three numbers"),
-    "colour": (replaced("points3D.txt", "255", "256"), "colour 256 128 0"),
+    "color": (replaced("points3D.txt", "255", "256"), "color 256 128 0"),
     "track": (replaced("points3D.txt", " 99 3", " 99"), "line 1: the last element of the track"),
     "point twice": (replaced("points3D.txt", "\n5", "\n11"), "a point occurs twice"),
     "point": (replaced("points3D.txt", "-1 -2", "nan -2"), "position of point 5 is not finite"),

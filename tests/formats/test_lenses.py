@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from r3jax.foreign.errors import ForeignFileError
 from r3jax.formats.lenses import Lens, pinhole_lens
+from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import Camera
 
 EXAMPLES = [

@@ -58,7 +58,7 @@ def test_text_with_other_properties_and_elements(tmp_path):
     np.testing.assert_array_equal(rgb, [[255, 0, 51], [1, 2, 3]])
 
 
-def test_big_endian_fractions_and_no_colours(tmp_path):
+def test_big_endian_fractions_and_no_colors(tmp_path):
     head = TEXT.replace("ascii", "binary_big_endian").partition("end_header\n")
     fields = [(name, ">f8") for name in "xyz"] + [("nx", ">f4")]
     fields += [(name, ">f4") for name in ("red", "green", "blue")]
@@ -86,7 +86,7 @@ DAMAGES = {
     "NaN": (("0.1", "nan"), "position of point 0 is not finite"),
     "word": (("0.1", "one"), "point 0: could not convert"),
     "short": ((" 0 51", " 0"), "point 0 has 6 numbers, not 7"),
-    "colour": (("255 0 51", "1e400 0 51"), "no whole numbers"),
+    "color": (("255 0 51", "1e400 0 51"), "no whole numbers"),
 }
 
 

@@ -76,7 +76,7 @@ def _npy_head(descr: str, shape: tuple[int, ...]) -> bytes:
 
 
 def damage_png(rng: np.random.Generator, data: bytes) -> bytes:
-    """Another size, depth or colour type, bombs in side chunks; the checksums are right."""
+    """Another size, depth or color type, bombs in side chunks; the checksums are right."""
     parts = _png_chunks(data)
     how = rng.integers(5)
     if not parts or parts[0][0] != b"IHDR" or how == 0:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r3jax.forecast.calibration import read_calibration
-from r3jax.forecast.psnr import STATISTICS
+from r3jax.apps.forecast.calibration import read_calibration
+from r3jax.apps.forecast.psnr import STATISTICS
 from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
@@ -22,7 +22,7 @@ CASES = 300
 
 
 def seeds() -> list[Files]:
-    return [{"calibration.json": (files("r3jax.forecast") / "calibration.json").read_bytes()}]
+    return [{"calibration.json": (files("r3jax.apps.forecast") / "calibration.json").read_bytes()}]
 
 
 def read(folder: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r3jax.audit.camera_paths import is_camera_path, read_camera_path
+from r3jax.apps.audit.camera_paths import is_camera_path, read_camera_path
 from r3jax.formats.errors import FormatError
 from r3jax.geometry.cameras import rigid_error
 from tests.fuzz.referee import CASES_SLOW

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from r3jax.apps.report import revisits
 from r3jax.cli import audit, benchmark, evaluate, explore, merge, options, replay, train
 from r3jax.cli.main import main
-from r3jax.evaluation import revisits
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.simulators.meshes import load_world
 from r3jax.trace.header import header_to_json
@@ -185,7 +185,7 @@ def with_work_left_out() -> None:
     audit.audit = begin
     explore.explore = begin
     train.train.fit = begin
-    evaluate.judge = begin
+    evaluate.evaluate = begin
     benchmark.make_plan = begin
     merge.rebuild = begin
     replay.differences = begin

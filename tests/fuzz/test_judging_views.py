@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.benchmark.judging import JudgingViews, read_judging_views, save_judging_views
+from r3jax.apps.benchmark.judging import JudgingViews, read_judging_views, save_judging_views
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.splatting.views import Views
 from tests.fuzz.containers import Payload, npy, pickled, zipped

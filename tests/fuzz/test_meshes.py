@@ -14,8 +14,8 @@ import trimesh
 from PIL import Image
 
 from r3jax.geometry.cameras import Camera
-from r3jax.scenes.registry import open_world
 from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.scenes.registry import open_world
 from tests.fuzz.containers import zipped
 from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Fifo, Files
@@ -30,7 +30,7 @@ NAMES = ("scene.glb", "scene.gltf", "scene.ply", "scene.obj", "scene.stl", "scen
 
 
 def room(*, textured: bool) -> trimesh.Trimesh:
-    """A box from within, plain vertex colours or a texture."""
+    """A box from within, plain vertex colors or a texture."""
     box = trimesh.creation.box(extents=(4.0, 4.0, 3.0))
     box.invert()
     rng = np.random.default_rng(0)

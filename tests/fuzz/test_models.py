@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r3jax.cli.captures import open_capture
-from r3jax.cli.errors import UserError
-from r3jax.cli.options import Evaluate
-from r3jax.cli.selection import choose_views, find_training, mapped_views
-from r3jax.evaluation.model_report import (
+from r3jax.apps.report.model_report import (
     quality_note,
     quality_table,
     read_judged_model,
     training_figure,
 )
+from r3jax.cli.captures import open_capture
+from r3jax.cli.errors import UserError
+from r3jax.cli.options import Evaluate
+from r3jax.cli.selection import choose_views, find_training, mapped_views
 from r3jax.trace.errors import RunError
 from tests.fuzz import test_runs
 from tests.fuzz.mutate import mutate

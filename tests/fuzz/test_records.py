@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from r3jax.benchmark.record import read_records
+from r3jax.apps.benchmark.record import read_records
 from r3jax.cli.console import Console
 from r3jax.cli.results import print_results
 from tests.evaluation.records import record

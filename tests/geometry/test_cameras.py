@@ -20,7 +20,7 @@ from r3jax.geometry.cameras import (
 )
 from tests.strategies import directions, points
 
-CAMERA = Camera(12, 8, 9.0, 11.0, 5.5, 4.25)  # nothing square, nothing centred
+CAMERA = Camera(12, 8, 9.0, 11.0, 5.5, 4.25)  # nothing square, nothing centered
 
 pose = jax.jit(pose_along)
 pose_gradient = jax.jit(jax.jacfwd(pose_along, argnums=1))

@@ -19,7 +19,7 @@ group = jax.jit(real.group_by_voxel)
 
 
 def crowd(seed: int, reach: int, spacing: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points [NUM, 3], colours and validity: several points a voxel, voxels `spacing` apart."""
+    """Points [NUM, 3], colors and validity: several points a voxel, voxels `spacing` apart."""
     random = np.random.default_rng(seed)
     voxel = random.integers(-reach, reach, (NUM, 3)) * spacing
     inside = random.integers(0, 16, (NUM, 3)) / 16

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.mapping import join as real
-from r3jax.mapping.join import Statistics, bin_words, grow, merge
+from r3jax.mapping.join import Statistics, grow, merge
+from r3jax.mapping.seen import bin_words
 from r3jax.mapping.state import MapState, empty_map
 from tests.mapping.reference import Row, assert_same_rows, read_map
 from tests.mutants import Modules, Mutant, assert_caught, each, load
@@ -235,15 +236,15 @@ def law_merged_drops(modules: Modules) -> None:
 
 CHAIN = ("r3jax.mapping.join",)
 MUTANTS = [
-    Mutant("join", "weight = new.count / jnp.maximum(n, 1.0)",
+    Mutant("join", "weight = n_b / jnp.maximum(n, 1.0)",
            "weight = 1.0 / jnp.maximum(n, 1.0)", law_joins),
-    Mutant("join", "weight = new.count / jnp.maximum(n, 1.0)",
-           "weight = new.count / jnp.maximum(n_a, 1.0)", law_joins),
+    Mutant("join", "weight = n_b / jnp.maximum(n, 1.0)",
+           "weight = n_b / jnp.maximum(n_a, 1.0)", law_joins),
     Mutant("join", " + jnp.sum(d * d, axis=0) * n_a * weight", "", law_joins),
     Mutant("join", "jnp.sum(d * d, axis=0) * n_a * weight",
            "jnp.sum(d * d, axis=0) * weight", law_joins),
-    Mutant("join", "at(state.m2) + new.m2 +", "at(state.m2) +", law_joins),
-    Mutant("join", "d = new.mean - mean_a", "d = mean_a - new.mean", law_joins),
+    Mutant("join", "m2_a + m2_b +", "m2_a +", law_joins),
+    Mutant("join", "d = mean_b - mean_a", "d = mean_a - mean_b", law_joins),
     Mutant("join", "at(state.visited) | new.visited", "new.visited", law_joins),
     Mutant("join", "at(state.visited) | new.visited", "at(state.visited) ^ new.visited", law_joins),
     Mutant("join", "jnp.maximum(at(state.resolution), new.resolution)",

@@ -29,7 +29,7 @@ def colors_by_voxel(sighting: Sighting) -> dict[tuple[int, ...], np.ndarray]:
 
 
 def assert_found(lookup, state: MapState, sighting: Sighting, queries: np.ndarray) -> None:
-    """A point's row holds the mean colour of its voxel; points elsewhere have no row."""
+    """A point's row holds the mean color of its voxel; points elsewhere have no row."""
     rows = np.asarray(lookup(state, jnp.asarray(queries)))
     mean, expected = np.asarray(state.mean).T, colors_by_voxel(sighting)
     owners: dict[int, tuple[int, ...]] = {}
@@ -56,7 +56,7 @@ def test_points_find_their_row_in_a_grown_map(seen):
 
 
 def fixed_sighting() -> Sighting:
-    """Voxels at (i, -2 i, 3 i), far apart colours."""
+    """Voxels at (i, -2 i, 3 i), far apart colors."""
     number = np.arange(NUM_POINTS)[:, None]
     points = (number * [1, -2, 3] + 0.5) * VOXEL_SIZE
     random = np.random.default_rng(4)

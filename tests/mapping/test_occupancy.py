@@ -37,7 +37,7 @@ update = jax.jit(integrate_depth)
 
 
 def rays_world(T: np.ndarray) -> np.ndarray:
-    """Rays through the pixel centres, scaled to z = 1 in the camera, [H, W, 3]."""
+    """Rays through the pixel centers, scaled to z = 1 in the camera, [H, W, 3]."""
     slope = (np.arange(SIZE) + 0.5 - 0.5 * SIZE) / float(CAMERA.fx)
     u, v = np.meshgrid(slope, slope)
     return np.stack([u, v, np.ones_like(u)], axis=-1) @ T[:3, :3].T
@@ -234,7 +234,7 @@ def test_one_look_decides_anywhere_within_range(grid):
     """At 4.99 m one hit makes a cell occupied, one pass makes it free, and the steps are known."""
     position = [0.40, 2.5, 1.3]
     after = update(grid, frame_at(position, [5.5, 2.5, 1.3], depth=4.98))
-    hit = jnp.array([[5.38, 2.5, 1.3]])  # in a cell whose centre lies beyond the range
+    hit = jnp.array([[5.38, 2.5, 1.3]])  # in a cell whose center lies beyond the range
     passed = jnp.array([[2.5, 2.5, 1.3]])
     assert bool(after.occupied[tuple(world_to_cell(grid, hit)[0])])
     np.testing.assert_allclose(log_odds_at(after, hit)[0], 2.8 * 0.5, rtol=1e-5)

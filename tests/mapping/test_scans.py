@@ -168,7 +168,7 @@ BAD = {
     "mask of other points": ({"valid": np.ones(3, bool)}, r"valid must be \[4\] bool, got bool"),
     "mask of numbers": ({"valid": np.ones(4)}, r"valid must be \[4\] bool, got float32"),
     "point not finite": ({"points_world": np.full((4, 3), np.nan)}, "3 of 4 points are not finite"),
-    "colour out of range": ({"rgb": np.full((4, 3), 2.0)}, r"rgb must lie in \[0, 1\]"),
+    "color out of range": ({"rgb": np.full((4, 3), 2.0)}, r"rgb must lie in \[0, 1\]"),
 }
 
 

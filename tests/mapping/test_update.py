@@ -108,7 +108,7 @@ def test_many_pixels_of_one_voxel_are_one_observation():
 
 
 def test_long_sequences_keep_their_precision():
-    """300 frames of nearly one colour: sums of squares would cancel, Welford's do not."""
+    """300 frames of nearly one color: sums of squares would cancel, Welford's do not."""
     random = np.random.default_rng(2)
     seen = [random_sighting(i, reach=1) for i in range(300)]
     seen = [s._replace(rgb=np.float32(0.9 + 1e-3 * random.random((NUM_POINTS, 3)))) for s in seen]
@@ -225,7 +225,7 @@ def law_points(modules: Modules) -> None:
 
 
 def law_padding(modules: Modules) -> None:
-    """Points without a measurement, and whatever colour they have, take no part."""
+    """Points without a measurement, and whatever color they have, take no part."""
     add = jax.jit(modules["update"].integrate_points)
     sighting = SEEN[0]
     bad = np.resize(np.array([np.nan, 0.0, np.inf, -np.inf, 0.0], np.float32), (10, 3))
@@ -236,19 +236,19 @@ def law_padding(modules: Modules) -> None:
     assert_identical_rows(add(new_map(), *padded), map_of([sighting]))
 
 
-CHAIN = ("r3jax.mapping.update",)
+CHAIN = ("r3jax.mapping.seen", "r3jax.mapping.update")
 MUTANTS = [
-    Mutant("update", "offset = position - center", "offset = center - position", law_points),
-    Mutant("update", "offset = position - center",
-           "offset = position - center + 0.5 * state.voxel_size", law_points),
-    Mutant("update", "nearest_bin(offset / distance[None, :], state.num_bins)",
+    Mutant("seen", "position[:, None]) - center", "position[:, None]) + center", law_points),
+    Mutant("seen", "position[:, None]) - center",
+           "position[:, None]) - center + 0.5 * state.voxel_size", law_points),
+    Mutant("seen", "nearest_bin(offset / distance[None, :], state.num_bins)",
            "nearest_bin(offset / distance[None, :], 32)", law_points),
     Mutant("update", "count=valid.astype(jnp.float32)",
            "count=2.0 * valid.astype(jnp.float32)", law_points),
     Mutant("update", "m2=jnp.zeros(valid.shape, dtype=jnp.float32)",
            "m2=0.01 * valid.astype(jnp.float32)", law_points),
-    Mutant("update", "resolution=focal / distance", "resolution=1.0 / distance", law_points),
-    Mutant("update", "resolution=focal / distance", "resolution=focal * distance", law_points),
+    Mutant("seen", ", focal / distance", ", 1.0 / distance", law_points),
+    Mutant("seen", ", focal / distance", ", focal * distance", law_points),
     Mutant("update", "sums[:3] / jnp.maximum(sums[3:], 1.0)", "sums[:3] / 2.0", law_points),
     Mutant("update", "leaders, chunk * size, size", "leaders, 2 * chunk * size, size", law_points),
     Mutant("update", "(num_voxels + (size - 1)) // size", "1", law_points),

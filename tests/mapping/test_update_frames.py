@@ -21,7 +21,7 @@ from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.strategies import VOXEL_SIZE
 
 HEIGHT, WIDTH, CAPACITY = 12, 16, 512  # one shape: one compile
-CAMERA = Camera(WIDTH, HEIGHT, 16.0, 32.0, 7.5, 6.5)  # nothing square, nothing centred
+CAMERA = Camera(WIDTH, HEIGHT, 16.0, 32.0, 7.5, 6.5)  # nothing square, nothing centered
 TURNS = {
     "x": np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
     "-x": np.array([[0, 0, -1], [1, 0, 0], [0, -1, 0]]),
@@ -31,7 +31,7 @@ TURNS = {
 
 
 def frame_of(depth: np.ndarray, turn: str = "x", seed: int = 0) -> Frame:
-    """A frame of random colours; the camera stands at a multiple of 1/1024 m."""
+    """A frame of random colors; the camera stands at a multiple of 1/1024 m."""
     random = np.random.default_rng(seed)
     T = np.eye(4)
     T[:3, :3] = TURNS[turn]
@@ -65,10 +65,23 @@ def reference_of(frames: list[Frame], takes_part: list[np.ndarray]) -> Reference
     return reference
 
 
-def map_of(frames: list[Frame], integrate=integrate, **options) -> MapState:
+def pixels_of(module):
+    """The part of `integrate` that the pixels decide, which the reference knows."""
+    update = jax.jit(module.integrate_pixels)
+
+    def add(state, frame, max_range=np.inf, drop_edges=True):
+        return update(state, frame, jnp.float32(max_range), jnp.asarray(drop_edges))
+
+    return add
+
+
+PIXELS = pixels_of(real)
+
+
+def map_of(frames: list[Frame], add=PIXELS, **options) -> MapState:
     state = new_map(CAPACITY)
     for frame in frames:
-        state = integrate(state, frame, **options)
+        state = add(state, frame, **options)
     return state
 
 
@@ -131,7 +144,7 @@ def test_the_same_frame_again_adds_observations_but_no_noise():
 @pytest.mark.parametrize("depth", [0.0, np.inf])
 def test_a_frame_without_measurements_changes_nothing(depth):
     before = map_of(FRAMES)
-    after = integrate(before, frame_of(np.full((HEIGHT, WIDTH), depth, np.float32)))
+    after = PIXELS(before, frame_of(np.full((HEIGHT, WIDTH), depth, np.float32)))
     jax.tree.map(np.testing.assert_array_equal, after, before)
 
 
@@ -150,7 +163,7 @@ def test_frames_scan_into_a_map():
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *FRAMES)
     step = lambda state, frame: (integrate(state, frame), None)
     scanned, _ = jax.lax.scan(step, new_map(CAPACITY), stacked)
-    assert_same_rows(read_map(scanned), read_map(map_of(FRAMES)))
+    assert_same_rows(read_map(scanned), read_map(map_of(FRAMES, integrate)))
 
 
 def test_sweeps_over_numbers_compile_once():
@@ -168,7 +181,7 @@ def test_a_map_may_be_updated_in_place():
     state = new_map(CAPACITY)
     for frame in FRAMES:
         state = integrate(state, frame, donate=True)
-    assert_identical_rows(state, map_of(FRAMES))
+    assert_identical_rows(state, map_of(FRAMES, integrate))
 
 
 @pytest.mark.parametrize("max_range", [0.0, -1.0, np.nan])
@@ -185,7 +198,7 @@ def law_frames(modules: Modules) -> None:
     measured = [is_measured(frame) for frame in FRAMES]
     reference = reference_of(FRAMES, measured)
     assert reference.clearance > 1e-6
-    state = map_of(FRAMES, modules["update"].integrate, drop_edges=False)
+    state = map_of(FRAMES, pixels_of(modules["update"]), drop_edges=False)
     assert_same_rows(read_map(state), reference.rows())
 
 
@@ -196,14 +209,14 @@ def law_edges(modules: Modules) -> None:
     assert 0.1 < edges.mean() < 0.7
     inside = reference_of([frame], [measured & ~edges]).rows()
     assert len(inside) < len(reference_of([frame], [measured]).rows())
-    assert_same_rows(read_map(map_of([frame], modules["update"].integrate)), inside)
+    assert_same_rows(read_map(map_of([frame], pixels_of(modules["update"]))), inside)
 
 
 def law_range(modules: Modules) -> None:
     """1.5 m is the depth of the nearest surface, whatever the length of its rays."""
     near = [np.asarray(frame.depth) == 1.5 for frame in FRAMES]
     options = {"max_range": 1.5, "drop_edges": False}
-    state = map_of(FRAMES, modules["update"].integrate, **options)
+    state = map_of(FRAMES, pixels_of(modules["update"]), **options)
     assert_same_rows(read_map(state), reference_of(FRAMES, near).rows())
 
 

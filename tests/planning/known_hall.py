@@ -15,7 +15,7 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.explorable import mask_unexplorable
 from r3jax.planning.travel import safe_cells
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.foresight import foresee
+from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.utility import visible_unexplored
 from tests.exploration.hall import Hall
 
@@ -57,6 +57,6 @@ def after_view(world: Known, T: Array) -> Known:
     """What is known after an imagined view, with every row of the map and every cell."""
     state, grid = world
     shown = visible_unexplored(state, grid, CAMERA, T, SCORING)
-    state, _ = foresee(state, CAMERA, T, SCORING)
+    state, _ = simulate_view(state, CAMERA, T, SCORING)
     log_odds = jnp.where(shown, LOG_ODDS_LIMIT, grid.log_odds)
     return state, eqx.tree_at(lambda g: g.log_odds, grid, log_odds)

@@ -26,7 +26,7 @@ def grid_of(free: np.ndarray, occupied: np.ndarray | None = None) -> OccupancyGr
 
 
 def center(*cell: float) -> np.ndarray:
-    """Centre of a cell in the world [m]."""
+    """Center of a cell in the world [m]."""
     return ORIGIN + (np.array(cell, float) + 0.5) * CELL
 
 

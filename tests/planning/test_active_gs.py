@@ -195,7 +195,7 @@ def law_regions(modules: Modules) -> None:
     count, total = module.low_confidence(state, seen, grid)
     expected_count = np.zeros(free.shape, int)
     expected_total = np.zeros((3, *free.shape))
-    centers = np.asarray(r3jax.scoring.voxels.voxels_of(state).center, float)
+    centers = np.asarray(state.center, float)
     confidence, normals = np.asarray(seen.confidence), np.asarray(seen.normal, float)
     for row in np.flatnonzero(np.asarray(state.occupied)):
         cell = np.floor((centers[:, row] - ORIGIN) / CELL).astype(int)

@@ -7,10 +7,10 @@ import pytest
 
 from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.occupancy import empty_grid
+from r3jax.mapping.seen import rows_in_view
 from r3jax.planning.policies.active_gs.confidence import aligned, no_sightings, see
 from r3jax.planning.policies.active_gs.glance import glance
-from r3jax.planning.policy import make_policy
-from r3jax.scoring.sighting import looked_at
+from r3jax.planning.registry import make_policy
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.test_active_gs_confidence import RANGE, frames, maps
 
@@ -35,7 +35,7 @@ def law_glance(modules: Modules) -> None:
     in_float64 = lambda x: np.asarray(x, dtype=np.float64)
     for frame, state, before, touched in history():
         after = modules["glance"].glance(before, touched, state, frame, REACH)
-        seen = np.asarray(looked_at(state, frame, REACH))
+        seen = np.asarray(rows_in_view(state, frame, REACH))
         is_touched = np.asarray(touched.views) > np.asarray(before.views)
         known = np.asarray(touched.views) > 0
         rows = np.flatnonzero(seen & known & ~is_touched)
@@ -69,7 +69,7 @@ def test_glances_are_what_a_loop_says():
 def test_a_look_may_raise_confidence_but_never_the_cosines_of_what_is_hidden():
     frame, state, before, touched = history()[-1]
     after = glance(before, touched, state, frame, REACH)
-    hidden = ~np.asarray(looked_at(state, frame, REACH))
+    hidden = ~np.asarray(rows_in_view(state, frame, REACH))
     assert hidden.any()
     np.testing.assert_array_equal(
         np.asarray(after.cosine_sum)[hidden], np.asarray(touched.cosine_sum)[hidden]
@@ -94,7 +94,7 @@ def test_the_policy_takes_note_of_pixels_and_glances(name):
 
 MUTANTS = [
     Mutant("glance", "(touched.views == before.views)", "True", law_glance),
-    Mutant("glance", "looked_at(state, frame, max_range) & ", "", law_glance),
+    Mutant("glance", "rows_in_view(state, frame, max_range) & ", "", law_glance),
     Mutant("glance", "1.0 - distance / max_range", "1.0", law_glance),
     Mutant("glance", "touched.normal * direction", "-touched.normal * direction", law_glance),
 ]

@@ -14,7 +14,6 @@ from r3jax.planning.candidates import (
     random_directions,
     region_of_interest,
     spread,
-    standpoints,
 )
 from r3jax.planning.travel import plan_travel
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, two_rooms
@@ -138,36 +137,6 @@ def test_the_same_key_draws_the_same_candidates(travel):
     assert not np.array_equal(first, other)
     raw = local_random(travel, 20, key=jax.random.key_data(KEY))
     np.testing.assert_array_equal(first, raw)
-
-
-def test_standpoints_are_spread_over_the_places_to_stop_within_reach(travel):
-    places = standpoints(travel, 12, travel.start[None], np.inf, key=KEY)
-    assert places.shape == (12, 3)
-    assert travel.goals[tuple(cells_of(places).T)].all()
-    rooms = cells_of(places)[:, 0] > 12
-    assert 0.3 < rooms.mean() < 0.7
-    gaps = np.linalg.norm(places[:, None] - places[None], axis=-1) + 9.0 * np.eye(12)
-    assert gaps.min() > 0.6  # by chance two of twelve are nearer than that
-    near = standpoints(travel, 12, travel.start[None], 0.7, key=KEY)
-    distance = np.linalg.norm(near - travel.start, axis=1)
-    assert 0.5 < distance.max() < 0.8
-    other = standpoints(travel, 12, travel.start[None], np.inf, key=jax.random.fold_in(KEY, 1))
-    assert not np.array_equal(places, other)
-    np.testing.assert_array_equal(
-        places, standpoints(travel, 12, travel.start[None], np.inf, key=KEY)
-    )
-
-
-def test_standpoints_are_as_many_as_wanted_wherever_the_robot_is():
-    free = np.zeros((9, 9, 9), bool)
-    free[3:6, 3:6, 3:6] = True  # one cell keeps the margin
-    tight = plan_travel(grid_of(free), center(4, 4, 4))
-    places = standpoints(tight, 5, center(4, 4, 4)[None], 1.0, key=KEY)
-    assert {tuple(c) for c in cells_of(places)} == {(4, 4, 4)}
-    nowhere = plan_travel(grid_of(np.zeros((9, 9, 9), bool)), center(4, 4, 4))
-    candidates = np.stack([center(4, 4, 4), center(1, 1, 1)])
-    places = standpoints(nowhere, 5, candidates, 1.0, key=KEY)
-    np.testing.assert_array_equal(places, candidates[[0, 1, 0, 1, 0]])
 
 
 @given(st.integers(0, 500), st.integers(1, 12))

@@ -27,7 +27,7 @@ def flood(mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 
 
 def neighbors(mask: np.ndarray) -> np.ndarray:
-    """Cells with a face neighbour in the mask."""
+    """Cells with a face neighbor in the mask."""
     padded = np.pad(mask, 1)
     shifted = [np.roll(padded, s, a)[1:-1, 1:-1, 1:-1] for a in range(3) for s in (-1, 1)]
     return np.any(shifted, axis=0)

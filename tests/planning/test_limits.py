@@ -68,7 +68,7 @@ def law_obeyed(modules: Modules, seed: int = 0) -> None:
         for spread in (0.05, 1.0, 5.0):
             poses = views(seed, spread)
             before = poses.copy()
-            obeyed = limits.obeyed(poses)
+            obeyed = limits.project_to_feasible(poses)
             np.testing.assert_array_equal(poses, before)
             # float32 poses know angles near none and near straight up to some hundredths only.
             assert is_allowed(limits, obeyed, 0.1).all()
@@ -80,7 +80,7 @@ def law_obeyed(modules: Modules, seed: int = 0) -> None:
             assert np.all(obeyed[:, 2, 1] <= 1e-6)  # nobody's head is down
             was_fine = is_allowed(limits, poses, -0.1)
             np.testing.assert_array_equal(obeyed[was_fine], poses[was_fine])
-            np.testing.assert_allclose(limits.obeyed(obeyed), obeyed, atol=1e-6)
+            np.testing.assert_allclose(limits.project_to_feasible(obeyed), obeyed, atol=1e-6)
             np.testing.assert_array_equal(obeyed[:, :2, 3], poses[:, :2, 3])
 
 
@@ -91,16 +91,20 @@ def law_nearest(modules: Modules) -> None:
     tilted = module.Limits(MOTIONS["gimbal"], now)
     up = poses_along(here[None], np.array([[0.0, -1.0, 1.0]]))
     half = math.sqrt(0.75)
-    np.testing.assert_allclose(tilted.obeyed(up)[0, :3, 2], [0.0, -half, 0.5], atol=1e-6)
+    np.testing.assert_allclose(
+        tilted.project_to_feasible(up)[0, :3, 2], [0.0, -half, 0.5], atol=1e-6
+    )
     walking = module.Limits(Motion(turn_per_meter=90.0), now)
     place = np.array([[0.3, 0.4, 0.0]])
     back = poses_along(place, np.array([[-1.0, 1e-3, 0.0]]))
     root = math.sqrt(0.5)
-    np.testing.assert_allclose(walking.obeyed(back)[0, :3, 2], [root, root, 0.0], atol=1e-6)
+    np.testing.assert_allclose(
+        walking.project_to_feasible(back)[0, :3, 2], [root, root, 0.0], atol=1e-6
+    )
     # Across the azimuth where the angles begin again: 20 degrees are 20, not 340.
     wrapped = module.Limits(Motion(turn_per_meter=90.0), _level(170.0, here))
     there = _level(-170.0, place[0])[None]
-    np.testing.assert_array_equal(wrapped.obeyed(there), there)
+    np.testing.assert_array_equal(wrapped.project_to_feasible(there), there)
 
 
 def _level(degrees: float, place: np.ndarray) -> np.ndarray:
@@ -153,7 +157,7 @@ def law_turns(modules: Modules, seed: int = 0) -> None:
     gimbal = modules["limits"].Limits(Motion(elevations=TURNING.elevations))
     for position, row in zip(positions, may, strict=True):
         poses = poses_along(np.tile(position, (len(directions), 1)), directions)
-        settled = gimbal.obeyed(poses)
+        settled = gimbal.project_to_feasible(poses)
         straight = np.linalg.norm(position - limits.T_world_camera[:3, 3])
         gap = 90.0 * straight - turn(limits.T_world_camera, settled)
         clear = np.abs(gap) > 0.1

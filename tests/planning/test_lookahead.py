@@ -12,12 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from r3jax.planning import lookahead as real
 from r3jax.planning.candidates import poses_along
-from r3jax.planning.config import PlannerConfig
 from r3jax.planning.limits import Limits
 from r3jax.planning.motion import Motion
 from r3jax.planning.travel import plan_travel
-from r3jax.scoring.batch import keep_positions_near, score_positions
-from r3jax.scoring.near import near
+from r3jax.scoring.batch import cache_positions_near, score_positions
+from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama import panorama
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.known_hall import CAMERA, CONFIG, SCORING, after_view, for_scoring
@@ -26,10 +25,11 @@ from tests.planning.rooms import center, grid_of, two_rooms
 PLACES = np.array([[1.0, 0.9, 1.2], [1.9, 0.9, 1.2], [1.0, 1.8, 1.2], [1.9, 1.7, 1.2]])
 """Each 0.7 m or more from the others."""
 
-WIDE = dataclasses.replace(CONFIG, horizon=3, beam=100, branching=len(PLACES) + 1)
+AHEAD = real.AheadConfig(**vars(CONFIG))
+WIDE = dataclasses.replace(AHEAD, horizon=3, beam=100, branching=len(PLACES) + 1)
 
 
-def outlook_of(config: PlannerConfig, view_seconds: float = 1.0) -> real.Outlook:
+def outlook_of(config: real.AheadConfig, view_seconds: float = 1.0) -> real.BeamProblem:
     """The places, seen from the first one; ways are straight."""
     state, grid = for_scoring()
     panoramas = score_positions(state, grid, CAMERA, PLACES, SCORING)
@@ -39,17 +39,17 @@ def outlook_of(config: PlannerConfig, view_seconds: float = 1.0) -> real.Outlook
     config = dataclasses.replace(config, view_seconds=view_seconds)
     utility = np.asarray(panoramas.best_score, np.float64)
     start, places = at_hand(), jnp.asarray(PLACES, jnp.float32)
-    _, kept = keep_positions_near(*start, CAMERA, places, SCORING)
-    return real.Outlook(poses, utility, gap[0], gap, kept, start, CAMERA, config)
+    _, kept = cache_positions_near(*start, CAMERA, places, SCORING)
+    return real.BeamProblem(poses, utility, gap[0], gap, kept, start, CAMERA, config)
 
 
 def at_hand():
     state, grid = for_scoring()
-    voxels, cells, _ = near(state, grid, jnp.asarray(PLACES, jnp.float32), SCORING)
+    voxels, cells, _ = gather_in_range(state, grid, jnp.asarray(PLACES, jnp.float32), SCORING)
     return voxels, cells
 
 
-def all_paths(outlook: real.Outlook, horizon: int) -> dict[tuple[int, ...], float]:
+def all_paths(problem: real.BeamProblem, horizon: int) -> dict[tuple[int, ...], float]:
     """The rate of every path, each view on the whole map as it is after those before it."""
     rates, worlds = {}, {(): (for_scoring(), 0.0, 0.0)}
     for length in range(1, horizon + 1):
@@ -57,9 +57,9 @@ def all_paths(outlook: real.Outlook, horizon: int) -> dict[tuple[int, ...], floa
             world, gained, seconds = worlds[path[:-1]]
             place = jnp.asarray(PLACES[path[-1]], jnp.float32)
             view = panorama(*world, CAMERA, place, SCORING)
-            way = outlook.between[path[-2], path[-1]] if length > 1 else outlook.lengths[path[-1]]
+            way = problem.between[path[-2], path[-1]] if length > 1 else problem.lengths[path[-1]]
             gained = gained + float(view.best_score)
-            seconds = seconds + way + outlook.config.view_seconds
+            seconds = seconds + way + problem.config.view_seconds
             worlds[path] = (after_view(world, view.T_world_camera), gained, seconds)
             if length == horizon:
                 rates[path] = gained / seconds
@@ -68,9 +68,9 @@ def all_paths(outlook: real.Outlook, horizon: int) -> dict[tuple[int, ...], floa
 
 def law_paths(modules: Modules) -> None:
     """With room for all of them, the search finds the best path of three views."""
-    outlook = outlook_of(WIDE)
-    found = modules["lookahead"].search(outlook)
-    rates = all_paths(outlook, 3)
+    problem = outlook_of(WIDE)
+    found = modules["lookahead"].search(problem)
+    rates = all_paths(problem, 3)
     best = max(rates, key=lambda path: rates[path])
     assert found[0].places == best
     for path in found[:20]:
@@ -87,9 +87,9 @@ def test_a_beam_with_room_for_all_finds_the_best_path():
 @pytest.mark.full
 def test_a_narrow_beam_keeps_its_promise():
     """Not the best path, perhaps, but its rate is true, and views never add less than nothing."""
-    outlook = outlook_of(dataclasses.replace(CONFIG, horizon=3, beam=2, branching=5))
-    rates = all_paths(outlook, 3)
-    found = real.search(outlook)
+    problem = outlook_of(dataclasses.replace(AHEAD, horizon=3, beam=2, branching=5))
+    rates = all_paths(problem, 3)
+    found = real.search(problem)
     assert len(found) == 2
     for path in found:
         assert path.rate == pytest.approx(rates[path.places], rel=1e-4)
@@ -99,9 +99,9 @@ def test_a_narrow_beam_keeps_its_promise():
 
 def law_one_view(modules: Modules) -> None:
     """A horizon of one is the next-best view, by gain over time."""
-    outlook = outlook_of(dataclasses.replace(WIDE, horizon=1), view_seconds=0.3)
-    found = modules["lookahead"].search(outlook)
-    rate = outlook.utility / (0.3 + outlook.lengths)
+    problem = outlook_of(dataclasses.replace(WIDE, horizon=1), view_seconds=0.3)
+    found = modules["lookahead"].search(problem)
+    rate = problem.utility / (0.3 + problem.lengths)
     assert found[0].places == (int(np.argmax(rate)),)
     assert found[0].rate == pytest.approx(rate.max())
 
@@ -117,8 +117,10 @@ def law_motion(modules: Modules) -> None:
     start = poses_along(PLACES[:1], np.array([[0.0, 1.0, 0.0]]))[0]
     limits = Limits(motion, start)
     flying = outlook_of(dataclasses.replace(WIDE, horizon=2), view_seconds=0.3)
-    outlook = dataclasses.replace(flying, poses=limits.obeyed(flying.poses), limits=limits)
-    found = modules["lookahead"].search(outlook)
+    problem = dataclasses.replace(
+        flying, poses=limits.project_to_feasible(flying.poses), limits=limits
+    )
+    found = modules["lookahead"].search(problem)
     assert len(found) > 10
     for path in found:
         seconds, here, place = 0.0, start, None
@@ -154,8 +156,8 @@ def test_choices_lie_apart():
 
 @pytest.mark.full
 def test_no_way_no_path():
-    outlook = dataclasses.replace(outlook_of(WIDE), lengths=np.full(len(PLACES), np.inf))
-    assert real.search(outlook) == []
+    problem = dataclasses.replace(outlook_of(WIDE), lengths=np.full(len(PLACES), np.inf))
+    assert real.search(problem) == []
 
 
 @given(st.integers(0, 1000))
@@ -187,19 +189,19 @@ def test_ways_between_rooms_lead_through_the_door():
     assert between[0, 1] > 1.6
 
 
-CHAIN = ("r3jax.scoring.foresight", "r3jax.planning.lookahead")
+CHAIN = ("r3jax.scoring.simulated", "r3jax.planning.lookahead")
 _TAKEN = "T = jnp.asarray(path.poses[-1]"
 _SECONDS = "seconds=path.seconds + float(cost[i])"
 _FIRST = "cost = config.view_seconds + ways"
 MUTANTS = [
     Mutant("lookahead", _TAKEN, "T = jnp.asarray(path.poses[0]", law_paths),
-    Mutant("lookahead", "outlook.between[last]", "outlook.lengths", law_paths),
+    Mutant("lookahead", "problem.between[last]", "problem.lengths", law_paths),
     Mutant("lookahead", _SECONDS, "seconds=float(cost[i])", law_paths),
     Mutant("lookahead", "return sum(self.gains) /", "return self.gains[-1] /", law_paths),
     Mutant("lookahead", _FIRST, "cost = ways", law_one_view),
     Mutant("lookahead", " + turning[k]", "", law_motion),
-    Mutant("lookahead", "poses = limits.obeyed(poses)", "pass", law_motion),
-    Mutant("lookahead", "ways / outlook.speed", "ways", law_motion),
+    Mutant("lookahead", "poses = limits.project_to_feasible(poses)", "pass", law_motion),
+    Mutant("lookahead", "ways / problem.speed", "ways", law_motion),
     Mutant("lookahead", "< _TURNED", "> _TURNED", law_apart),
     Mutant("lookahead", "others = list(taken)", "others = []", law_apart),
 ]

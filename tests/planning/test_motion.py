@@ -16,7 +16,7 @@ from r3jax.planning.motion import (
     motion_of,
     motion_of_record,
 )
-from r3jax.planning.policy import make_policy
+from r3jax.planning.registry import make_policy
 from r3jax.trace.header import settings_of
 
 

@@ -113,7 +113,7 @@ def law_heights_count_from_the_first_view(modules: Modules) -> None:
     higher[2, 3] += 0.1
     for pose in (first, higher):
         args = state, empty_map(64), GRID, pose, config
-        state, travel, _ = modules["decision"].look_round(*args)
+        state, travel, _ = modules["decision"].prepare_decision(*args)
         low, high = first[2, 3] - 0.6, first[2, 3] + 0.4
         np.testing.assert_allclose(travel.heights, (low, high), atol=1e-6)
     assert modules["decision"].initial_state(CAMERA, GRID).start_height is None
@@ -158,8 +158,8 @@ def law_pool_waits_for_turns(modules: Modules) -> None:
 
 def _is_cut_short(limits: Limits, poses: np.ndarray) -> np.ndarray:
     """Which poses the carrier cannot turn to, once their elevations are allowed."""
-    tilted = Limits(Motion(elevations=limits.motion.elevations)).obeyed(poses)
-    gap = np.abs(limits.obeyed(poses)[:, :3, :3] - tilted[:, :3, :3])
+    tilted = Limits(Motion(elevations=limits.motion.elevations)).project_to_feasible(poses)
+    gap = np.abs(limits.project_to_feasible(poses)[:, :3, :3] - tilted[:, :3, :3])
     return gap.max(axis=(1, 2)) > 1e-4
 
 
@@ -192,8 +192,8 @@ def test_law(law):
 
 
 MUTANTS = [
-    Mutant("greedy", "limits.obeyed(drawn.poses)", "drawn.poses", LAWS[0]),
-    Mutant("greedy", "            poses = limits.obeyed(poses)\n", "", LAWS[1]),
+    Mutant("greedy", "limits.project_to_feasible(drawn.poses)", "drawn.poses", LAWS[0]),
+    Mutant("greedy", "            poses = limits.project_to_feasible(poses)\n", "", LAWS[1]),
     Mutant("greedy", "pose, travel.heights)", "pose)", LAWS[0]),
     Mutant("greedy", "limits.path_costs(lengths, poses)", "lengths", law_turns_cost),
     Mutant("greedy", "memory, self.config.motion)", "memory)", LAWS[3]),

@@ -16,7 +16,8 @@ from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.motion import MOTIONS, Motion
-from r3jax.planning.policy import Outcome, make_policy, policy_names
+from r3jax.planning.policy import Outcome
+from r3jax.planning.registry import make_policy, policy_names
 from r3jax.scoring import batch
 from r3jax.scoring.config import ScoringConfig
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, known_flat, pose_at

@@ -14,7 +14,7 @@ import r3jax
 from r3jax.geometry.cameras import look_at
 from r3jax.planning import next_views as real
 from r3jax.scoring.batch import score_positions, score_views, score_views_near
-from r3jax.scoring.foresight import foresee
+from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.utility import view_utility
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.known_hall import (
@@ -107,8 +107,8 @@ def test_a_view_never_adds_more_after_other_views(seed):
     state, grid = for_scoring()
     first, second, view = jnp.asarray(poses_of(seed)[:3], jnp.float32)
     utility = lambda s: float(view_utility(s, grid, CAMERA, view, SCORING).rendering)
-    one, _ = foresee(state, CAMERA, first, SCORING)
-    both, _ = foresee(one, CAMERA, second, SCORING)
+    one, _ = simulate_view(state, CAMERA, first, SCORING)
+    both, _ = simulate_view(one, CAMERA, second, SCORING)
     assert utility(state) + 1e-3 >= utility(one)
     assert utility(one) + 1e-3 >= utility(both) >= 0.0
 
@@ -159,13 +159,13 @@ def test_what_cannot_be_chosen_from_is_refused():
         r3jax.next_views(state, unknown, CAMERA, 1, config=CONFIG)
 
 
-CHAIN = ("r3jax.scoring.foresight", "r3jax.planning.next_views")
+CHAIN = ("r3jax.mapping.seen", "r3jax.scoring.simulated", "r3jax.planning.next_views")
 MUTANTS = [
     Mutant("next_views", "is_new[:] = False", "is_new[:] = True", law_greedy),
     Mutant("next_views", "left[best] -= 1", "left[best] -= 0", law_each_once),
     Mutant("next_views", "np.argsort(-bound[stale]", "np.argsort(bound[stale]", law_lazy),
-    Mutant("foresight", "& ~visible_cells", "| visible_cells", law_greedy),
-    Mutant("foresight", "visited[:, index] | words", "visited[:, index]", law_greedy),
+    Mutant("simulated", "& ~visible_cells", "| visible_cells", law_greedy),
+    Mutant("seen", "visited[:, index] | words", "visited[:, index]", law_greedy),
 ]
 
 

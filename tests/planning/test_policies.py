@@ -15,12 +15,12 @@ from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decision import ENOUGH_LOOKS, initial_state, look_round, net_utility
-from r3jax.planning.policies.demand import OursDemand
+from r3jax.planning.decision import ENOUGH_LOOKS, initial_state, net_utility, prepare_decision
 from r3jax.planning.policies.frontier import Frontier
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policies.renderability import Ours, OursPano
-from r3jax.planning.policy import Outcome, Policy, describe, make_policy, policy_names, source_of
+from r3jax.planning.policy import Outcome, Policy
+from r3jax.planning.registry import describe, make_policy, policy_names, source_of
 from r3jax.planning.travel import plan_travel
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 from tests.planning.test_travel import assert_inside
@@ -28,8 +28,7 @@ from tests.planning.test_travel import assert_inside
 KEY = jax.random.key(3)
 CAMERA = Camera.from_fov(64, 64)
 NUM = 40
-NUM_STANDPOINTS = 9
-CONFIG = PlannerConfig(num_candidates=NUM, num_frontier=12, num_standpoints=NUM_STANDPOINTS)
+CONFIG = PlannerConfig(num_candidates=NUM, num_frontier=12)
 
 
 def flat():
@@ -47,11 +46,10 @@ def prefer_high_x(map_state, grid, camera, poses, config):
     return SimpleNamespace(exploration=x * 0 + 1, rendering=(x + 2) ** 2, total=(x + 2) ** 2 + 1)
 
 
-def look_down(map_state, grid, camera, positions, config, allowed, standpoints=None):
+def look_down(map_state, grid, camera, positions, config, allowed):
     """A stand-in for `score_positions`: straight down is best, high positions above all."""
     assert positions.shape == (NUM, 3)
     assert allowed.shape == (NUM, 526)
-    assert standpoints is None or standpoints.shape == (NUM_STANDPOINTS, 3)
     down = np.tile([0.0, 0.0, -1.0], (NUM, 1))
     return SimpleNamespace(
         T_world_camera=poses_along(positions, down).astype(np.float32),
@@ -63,7 +61,6 @@ def policies() -> list:
     return [
         Ours(CONFIG, prefer_high_x),
         OursPano(CONFIG, look_down),
-        OursDemand(CONFIG, look_down),
         Frontier(CONFIG),
         Random(CONFIG),
     ]
@@ -165,32 +162,15 @@ def test_ours_mixes_local_views_with_views_of_the_frontier(world):
     assert np.linalg.norm(offset, axis=1).max() <= 0.5
 
 
-@pytest.mark.parametrize("policy_class", [OursPano, OursDemand])
-def test_pano_takes_the_direction_from_the_panorama(policy_class, world):
-    decision, _, _ = decide(policy_class(CONFIG, look_down), world, center(6, 6, 4))
+def test_pano_takes_the_direction_from_the_panorama(world):
+    decision, _, _ = decide(OursPano(CONFIG, look_down), world, center(6, 6, 4))
     np.testing.assert_allclose(decision.T_world_camera[:3, 2], [0, 0, -1], atol=1e-6)
     np.testing.assert_allclose(
         decision.utilities["utility"], decision.candidates[:, 2, 3] ** 2, rtol=1e-5
     )
 
 
-def test_those_who_ask_stand_all_over_where_the_robot_can_go(world):
-    asked = []
-
-    def spy(map_state, grid, camera, positions, config, allowed, standpoints):
-        asked.append(standpoints)
-        return look_down(map_state, grid, camera, positions, config, allowed, standpoints)
-
-    start = center(6, 6, 4)
-    for key in range(2):
-        decide(OursDemand(CONFIG, spy), world, start, key=jax.random.key(key))
-    travel = plan_travel(world[1], start)
-    assert np.isfinite(travel.lengths(asked[0])).all()
-    assert np.ptp(asked[0][:, 0]) > 2.0
-    assert not np.array_equal(*asked)
-
-
-@pytest.mark.parametrize("policy_class", [Ours, OursPano, OursDemand])
+@pytest.mark.parametrize("policy_class", [Ours, OursPano])
 def test_the_scorer_never_sees_hopeless_cells(policy_class):
     free, occupied = two_rooms()
     occupied[12] = True  # the door is shut: the second room cannot be entered
@@ -262,7 +242,6 @@ def test_the_registry_makes_what_it_names():
     known = {
         "ours",
         "ours-pano",
-        "ours-demand",
         "cover",
         "unseen",
         "unseen-depth",
@@ -282,6 +261,8 @@ def test_an_unknown_name_lists_the_known_ones():
     for call in (make_policy, describe, source_of):
         with pytest.raises(ValueError, match=r"'best'.*ours, ours-pano, .*random"):
             call("best")
+        with pytest.raises(ValueError, match=r"'ours-demand' has left the package: .* e43d800"):
+            call("ours-demand")
     with pytest.raises(ValueError, match=r"no setting speed; known: num_candidates"):
         make_policy("ours", speed=1.0)
 
@@ -292,19 +273,12 @@ def test_an_unknown_name_lists_the_known_ones():
         ("num_candidates", 0),
         ("num_frontier", -1),
         ("num_frontier", 101),
-        ("num_standpoints", 0),
-        ("num_standpoints", 257),
         ("radius", np.inf),
         ("lambda2", -0.5),
         ("safety_margin", np.nan),
         ("refine", -1),
         ("refine", 101),
         ("refine_radius", np.inf),
-        ("horizon", 0),
-        ("num_spread", -1),
-        ("beam", 0),
-        ("branching", 0),
-        ("view_seconds", -1.0),
     ],
 )
 def test_impossible_settings_are_named(setting, value):
@@ -322,7 +296,7 @@ def test_cells_looked_at_in_vain_are_left_alone():
     config = PlannerConfig()
     in_view = None
     for look in range(ENOUGH_LOOKS):
-        state, _, masked = look_round(state, empty_map(64), grid, pose, config)
+        state, _, masked = prepare_decision(state, empty_map(64), grid, pose, config)
         seen = np.asarray(state.looks) == look + 1
         assert in_view is None or np.array_equal(seen, in_view)
         in_view = seen
@@ -331,5 +305,5 @@ def test_cells_looked_at_in_vain_are_left_alone():
     assert in_view.sum() > 50
     assert np.asarray(masked.unexplored).any()  # what no view has shown still counts
     away = poses_along(center(14, 6, 4)[None], np.array([[-1.0, 0.0, 0.0]]))[0]
-    state, _, _ = look_round(state, empty_map(64), grid, away, config)
+    state, _, _ = prepare_decision(state, empty_map(64), grid, away, config)
     assert not np.any((np.asarray(state.looks) > ENOUGH_LOOKS) & in_view)

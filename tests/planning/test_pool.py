@@ -45,7 +45,7 @@ def law_columns(modules: Modules) -> None:
 def law_places(modules: Modules) -> None:
     """By hand: free layers 1..8, so the floor is under layer 1 and stops are layers 2..7.
 
-    Their centres lie 0.3, 0.5, ..., 1.3 m above the floor. 1.75 m takes layer 7 (0.45 m below
+    Their centers lie 0.3, 0.5, ..., 1.3 m above the floor. 1.75 m takes layer 7 (0.45 m below
     it); 1.0 m takes layer 5 (0.9 m: as near as 1.1 m, and lower); 2.5 m is too far from all.
     """
     coarse, fine = modules["pool"].STAGES

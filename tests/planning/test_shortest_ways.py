@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from r3jax.planning.shortest_ways import shortest_ways
+from r3jax.planning.shortest_paths import shortest_paths
 from tests.mutants import Mutant, assert_caught, each, load
 
 
@@ -46,15 +46,15 @@ def assert_costs_are_scipys(find):
 
 def law_costs_are_scipys(modules):
     """Interpreted: Numba would keep a fault's machine code on the disk."""
-    fresh = modules["shortest_ways"]
+    fresh = modules["shortest_paths"]
     with mock.patch.object(fresh, "_compiled", return_value=fresh._settle):
-        assert_costs_are_scipys(fresh.shortest_ways)
+        assert_costs_are_scipys(fresh.shortest_paths)
 
 
 @pytest.mark.full
 def test_costs_are_scipys():
-    assert_costs_are_scipys(shortest_ways)
-    law_costs_are_scipys(load(("r3jax.planning.shortest_ways",)))
+    assert_costs_are_scipys(shortest_paths)
+    law_costs_are_scipys(load(("r3jax.planning.shortest_paths",)))
 
 
 MUTANTS = [
@@ -66,15 +66,15 @@ MUTANTS = [
 ]
 
 
-@each([Mutant("shortest_ways", *change, law_costs_are_scipys) for change in MUTANTS])
+@each([Mutant("shortest_paths", *change, law_costs_are_scipys) for change in MUTANTS])
 def test_faults_are_noticed(mutant):
-    assert_caught(("r3jax.planning.shortest_ways",), mutant)
+    assert_caught(("r3jax.planning.shortest_paths",), mutant)
 
 
 @given(st.integers(0, 1000), st.floats(0.3, 1.0))
 def test_every_way_leads_back_to_the_start(seed, share):
     usable, start = random_space(seed, share)
-    cost, previous = shortest_ways(usable, start)
+    cost, previous = shortest_paths(usable, start)
     reached = np.isfinite(cost)
     assert np.array_equal(previous >= 0, reached & (cost > 0.0))
     assert not np.any(reached & ~usable)
@@ -86,12 +86,12 @@ def test_every_way_leads_back_to_the_start(seed, share):
 
 
 def test_nothing_is_reached_from_nowhere():
-    cost, previous = shortest_ways(np.ones((3, 4, 5), dtype=bool), None)
+    cost, previous = shortest_paths(np.ones((3, 4, 5), dtype=bool), None)
     assert np.all(np.isinf(cost))
     assert np.all(previous == -1)
 
 
 def test_a_space_of_one_cell():
-    cost, previous = shortest_ways(np.ones((1, 1, 1), dtype=bool), (0, 0, 0))
+    cost, previous = shortest_paths(np.ones((1, 1, 1), dtype=bool), (0, 0, 0))
     assert cost.tolist() == [[[0.0]]]
     assert previous.tolist() == [[[-1]]]

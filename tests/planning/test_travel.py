@@ -63,7 +63,7 @@ def assert_inside(mask: np.ndarray, waypoints: np.ndarray) -> None:
 
 
 def test_safe_cells_keep_a_ball_free_of_everything_not_known():
-    """The definition, cell by cell: distance from the centre to the nearest cell not free."""
+    """The definition, cell by cell: distance from the center to the nearest cell not free."""
     rng = np.random.default_rng(0)
     free = rng.random(SHAPE) > 0.03
     for margin in (0.0, 0.1, 0.25, 0.3, 0.45):

@@ -14,10 +14,10 @@ import pytest
 import r3jax
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.candidates import poses_along
-from r3jax.planning.policy import make_policy
+from r3jax.planning.registry import make_policy
 from r3jax.scoring import batch, sharding
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.near import near
+from r3jax.scoring.gather import gather_in_range
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, pose_at, two_rooms
 
@@ -79,8 +79,8 @@ def test_each_device_holds_a_share_and_the_whole_map(monkeypatch):
     kept = sharding._score
     monkeypatch.setattr(sharding, "_score", lambda *a: given.append(a) or kept(*a))
     candidates, devices = jnp.asarray(poses()), jax.local_devices()
-    voxels, cells, _ = near(*flat(), candidates[:, :3, 3], CONFIG)
-    known = (voxels, cells, CAMERA, CONFIG, None)  # no demand
+    voxels, cells, _ = gather_in_range(*flat(), candidates[:, :3, 3], CONFIG)
+    known = (voxels, cells, CAMERA, CONFIG)
     scores = sharding.score_on_devices(batch._score_views, known, candidates, devices)
     ((_, _, spread, shares),) = given
     for shared in (shares, *jax.tree.leaves(scores)):
@@ -101,7 +101,7 @@ def law_each_device_scores_its_share_only(modules: Modules) -> None:
     for count in (3, 4, 5, 11):
         candidates = jnp.arange(count, dtype=jnp.float32)[:, None]
         score = functools.partial(size_of_share, jnp.float32(2.0))
-        values, shares = modules["batch"].deal(score, candidates)
+        values, shares = modules["batch"].map_over_devices(score, candidates)
         np.testing.assert_array_equal(values, 2.0 * np.arange(count))
         np.testing.assert_array_equal(shares, np.full(count, -(-count // min(4, count))))
 
@@ -138,19 +138,19 @@ def test_scores_compile_once_for_all_maps_and_settings():
 
     for scale in (1.0, 2.0, 3.0):
         candidates = jnp.full((6, 1), scale)
-        values = batch.deal(functools.partial(score, scale, {"name": center}), candidates)
+        values = batch.map_over_devices(
+            functools.partial(score, scale, {"name": center}), candidates
+        )
         np.testing.assert_array_equal(values, np.full(6, scale * scale))
     assert traces == [{"name": center}]
 
 
-@pytest.mark.parametrize("name", ["ours", "ours-pano", "ours-demand", "active-gs"])
+@pytest.mark.parametrize("name", ["ours", "ours-pano", "active-gs"])
 def test_a_decision_is_that_of_one_device(name, one_device, monkeypatch):
     used = []
     kept = batch.score_on_devices
     monkeypatch.setattr(batch, "score_on_devices", lambda *a: used.append(a[3]) or kept(*a))
-    policy = make_policy(
-        name, num_candidates=NUM, num_frontier=3, num_standpoints=5, scoring=CONFIG
-    )
+    policy = make_policy(name, num_candidates=NUM, num_frontier=3, scoring=CONFIG)
     state, grid = flat()
 
     def decide():
@@ -159,12 +159,10 @@ def test_a_decision_is_that_of_one_device(name, one_device, monkeypatch):
         return policy.decide(planner, state, grid, start, key=jax.random.key(1))[0]
 
     several = decide()
-    # Standpoints are dealt out too, before the candidates.
-    times = 2 if name == "ours-demand" else 1
-    assert used == times * [jax.local_devices()]
+    assert used == [jax.local_devices()]
     one_device()
     one = decide()
-    assert len(used) == times
+    assert len(used) == 1
     np.testing.assert_array_equal(several.T_world_camera, one.T_world_camera)
     np.testing.assert_array_equal(several.candidates, one.candidates)
     assert several.utilities.keys() == one.utilities.keys()

@@ -10,10 +10,9 @@ import r3jax
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice, octahedral_direction
 from r3jax.mapping.state import MapState
-from r3jax.scenes import procedural
-from r3jax.scoring.voxels import voxels_of
 from r3jax.simulators.raycast import RaycastSimulator
 from r3jax.simulators.rays import TriangleScene
+from r3jax.simulators.scenes import procedural
 
 CAPACITY = 1 << 18
 NEAREST, FARTHEST = 1.0, 4.0
@@ -113,7 +112,7 @@ def scan(name: str, num_frames: int, num_stations: int, seed: int = 0) -> Scanne
         scene.state = r3jax.integrate(scene.state, frame)
     assert int(scene.state.dropped) == 0
     seen = np.asarray(scene.state.count) > 0
-    scene.centers = np.where(seen[:, None], np.asarray(voxels_of(scene.state).center).T, np.nan)
+    scene.centers = np.where(seen[:, None], np.asarray(scene.state.center).T, np.nan)
     return scene
 
 

@@ -112,7 +112,7 @@ def tiny_map() -> MapState:
         mean=jnp.zeros((3, NUM)),
         m2=voxels.m2,
         resolution=voxels.resolution,
-        voxel_size=voxels.size,
+        voxel_size=voxels.voxel_size,
         dropped=jnp.zeros((), jnp.int32),
         num_bins=64,
     )

@@ -7,9 +7,10 @@ import pytest
 
 import r3jax
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.scoring import lack
-from r3jax.scoring.chunks import select
-from r3jax.scoring.voxels import Voxels, voxels_of
+from r3jax.mapping.state import MapState
+from r3jax.scoring import deficit as lack
+from r3jax.scoring.config import PAPER, Forms
+from r3jax.visibility.selection import select
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 NUM = 64
@@ -19,7 +20,7 @@ FOCAL = 50.0
 SEED = 5
 
 
-def make_voxels(kind=Voxels, delta: str = "trace"):
+def make_voxels():
     """Voxels in a row, seen from random bins with random consistency; the last is absent."""
     random = np.random.default_rng(SEED)
     words = random.integers(0, 1 << 32, (2, NUM)) & random.integers(0, 1 << 32, (2, NUM))
@@ -28,19 +29,20 @@ def make_voxels(kind=Voxels, delta: str = "trace"):
     packed = sum((row.astype(np.int64) + (1 << 20)) << 21 * i for i, row in enumerate(index))
     count = random.integers(1, 9, NUM).astype(np.float32)
     count[-1] = 0.0
-    return kind(
+    return MapState(
         key=jnp.asarray(np.stack([packed & 0xFFFFFFFF, packed >> 32]), jnp.uint32),
         visited=jnp.asarray(words, jnp.uint32),
         count=jnp.asarray(count),
         m2=jnp.asarray(random.uniform(0.0, 0.5, NUM) * np.maximum(count - 1, 0), jnp.float32),
+        mean=jnp.zeros((3, NUM), jnp.float32),
         resolution=jnp.asarray(random.uniform(10.0, 80.0, NUM), jnp.float32),
-        size=jnp.asarray(SIZE, jnp.float32),
+        voxel_size=jnp.asarray(SIZE, jnp.float32),
+        dropped=jnp.zeros((), jnp.int32),
         num_bins=64,
-        delta_form=delta,
     )
 
 
-def expected_terms(voxels, kappa: str = "box") -> dict[str, np.ndarray]:
+def expected_terms(voxels, forms: Forms = PAPER) -> dict[str, np.ndarray]:
     """The table of the design, voxel by voxel in float64."""
     words = np.asarray(voxels.visited)
     count, m2 = (np.asarray(x, np.float64) for x in (voxels.count, voxels.m2))
@@ -57,9 +59,9 @@ def expected_terms(voxels, kappa: str = "box") -> dict[str, np.ndarray]:
         e1 = np.cross([0.0, 0.0, 1.0], r)
         flat = q[q @ r > 0.0] @ np.stack([e1, np.cross(r, e1)], axis=1)
         is_inside = len(flat) > 0 and bool(((flat.min(0) <= 0) & (flat.max(0) >= 0)).all())
-        power = 1.0 if is_inside or kappa == "one" else 2.0
+        power = 1.0 if is_inside or forms.kappa == "one" else 2.0
         variance = m2[i] / max(count[i] - 1, 1)
-        form = 2 * variance if voxels.delta_form == "pairwise" else np.sqrt(2 / 1.5 * variance)
+        form = 2 * variance if forms.delta == "pairwise" else np.sqrt(2 / 1.5 * variance)
         delta = float(np.clip(1 - form, 0, 1)) if count[i] > 1 else 1.0
         bias = cosine**power
         noise = delta ** (power * (1 - bias))
@@ -72,17 +74,16 @@ def expected_terms(voxels, kappa: str = "box") -> dict[str, np.ndarray]:
 
 
 def law_formulas(modules: Modules, kappa: str = "box", delta: str = "trace") -> None:
-    voxels = make_voxels(modules["voxels"].Voxels, delta)
+    voxels, forms = make_voxels(), Forms(kappa, delta)
     position = jnp.asarray(POSITION, jnp.float32)
-    found = modules["renderability"].score_voxels(voxels, position, jnp.float32(FOCAL), kappa)
-    for name, expected in expected_terms(voxels, kappa).items():
+    found = modules["renderability"].score_voxels(voxels, position, jnp.float32(FOCAL), forms)
+    for name, expected in expected_terms(voxels, forms).items():
         np.testing.assert_allclose(getattr(found, name), expected, atol=2e-5, err_msg=name)
 
 
 CHAIN = (
     "r3jax.scoring.directions",
-    "r3jax.scoring.voxels",
-    "r3jax.scoring.visibility",
+    "r3jax.visibility.depth_buffer",
     "r3jax.scoring.renderability",
 )
 _IN_KAPPA = """(visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
@@ -96,14 +97,15 @@ MUTANTS = [
     Mutant("directions", "-z * a_y, z * a_x", "-z * a_x, z * a_y", law_formulas),
     Mutant("renderability", "cosine, cosine * cosine)", "cosine, cosine)", law_formulas),
     Mutant("renderability", "kappa_value * (1.0 - bias)", "1.0 - bias", law_formulas),
-    Mutant("renderability", "1.0 - voxels.delta * bias", "1.0 - bias", law_formulas),
+    Mutant("renderability", "1.0 - delta * bias", "1.0 - bias", law_formulas),
     Mutant("renderability", "* distance / focal, 1.0)", "* distance / focal, 2.0)", law_formulas),
     Mutant("renderability", "value=blank(bias * noise * resolution)",
            "value=blank(bias * noise)", law_formulas),
     Mutant("renderability", "jnp.where(voxels.present, term, 0.0)", "term", law_formulas),
-    Mutant("voxels", "2.0 / 1.5 * variance", "2.0 * variance", law_formulas),
-    Mutant("voxels", "jnp.maximum(count - 1.0, 1.0)", "jnp.maximum(count, 1.0)", law_formulas),
-    Mutant("voxels", "count > 1.0, jnp.clip", "count > 3.0, jnp.clip", law_formulas),
+    Mutant("renderability", "2.0 / 1.5 * variance", "2.0 * variance", law_formulas),
+    Mutant("renderability", "jnp.maximum(count - 1.0, 1.0)", "jnp.maximum(count, 1.0)",
+           law_formulas),
+    Mutant("renderability", "count > 1.0, jnp.clip", "count > 3.0, jnp.clip", law_formulas),
 ]  # fmt: skip
 
 
@@ -131,8 +133,8 @@ def test_the_derivative_of_the_lack_is_that_of_the_dense_sum():
     voxels = make_voxels()
     visible = select(voxels.present)
     position, focal = jnp.asarray(POSITION, jnp.float32), jnp.float32(FOCAL)
-    looped = lambda p: lack.lack_by_direction(voxels, visible, p, focal, "box", 1)[0]
-    dense = lambda p: lack._lack(voxels, visible.mask, p, focal, "box", 1)[0]
+    looped = lambda p: lack.deficit_per_bin(voxels, visible, p, focal, PAPER, 1)[0]
+    dense = lambda p: lack._deficit(voxels, visible.mask, p, focal, PAPER, 1)[0]
     assert float(looped(position)) == pytest.approx(float(dense(position)), rel=1e-6)
     gradient = np.asarray(jax.jit(jax.grad(looped))(position))
     np.testing.assert_allclose(gradient, jax.jit(jax.grad(dense))(position), rtol=1e-5, atol=1e-5)
@@ -192,7 +194,7 @@ def test_the_derivative_of_a_voxel_is_its_difference_quotient():
 def test_rows_of_a_map_are_scored_as_they_stand():
     m = observed(GRAY, np.stack([AXIS, -AXIS]))
     row = int(r3jax.lookup(m, jnp.asarray(CENTER)))
-    voxels = voxels_of(m)
+    voxels = m
     assert np.flatnonzero(np.asarray(voxels.present)).tolist() == [row]
     np.testing.assert_allclose(voxels.center[:, row], CENTER)
 

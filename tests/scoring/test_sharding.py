@@ -39,4 +39,6 @@ def test_one_device_is_left_alone(monkeypatch):
     score = functools.partial(lambda scale, candidates: scale * candidates, 2.0)
     for count in (1, 4, 7):
         candidates = jnp.arange(count, dtype=jnp.float32)
-        np.testing.assert_array_equal(batch.deal(score, candidates), 2.0 * np.arange(count))
+        np.testing.assert_array_equal(
+            batch.map_over_devices(score, candidates), 2.0 * np.arange(count)
+        )

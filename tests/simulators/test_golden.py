@@ -13,7 +13,7 @@ from tests.simulators.habitat_golden import load_house, load_simple_room
 
 
 def compare(simulator, poses, golden):
-    """Share of pixels with depth within 1 cm, and mean absolute colour difference [0..255]."""
+    """Share of pixels with depth within 1 cm, and mean absolute color difference [0..255]."""
     close, difference = [], []
     for pose, rgb, depth in zip(poses, golden["rgb"], golden["depth"], strict=True):
         frame = simulator.render(pose)

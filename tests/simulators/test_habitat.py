@@ -85,7 +85,7 @@ def room(shared):
 
 
 def law_golden(modules: Modules) -> None:
-    """At our poses Habitat gives its recorded frames; copies, colours in [0, 1], holes as 0."""
+    """At our poses Habitat gives its recorded frames; copies, colors in [0, 1], holes as 0."""
     golden = load_simple_room(shared_path)
     with pytest.MonkeyPatch.context() as patch:
         installed(FakeHabitat(recorded(golden)), patch)

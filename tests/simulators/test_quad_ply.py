@@ -1,6 +1,6 @@
-"""Quads with vertex colours, as in Replica's mesh.ply, against what can be worked out on paper.
+"""Quads with vertex colors, as in Replica's mesh.ply, against what can be worked out on paper.
 
-The wall is x = 3 + y / 4 and its colour an affine function of the place: both are the same
+The wall is x = 3 + y / 4 and its color an affine function of the place: both are the same
 whichever diagonal cuts a quad in two.
 """
 

@@ -11,7 +11,7 @@ from r3jax.splatting import reference
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 
-_rasterise = jax.jit(reference.rasterise)
+_rasterize = jax.jit(reference.rasterize)
 
 BAND = 1e-4
 """Relative distance from a threshold at which float32 may decide either way."""
@@ -72,7 +72,7 @@ def safe_pixels(scene: GaussianScene, camera: Camera, T_world_camera: jax.Array)
         logits = jnp.log(moved) - jnp.log1p(-moved)
         shifted = GaussianScene(scene.means, scene.quats, scene.log_scales, logits, scene.sh)
         config = RasterConfig(backend="reference")
-        return _rasterise(shifted, camera, T_world_camera, zeros, config).alpha
+        return _rasterize(shifted, camera, T_world_camera, zeros, config).alpha
 
     change = np.asarray(jnp.abs(alpha(1.0) - alpha(-1.0)))
     # A Gaussian at the cut-off appears or goes with alpha 1/255 times the transmittance.

@@ -1,4 +1,4 @@
-"""The readable rasteriser against closed forms and a plain float64 loop."""
+"""The readable rasterizer against closed forms and a plain float64 loop."""
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +66,7 @@ def assert_equals_loop(modules: Modules) -> None:
     """The whole image equals a loop over pixels and Gaussians in float64."""
     scene, (camera, pose) = random_cloud(5, COUNT), view(24, 18)
     zeros = jnp.zeros((COUNT, 2))
-    found = jax.jit(modules["reference"].rasterise)(scene, camera, pose, zeros, CONFIG)
+    found = jax.jit(modules["reference"].rasterize)(scene, camera, pose, zeros, CONFIG)
     projected = project_gaussians(scene, camera, pose, zeros)
     expected = np.zeros((18, 24, 5))
     safe = np.ones((18, 24), dtype=bool)
@@ -123,10 +123,10 @@ def test_order_of_rows_does_not_matter(seed):
     shuffled = np.random.default_rng(seed).permutation(COUNT)
     mixed = jax.tree.map(lambda x: x[shuffled], scene)
     zeros = jnp.zeros((COUNT, 2))
-    one = rasterise(scene, camera, pose, zeros, CONFIG)
-    other = rasterise(mixed, camera, pose, zeros, CONFIG)
+    one = rasterize(scene, camera, pose, zeros, CONFIG)
+    other = rasterize(mixed, camera, pose, zeros, CONFIG)
     np.testing.assert_allclose(other.rgb, one.rgb, atol=1e-5)
     assert float(one.alpha.max()) < 1.0
 
 
-rasterise = jax.jit(reference.rasterise)
+rasterize = jax.jit(reference.rasterize)

@@ -120,16 +120,16 @@ def test_gradients_by_intrinsics(backend):
 
 
 def test_an_unknown_backend_is_refused_by_name():
-    with pytest.raises(ValueError, match="no rasteriser backend 'cuda'"):
+    with pytest.raises(ValueError, match="no rasterizer backend 'cuda'"):
         backend_module.find_backend("cuda")
 
 
 def test_auto_takes_numba_on_a_cpu():
     if jax.default_backend() != "cpu":
         pytest.skip("needs a CPU as JAX's device")
-    from r3jax.splatting.backends.numba import rasterise
+    from r3jax.splatting.backends.numba import rasterize
 
-    assert backend_module.find_backend("auto") is rasterise
+    assert backend_module.find_backend("auto") is rasterize
 
 
 @pytest.mark.parametrize("needed", [1, 1000, 5000, 123_456, 3_000_000])

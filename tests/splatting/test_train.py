@@ -103,9 +103,9 @@ def test_several_views_a_step_average_their_gradients(views):
 
 
 def start(views: Views) -> GaussianScene:
-    from r3jax.splatting.initialise import initialise
+    from r3jax.splatting.initialize import initialize
 
-    return initialise(views, 300, 400, 1)
+    return initialize(views, 300, 400, 1)
 
 
 def test_training_that_diverges_names_the_step_and_keeps_the_last_good_checkpoint(views, tmp_path):

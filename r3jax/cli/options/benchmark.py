@@ -80,7 +80,7 @@ class Benchmark:
     """Look through faces seen from behind, as Habitat-Sim always does."""
 
     backend: Literal["auto", "numba", "xla", "splax"] = "auto"
-    """Rasteriser: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
+    """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
 
     engine: Literal["local", "slurm"] = "local"
     """`local`: processes on this machine, one GPU each where there are several. `slurm`: an array

@@ -54,7 +54,7 @@ class Train:
     """Behind everything."""
 
     backend: Literal["auto", "numba", "xla", "splax"] = "auto"
-    """Rasteriser: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
+    """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
 
     up: Literal["y", "z"] = "y"
     """Axis of a recording's world that points up."""
@@ -99,7 +99,7 @@ class Evaluate:
     """Of the bootstrap."""
 
     backend: Literal["auto", "numba", "xla", "splax"] = "auto"
-    """Rasteriser: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
+    """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
 
     up: Literal["y", "z"] = "y"
     """Axis of a recording's world that points up."""

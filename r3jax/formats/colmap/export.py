@@ -1,4 +1,4 @@
-"""A run as a COLMAP model: in metres, in the run's own world, nothing turned or scaled."""
+"""A run as a COLMAP model: in meters, in the run's own world, nothing turned or scaled."""
 
 from collections.abc import Sequence
 
@@ -42,7 +42,7 @@ def model_of(run: Run, xyz: np.ndarray, rgb: np.ndarray) -> ColmapModel:
     Args:
         run: a run.
         xyz: points in the world, such as the map's voxels, [m, 3] [m].
-        rgb: their colours, [m, 3] uint8.
+        rgb: their colors, [m, 3] uint8.
     """
     names = [run.image_path(row.step).name for row in run.rows]
     poses = np.stack([row.pose for row in run.rows]).astype(np.float64)

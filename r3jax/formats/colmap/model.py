@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.foreign.errors import ForeignFileError
 from r3jax.formats.lenses import Lens
 from r3jax.formats.poses import MAX_DISTANCE, MAX_DRIFT
+from r3jax.formats.validation.errors import ForeignFileError
 
 NO_POINT = -1
 """In place of a point's id, where a keypoint belongs to none."""

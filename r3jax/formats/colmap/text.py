@@ -9,11 +9,11 @@ from typing import TypeVar
 import numpy as np
 
 from r3jax.files import write_atomic
-from r3jax.foreign.errors import ForeignFileError
-from r3jax.foreign.files import read_bytes
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import Lens
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import read_bytes
 
 T = TypeVar("T")
 
@@ -166,7 +166,7 @@ def _point(text: str) -> _Point:
         raise ForeignFileError("the last element of the track lacks its keypoint")
     rgb = [_id(word) for word in words[4:7]]
     if max(rgb) > 255:
-        raise ForeignFileError(f"the colour {' '.join(words[4:7])} is not 0 to 255")
+        raise ForeignFileError(f"the color {' '.join(words[4:7])} is not 0 to 255")
     xyz = [_number(word) for word in words[1:4]]
     return _id(words[0]), xyz, rgb, _number(words[7]), [_id(word) for word in words[8:]]
 

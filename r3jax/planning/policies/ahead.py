@@ -8,31 +8,34 @@ that is done is left for one that is not, however far, if nothing nearer is wort
 Shape symbols: C candidates.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from r3jax.geometry.cameras import Camera
+from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import best_views, poses_along, spread
 from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_positions
-from r3jax.planning.lookahead import SPEED, Outlook, lengths_between, search
+from r3jax.planning.lookahead import SPEED, AheadConfig, BeamProblem, lengths_between, search
 from r3jax.planning.refine import refine_best
 from r3jax.planning.situation import Situation
-from r3jax.scoring.batch import keep_positions_near
+from r3jax.scoring.batch import cache_positions_near
 from r3jax.scoring.cells import Cells
-from r3jax.scoring.kept import Kept
-from r3jax.scoring.near import near
-from r3jax.scoring.voxels import Voxels
+from r3jax.scoring.gather import gather_in_range
+from r3jax.scoring.panorama_cache import PanoramaCache
 
 
 @dataclass(frozen=True)
 class OursAhead(GreedyPolicy):
     """The first view of the best path of several, each as if those before it had been taken."""
 
+    config: AheadConfig = field(default_factory=AheadConfig)
+
     name = "ours-ahead"
     source = "look-ahead on Ours-Pano, this project"
+    Config = AheadConfig
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """Positions of Ours, and some spread over all reachable space; no directions yet."""
@@ -63,17 +66,19 @@ class OursAhead(GreedyPolicy):
         scoring, travel = self.config.scoring, situation.travel
         positions = poses[:, :3, 3]
         places = jnp.asarray(positions, dtype=jnp.float32)
-        voxels, cells, _ = near(situation.map_state, situation.scoring_grid, places, scoring)
+        voxels, cells, _ = gather_in_range(
+            situation.map_state, situation.scoring_grid, places, scoring
+        )
         allowed = situation.limits.allowed_axes(positions, scoring.panorama_bins)
         start = (voxels, cells)
-        panorama, kept = keep_positions_near(*start, situation.camera, places, scoring, allowed)
+        panorama, kept = cache_positions_near(*start, situation.camera, places, scoring, allowed)
         turned, utility = best_views(positions, panorama)
-        turned = situation.limits.obeyed(turned)
+        turned = situation.limits.project_to_feasible(turned)
         if self.config.refine:
             turned, utility = self._refined(situation, turned, utility)
             kept = self._kept_again(kept, start, situation.camera, positions, turned[:, :3, 3])
             positions = turned[:, :3, 3]
-        outlook = Outlook(
+        problem = BeamProblem(
             turned,
             utility,
             travel.lengths(positions),
@@ -85,7 +90,7 @@ class OursAhead(GreedyPolicy):
             situation.limits,
         )
         rate = np.full(len(positions), -np.inf)
-        for path in search(outlook):
+        for path in search(problem):
             rate[path.places[0]] = max(rate[path.places[0]], path.rate)
         return turned, {"utility": utility, "ahead": rate}
 
@@ -106,12 +111,12 @@ class OursAhead(GreedyPolicy):
 
     def _kept_again(
         self,
-        kept: Kept,
-        start: tuple[Voxels, Cells],
+        kept: PanoramaCache,
+        start: tuple[MapState, Cells],
         camera: Camera,
         before: np.ndarray,
         after: np.ndarray,
-    ) -> Kept:
+    ) -> PanoramaCache:
         """The same panoramas, but for the few positions [C, 3] that have moved."""
         moved = np.flatnonzero((before != after).any(axis=1))
         if len(moved) == 0:
@@ -119,7 +124,7 @@ class OursAhead(GreedyPolicy):
         room = -(-len(moved) // self.config.refine) * self.config.refine  # compiles once
         padded = jnp.asarray(moved[np.arange(room) % len(moved)])
         places = jnp.asarray(after, dtype=jnp.float32)[padded]
-        _, others = keep_positions_near(*start, camera, places, self.config.scoring)
+        _, others = cache_positions_near(*start, camera, places, self.config.scoring)
         return kept.replaced(padded, others)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:

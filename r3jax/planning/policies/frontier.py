@@ -25,7 +25,7 @@ _MAX_TARGETS = 300
 """Frontier cells that are considered per decision, drawn at random."""
 
 _STOPS_PER_TARGET = 4
-"""Places that are tried per frontier cell: the nearest by path among its neighbours."""
+"""Places that are tried per frontier cell: the nearest by path among its neighbors."""
 
 _ATTEMPT_COSINE = 0.9
 _ATTEMPT_REACH = 3.0
@@ -119,7 +119,7 @@ def nearest_views(
         key: draws the targets that are considered, if there are very many.
 
     Returns:
-        Places and the targets' centres, [n, 3] float64 each [m], n <= num.
+        Places and the targets' centers, [n, 3] float64 each [m], n <= num.
     """
     cells, stops = np.argwhere(targets), np.argwhere(travel.goals)
     if len(cells) == 0 or len(stops) == 0:

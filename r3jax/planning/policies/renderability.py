@@ -9,7 +9,6 @@ Shape symbols: C candidates, always `config.num_candidates`, so that scoring com
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Array
@@ -75,7 +74,6 @@ def turned_views(
     situation: Situation,
     positions: np.ndarray,
     scoring: ScoringConfig,
-    **asked: Any,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """What `GreedyPolicy.score` answers for positions that look where it is worth most.
 
@@ -84,7 +82,6 @@ def turned_views(
         situation: what is known.
         positions: [C, 3] [m].
         scoring: settings of the utilities.
-        **asked: further arguments of `score_positions`.
     """
     panorama = score_all(
         situation.map_state,
@@ -93,7 +90,6 @@ def turned_views(
         positions.astype(np.float32),
         scoring,
         situation.limits.allowed_axes(positions, scoring.panorama_bins),
-        **asked,
     )
     turned, utility = best_views(positions, panorama)
     return turned, {"utility": utility}

@@ -1,6 +1,6 @@
 """Farthest point: spread the views evenly over free space and directions, blind to the scene.
 
-    distance(a, b) = |x_a - x_b|  +  angle between the viewing axes / (90 degrees per metre)
+    distance(a, b) = |x_a - x_b|  +  angle between the viewing axes / (90 degrees per meter)
 
 The next view is the candidate whose nearest pose taken so far is farthest away (Gonzalez 1985).
 Candidates lie anywhere that the robot can go, not only near it, and paths cost nothing. POp-GS
@@ -26,7 +26,7 @@ from r3jax.planning.greedy import Drawn, GreedyPolicy, free_views
 from r3jax.planning.situation import Situation
 
 METRES_PER_RADIAN = 2.0 / np.pi
-"""A quarter turn counts as much as a metre."""
+"""A quarter turn counts as much as a meter."""
 
 FIRST_ROOM = 256
 """Poses that the memory holds before it doubles."""
@@ -63,7 +63,7 @@ def remember(taken: PosesTaken, T_world_camera: np.ndarray) -> PosesTaken:
 def nearest_taken(taken: PosesTaken, poses: np.ndarray) -> np.ndarray:
     """Distance from each pose [C, 4, 4] to the nearest one taken, [C] float64; inf: none was.
 
-    Metres between the cameras plus a metre for every 90 degrees between their axes. Roll does not
+    Meters between the cameras plus a meter for every 90 degrees between their axes. Roll does not
     count: the views have none.
     """
     num = int(taken.num)

@@ -25,14 +25,14 @@ from r3jax.splatting.projection import without_nans
 from r3jax.splatting.scene import GaussianScene
 
 
-def rasterise(
+def rasterize(
     scene: GaussianScene,
     camera: Camera,
     T_world_camera: Float[Array, "4 4"],
     center_offsets: Float[Array, "n 2"],
     config: RasterConfig,
 ) -> Composite:
-    """Composites the scene on black; see `backend.Rasterise`.
+    """Composites the scene on black; see `backend.Rasterize`.
 
     `center_offsets` is for its gradient: splax has counted the tiles of the centers before they
     could be moved, so that offsets other than 0 make the images NaN.
@@ -120,12 +120,12 @@ def load_splax() -> ModuleType:
         splax = importlib.import_module("splax")
     except ImportError as error:
         raise ImportError(
-            "the rasteriser backend 'splax' needs packages that are not installed: "
+            "the rasterizer backend 'splax' needs packages that are not installed: "
             "pip install 'r3jax[gpu]', or choose another backend"
         ) from error
     if jax.default_backend() not in ("gpu", "cuda"):
         raise RuntimeError(
-            "the rasteriser backend 'splax' needs an NVIDIA GPU, and JAX runs on "
+            "the rasterizer backend 'splax' needs an NVIDIA GPU, and JAX runs on "
             f"{jax.default_backend()!r}: choose backend 'auto' or 'xla'"
         )
     return splax

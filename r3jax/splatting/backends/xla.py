@@ -76,14 +76,14 @@ class Batch(eqx.Module):
     """Whether there is anything to do: the first tile has most Gaussians."""
 
 
-def rasterise(
+def rasterize(
     scene: GaussianScene,
     camera: Camera,
     T_world_camera: Float[Array, "4 4"],
     center_offsets: Float[Array, "n 2"],
     config: RasterConfig,
 ) -> Composite:
-    """Composites the scene on black; see `backend.Rasterise`.
+    """Composites the scene on black; see `backend.Rasterize`.
 
     Raises:
         ValueError: a batch or chunk size below 1.

@@ -1,4 +1,4 @@
-"""The numba rasteriser against the readable one: images, all gradients, and rough input."""
+"""The numba rasterizer against the readable one: images, all gradients, and rough input."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ from tests.splatting.clouds import random_cloud, safe_pixels, view
 from tests.tiers import quick_and_full
 
 COUNT, SIZE, BUDGET = 120, (50, 38), 1 << 12
-BACKENDS = {"numba": numba.rasterise, "reference": reference.rasterise}
+BACKENDS = {"numba": numba.rasterize, "reference": reference.rasterize}
 
 
 def composite(backend: str, scene, camera, pose, offsets=None, budget: int = BUDGET):
@@ -158,10 +158,10 @@ def test_pose_gradient_is_a_difference_quotient():
 
 def test_one_gaussian_and_none_in_sight():
     scene, (camera, pose) = random_cloud(1, 1), view(*SIZE)
-    centred = dataclasses.replace(scene, means=jnp.zeros((1, 3)), opacity_logits=jnp.ones(1))
-    _, found = assert_images_agree(centred, camera, pose)
+    centered = dataclasses.replace(scene, means=jnp.zeros((1, 3)), opacity_logits=jnp.ones(1))
+    _, found = assert_images_agree(centered, camera, pose)
     assert float(found.alpha.max()) > 0.5
-    behind = dataclasses.replace(centred, means=2.0 * pose[None, :3, 3])
+    behind = dataclasses.replace(centered, means=2.0 * pose[None, :3, 3])
     weights = random_weights(0, np.ones(SIZE[::-1], dtype=bool))
     result = render_with("numba", behind, camera, pose)
     assert float(result.alpha.max()) == float(result.rgb.max()) == 0.0

@@ -88,7 +88,7 @@ def plain_python():
 
 
 class Case:
-    """A view from within a cloud, some of it broad and solid, by the readable rasteriser."""
+    """A view from within a cloud, some of it broad and solid, by the readable rasterizer."""
 
     def __init__(self):
         cloud, is_broad = random_cloud(2, COUNT), jnp.arange(COUNT) % 4 == 0
@@ -121,7 +121,7 @@ class Case:
     def reference_images(self, scene, view_numbers, offsets):
         pose, (fx, fy, cx, cy) = view_numbers
         camera = type(self.camera)(*SIZE, fx, fy, cx, cy)
-        result = reference.rasterise(scene, camera, pose, offsets, RasterConfig())
+        result = reference.rasterize(scene, camera, pose, offsets, RasterConfig())
         return result.rgb, result.depth_sum, result.alpha
 
     def count_rows(self) -> int:

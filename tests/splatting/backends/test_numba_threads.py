@@ -1,4 +1,4 @@
-"""The numba rasteriser among threads, on one core, inside loops: same bits, no deadlock."""
+"""The numba rasterizer among threads, on one core, inside loops: same bits, no deadlock."""
 
 import os
 import subprocess
@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r3jax.splatting import backend
 from r3jax.splatting.backends import numba
 from r3jax.splatting.backends.numba import bridge
+from r3jax.splatting.backends.xla import rasterize as xla_rasterize
 from r3jax.splatting.config import RasterConfig
 from tests.splatting.clouds import random_cloud, view
 
@@ -24,7 +26,7 @@ CONFIG = RasterConfig(backend="numba", max_intersections=1 << 14)
 
 
 def loss(scene, camera, pose):
-    result = numba.rasterise(scene, camera, pose, jnp.zeros((COUNT, 2)), CONFIG)
+    result = numba.rasterize(scene, camera, pose, jnp.zeros((COUNT, 2)), CONFIG)
     ramp = jnp.arange(SIZE[0], dtype=jnp.float32)[None, :]
     return jnp.sum(result.rgb.sum(axis=-1) * ramp + result.depth_sum), result
 
@@ -140,3 +142,17 @@ def test_a_threading_layer_for_one_rendering_only_is_refused(monkeypatch):
 def test_workers_follow_the_cores_of_the_process(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3}, raising=False)
     assert bridge.num_workers() == 1
+
+
+@pytest.mark.parametrize("version", [(0, 2), (0, 4), (1, 3), (-1, -1)])
+@pytest.mark.parametrize("name", ["auto", "numba"])
+def test_another_interface_of_xla_is_not_read_by_our_offsets(name, version, monkeypatch):
+    monkeypatch.setattr(backend, "ffi_version", lambda: version)
+    with pytest.warns(RuntimeWarning, match=r"version 0\.3 of its foreign function interface"):
+        assert backend.find_backend(name) is xla_rasterize
+
+
+def test_the_interface_here_is_the_one_that_the_bridge_was_written_for():
+    if jax.__version_info__[:2] == (0, 10):
+        assert backend.ffi_version() == backend.WRITTEN_FOR
+    assert backend.ffi_version() > (-1, -1), "the header has moved"

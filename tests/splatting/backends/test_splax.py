@@ -2,7 +2,7 @@
 
 The stand-in follows the documented conventions of `splax.project` and `splax.rasterize_depth`
 (world-to-camera matrix, linear scales, wxyz, opacities in [0, 1], intrinsics as plain numbers,
-depth divided by alpha). So the readable rasteriser must come out, with all its gradients. With
+depth divided by alpha). So the readable rasterizer must come out, with all its gradients. With
 the package and a GPU, `test_golden.py` runs the real one.
 """
 
@@ -79,8 +79,8 @@ def stand_in(monkeypatch):
     monkeypatch.setattr(splax, "load_splax", lambda: module)
 
 
-def loss(rasterise, scene, camera, pose, offsets):
-    result = rasterise(scene, camera, pose, offsets, CONFIG)
+def loss(rasterize, scene, camera, pose, offsets):
+    result = rasterize(scene, camera, pose, offsets, CONFIG)
     columns = jnp.linspace(-1.0, 1.0, SIZE[0])[None, :] + jnp.linspace(0.0, 2.0, SIZE[1])[:, None]
     images = (*jnp.moveaxis(result.rgb, -1, 0), result.depth_sum, result.alpha)
     return sum(jnp.sum(image * columns * (i + 1)) for i, image in enumerate(images)), result
@@ -91,12 +91,12 @@ def test_images_and_gradients_are_those_of_the_reference(stand_in):
     camera, pose = view(*SIZE)
     variables = (random_cloud(2, COUNT), camera, pose, jnp.zeros((COUNT, 2)))
 
-    def step(rasterise):
+    def step(rasterize):
         by_all = jax.value_and_grad(loss, argnums=(1, 2, 3, 4), has_aux=True)
-        return jax.jit(lambda *v: by_all(rasterise, *v))(*variables)
+        return jax.jit(lambda *v: by_all(rasterize, *v))(*variables)
 
-    (_, found), by_found = step(splax.rasterise)
-    (_, expected), by_expected = step(reference.rasterise)
+    (_, found), by_found = step(splax.rasterize)
+    (_, expected), by_expected = step(reference.rasterize)
     # One pixel in a thousand may lie on a threshold.
     for name in ("rgb", "depth_sum", "alpha"):
         difference = np.abs(np.asarray(getattr(found, name) - getattr(expected, name)))
@@ -113,7 +113,7 @@ def test_moved_centers_cannot_be_drawn(stand_in):
     """splax counted their tiles where they were: better no image than a wrong one."""
     camera, pose = view(*SIZE)
     offsets = jnp.zeros((COUNT, 2)).at[3, 1].set(0.5)
-    result = splax.rasterise(random_cloud(2, COUNT), camera, pose, offsets, CONFIG)
+    result = splax.rasterize(random_cloud(2, COUNT), camera, pose, offsets, CONFIG)
     assert np.isnan(result.rgb).all()
     assert np.isnan(result.alpha).all()
 
@@ -125,7 +125,7 @@ def test_what_is_not_a_number_does_not_reach_the_kernels(stand_in):
         scene.means.at[4].set(jnp.nan), scene.quats, scene.log_scales, scene.opacity_logits,
         scene.sh,
     )  # fmt: skip
-    by = jax.grad(lambda s: loss(splax.rasterise, s, camera, pose, jnp.zeros((COUNT, 2)))[0])
+    by = jax.grad(lambda s: loss(splax.rasterize, s, camera, pose, jnp.zeros((COUNT, 2)))[0])
     for leaf in jax.tree.leaves(by(broken)):
         assert np.isfinite(leaf).all()
 
@@ -168,10 +168,10 @@ def test_the_package_draws_what_the_reference_draws():
     )
     zeros = jnp.zeros((COUNT, 2))
     (_, found), by_found = jax.value_and_grad(
-        lambda s: loss(splax.rasterise, s, camera, pose, zeros), has_aux=True
+        lambda s: loss(splax.rasterize, s, camera, pose, zeros), has_aux=True
     )(scene)
     (_, expected), by_expected = jax.value_and_grad(
-        lambda s: loss(reference.rasterise, s, camera, pose, zeros), has_aux=True
+        lambda s: loss(reference.rasterize, s, camera, pose, zeros), has_aux=True
     )(scene)
     difference = np.abs(np.asarray(found.rgb - expected.rgb)).max(axis=-1)
     assert np.mean(difference > 1e-4) < 1e-2

@@ -1,4 +1,4 @@
-"""The pure-JAX rasteriser against the readable one: images, all gradients, and rough input."""
+"""The pure-JAX rasterizer against the readable one: images, all gradients, and rough input."""
 
 import dataclasses
 from functools import partial
@@ -23,9 +23,9 @@ COUNT, SIZE, BUDGET = 120, (50, 38), 1 << 12
 CONFIG = RasterConfig(max_intersections=BUDGET, tiles_per_batch=4, gaussians_per_chunk=16)
 
 
-def composite(rasterise, scene, camera, pose, offsets=None, config=CONFIG):
+def composite(rasterize, scene, camera, pose, offsets=None, config=CONFIG):
     offsets = jnp.zeros((scene.capacity, 2)) if offsets is None else offsets
-    return rasterise(scene, camera, pose, offsets, config)
+    return rasterize(scene, camera, pose, offsets, config)
 
 
 def weighted_sum(weights, *arguments):
@@ -37,8 +37,8 @@ def weighted_sum(weights, *arguments):
 
 render_with = eqx.filter_jit(composite)
 gradients_with = eqx.filter_jit(
-    lambda weights, rasterise, variables: jax.grad(
-        lambda variables: weighted_sum(weights, rasterise, *variables)
+    lambda weights, rasterize, variables: jax.grad(
+        lambda variables: weighted_sum(weights, rasterize, *variables)
     )(variables)
 )
 
@@ -63,10 +63,10 @@ def solid(seed: int):
     return dataclasses.replace(scene, opacity_logits=logits, log_scales=scales)
 
 
-def assert_images_agree(rasterise, scene, camera, pose) -> np.ndarray:
+def assert_images_agree(rasterize, scene, camera, pose) -> np.ndarray:
     safe = safe_pixels(scene, camera, pose)
-    found = render_with(rasterise, scene, camera, pose)
-    expected = render_with(reference.rasterise, scene, camera, pose)
+    found = render_with(rasterize, scene, camera, pose)
+    expected = render_with(reference.rasterize, scene, camera, pose)
     assert int(found.overflow) == 0
     for name, size in (("rgb", 1.0), ("alpha", 1.0), ("depth_sum", 3.0)):
         difference = np.abs(np.asarray(getattr(found, name) - getattr(expected, name)))
@@ -74,14 +74,14 @@ def assert_images_agree(rasterise, scene, camera, pose) -> np.ndarray:
     return safe
 
 
-def assert_agrees(rasterise, seed, scene, camera, pose) -> None:
+def assert_agrees(rasterize, seed, scene, camera, pose) -> None:
     """Images on the safe pixels to 1e-4, the gradients by everything to 1e-3."""
-    safe = assert_images_agree(rasterise, scene, camera, pose)
+    safe = assert_images_agree(rasterize, scene, camera, pose)
     assert safe.mean() > 0.6
     weights = random_weights(seed, safe)
     variables = (scene, camera, pose, jnp.zeros((scene.capacity, 2)))
-    found = gradients_with(weights, rasterise, variables)
-    expected = gradients_with(weights, reference.rasterise, variables)
+    found = gradients_with(weights, rasterize, variables)
+    expected = gradients_with(weights, reference.rasterize, variables)
     paths = jax.tree_util.tree_leaves_with_path(expected)
     for (path, by), ours in zip(paths, jax.tree.leaves(found), strict=True):
         off, whole = np.linalg.norm(ours - by), np.linalg.norm(by)
@@ -89,9 +89,9 @@ def assert_agrees(rasterise, seed, scene, camera, pose) -> None:
 
 
 def assert_clouds_agree(modules: Modules) -> None:
-    rasterise = modules["xla"].rasterise
+    rasterize = modules["xla"].rasterize
     for seed, scene in ((1, random_cloud(1, COUNT)), (2, solid(2))):
-        assert_agrees(rasterise, seed, scene, *view(*SIZE))
+        assert_agrees(rasterize, seed, scene, *view(*SIZE))
 
 
 seeds = st.integers(0, 10_000)
@@ -101,20 +101,20 @@ seeds = st.integers(0, 10_000)
 @settings(max_examples=8)
 @given(seeds)
 def test_images_and_gradients_agree(seed):
-    assert_agrees(xla.rasterise, seed, random_cloud(seed, COUNT), *view(*SIZE))
+    assert_agrees(xla.rasterize, seed, random_cloud(seed, COUNT), *view(*SIZE))
 
 
 @pytest.mark.full
 @settings(max_examples=6)
 @given(seeds)
 def test_solid_clouds_agree(seed):
-    assert_agrees(xla.rasterise, seed, solid(seed), *view(*SIZE))
+    assert_agrees(xla.rasterize, seed, solid(seed), *view(*SIZE))
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("size", [(1, 1), (17, 33)])
 def test_sizes_of_the_image(size):
-    assert_images_agree(xla.rasterise, random_cloud(4, COUNT), *view(*size))
+    assert_images_agree(xla.rasterize, random_cloud(4, COUNT), *view(*size))
 
 
 @pytest.mark.full
@@ -122,7 +122,7 @@ def test_gaussians_larger_than_the_image():
     """And a camera in the middle of the cloud, where many lie behind or beside it."""
     scene, (camera, pose) = random_cloud(5, COUNT), view(*SIZE, distance=0.3)
     scene = dataclasses.replace(scene, log_scales=scene.log_scales + 2.0)
-    assert_agrees(xla.rasterise, 5, scene, camera, pose)
+    assert_agrees(xla.rasterize, 5, scene, camera, pose)
 
 
 @pytest.mark.full
@@ -138,28 +138,28 @@ def test_sizes_of_batches_and_chunks_do_not_matter(batch, chunk):
     scene, (camera, pose) = solid(3), view(*SIZE)
     config = dataclasses.replace(CONFIG, tiles_per_batch=batch, gaussians_per_chunk=chunk)
     other = partial(_configured, config)
-    one, two = (render_with(r, scene, camera, pose) for r in (xla.rasterise, other))
+    one, two = (render_with(r, scene, camera, pose) for r in (xla.rasterize, other))
     np.testing.assert_allclose(one.rgb, two.rgb, atol=1e-4)
-    by_one, by_two = (gradients_with(ALL, r, (scene, camera, pose)) for r in (xla.rasterise, other))
+    by_one, by_two = (gradients_with(ALL, r, (scene, camera, pose)) for r in (xla.rasterize, other))
     for a, b in zip(jax.tree.leaves(by_one), jax.tree.leaves(by_two), strict=True):
         assert np.linalg.norm(a - b) <= 1e-3 * np.linalg.norm(a) + 1e-6
 
 
 def _configured(config, scene, camera, pose, offsets, _):
-    return xla.rasterise(scene, camera, pose, offsets, config)
+    return xla.rasterize(scene, camera, pose, offsets, config)
 
 
 def test_sizes_below_one_are_refused():
     config = RasterConfig(gaussians_per_chunk=0)
     with pytest.raises(ValueError, match="gaussians_per_chunk must be at least 1, got 0"):
-        composite(xla.rasterise, random_cloud(1, 2), *view(*SIZE), config=config)
+        composite(xla.rasterize, random_cloud(1, 2), *view(*SIZE), config=config)
 
 
 def test_overflow_is_counted():
     scene, (camera, pose) = random_cloud(8, COUNT), view(*SIZE)
-    needed = int(render_with(xla.rasterise, scene, camera, pose).num_intersections)
+    needed = int(render_with(xla.rasterize, scene, camera, pose).num_intersections)
     tight = dataclasses.replace(CONFIG, max_intersections=needed - 5)
-    found = render_with(xla.rasterise, scene, camera, pose, None, tight)
+    found = render_with(xla.rasterize, scene, camera, pose, None, tight)
     assert (int(found.num_intersections), int(found.overflow)) == (needed, 5)
 
 
@@ -167,12 +167,12 @@ def test_overflow_is_counted():
 def test_one_gaussian_and_none_in_sight():
     scene, (camera, pose) = random_cloud(1, 1), view(*SIZE)
     centered = dataclasses.replace(scene, means=jnp.zeros((1, 3)), opacity_logits=jnp.ones(1))
-    assert_images_agree(xla.rasterise, centered, camera, pose)
+    assert_images_agree(xla.rasterize, centered, camera, pose)
     behind = dataclasses.replace(centered, means=2.0 * pose[None, :3, 3])
-    result = render_with(xla.rasterise, behind, camera, pose)
+    result = render_with(xla.rasterize, behind, camera, pose)
     assert float(result.alpha.max()) == float(result.rgb.max()) == 0.0
     assert int(result.num_intersections) == 0
-    for leaf in jax.tree.leaves(gradients_with(ALL, xla.rasterise, (behind, camera, pose))):
+    for leaf in jax.tree.leaves(gradients_with(ALL, xla.rasterize, (behind, camera, pose))):
         assert float(jnp.abs(leaf).max()) == 0.0
 
 
@@ -188,10 +188,10 @@ def test_what_is_not_a_number_is_not_drawn(seed, name):
     shape = getattr(scene, name).shape
     spoiled = dataclasses.replace(scene, **{name: jnp.asarray(values.reshape(shape))})
     faded = dataclasses.replace(scene, opacity_logits=scene.opacity_logits.at[broken].set(-50.0))
-    found = render_with(xla.rasterise, spoiled, camera, pose)
-    expected = render_with(xla.rasterise, faded, camera, pose)
+    found = render_with(xla.rasterize, spoiled, camera, pose)
+    expected = render_with(xla.rasterize, faded, camera, pose)
     np.testing.assert_array_equal(found.rgb, expected.rgb)
-    for leaf in jax.tree.leaves(gradients_with(ALL, xla.rasterise, (spoiled, camera, pose))):
+    for leaf in jax.tree.leaves(gradients_with(ALL, xla.rasterize, (spoiled, camera, pose))):
         assert np.isfinite(leaf).all()
 
 
@@ -202,7 +202,7 @@ def test_vmap_and_scan_equal_one_view_after_the_other():
     poses = jnp.stack([look_at(eye, np.zeros(3)) for eye in eyes])
 
     def loss(scene, pose):
-        result = composite(xla.rasterise, scene, camera, pose)
+        result = composite(xla.rasterize, scene, camera, pose)
         return jnp.sum(result.rgb * ALL[0]) + jnp.sum(result.depth_sum), result.overflow
 
     step = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
@@ -222,7 +222,7 @@ def test_memory_does_not_grow_with_the_layers():
     scene = jax.eval_shape(lambda: random_cloud(0, count))
     camera = Camera.from_fov(edge, edge, 60.0)
     loss = lambda scene: jnp.sum(
-        composite(xla.rasterise, scene, camera, jnp.eye(4), config=RasterConfig()).rgb
+        composite(xla.rasterize, scene, camera, jnp.eye(4), config=RasterConfig()).rgb
     )
     compiled = jax.jit(jax.grad(loss)).lower(scene).compile()
     analysis = compiled.memory_analysis()

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.frame import Frame
+from r3jax.geometry.compaction import positions_of_set
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.voxels import EMPTY_WORD, unpack, voxel_center
 from r3jax.mapping.associate import Groups, group_by_voxel, points_of_pixels
-from r3jax.mapping.compact import positions_of_set
 from r3jax.mapping.join import CHUNK
 from r3jax.mapping.state import MapState
 from r3jax.mapping.table import find

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from r3jax.frame import Frame
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.voxels import unpack, voxel_center
+from r3jax.mapping.seen import rows_in_view
 from r3jax.mapping.state import MapState
 from r3jax.planning.policies.active_gs.confidence import Sightings
-from r3jax.scoring.sighting import looked_at
 
 
 @jax.jit
@@ -37,7 +37,7 @@ def glance(
         frame: the frame.
         max_range: d_max, the sensor's range [m].
     """
-    is_new = looked_at(state, frame, max_range) & (touched.views == before.views)
+    is_new = rows_in_view(state, frame, max_range) & (touched.views == before.views)
     center = voxel_center(jnp.stack(unpack(state.key[0], state.key[1])), state.voxel_size)
     offset = frame.position[:, None] - center
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)

@@ -15,7 +15,6 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import VIEW_DISTANCE, host_generator
 from r3jax.planning.policies.active_gs.confidence import Sightings
 from r3jax.planning.travel import Travel
-from r3jax.scoring.voxels import voxels_of
 
 LOW_CONFIDENCE = 0.3
 """Voxels with less than this are worth another look."""
@@ -60,7 +59,7 @@ def low_confidence(
     state: MapState, seen: Sightings, grid: OccupancyGrid
 ) -> tuple[Int[Array, "X Y Z"], Float[Array, "3 X Y Z"]]:
     """Per cell the number of voxels of low confidence, and the sum of their normals."""
-    cell = world_to_cell(grid, voxels_of(state).center.T)
+    cell = world_to_cell(grid, state.center.T)
     shape = grid.log_odds.shape
     is_low = state.occupied & (seen.confidence < LOW_CONFIDENCE)
     flat = jnp.zeros(state.capacity, dtype=jnp.int32)

@@ -1,4 +1,4 @@
-"""Rasteriser for CPUs: projection, binning, sort, compositing and all gradients in Numba."""
+"""Rasterizer for CPUs: projection, binning, sort, compositing and all gradients in Numba."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ _Residuals = tuple[_Cloud, Array, tuple[Array, ...], tuple[Array, ...]]
 """Cloud, view, images, and what the kernels keep for the backward pass."""
 
 
-def rasterise(
+def rasterize(
     scene: GaussianScene,
     camera: Camera,
     T_world_camera: Float[Array, "4 4"],

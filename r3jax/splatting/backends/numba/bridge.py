@@ -28,7 +28,7 @@ from r3jax.splatting.backends.numba.passes import backward_pass, forward_pass
 
 FORWARD, BACKWARD = "r3jax_splatting_forward", "r3jax_splatting_backward"
 
-# Offsets in bytes in the structs of XLA's FFI, API version 0.x.
+# Offsets in bytes in the structs of XLA's FFI, API version `splatting.backend.WRITTEN_FOR`.
 _EXTENSION, _API = 8, 16
 _API_MINOR = 36  # in XLA_FFI_Api
 _ARGUMENTS, _RESULTS = 72, 112  # in XLA_FFI_CallFrame: arrays of pointers to buffers
@@ -206,7 +206,7 @@ def require_threads() -> None:
     layer = threading_layer()
     if layer == "workqueue":
         raise RuntimeError(
-            "the numba rasteriser needs Numba's threading layer `omp` or `tbb`, but only "
+            "the numba rasterizer needs Numba's threading layer `omp` or `tbb`, but only "
             "`workqueue` is there, which aborts the process when two renderings run at once. "
             "Install OpenMP (libgomp) or `pip install tbb`, or render with backend='xla'."
         )

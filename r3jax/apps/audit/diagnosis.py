@@ -1,0 +1,225 @@
+"""How well every surface would render for somebody who stands somewhere else, and why not better.
+
+Renderability belongs to a voxel *and* a place from which it is asked. The places here are spread
+over all where somebody could stand; of each voxel the answers of those that see it are averaged.
+
+Shape symbols: N rows of the map; p standpoints.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.apps.audit.sight import LEAST
+from r3jax.mapping.state import MapState
+from r3jax.scoring.batch import map_over_devices
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.renderability import score_voxels
+from r3jax.visibility.depth_buffer import seen_in
+from r3jax.visibility.selection import for_selected, select
+from r3jax.visibility.views import panorama_view
+
+CAUSES = ("fine", "angle", "rare", "distance", "noise")
+"""What a voxel suffers from most; the numbers in `Diagnosis.cause` count along these."""
+
+FINE = 0.5
+"""A voxel whose mean renderability is at least this counts as fine."""
+
+FEW = 3
+"""A voxel that was measured in fewer pictures was seen too rarely."""
+
+
+class Demand(eqx.Module):
+    """From where surfaces will be looked at. Surfaces do not move, so it is made once."""
+
+    position: Float[Array, "p 3"]
+    """The standpoints [audit units]."""
+
+    visible: Bool[Array, "p N"]
+    """True where a standpoint sees a voxel."""
+
+    @property
+    def num_seen(self) -> Float[Array, " N"]:
+        """Standpoints that see each voxel."""
+        return jnp.sum(self.visible, axis=0, dtype=jnp.float32)
+
+
+class Answers(eqx.Module):
+    """What the standpoints say of the voxels."""
+
+    value: Float[Array, "p N"]
+    """Renderability of each voxel from each standpoint; 0 where it does not see it."""
+
+    terms: Float[Array, "3 N"]
+    """Sums of bias, noise and resolution over the standpoints that see a voxel."""
+
+    costs: Float[Array, "3 N"]
+    """Sums of -log of the same."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is wrong with each voxel. Means are over the standpoints that see it."""
+
+    num_seen: np.ndarray
+    """Standpoints that see the voxel, [N]; where there is none the rest is 0."""
+
+    value: np.ndarray
+    """Mean renderability, [N]."""
+
+    bias: np.ndarray
+    """Mean factor of the angle, [N]."""
+
+    noise: np.ndarray
+    """Mean factor of the color's consistency, [N]."""
+
+    resolution: np.ndarray
+    """Mean factor of the distance, [N]."""
+
+    num_directions: np.ndarray
+    """Direction bins that have seen the voxel, [N]."""
+
+    cause: np.ndarray
+    """Index into `CAUSES`, [N] int."""
+
+    @property
+    def is_judged(self) -> np.ndarray:
+        """True for voxels that some standpoint sees, [N]."""
+        return self.num_seen > 0.0
+
+    @property
+    def mean(self) -> float:
+        """Mean renderability of the surfaces that can be seen; 0 where there are none."""
+        return float(self.value[self.is_judged].mean()) if self.is_judged.any() else 0.0
+
+    @property
+    def fine_share(self) -> float:
+        """Share of the surfaces that can be seen, of those that are fine."""
+        judged = self.is_judged
+        return float((self.value[judged] >= FINE).mean()) if judged.any() else 0.0
+
+    def share(self, cause: str) -> float:
+        """Share of the surfaces that can be seen, of those with this cause."""
+        judged = self.is_judged
+        wanted = self.cause[judged] == CAUSES.index(cause)
+        return float(wanted.mean()) if judged.any() else 0.0
+
+
+def demand_of(state: MapState, standpoints: np.ndarray, config: ScoringConfig) -> Demand:
+    """Which voxels each standpoint sees.
+
+    Args:
+        state: the map.
+        standpoints: [p, 3] [audit units].
+        config: range and size of the panoramic depth buffer.
+    """
+    position = jnp.asarray(standpoints, dtype=jnp.float32)
+    return Demand(position, map_over_devices(functools.partial(_visible, state, config), position))
+
+
+@jax.jit
+def _visible(
+    voxels: MapState, config: ScoringConfig, positions: Float[Array, "p 3"]
+) -> Bool[Array, "p N"]:
+    def seen_from(position: Float[Array, " 3"]) -> Bool[Array, " N"]:
+        _, visible = seen_in(voxels, panorama_view(position, config), config)
+        return visible.mask
+
+    return jax.lax.map(seen_from, positions)
+
+
+def ask(state: MapState, demand: Demand, focal: Float[Array, ""], config: ScoringConfig) -> Answers:
+    """Every standpoint's answers.
+
+    Args:
+        state: the map; its surfaces are those of the demand.
+        demand: who asks.
+        focal: focal length of the camera that would render [px], in the map's unit.
+        config: of the closed forms.
+    """
+    # Numbers of the standpoints; candidates are floats to whoever deals them out.
+    ids = jnp.arange(demand.position.shape[0], dtype=jnp.float32)
+    part = functools.partial(_answers, state, demand, focal, config)
+    value, terms, costs = map_over_devices(part, ids)
+    return Answers(value, jnp.sum(terms, axis=0), jnp.sum(costs, axis=0))
+
+
+@jax.jit
+def _answers(
+    voxels: MapState,
+    demand: Demand,
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    ids: Float[Array, " q"],
+) -> tuple[Float[Array, "q N"], Float[Array, "q 3 N"], Float[Array, "q 3 N"]]:
+    """Values, terms and costs of some of the standpoints."""
+    num = voxels.count.shape[0]
+
+    def answer(number: Float[Array, ""]) -> tuple[Array, Array, Array]:
+        index = number.astype(jnp.int32)
+        position = demand.position[index]
+
+        def score(
+            rows: Int[Array, " K"], valid: Bool[Array, " K"], found: tuple[Array, Array]
+        ) -> tuple[Array, Array]:
+            terms = score_voxels(voxels.take(rows, valid), position, focal, config.forms)
+            target = jnp.where(valid, rows, num)
+            value, factors = found
+            three = jnp.stack([terms.bias, terms.noise, terms.resolution])
+            return (
+                value.at[target].set(terms.value, mode="drop"),
+                factors.at[:, target].set(three, mode="drop"),
+            )
+
+        seen = demand.visible[index] & voxels.present
+        blank = jnp.zeros(num), jnp.ones((3, num))
+        value, factors = for_selected(select(seen), score, blank)
+        costs = -jnp.log(jnp.maximum(factors, LEAST))
+        return value, jnp.where(seen[None, :], factors, 0.0), costs
+
+    return jax.lax.map(answer, ids)
+
+
+def diagnose(state: MapState, demand: Demand, answers: Answers) -> Diagnosis:
+    """Judges every voxel by the mean of the answers.
+
+    Args:
+        state: the map.
+        demand: who was asked.
+        answers: what they say of this map.
+    """
+    count = np.asarray(demand.num_seen)
+    value = np.asarray(jnp.sum(answers.value, axis=0)) / np.maximum(count, 1.0)
+    bias, noise, resolution = np.asarray(answers.terms) / np.maximum(count, 1.0)
+    directions = np.bitwise_count(np.asarray(state.visited)).sum(axis=0).astype(np.int64)
+    return Diagnosis(
+        num_seen=count,
+        value=value,
+        bias=bias,
+        noise=noise,
+        resolution=resolution,
+        num_directions=directions,
+        cause=cause_of(value, np.asarray(answers.costs), np.asarray(state.count)),
+    )
+
+
+def cause_of(value: np.ndarray, costs: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Index into `CAUSES` of each voxel, [N]: the dearest term, where the product is not fine.
+
+    A low bias of a voxel that hardly any picture has measured is called rare; of others, angle.
+
+    Args:
+        value: mean renderability, [N].
+        costs: sums of -log of bias, noise and resolution, [3, N].
+        count: pictures that have measured the voxel, [N].
+    """
+    dearest = np.argmax(costs, axis=0)
+    of_bias = np.where(count < FEW, CAUSES.index("rare"), CAUSES.index("angle"))
+    of_others = np.where(dearest == 1, CAUSES.index("noise"), CAUSES.index("distance"))
+    found = np.where(dearest == 0, of_bias, of_others)
+    return np.where(value >= FINE, CAUSES.index("fine"), found)

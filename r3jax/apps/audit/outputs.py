@@ -1,0 +1,169 @@
+"""What an audit leaves on disk beside its report, all of it in the capture's own coordinates.
+
+voxels.ply                 voxels, colored by renderability from red to green
+causes.ply                 voxels, colored by what they suffer from; the terms as properties
+suggested.json             the suggested views as nerfstudio's camera_path.json
+suggested_transforms.json  the same as a transforms.json
+audit.json                 every number
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.apps.audit.audit import Audit
+from r3jax.apps.audit.camera_paths import write_camera_path, write_path_transforms
+from r3jax.apps.audit.colors import cause_colors, score_colors
+from r3jax.apps.audit.diagnosis import CAUSES, FEW, FINE, Diagnosis
+from r3jax.apps.audit.regions import Region
+from r3jax.files import write_atomic
+from r3jax.formats.pointcloud import write_points
+from r3jax.formats.transforms import OPENGL_FROM_OPENCV
+
+FORMAT = 1
+"""Version of audit.json."""
+
+
+def write_outputs(audit: Audit, folder: Path) -> dict[str, Path]:
+    """Writes everything but the report.
+
+    Args:
+        audit: what was found.
+        folder: a folder that exists.
+
+    Returns:
+        The files by what they hold.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    written = {
+        "renderability": folder / "voxels.ply",
+        "causes": folder / "causes.ply",
+        "numbers": folder / "audit.json",
+    }
+    _write_clouds(audit, written["renderability"], written["causes"])
+    poses = suggested_poses(audit)
+    if len(poses):
+        written["camera path"] = folder / "suggested.json"
+        written["transforms"] = folder / "suggested_transforms.json"
+        write_camera_path(written["camera path"], poses, audit.lens.camera)
+        write_path_transforms(written["transforms"], poses, audit.lens.camera)
+    text = json.dumps(record_of(audit), indent=1, allow_nan=False)
+    write_atomic(written["numbers"], (text + "\n").encode())
+    return written
+
+
+def suggested_poses(audit: Audit) -> np.ndarray:
+    """`T_world_camera` of the suggested views, in the capture's own coordinates, [k, 4, 4]."""
+    if not audit.plan.views:
+        return np.zeros((0, 4, 4))
+    return audit.survey.alignment.poses_back(np.stack([view.pose for view in audit.plan.views]))
+
+
+def _write_clouds(audit: Audit, values: Path, causes: Path) -> None:
+    state, found = audit.seen.state, audit.diagnosis
+    present = np.asarray(state.occupied)
+    centers = np.asarray(state.center, np.float64).T[present]
+    points = audit.survey.alignment.points_back(centers).astype(np.float32)
+    judged = found.is_judged[present]
+    shown = score_colors(found.value)[present]
+    write_points(
+        values, points[judged], shown[judged], {"renderability": found.value[present][judged]}
+    )
+    properties = {
+        "renderability": found.value,
+        "bias": found.bias,
+        "noise": found.noise,
+        "resolution": found.resolution,
+        "directions": found.num_directions,
+        "observations": np.asarray(state.count),
+        "cause": found.cause,
+    }
+    write_points(
+        causes,
+        points,
+        cause_colors(found)[present],
+        {name: np.asarray(column, np.float32)[present] for name, column in properties.items()},
+    )
+
+
+def record_of(audit: Audit) -> dict[str, Any]:
+    """The content of audit.json."""
+    survey, found, plan = audit.survey, audit.diagnosis, audit.plan
+    square = survey.length(1.0) ** 2
+    renderability = audit.renderability
+    return {
+        "format": FORMAT,
+        "capture": audit.source.name,
+        "unit": "metre" if audit.source.is_metric else "unknown",
+        "depth_from": audit.source.kind,
+        "pictures": len(audit.source),
+        "pictures_used": survey.chosen.tolist(),
+        "voxel_size": survey.length(survey.voxel_size),
+        "max_range": survey.length(float(audit.config.max_range)),
+        "median_depth": survey.median_depth,
+        "far_depth": survey.far_depth,
+        "up": survey.alignment.directions_back(np.array([[0.0, 0.0, 1.0]]))[0].tolist(),
+        "folds": len(audit.seen.folds),
+        "fine_from": FINE,
+        "rare_below": FEW,
+        "surfaces": {
+            **_surfaces(found, survey.voxel_size**2 * square),
+            "unseen_area": audit.unseen_area * square,
+        },
+        "regions": [_region(audit, region) for region in (*audit.regions, *audit.unseen)],
+        "path": {
+            "own": audit.is_own_path,
+            "mean": float(renderability.mean()),
+            "frames": [
+                {
+                    "index": frame.index,
+                    "label": frame.label,
+                    "fold": int(audit.seen.fold_of[i]) if audit.is_own_path else None,
+                    **dataclasses.asdict(frame.score),
+                }
+                for i, frame in enumerate(audit.frames)
+            ],
+        },
+        "suggested": [
+            {
+                "camera_to_world_opengl": (pose @ OPENGL_FROM_OPENCV).tolist(),
+                "gain_in_voxels": view.gain,
+                "unseen_cells": len(view.cells),
+                "voxels_shown": len(view.shown),
+                "voxels_mended": view.num_mended,
+                "causes": view.causes,
+                "mean_after": view.mean_after,
+                "fine_after": view.fine_after,
+            }
+            for view, pose in zip(plan.views, suggested_poses(audit), strict=True)
+        ],
+        "mean_after_random_views": list(plan.random_mean),
+    }
+
+
+def _surfaces(found: Diagnosis, face: float) -> dict[str, Any]:
+    """Shares and areas by cause; `face` is the area of a voxel's face in the capture's units."""
+    judged = int(found.is_judged.sum())
+    return {
+        "voxels_judged": judged,
+        "area_judged": judged * face,
+        "mean": found.mean,
+        "share": {name: found.share(name) for name in CAUSES},
+        "area": {name: found.share(name) * judged * face for name in CAUSES},
+    }
+
+
+def _region(audit: Audit, region: Region) -> dict[str, Any]:
+    back = audit.survey.alignment.points_back
+    return {
+        "center": back(region.center[None])[0].tolist(),
+        "area": region.area * audit.survey.length(1.0) ** 2,
+        "cause": region.cause,
+        "renderability": region.renderability,
+        "bad_share": region.bad_share,
+    }

@@ -1,0 +1,221 @@
+"""Runs cells in processes of their own on this machine, one GPU each where there are several.
+
+A process that crashes, or is killed for its memory, costs its cell and nothing else. Light on
+purpose: a worker imports this module before its environment is set, and nothing here may wake JAX.
+"""
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from r3jax.apps.benchmark.cells import Cell
+    from r3jax.apps.benchmark.engines.events import Report
+
+_STAGE_EVERY = 0.5
+"""Stages are told at most this often [s]."""
+
+
+def run_here(cells: Sequence["Cell"], root: Path, report: "Report") -> None:
+    """Runs cells one after the other in this process."""
+    from r3jax.apps.benchmark.engines.events import Event
+    from r3jax.apps.benchmark.run_cell import run_cell
+
+    for cell in cells:
+        report(Event(cell, "started"))
+        try:
+            run_cell(cell, root, lambda stage, cell=cell: report(Event(cell, "stage", stage)))
+        except Exception as error:
+            report(Event(cell, "failed", in_words(error)))
+        else:
+            report(Event(cell, "done"))
+
+
+def run_in_processes(
+    cells: Sequence["Cell"], root: Path, report: "Report", *, jobs: int = 1
+) -> None:
+    """Runs cells in `jobs` processes; each takes the next cell when it is free.
+
+    Args:
+        cells: what to do.
+        root: folder of the benchmark.
+        report: told what happens.
+        jobs: processes at a time, at least 1.
+
+    Raises:
+        ValueError: jobs below 1.
+        KeyboardInterrupt: Ctrl-C; the processes are ended, what is complete stays.
+    """
+    from r3jax.apps.benchmark.engines.events import Event
+
+    if jobs < 1:
+        raise ValueError(f"jobs must be at least 1, got {jobs}")
+    waiting = deque(cells)
+    environments = worker_environments(min(jobs, len(cells)))
+    workers = [_Worker(environment) for environment in environments]
+    try:
+        while waiting or any(worker.cell for worker in workers):
+            for worker in workers:
+                if worker.cell is None and waiting:
+                    worker.start(waiting.popleft(), root)
+                    report(Event(worker.cell, "started"))  # pyright: ignore[reportArgumentType]
+            busy = {worker.pipe: worker for worker in workers if worker.cell is not None}
+            for pipe in multiprocessing.connection.wait(list(busy)):  # pyright: ignore[reportArgumentType]
+                event = busy[pipe].receive()  # pyright: ignore[reportArgumentType]
+                report(event)
+    finally:
+        for worker in workers:
+            worker.kill()
+
+
+class _Worker:
+    """A process, started when it is first needed and again after it died."""
+
+    def __init__(self, environment: dict[str, str]):
+        self._environment = environment
+        self._process: Any = None
+        self.pipe: Connection | None = None
+        self.cell: Cell | None = None
+
+    def start(self, cell: "Cell", root: Path) -> None:
+        """Gives it a cell."""
+        if self._process is None:
+            # JAX runs threads, which do not survive a fork.
+            context = multiprocessing.get_context("spawn")
+            self.pipe, far_end = context.Pipe()
+            self._process = context.Process(
+                target=_serve, args=(far_end, self._environment), daemon=True
+            )
+            self._process.start()
+            far_end.close()  # so that the pipe ends when the process does
+        assert self.pipe is not None
+        self.cell = cell
+        self.pipe.send((cell, root))
+
+    def receive(self) -> Any:
+        """The next event of its cell; a process that died makes it a failure."""
+        from r3jax.apps.benchmark.engines.events import Event
+
+        assert self.pipe is not None
+        assert self.cell is not None
+        cell = self.cell
+        try:
+            kind, text = self.pipe.recv()
+        except (EOFError, ConnectionError):
+            self._process.join()
+            kind, text = "failed", _death(self._process.exitcode)
+            self.kill()
+        if kind in ("done", "failed"):
+            self.cell = None
+        return Event(cell, kind, text)
+
+    def kill(self) -> None:
+        """Ends the process at once: whatever it was writing is whole or absent."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._process, self.cell = None, None
+        if self.pipe is not None:
+            self.pipe.close()
+            self.pipe = None
+
+
+def _death(exit_code: int) -> str:
+    if exit_code == -signal.SIGKILL:
+        return "its process was killed, perhaps because the memory ran out"
+    return f"its process ended with code {exit_code}"
+
+
+def in_words(error: BaseException) -> str:
+    """An error in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _serve(pipe: Connection, environment: dict[str, str]) -> None:
+    """A worker's life: cells in, stages and ends out."""
+    os.environ.update(environment)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    while True:
+        try:
+            cell, root = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(_outcome(cell, root, pipe))
+
+
+def _outcome(cell: "Cell", root: Path, pipe: Connection) -> tuple[str, str]:
+    last = -_STAGE_EVERY
+
+    def on_stage(stage: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _STAGE_EVERY:
+            last = time.monotonic()
+            pipe.send(("stage", stage))
+
+    try:
+        from r3jax.apps.benchmark.run_cell import run_cell
+
+        run_cell(cell, root, on_stage)
+    except Exception as error:
+        return "failed", in_words(error)
+    return "done", ""
+
+
+def _die_with_parent() -> None:
+    """A parent that is killed cannot end its workers: they notice and go."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+def worker_environments(count: int) -> list[dict[str, str]]:
+    """The environment of each of `count` workers: its GPU and its share of memory or cores.
+
+    What the user has set is left alone.
+    """
+    gpus = visible_gpus()
+    wanted: list[dict[str, str]] = []
+    for index in range(count):
+        if gpus:
+            sharing = -(-count // len(gpus))
+            environment = {"CUDA_VISIBLE_DEVICES": gpus[index % len(gpus)]}
+            if sharing > 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:
+                environment["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{0.9 / sharing:.3f}"
+        elif "NUMBA_NUM_THREADS" not in os.environ:
+            threads = max(1, len(os.sched_getaffinity(0)) // count)
+            environment = {"NUMBA_NUM_THREADS": str(threads)}
+        else:
+            environment = {}
+        wanted.append(environment)
+    return wanted
+
+
+def visible_gpus() -> list[str]:
+    """What CUDA_VISIBLE_DEVICES may hold for one GPU each; empty without any.
+
+    JAX is not asked: it would take the memory of all of them.
+    """
+    if "CUDA_VISIBLE_DEVICES" in os.environ:
+        given = os.environ["CUDA_VISIBLE_DEVICES"].split(",")
+        return [gpu.strip() for gpu in given if gpu.strip() not in ("", "-1")]
+    if os.environ.get("JAX_PLATFORMS", "").lower() == "cpu" or shutil.which("nvidia-smi") is None:
+        return []
+    try:
+        listed = subprocess.run(
+            ["nvidia-smi", "--list-gpus"], capture_output=True, text=True, timeout=30, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [str(i) for i in range(listed.stdout.count("GPU "))]

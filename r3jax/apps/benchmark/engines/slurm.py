@@ -1,0 +1,151 @@
+"""Runs cells as an array job of a Slurm cluster, through submitit.
+
+A job that is preempted or runs out of time is put back into the queue by submitit and goes on
+with its cell: all that is complete lies in the benchmark's folder, which every node must see.
+"""
+
+import itertools
+import time
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from r3jax.apps.benchmark.cells import Cell, snapshots_left
+from r3jax.apps.benchmark.engines.events import Event, Report
+from r3jax.apps.benchmark.engines.local import in_words
+from r3jax.apps.benchmark.engines.slurm_queue import ended_jobs
+
+_TIMEOUT = 240
+"""Minutes that a job asks for, unless the user says otherwise."""
+
+_MAX_TIMEOUTS = 100
+"""A job goes back into the queue so many times: each time it gets further."""
+
+_LOOKS_PER_QUESTION = 6
+"""Results are looked for at each look, the queue is asked at every sixth: a controller has many
+users."""
+
+
+class CellJob:
+    """What runs on a node."""
+
+    def __call__(self, cell: Cell, root: Path) -> str:
+        """Does what is left of a cell; why it failed, or nothing."""
+        from r3jax.apps.benchmark.run_cell import run_cell
+
+        try:
+            run_cell(cell, root)
+        except Exception as error:
+            return in_words(error)
+        return ""
+
+    def checkpoint(self, cell: Cell, root: Path) -> Any:
+        """What goes back into the queue: the same, since the folder knows how far it is."""
+        return _submitit().helpers.DelayedSubmission(self, cell, root)
+
+
+def run_on_cluster(
+    cells: Sequence[Cell],
+    root: Path,
+    report: Report,
+    *,
+    jobs: int = 1,
+    parameters: dict[str, Any] | None = None,
+    cluster: str | None = "slurm",
+    poll_every: float = 5.0,
+) -> None:
+    """Submits an array job with one task per cell, and waits for all of them.
+
+    Args:
+        cells: what to do.
+        root: folder of the benchmark, at the same path on every node.
+        report: told what happens.
+        jobs: tasks at a time.
+        parameters: of `submitit.AutoExecutor.update_parameters`: `timeout_min`,
+            `slurm_partition`, `gpus_per_node`, ...
+        cluster: where submitit submits: `slurm`; `local` needs no cluster.
+        poll_every: seconds between two looks at the jobs.
+
+    Raises:
+        ImportError: submitit is not installed.
+        KeyboardInterrupt: Ctrl-C; the jobs go on, and another `r3jax benchmark` with the same
+            arguments collects what they have done.
+    """
+    submitit = _submitit()
+    root = Path(root).resolve()
+    executor = submitit.AutoExecutor(
+        folder=root / "slurm", cluster=cluster, slurm_max_num_timeout=_MAX_TIMEOUTS
+    )
+    shared = {"name": "r3jax", "timeout_min": _TIMEOUT, "slurm_array_parallelism": jobs}
+    executor.update_parameters(**shared | (parameters or {}))
+    submitted = executor.map_array(CellJob(), cells, [root] * len(cells))
+    waiting = {job.job_id: (cell, job) for cell, job in zip(cells, submitted, strict=True)}
+    for job_id, (cell, _) in waiting.items():
+        report(Event(cell, "started", f"job {job_id}"))
+    ended = ended_jobs if cluster == "slurm" else partial(_ended_by_submitit, submitted)
+    _wait_for(waiting, root, report, ended, poll_every)
+
+
+def _wait_for(
+    waiting: dict[str, tuple[Cell, Any]],
+    root: Path,
+    report: Report,
+    ended: Callable[[Iterable[str]], dict[str, str]],
+    poll_every: float,
+) -> None:
+    """Tells the end of each job of `waiting`, which holds cell and job by the job's id.
+
+    A job that leaves a result has ended. One that left the queue without any may have a result
+    that a network file system does not show yet: it has failed at the next question.
+    """
+    before: dict[str, str] = {}
+    for look in itertools.count():
+        asks = look % _LOOKS_PER_QUESTION == 0
+        now = ended(waiting) if asks else {}
+        for job_id, (cell, job) in tuple(waiting.items()):
+            if job.paths.result_pickle.exists():
+                report(_end_of(cell, job))
+            elif job_id in before and job_id in now:
+                report(_end_without_result(cell, root, job, now[job_id]))
+            else:
+                continue
+            del waiting[job_id]
+        if not waiting:
+            return
+        before = now if asks else before
+        time.sleep(poll_every)
+
+
+def _end_of(cell: Cell, job: Any) -> Event:
+    error = job.exception()  # of the job itself: out of time too often, ...
+    reason = job.result() if error is None else in_words(error)
+    return Event(cell, "failed", f"job {job.job_id}: {reason}") if reason else Event(cell, "done")
+
+
+def _end_without_result(cell: Cell, root: Path, job: Any, state: str) -> Event:
+    """Of a job that was killed, perhaps only after its last record was written."""
+    if not snapshots_left(root, cell):
+        return Event(cell, "done")
+    text = f"job {job.job_id} ended without a result: {state}"
+    log = job.paths.stderr
+    lines: list[str] = log.read_text(errors="replace").splitlines() if log.exists() else []
+    said = [line.strip() for line in lines if line.strip()]
+    said = [line for line in said if "error" in line.lower()] or said
+    return Event(cell, "failed", f"{text}; {log} says: {said[-1]}" if said else text)
+
+
+def _ended_by_submitit(jobs: Sequence[Any], job_ids: Iterable[str]) -> dict[str, str]:
+    """As `ended_jobs`, for submitit's other clusters."""
+    wanted = set(job_ids)
+    return {job.job_id: job.state for job in jobs if job.job_id in wanted and job.done()}
+
+
+def _submitit() -> Any:
+    try:
+        import submitit
+    except ImportError as error:
+        raise ImportError(
+            "--engine slurm needs the package submitit: pip install 'r3jax[slurm]'"
+        ) from error
+    return submitit

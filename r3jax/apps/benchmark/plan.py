@@ -1,0 +1,128 @@
+"""What a benchmark has to do: scenes x policies x seeds, and which of it is done."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.apps.benchmark.cells import Cell, snapshots_left
+from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.judging import FOLDER, JudgingViews, judging_path, save_judging_views
+from r3jax.evaluation.test_views import ViewSet, load_view_set, render_view_set
+from r3jax.exploration.step import check_world
+from r3jax.simulators.free_space import GroundTruth
+from r3jax.simulators.scenes.registry import open_scene
+from r3jax.splatting.views import load_views
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asks for."""
+
+    scenes: tuple[str, ...]
+    """Embedded scenes by name, or `mesh:<file>`."""
+
+    policies: tuple[str, ...]
+    """Their names."""
+
+    seeds: tuple[int, ...]
+    """One exploration and one training each."""
+
+    conditions: Conditions
+    """The same for all."""
+
+    max_test_views: int | None = 120
+    """Test views of a scene at most; None: all of the lattice."""
+
+    settings: dict[str, Any] = field(default_factory=dict[str, Any])
+    """Settings of all policies that differ from their defaults."""
+
+    up: str | None = None
+    """Vertical axis of mesh files; None: as their format has it."""
+
+    scale: float = 1.0
+    """Metres in a unit of the mesh files."""
+
+    cull_backfaces: bool = False
+    """Whether faces seen from behind are not there."""
+
+
+def make_plan(
+    request: Request, root: Path, on_stage: Callable[[str], None] = lambda stage: None
+) -> tuple[Cell, ...]:
+    """Every cell, scene by scene, with each scene's test views rendered and stored.
+
+    Args:
+        request: what to do.
+        root: folder of the benchmark.
+        on_stage: told what happens now.
+
+    Raises:
+        ValueError: an unknown scene or policy, a setting that cannot work, nothing to do.
+        OSError: a folder that cannot be written.
+    """
+    for name in ("scenes", "policies", "seeds"):
+        given = getattr(request, name)
+        if not given:
+            raise ValueError(f"there is nothing to do: no {name} are given")
+        if len(set(given)) < len(given):
+            raise ValueError(f"{name} holds something twice: {', '.join(map(str, given))}")
+    for policy in request.policies:  # what can be checked quickly comes before the scenes
+        request.conditions.policy(policy, request.settings)
+    cells: list[Cell] = []
+    for scene in request.scenes:
+        view_set = _prepare_scene(request, scene, root, on_stage)
+        for policy, seed in itertools.product(request.policies, request.seeds):
+            cells.append(
+                Cell(
+                    scene=scene,
+                    scene_hash=view_set.scene_hash,
+                    policy=policy,
+                    seed=seed,
+                    conditions=request.conditions,
+                    test_views_hash=view_set.hash,
+                    num_test_views=len(view_set),
+                    settings=request.settings,
+                    up=request.up,
+                    scale=request.scale,
+                    cull_backfaces=request.cull_backfaces,
+                )
+            )
+    return tuple(cells)
+
+
+def cells_left(root: Path, cells: Sequence[Cell]) -> tuple[Cell, ...]:
+    """The cells that have snapshots without a record."""
+    return tuple(cell for cell in cells if snapshots_left(root, cell))
+
+
+def _prepare_scene(
+    request: Request, scene: str, root: Path, on_stage: Callable[[str], None]
+) -> ViewSet:
+    """A scene's test set; its images lie in the folder afterwards."""
+    conditions, folder = request.conditions, Path(root) / FOLDER
+    on_stage(f"opening {scene}")
+    # Always the same start, whatever the seeds: the test set is what can be reached from it.
+    simulator = open_scene(
+        scene,
+        up=request.up,
+        scale=request.scale,
+        cull_back_faces=request.cull_backfaces,
+        noise=0.0,
+        seed=0,
+    )
+    check_world(simulator.bounds, conditions.exploration_config().cell_size)
+    truth = GroundTruth(simulator)
+    on_stage(f"finding the test views of {scene}")
+    view_set = load_view_set(folder, truth, max_views=request.max_test_views)
+    path = judging_path(root, view_set.scene_hash, view_set.hash, conditions)
+    if not path.exists():
+        on_stage(f"rendering {len(view_set)} test views of {scene}")
+        frames = render_view_set(truth, view_set, conditions.resolution, conditions.fov)
+        views = load_views(frames, conditions.train_resolution)
+        poses = view_set.poses.astype(np.float32)
+        save_judging_views(path, JudgingViews(view_set.hash, poses, views))
+    return view_set

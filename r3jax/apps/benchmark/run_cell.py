@@ -1,0 +1,283 @@
+"""One cell: explore once, then for each snapshot train from scratch, judge, and record.
+
+Whatever is finished stays finished: a process that is killed at any moment and started again
+goes on behind the last complete stage (a training behind its last checkpoint).
+"""
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+import json
+import time
+import traceback
+from collections.abc import Callable, Generator
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.apps.benchmark.cells import Cell, CellPaths, identity, paths_of, snapshots_left
+from r3jax.apps.benchmark.judging import JudgingViews, load_judging_views
+from r3jax.apps.benchmark.record import make_record, write_record
+from r3jax.evaluation.evaluate import evaluate
+from r3jax.evaluation.lpips import load_lpips
+from r3jax.evaluation.maps import map_of
+from r3jax.exploration.budget import parse_budget
+from r3jax.exploration.loop import explore
+from r3jax.exploration.state import StopReason
+from r3jax.files import lock_folder, write_atomic
+from r3jax.scoring.renderability import renderability
+from r3jax.simulators.scenes.registry import open_scene, scene_hash
+from r3jax.splatting import train
+from r3jax.splatting.checkpoints import remove_checkpoints
+from r3jax.splatting.errors import CheckpointError
+from r3jax.splatting.ply import write_scene
+from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.views import load_views
+from r3jax.trace.errors import RunError
+from r3jax.trace.header import RunHeader, camera_fields, package_versions, policy_fields
+from r3jax.trace.reader import Run, read_run
+from r3jax.trace.rows import StepRow
+from r3jax.trace.writer import RunWriter
+
+OnStage = Callable[[str], None]
+"""Told what happens now, in a few words."""
+
+_COMPLETE = {
+    StopReason.BUDGET.value,
+    StopReason.FORECAST.value,
+    StopReason.NO_CANDIDATE.value,
+    StopReason.NO_REACHABLE_CANDIDATE.value,
+    StopReason.STUCK.value,
+}
+"""Ends that belong to the result; after any other the exploration is repeated."""
+
+_LOCK_PATIENCE = 20.0
+"""A worker whose parent was killed needs a moment to notice [s]."""
+
+
+class CellError(RuntimeError):
+    """A cell that cannot be done, with the reason."""
+
+
+def run_cell(cell: Cell, root: Path, on_stage: OnStage = lambda stage: None) -> None:
+    """Does what is left of a cell.
+
+    Args:
+        cell: what to do.
+        root: folder of the benchmark.
+        on_stage: told what happens now.
+
+    Raises:
+        CellError: another process is at it, or some snapshots failed; the others are recorded.
+        KeyboardInterrupt: Ctrl-C; the next call goes on from here.
+    """
+    paths = paths_of(root, cell)
+    paths.folder.mkdir(parents=True, exist_ok=True)
+    with _lock(paths.folder):
+        try:
+            _run_locked(cell, root, paths, on_stage)
+        except Exception:
+            write_atomic(paths.error, traceback.format_exc().encode())
+            raise
+        paths.error.unlink(missing_ok=True)
+
+
+def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> None:
+    left = snapshots_left(root, cell)
+    if not left:
+        return
+    write_atomic(paths.identity, json.dumps(identity(cell), indent=1).encode())
+    run = _finished_run(paths.run) or _explore(cell, paths, on_stage)
+    judging = load_judging_views(root, cell)
+    failures: list[str] = []
+    for snapshot in left:
+        stage: OnStage = lambda what, snapshot=snapshot: on_stage(f"{snapshot}: {what}")
+        try:
+            _do_snapshot(cell, root, run, judging, snapshot, stage)
+        except Exception as error:  # the other snapshots may work
+            traceback.print_exc()
+            failures.append(f"{snapshot}: {type(error).__name__}: {error}")
+    if failures:
+        raise CellError("; ".join(failures))
+
+
+@contextlib.contextmanager
+def _lock(folder: Path) -> Generator[None]:
+    """One process at a time."""
+    end = time.monotonic() + _LOCK_PATIENCE
+    while True:
+        try:
+            lock = lock_folder(folder)
+            break
+        except BlockingIOError:
+            if time.monotonic() > end:
+                raise CellError(f"{folder}: another process is at this cell") from None
+            time.sleep(0.2)
+    with lock:
+        yield
+
+
+def _finished_run(path: Path) -> Run | None:
+    """The exploration, if there is one that came to its end."""
+    try:
+        run = read_run(path)
+    except RunError:
+        return None
+    return run if run.end is not None and run.end.outcome in _COMPLETE else None
+
+
+def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
+    """Explores, or goes on with the exploration that was cut off."""
+    conditions = cell.conditions
+    on_stage("opening the scene")
+    simulator = open_scene(
+        cell.scene,
+        up=cell.up,
+        scale=cell.scale,
+        cull_back_faces=cell.cull_backfaces,
+        camera=conditions.camera,
+        noise=conditions.noise,
+        seed=cell.seed,
+        max_range=conditions.max_range,
+    )
+    found = scene_hash(simulator)
+    if found != cell.scene_hash:
+        raise CellError(
+            f"the scene {cell.scene} has the hash {found[:12]}, but {cell.scene_hash[:12]} when "
+            "the benchmark was planned: the file has changed meanwhile, start again"
+        )
+    policy = conditions.policy(cell.policy, cell.settings)
+    config = conditions.exploration_config()
+    header = RunHeader(
+        scene={
+            "name": cell.scene,
+            "hash": found,
+            "up": cell.up,
+            "scale": cell.scale,
+            "cull_backfaces": cell.cull_backfaces,
+            "noise": conditions.noise,
+            "max_range": conditions.max_range,
+            "start": None,
+        },
+        policy=policy_fields(policy),
+        budget=conditions.budget,
+        seed=cell.seed,
+        config=dataclasses.asdict(config),
+        camera=camera_fields(simulator.camera),
+        bounds=np.asarray(simulator.bounds).tolist(),
+        packages=package_versions(),
+    )
+    on_stage("exploring")
+    recorder, begun = _begin_or_resume(paths.run, header)
+    with recorder:
+        result = explore(
+            simulator,
+            policy,
+            budget=conditions.budget,
+            seed=cell.seed,
+            config=config,
+            recorder=recorder,
+            resume=begun,
+            on_step=lambda row: on_stage(f"exploring, {row.step + 1} views"),
+        )
+    if result.reason is StopReason.INTERRUPTED:
+        raise KeyboardInterrupt
+    if result.reason.value not in _COMPLETE:
+        raise CellError(f"the exploration ended early: {result.message}")
+    return read_run(paths.run)
+
+
+def _begin_or_resume(path: Path, header: RunHeader) -> tuple[RunWriter, Run | None]:
+    """A new run, or what was recorded of the one that lies there."""
+    if (path / "run.json").exists():
+        try:
+            return RunWriter.resume(path)
+        except RunError as error:  # of another version, damaged, not ours to write
+            raise CellError(f"{error}; move it away to explore anew") from None
+    try:
+        return RunWriter(path, header), None
+    except RunError as error:  # somebody else's folder
+        raise CellError(str(error)) from None
+
+
+def steps_within(run: Run, snapshot: str) -> tuple[StepRow, ...]:
+    """The views that were taken within a snapshot's budget.
+
+    As in the loop, a view must arrive within the budget; the time that mapping it takes comes
+    after.
+    """
+    budget = parse_budget(snapshot)
+
+    def is_within(row: StepRow) -> bool:
+        seconds = row.seconds - row.charged.get("mapping", 0.0)
+        return budget.allows(views=row.step + 1, seconds=seconds, metres=row.metres)
+
+    return tuple(itertools.takewhile(is_within, run.rows))
+
+
+def _do_snapshot(
+    cell: Cell, root: Path, run: Run, judging: JudgingViews, snapshot: str, on_stage: OnStage
+) -> None:
+    """Trains, judges and records one snapshot."""
+    conditions, paths = cell.conditions, paths_of(root, cell)
+    steps = steps_within(run, snapshot)
+    scene = _train(cell, paths, run, len(steps), snapshot, on_stage)
+    on_stage("mapping its views")
+    frames = (run.frame(row.step) for row in steps)
+    loop = conditions.exploration_config()
+    state = map_of(
+        frames,
+        voxel_size=loop.voxel_size,
+        max_range=loop.max_range,
+        num_bins=loop.num_bins,
+        drop_edges=loop.drop_edges,
+    )
+    camera = conditions.camera
+    expected = [float(renderability(state, camera, jnp.asarray(T))) for T in judging.poses]
+    on_stage("judging")
+    config = conditions.train_config(cell.seed)
+    judgment = evaluate(
+        scene,
+        judging.views,
+        config.raster,
+        lpips=None if conditions.lpips == "none" else load_lpips(conditions.lpips),
+        renderability=expected,
+    )
+    assert run.end is not None
+    outcome = run.end.outcome if len(steps) == len(run.rows) else StopReason.BUDGET.value
+    record = make_record(root, cell, snapshot, steps, outcome, judgment.rows)
+    write_record(paths.record(snapshot), record)
+    # The model is kept, the optimizer's state is not.
+    remove_checkpoints(paths.checkpoints(snapshot))
+
+
+def _train(
+    cell: Cell, paths: CellPaths, run: Run, num_views: int, snapshot: str, on_stage: OnStage
+) -> GaussianScene:
+    """Vanilla 3DGS from scratch on the first views, or on from the newest checkpoint."""
+    on_stage("reading its views")
+    frames = (run.frame(step) for step in range(num_views))
+    views = load_views(frames, cell.conditions.train_resolution)
+    config = cell.conditions.train_config(cell.seed)
+    folder = paths.checkpoints(snapshot)
+    fit = functools.partial(
+        train.fit,
+        views,
+        config,
+        folder=folder,
+        checkpoint_every=max(1, min(1000, config.iterations // 5)),
+        on_progress=lambda progress: on_stage(
+            f"training, step {progress.step}/{progress.iterations}"
+        ),
+    )
+    try:
+        result = fit(resume=True)
+    except CheckpointError:  # nothing there yet, or all of it is damaged
+        result = fit(overwrite=True)
+    if result.interrupted:
+        raise KeyboardInterrupt
+    paths.model(snapshot).parent.mkdir(parents=True, exist_ok=True)
+    write_scene(paths.model(snapshot), result.scene)
+    return result.scene

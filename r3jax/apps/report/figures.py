@@ -1,0 +1,194 @@
+"""The figures of a run. Each function makes one `matplotlib` figure from what was recorded."""
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from r3jax.apps.report import style
+from r3jax.apps.report.pictures import PanoramaPicture, floor_picture
+from r3jax.apps.report.summary import map_row_bytes, stage_times
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.trace.reader import Run
+
+
+def progress_figure(run: Run) -> Figure:
+    """Coverage and mean renderability against views and against seconds."""
+    figure = style.new_figure(10.0, 5.6)
+    axes = figure.subplots(2, 2, sharex="col", sharey="row")
+    views = np.arange(1, len(run.rows) + 1)
+    seconds = np.array([row.seconds for row in run.rows])
+    known = np.array([100.0 * row.coverage.known_share for row in run.rows])
+    mean = np.array([row.coverage.mean_renderability for row in run.rows])
+    arrival = np.array([row.coverage.arrival_renderability for row in run.rows])
+    for column, (x, label) in enumerate([(views, "views"), (seconds, "mission clock [s]")]):
+        top = style.dress(axes[0, column], y="explored [% of the box]" if column == 0 else "")
+        top.plot(x, known, color=style.ACCENT, linewidth=2.0, marker="o", markersize=2.5)
+        top.set_ylim(0.0, max(10.0, 1.12 * known.max()))
+        below = style.dress(axes[1, column], x=label, y="renderability" if column == 0 else "")
+        below.plot(
+            x, mean, color=style.ACCENT, linewidth=2.0, label="mean of probe views in free space"
+        )
+        below.plot(
+            x,
+            arrival,
+            color=style.SECOND,
+            linestyle="none",
+            marker="o",
+            markersize=3.5,
+            alpha=0.8,
+            label="each view just before it was mapped",
+        )
+        below.set_ylim(0.0, 1.0)
+    axes[0, 0].set_title("Against views", fontsize=11, loc="left", fontweight="bold")
+    axes[0, 1].set_title("Against time", fontsize=11, loc="left", fontweight="bold")
+    axes[1, 0].legend(fontsize=8, frameon=False, loc="upper left")
+    return figure
+
+
+def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
+    """The place from above, with the path colored by acquisition order."""
+    positions = np.array([row.pose[:3, 3] for row in run.rows])
+    forward = np.array([row.pose[:3, 2] for row in run.rows])
+    picture, extent = floor_picture(map_state, grid, float(np.median(positions[:, 2])))
+    width, height = extent[1] - extent[0], extent[3] - extent[2]
+    figure = style.new_figure(9.0, float(np.clip(9.0 * height / width, 4.0, 12.0)))
+    axes = style.dress(figure.subplots(), x="x [m]", y="y [m]")
+    axes.grid(visible=False)
+    axes.imshow(picture, origin="lower", extent=extent, interpolation="nearest")
+    order = np.arange(len(run.rows))
+    segments: list[np.ndarray] = []
+    colors: list[int] = []
+    for row in run.rows[1:]:
+        if row.choice is not None and len(row.choice.waypoints) > 1:
+            segments.append(row.choice.waypoints[:, :2])
+            colors.append(row.step)
+    span = (0, max(1, len(order) - 1))
+    edge = LineCollection(segments, linewidths=4.0, colors="white", capstyle="round")
+    lines = LineCollection(segments, linewidths=2.0, cmap=style.PATH_MAP, capstyle="round")
+    lines.set_array(np.asarray(colors, dtype=float))
+    lines.set_clim(*span)
+    axes.add_collection(edge)
+    axes.add_collection(lines)
+    axes.quiver(
+        *(positions[:, :2].T),
+        *(forward[:, :2].T),
+        order,
+        cmap=style.PATH_MAP,
+        clim=span,
+        angles="xy",
+        scale_units="xy",
+        scale=3.0,
+        width=0.0028,
+    )
+    dots = axes.scatter(
+        *positions[:, :2].T,
+        c=order,
+        cmap=style.PATH_MAP,
+        vmin=span[0],
+        vmax=span[1],
+        s=26,
+        edgecolors="white",
+        linewidths=0.8,
+        zorder=3,
+    )
+    for place, text, offset in (
+        (positions[0], "start", (-34, -16)),
+        (positions[-1], "end", (8, 8)),
+    ):
+        axes.annotate(
+            text,
+            place[:2],
+            xytext=offset,
+            textcoords="offset points",
+            fontsize=9,
+            fontweight="bold",
+            color=style.INK,
+            bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0},
+        )
+    bar = figure.colorbar(dots, ax=axes, shrink=0.6, pad=0.01)
+    bar.set_label("order of acquisition", fontsize=9, color=style.MUTED)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=8, colors=style.MUTED)
+    return figure
+
+
+def panorama_figure(picture: PanoramaPicture) -> Figure:
+    """All directions from one position: what the map knows, and how well it would render."""
+    figure = style.new_figure(10.0, 9.6)
+    upper, lower = figure.subplots(2, 1)
+    extent = (180.0, -180.0, -90.0, 90.0)
+    for axes, title in (
+        (upper, "Mean color of the voxels seen"),
+        (lower, "Renderability R of the voxels seen"),
+    ):
+        style.dress(axes, title, "azimuth [°]", "elevation [°]").grid(visible=False)
+        axes.set_xticks(range(-180, 181, 60))
+        axes.set_yticks(range(-90, 91, 45))
+    upper.imshow(picture.rgb, extent=extent)
+    lower.set_facecolor("#e5e7eb")
+    image = lower.imshow(picture.value, extent=extent, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
+    bar = figure.colorbar(image, ax=[upper, lower], shrink=0.4, pad=0.01, anchor=(0.0, 0.0))
+    bar.outline.set_visible(False)
+    bar.set_label("R (gray: nothing mapped within range)", fontsize=9, color=style.MUTED)
+    bar.ax.tick_params(labelsize=8, colors=style.MUTED)
+    for axes in (upper, lower):
+        axes.plot(
+            np.rad2deg(picture.azimuth),
+            np.rad2deg(picture.elevation),
+            marker="+",
+            markersize=14,
+            markeredgewidth=2.0,
+            color="white" if axes is upper else style.INK,
+        )
+    return figure
+
+
+def cost_figure(run: Run) -> Figure:
+    """Step times by stage, and the memory of the map."""
+    figure = style.new_figure(10.0, 3.8)
+    left, right = figure.subplots(1, 2, width_ratios=[1.4, 1.0])
+    table = stage_times(run)
+    style.dress(left, "Step times: median, and 95th percentile as a line", "milliseconds")
+    names = [stage.name for stage in table]
+    median = np.array([1e3 * stage.median for stage in table])
+    p95 = np.array([1e3 * stage.p95 for stage in table])
+    colors = [style.ACCENT if stage.on_clock else "#cbd5e1" for stage in table]
+    left.barh(names, median, color=colors, height=0.62)
+    left.hlines(names, np.minimum(median, p95), p95, color=style.INK, linewidth=1.4)
+    left.set_xscale("log")
+    left.set_xlim(left=0.5)
+    left.invert_yaxis()
+    left.tick_params(axis="y", labelcolor=style.INK)
+    left.grid(visible=False, axis="y")
+    style.dress(right, "Memory of the map", "views", "MB")
+    views = np.arange(1, len(run.rows) + 1)
+    used = np.array([row.coverage.voxels * map_row_bytes(run) for row in run.rows]) / 1e6
+    allocated = np.array([row.coverage.map_bytes for row in run.rows]) / 1e6
+    right.fill_between(views, used, color=style.ACCENT, alpha=0.18, linewidth=0)
+    right.plot(views, used, color=style.ACCENT, linewidth=2.0, label="rows in use")
+    right.step(views, allocated, color=style.SECOND, where="post", label="allocated")
+    right.set_ylim(0.0, 1.15 * allocated.max())
+    right.legend(fontsize=8, frameon=False, loc="center right")
+    return figure
+
+
+def strip_figure(run: Run, count: int = 12) -> Figure:
+    """Some of the recorded images, evenly spread over the run."""
+    from PIL import Image
+
+    steps = np.unique(np.linspace(0, len(run.rows) - 1, count).round().astype(int))
+    columns = min(6, len(steps))
+    lines = -(-len(steps) // columns)
+    camera = run.camera
+    shape = camera.height / camera.width
+    figure = style.new_figure(10.0, lines * (10.0 / columns * shape + 0.25))
+    grid = figure.subplots(lines, columns, squeeze=False)
+    for axes in grid.flat:
+        style.blank(axes)
+    for axes, step in zip(grid.flat, steps, strict=False):
+        image = Image.fromarray(run.images(int(step))[0])
+        image.thumbnail((256, 256))
+        axes.imshow(np.asarray(image))
+        axes.set_title(f"view {step + 1}", fontsize=8, color=style.MUTED, loc="left", pad=2)
+    return figure

@@ -1,0 +1,142 @@
+"""Pictures computed from a map: the floor from above, and everything round a position.
+
+Shape symbols: N rows of the map; h w picture size.
+"""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.scoring.renderability import voxel_renderability
+
+_UNKNOWN = (0.86, 0.87, 0.89)
+_FREE = (0.985, 0.985, 0.985)
+_OCCUPIED = (0.68, 0.71, 0.76)
+_HEIGHT, _WIDTH = 256, 512
+"""Size of a panorama picture [px]."""
+
+_LARGEST = 2048
+"""Width and height of a floor picture at most, unless the grid itself has more cells [px]."""
+
+_HEADROOM = 0.35
+"""The floor picture shows what lies below the cameras' height plus this [m]."""
+
+
+def floor_picture(
+    map_state: MapState, grid: OccupancyGrid, height: float
+) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """The place from above, cut open over the cameras' heads.
+
+    Light gray is unexplored at the cameras' height, white is free, dark gray is occupied; on
+    top lie the highest voxels below the cut, in their mean color.
+
+    Args:
+        map_state: the voxels.
+        grid: free and unexplored space.
+        height: typical height of the cameras [m].
+
+    Returns:
+        The picture [h, w, 3] in [0, 1], row 0 at the lowest y, and its extent in meters
+        (left, right, bottom, top).
+    """
+    origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
+    shape = np.asarray(grid.log_odds.shape)
+    layer = int(np.clip((height - origin[2]) / cell, 0, shape[2] - 1))
+    voxel = float(map_state.voxel_size)
+    # A pixel shows a voxel, unless the cells are so much larger that nobody could see one.
+    scale = max(1, min(round(cell / voxel), _LARGEST // int(shape[:2].max())))
+    picture = np.full((*shape[:2], 3), _UNKNOWN)
+    picture[np.asarray(grid.free)[:, :, layer]] = _FREE
+    picture[np.asarray(grid.occupied)[:, :, layer]] = _OCCUPIED
+    picture = picture.repeat(scale, axis=0).repeat(scale, axis=1)  # [x, y, 3]
+
+    present = np.asarray(map_state.occupied)
+    centers = np.asarray(map_state.center)[:, present]
+    colors = np.asarray(map_state.mean)[:, present].T
+    below = centers[2] < height + _HEADROOM
+    order = np.argsort(centers[2][below], kind="stable")  # the highest is painted last
+    centers, colors = centers[:, below][:, order], colors[below][order]
+    pixel = np.floor((centers[:2] - origin[:2, None]) / (cell / scale)).astype(int)
+    inside = np.all((pixel >= 0) & (pixel < np.array(picture.shape[:2])[:, None]), axis=0)
+    picture[pixel[0, inside], pixel[1, inside]] = colors[inside]
+    left, bottom = origin[:2]
+    right, top = origin[:2] + shape[:2] * cell
+    return picture.transpose(1, 0, 2), (float(left), float(right), float(bottom), float(top))
+
+
+@dataclass(frozen=True)
+class PanoramaPicture:
+    """An equirectangular picture round a position; the middle column looks along +x."""
+
+    rgb: np.ndarray
+    """Mean color of the voxel seen, [h, w, 3]; light gray where there is none."""
+
+    value: np.ndarray
+    """Renderability of the voxel seen, [h, w]; NaN where there is none."""
+
+    azimuth: float
+    """Of the camera's axis in this position [rad]."""
+
+    elevation: float
+    """Of the camera's axis in this position [rad]."""
+
+
+def panorama_picture(
+    map_state: MapState, camera: Camera, T_world_camera: np.ndarray, max_range: float
+) -> PanoramaPicture:
+    """Renderability in all directions from a camera's position.
+
+    Args:
+        map_state: the voxels.
+        camera: its focal length sets the resolution that is asked for.
+        T_world_camera: the pose, [4, 4].
+        max_range: range of the sensor [m].
+    """
+    position = jnp.asarray(T_world_camera[:3, 3], dtype=jnp.float32)
+    value = np.asarray(voxel_renderability(map_state, position, camera.focal).value)
+    row = _nearest_rows(map_state, np.asarray(position), max_range)
+    is_seen = row < map_state.capacity
+    row = np.where(is_seen, row, 0)
+    rgb = np.where(is_seen[..., None], np.asarray(map_state.mean).T[row], np.asarray(_UNKNOWN))
+    forward = T_world_camera[:3, 2]
+    return PanoramaPicture(
+        rgb=rgb,
+        value=np.where(is_seen, value[row], np.nan),
+        azimuth=float(np.arctan2(forward[1], forward[0])),
+        elevation=float(np.arcsin(np.clip(forward[2], -1.0, 1.0))),
+    )
+
+
+def _nearest_rows(map_state: MapState, position: np.ndarray, max_range: float) -> np.ndarray:
+    """The map row that is seen in every direction, [h, w]; N where there is none.
+
+    A painter's picture: every voxel covers the angle of its edge, the far ones are painted
+    first. The first column looks along azimuth +180 degrees, the first row straight up.
+    """
+    offset = np.asarray(map_state.center).T - position
+    distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
+    rows = np.flatnonzero(np.asarray(map_state.occupied) & (distance <= max_range))
+    rows = rows[np.argsort(-distance[rows], kind="stable")]
+    offset, distance = offset[rows], distance[rows]
+    elevation = np.arcsin(offset[:, 2] / distance)
+    azimuth = np.arctan2(offset[:, 1], offset[:, 0])
+    # Half the angle of a voxel seen corner on, so that walls have no gaps; wider near the poles.
+    half = np.arctan(0.75 * float(map_state.voxel_size) / distance)
+    half_wide = np.minimum(half / np.maximum(np.cos(elevation), 1e-3), np.pi)
+    pixel = np.pi / _HEIGHT
+    top = np.clip((0.5 * np.pi - elevation - half) / pixel, 0, _HEIGHT).astype(int)
+    bottom = np.ceil((0.5 * np.pi - elevation + half) / pixel).astype(int)
+    left = np.floor((np.pi - azimuth - half_wide) / pixel).astype(int)
+    right = np.ceil((np.pi - azimuth + half_wide) / pixel).astype(int)
+    picture = np.full((_HEIGHT, _WIDTH), map_state.capacity)
+    for row, y0, y1, x0, x1 in zip(rows, top, bottom, left, right, strict=True):
+        picture[y0:y1, max(x0, 0) : x1] = row
+        if x0 < 0:  # the picture closes on itself
+            picture[y0:y1, x0:] = row
+        if x1 > _WIDTH:
+            picture[y0:y1, : x1 - _WIDTH] = row
+    return picture

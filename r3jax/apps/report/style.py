@@ -1,0 +1,78 @@
+"""The look that all figures share: light, few colors, nothing global."""
+
+import io
+
+from matplotlib.axes import Axes
+from matplotlib.axis import Tick
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+INK = "#1f2937"
+"""Text and frames."""
+
+MUTED = "#6b7280"
+"""Secondary text, grids."""
+
+ACCENT = "#0f766e"
+"""The first curve."""
+
+SECOND = "#d97706"
+"""The second curve."""
+
+NEVER_SEEN = "#334155"
+"""What no view has shown."""
+
+TOO_OBLIQUE = "#2563eb"
+"""What was seen from other directions only."""
+
+INCONSISTENT = "#dc2626"
+"""What looked different from view to view."""
+
+TOO_FAR = "#f59e0b"
+"""What was seen from farther away only."""
+
+PATH_MAP = "plasma"
+"""Colors of acquisition order."""
+
+SCORE_MAP = "RdYlGn"
+"""Colors of renderability, 0 to 1."""
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of that size [inch] without pyplot's global state."""
+    return Figure(figsize=(width, height), dpi=110, layout="constrained", facecolor="white")
+
+
+def dress(axes: Axes, title: str = "", x: str = "", y: str = "") -> Axes:
+    """Gives axes the common look."""
+    axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
+    axes.set_xlabel(x, fontsize=9, color=MUTED)
+    axes.set_ylabel(y, fontsize=9, color=MUTED)
+    axes.tick_params(labelsize=8, colors=MUTED, length=3)
+    axes.grid(visible=True, color="#e5e7eb", linewidth=0.8)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color("#9ca3af")
+    return axes
+
+
+def blank(axes: Axes, title: str = "") -> Axes:
+    """Axes for a picture: no ticks, no grid."""
+    dress(axes, title)
+    axes.grid(visible=False)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    return axes
+
+
+def to_png(figure: Figure) -> bytes:
+    """The figure as PNG bytes. Dollar signs in names are no formulas; log axes write theirs so."""
+    numbers = {label for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
+    for text in figure.findobj(Text):
+        text.set_parse_math(text in numbers)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()

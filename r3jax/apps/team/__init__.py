@@ -1,0 +1,1 @@
+"""Several cameras that explore one place and exchange frames."""

@@ -1,0 +1,338 @@
+"""Several cameras in one scene: each flies its own mission, and they tell each other what they saw.
+
+They fly at the same time. Every member has its own lens, policy, map and mission clock; the one
+whose clock is behind steps next, so a mission lasts as long as its longest clock. At a meeting
+all learn the frames that were taken until then; in between each has its own frames on top. When
+it decides, it takes the views that the others were on their way to at the last meeting as taken,
+and leaves to them what lies nearer to them (`planning.promised`).
+
+Nobody knows anything before it happened: a frame is told once it is taken, and a member hears of
+it at the first meeting after that. Members that decide at the same time decide in turn.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.apps.team.sharing import Common, Sight, Told, in_order, last_meeting, tell
+from r3jax.exploration.budget import Budget, parse_budget
+from r3jax.exploration.clock import make_clock, timed
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.guard import GuardedSimulator
+from r3jax.exploration.loop import Result
+from r3jax.exploration.recording import record_end, record_view
+from r3jax.exploration.state import LoopState, Mission, Stop, StopReason
+from r3jax.exploration.step import relive, start_state, step
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.planning.planner import add_frame, tell_policy
+from r3jax.planning.policy import Policy
+from r3jax.planning.reserved_views import PromisedView, ReservedViews
+from r3jax.scoring.config import ScoringConfig
+from r3jax.simulators.base import Simulator
+from r3jax.trace.errors import RecordingStopped
+from r3jax.trace.reader import Run
+from r3jax.trace.rows import StepRow
+from r3jax.trace.writer import RunWriter
+
+
+@dataclass(frozen=True)
+class Member:
+    """One camera of a team."""
+
+    simulator: Simulator
+    """The scene as its camera sees it: lens, resolution, start."""
+
+    policy: Policy
+    """Chooses its views."""
+
+
+@dataclass(frozen=True)
+class TeamView:
+    """What all together knew after a view."""
+
+    seconds: float
+    """Mission clock of the member that took it [s]."""
+
+    member: int
+
+    voxels: int
+    """Occupied voxels of the common map."""
+
+    known_share: float
+    """Known cells over all cells of the scene's box."""
+
+
+@dataclass(frozen=True)
+class TeamResult:
+    """A finished exploration by several cameras."""
+
+    members: tuple[Result, ...]
+    """Each one's own rows; the map and the grid of each last state are the common ones."""
+
+    views: tuple[TeamView, ...]
+    """All views in the order of the clock, and what was known after each by whoever knew all."""
+
+    map_state: MapState
+    """Of all frames, in that order."""
+
+    grid: OccupancyGrid
+
+    @property
+    def seconds(self) -> float:
+        """How long the mission lasted: the longest clock [s]."""
+        return max(result.state.seconds for result in self.members)
+
+
+@dataclass(frozen=True)
+class _Flying:
+    """One member under way."""
+
+    number: int
+    mission: Mission
+    state: LoopState
+    recorded: Run | None = None
+    recorder: RunWriter | None = None
+    rows: tuple[StepRow, ...] = ()
+
+    heard: tuple[Told, ...] = ()
+    """What was told since it last took anything over."""
+
+    owed: float = 0.0
+    """Seconds that taking over took, and that no row has been charged for."""
+
+    stop: Stop | None = None
+
+
+def explore_team(
+    members: Sequence[Member],
+    *,
+    budget: Budget | str,
+    seed: int = 0,
+    config: ExplorationConfig | None = None,
+    meet_every: float = 0.0,
+    recorders: Sequence[RunWriter] | None = None,
+    resume: Sequence[Run] | None = None,
+    on_step: Callable[[int, StepRow], None] | None = None,
+    on_stage: Callable[[str], None] | None = None,
+) -> TeamResult:
+    """Explores an unknown scene with several cameras at once.
+
+    Args:
+        members: the cameras; all in the same world. Each one's start is free space for all.
+        budget: of each member: seconds of its mission clock, its meters, its views.
+        seed: all randomness follows from it. The first member's is that of `explore`.
+        config: settings of every member's loop.
+        meet_every: seconds between two meetings; 0: the radio is always on. Whatever it is,
+            they meet when all are done. The frames between two meetings are kept in memory.
+        recorders: where each member's run is written; None keeps nothing.
+        resume: what was recorded of each member before the team was cut off. All of it is decided
+            and mapped again, only the pictures are not taken again; under the model clock the
+            result is the one of a team that was never cut off, bit for bit.
+        on_step: called with a member's number and the row of every view.
+        on_stage: called with the name of what happens next.
+
+    Returns:
+        Each member's result, and the map of all frames: the one that a single camera would have
+        that had taken them in the order of the clock.
+
+    Raises:
+        ValueError: no member, worlds with different boxes, a budget that is not understood, a
+            negative interval, a start outside the scene's box.
+        RunError: a recorded frame is missing or broken.
+        OracleReadError: something beside the loop asked a simulator for a picture.
+    """
+    config = config or ExplorationConfig()
+    budget = parse_budget(budget) if isinstance(budget, str) else budget
+    _check(members, meet_every)
+    flying = [
+        _Flying(
+            number,
+            *_set_out(number, members, budget, seed, config, on_stage, recorded),
+            recorded=recorded,
+            recorder=None if recorders is None else recorders[number],
+        )
+        for number, recorded in enumerate(resume or [None] * len(members))
+    ]
+    return _fly(flying, meet_every, on_step or (lambda number, row: None))
+
+
+def _check(members: Sequence[Member], meet_every: float) -> None:
+    """Refuses what is no team.
+
+    Raises:
+        ValueError: says what is wrong.
+    """
+    if not members:
+        raise ValueError("a team needs at least one member")
+    if not meet_every >= 0.0:
+        raise ValueError(f"meet_every must be a time >= 0 [s], got {meet_every}")
+    box = np.asarray(members[0].simulator.bounds)
+    for number, member in enumerate(members):
+        if not np.array_equal(member.simulator.bounds, box):
+            raise ValueError(
+                f"member {number} is in another world than member 0: its box is "
+                f"{np.asarray(member.simulator.bounds).tolist()}, not {box.tolist()}"
+            )
+
+
+def _set_out(
+    number: int,
+    members: Sequence[Member],
+    budget: Budget,
+    seed: int,
+    config: ExplorationConfig,
+    on_stage: Callable[[str], None] | None,
+    recorded: Run | None,
+) -> tuple[Mission, LoopState]:
+    """One member's mission, and its state before the first view."""
+    key = jax.random.key(seed)
+    # The first member is the camera that `explore` would fly alone.
+    init_key, key = jax.random.split(jax.random.fold_in(key, number) if number else key)
+    mission = Mission(
+        GuardedSimulator(members[number].simulator, views=len(recorded.rows) if recorded else 0),
+        members[number].policy,
+        budget,
+        key,
+        config,
+        make_clock(config.clock),
+        on_stage=on_stage or (lambda stage: None),
+    )
+    others = [m.simulator.start_pose for i, m in enumerate(members) if i != number]
+    return mission, start_state(mission, init_key, others)
+
+
+def _fly(
+    flying: list[_Flying], meet_every: float, on_step: Callable[[int, StepRow], None]
+) -> TeamResult:
+    """Steps until nobody flies any more, and lets all meet at the end."""
+    first = flying[0]
+    config = first.mission.config
+    common = Common(
+        empty_map(config.capacity, config.voxel_size, config.num_bins), first.state.grid
+    )
+    views: list[TeamView] = []
+    try:
+        while any(me.stop is None for me in flying):
+            # Of two with the same clock the first one: `min` keeps the order.
+            me = min((me for me in flying if me.stop is None), key=lambda me: me.state.seconds)
+            until = last_meeting(me.state.seconds, meet_every)
+            common = _meet(flying, common, until, views)
+            me = _take_over(flying[me.number], common)
+            me, sight = _step(me, _promised_to(me, common))
+            flying[me.number] = me
+            if sight is not None:
+                common = replace(common, waiting=(*common.waiting, sight))
+                on_step(me.number, me.rows[-1])
+    except KeyboardInterrupt:
+        _stop_all(flying, StopReason.INTERRUPTED, "interrupted by the user")
+    except RecordingStopped as error:
+        _stop_all(flying, StopReason.RECORDING_STOPPED, str(error))
+    except Exception as error:
+        _stop_all(flying, StopReason.FAILED, f"{type(error).__name__}: {error}")
+        for me in flying:
+            _land(me, me.state)
+        raise
+    common = _meet(flying, common, math.inf, views)
+    results = tuple(_land(me, _with_common(me.state, common)) for me in flying)
+    return TeamResult(results, tuple(views), common.map_state, common.grid)
+
+
+def _meet(flying: list[_Flying], common: Common, until: float, views: list[TeamView]) -> Common:
+    """All frames up to a time become common; notes who has heard what, and what all know."""
+    mission = flying[0].mission
+    common, told = tell(common, until, mission.config, repeat_compiled=mission.clock.measures)
+    for me in flying:
+        if told and me.stop is None:
+            flying[me.number] = replace(me, heard=(*me.heard, *told))
+    views += [TeamView(t.sight.seconds, t.sight.member, t.voxels, t.known_share) for t in told]
+    return common
+
+
+def _take_over(me: _Flying, common: Common) -> _Flying:
+    """The common map becomes one's own, with the frames on top that were not told yet."""
+    heard = me.heard
+    if all(told.sight.member == me.number for told in heard):
+        return replace(me, heard=())  # one's own map is just that already
+    me.mission.on_stage("map")
+    clock, config = me.mission.clock, me.mission.config
+    map_state, grid = common.map_state, common.grid
+    owed = me.owed
+    for sight in in_order(common.waiting):
+        if sight.member == me.number:
+            (map_state, grid), seconds = timed(
+                add_frame, map_state, grid, sight.frame, config, repeat_compiled=clock.measures
+            )
+            owed += clock.charge("mapping", seconds)
+    planner = replace(me.state.planner, map_state=map_state, grid=grid)
+    for told in heard:
+        seconds = 0.0
+        if told.sight.member != me.number:
+            planner, seconds = timed(
+                tell_policy, planner, told.sight.frame, repeat_compiled=clock.measures
+            )
+        owed += clock.charge("mapping", told.mapping + seconds)
+    return replace(me, state=replace(me.state, planner=planner), heard=(), owed=owed)
+
+
+def _with_common(state: LoopState, common: Common) -> LoopState:
+    """The state with the map and the grid of all."""
+    planner = replace(state.planner, map_state=common.map_state, grid=common.grid)
+    return replace(state, planner=planner)
+
+
+def _promised_to(me: _Flying, common: Common) -> tuple[PromisedView, ...]:
+    """The views that the others were on their way to at the last meeting."""
+    first: dict[int, Sight] = {}
+    for sight in in_order(common.waiting):
+        if sight.member != me.number:
+            first.setdefault(sight.member, sight)
+    return tuple(
+        PromisedView(s.frame.camera, np.asarray(s.frame.T_world_camera)) for s in first.values()
+    )
+
+
+def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Sight | None]:
+    """One view of one member, or its end; a view that was recorded is lived through again."""
+    mission, state = me.mission, me.state
+    if promised:
+        scoring = ScoringConfig(max_range=jnp.asarray(mission.config.max_range, jnp.float32))
+        state = _decided_by(state, ReservedViews(mission.policy, promised, scoring))
+    if me.recorded is not None and me.state.views < len(me.recorded.rows):
+        row = me.recorded.rows[me.state.views]
+        frame = me.recorded.frame(row.step)
+        after = _decided_by(relive(state, mission, row, frame), mission.policy)
+    else:
+        after, output = step(state, mission, exchange=me.owed)
+        after = _decided_by(after, mission.policy)
+        if isinstance(output, Stop):
+            return replace(me, stop=output), None
+        row, frame = output.row, output.frame
+        if me.recorder is not None:
+            mission.on_stage("record")
+            record_view(me.recorder, output, after, mission.config)
+    me = replace(me, state=after, rows=(*me.rows, row), owed=0.0)
+    return me, Sight(after.seconds, me.number, frame)
+
+
+def _decided_by(state: LoopState, policy: Policy) -> LoopState:
+    """The state of a planner whose next decision is a policy's."""
+    return replace(state, planner=replace(state.planner, policy=policy))
+
+
+def _stop_all(flying: list[_Flying], reason: StopReason, why: str) -> None:
+    for me in flying:
+        if me.stop is None:
+            message = f"{why}, after {me.state.views} views"
+            flying[me.number] = replace(me, stop=Stop(reason, message))
+
+
+def _land(me: _Flying, state: LoopState) -> Result:
+    """Records how a member ended."""
+    assert me.stop is not None
+    stop = me.stop if me.recorder is None else record_end(me.recorder, state, me.stop)
+    return Result(state, me.rows, stop.reason, stop.message)

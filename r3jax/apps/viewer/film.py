@@ -1,0 +1,183 @@
+"""A run as pictures and as a film, without a browser.
+
+Shape symbols: n blocks; H W picture size.
+"""
+
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from r3jax.apps.viewer.blocks import QUANTITIES, block_colors
+from r3jax.apps.viewer.known import Known, cut_height, known_at, scoring_of
+from r3jax.apps.viewer.poster import Sheet, compose
+from r3jax.apps.viewer.raster import Squares, draw, lines, overview
+from r3jax.apps.viewer.shapes import frustum_segments, path_segments
+from r3jax.apps.viewer.timeline import Timeline
+from r3jax.apps.viewer.video import write_video
+from r3jax.formats.errors import FormatError
+from r3jax.trace.reader import Run
+
+WIDTH, HEIGHT = 1280, 720
+"""Size of every picture [px]; even numbers, which H.264 wants."""
+
+BUDGET = 400_000
+"""Blocks in a picture at most."""
+
+_TURN = 24.0
+"""How far the film's camera goes round the place [deg]."""
+
+_LAST_FOR = 2.0
+"""How long the film stays on its last picture [s]."""
+
+_INK = np.array((31, 41, 55), np.uint8)
+_NOW = np.array((220, 38, 38), np.uint8)
+
+
+class Film:
+    """Draws the moments of one run, all from the same place and on the same terms."""
+
+    def __init__(self, run: Run, timeline: Timeline):
+        """Places the camera by the last map."""
+        self.run, self._timeline = run, timeline
+        self._config = scoring_of(run.header)
+        self._last = self._known(len(run.rows) - 1)
+        centers = self._last.blocks.centers
+        self._cut = cut_height(run.rows, centers)
+        shown = centers[centers[:, 2] < self._cut]
+        positions = np.stack([row.pose[:3, 3] for row in run.rows])
+        self._extent = np.concatenate([shown, positions]) if len(shown) else positions
+
+    def still(self, quantity: str, *, from_above: bool) -> np.ndarray:
+        """The last map, [H, W, 3] uint8.
+
+        Args:
+            quantity: one of `QUANTITIES`.
+            from_above: straight down, or at an angle.
+        """
+        elevation = 89.0 if from_above else 48.0
+        picture = self._scene(self._last, quantity, elevation=elevation, azimuth=-90.0, fine=2)
+        return compose(picture, self._sheet(self._last.moment.step, quantity))
+
+    def picture(self, step: int, quantity: str = "renderability") -> np.ndarray:
+        """The map after one view, [H, W, 3] uint8; the camera goes round as views go by."""
+        known = self._known(step)
+        share = step / max(len(self.run.rows) - 1, 1)
+        azimuth = -90.0 + _TURN * (share - 0.5)
+        picture = self._scene(known, quantity, elevation=48.0, azimuth=azimuth, fine=1)
+        return compose(picture, self._sheet(step, quantity))
+
+    def _known(self, step: int) -> Known:
+        return known_at(self._timeline.at(step), self.run.camera, self._config, BUDGET)
+
+    def _scene(
+        self, known: Known, quantity: str, *, elevation: float, azimuth: float, fine: int
+    ) -> np.ndarray:
+        """Blocks, path and frusta; drawn `fine` times as large and made smaller again."""
+        width, height = fine * Sheet.scene_width(WIDTH), fine * HEIGHT
+        narrow = 12.0 if elevation > 80.0 else 32.0  # from above, walls should not lean
+        camera, pose = overview(self._extent, width, height, azimuth, elevation, narrow)
+        blocks, step = known.blocks, known.moment.step
+        colors = block_colors(blocks, known.moment.map_state, known.terms, quantity)
+        low = blocks.centers[:, 2] < self._cut
+        layers = [Squares(blocks.centers[low], colors[low], blocks.edge)]
+        layers += self._lines(step, least=2.0 * fine)
+        picture = draw(camera, pose, layers)
+        image = Image.fromarray(picture)
+        return np.asarray(image.resize((width // fine, HEIGHT), Image.Resampling.BOX))
+
+    def _lines(self, step: int, least: float) -> list[Squares]:
+        """The way so far, the views along it, and the newest one larger."""
+        rows = self.run.rows[: step + 1]
+        segments, colors = path_segments(rows, len(self.run.rows))
+        frusta = [frustum_segments(self.run.camera, row.pose, 0.14) for row in rows]
+        newest = frustum_segments(self.run.camera, rows[-1].pose, 0.45)
+        return [
+            lines(segments, colors[:, 0], 0.02, 1.5 * least),
+            lines(np.concatenate(frusta), _INK, 0.006, 0.6 * least),
+            lines(newest, _NOW, 0.02, 1.2 * least, lift=0.3),
+        ]
+
+    def _sheet(self, step: int, quantity: str) -> Sheet:
+        image, _ = self.run.images(step)
+        return Sheet.of_run(self.run, step, image, quantity)
+
+
+def export_film(
+    run: Run,
+    out: Path,
+    *,
+    video: bool,
+    on_picture: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Writes pictures of the last map, one picture per view, and a film of them.
+
+    Args:
+        run: with at least one view.
+        out: a folder that does not exist yet, or is empty. It is complete or not there.
+        video: write `run.mp4` too.
+        on_picture: told how many pictures are done, and how many there will be.
+
+    Returns:
+        What was written: the stills, the folder of the pictures, the film.
+
+    Raises:
+        FormatError: `out` holds something, or is no name of a folder.
+        RunError: the run has no view, or a frame is missing or broken.
+        ImportError: a film is asked for, and PyAV is not installed.
+        OSError: the disk is full, not writable, ...
+    """
+    if "\0" in str(out):
+        raise FormatError(Path(repr(out.name)), "this cannot be the name of a folder")
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise FormatError(out, "something is there already: give another folder")
+    out = out.absolute()
+    film = Film(run, Timeline(run))
+    partial = out.with_name(f".{out.name}.{secrets.token_hex(4)}.partial")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial.mkdir()
+    try:
+        written = _fill(partial, film, video, on_picture)
+        os.replace(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return [out / path.relative_to(partial) for path in written]
+
+
+def _fill(
+    folder: Path, film: Film, video: bool, on_picture: Callable[[int, int], None]
+) -> list[Path]:
+    stills = [(name, above) for above in (False, True) for name in QUANTITIES]
+    num_views = len(film.run.rows)
+    total = num_views + len(stills)
+    pictures = folder / "views"
+    pictures.mkdir()
+    for step in range(num_views):
+        _save(pictures / f"{step:06d}.png", film.picture(step))
+        on_picture(step + 1, total)
+    written = [pictures]
+    for number, (name, above) in enumerate(stills, start=1):
+        path = folder / f"{'above' if above else 'oblique'}-{name}.png"
+        _save(path, film.still(name, from_above=above))
+        written.append(path)
+        on_picture(num_views + number, total)
+    if video:
+        path = folder / "run.mp4"
+        rate = int(np.clip(num_views / 12.0, 2, 12))
+        write_video(path, _read_back(pictures, num_views, round(_LAST_FOR * rate)), rate)
+        written.append(path)
+    return written
+
+
+def _save(path: Path, picture: np.ndarray) -> None:
+    Image.fromarray(picture).save(path, compress_level=6)
+
+
+def _read_back(folder: Path, num_views: int, last_for: int) -> Iterator[np.ndarray]:
+    """The pictures in order; the last one stays for a while."""
+    for step in [*range(num_views), *[num_views - 1] * last_for]:
+        yield np.asarray(Image.open(folder / f"{step:06d}.png").convert("RGB"))

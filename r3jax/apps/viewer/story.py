@@ -1,0 +1,252 @@
+"""A run as the viewer sees it: recorded, or still going on."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from r3jax.apps.viewer.decisions import Offer
+from r3jax.apps.viewer.timeline import Moment, Timeline
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.explain_run import Reason, explain_run
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.planner import add_to_grid, first_grid
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run
+from r3jax.trace.rows import StepRow
+
+_THUMBNAIL = 256
+"""Longer side of the pictures that a live story keeps [px], about."""
+
+_OFFERS_KEPT = 200
+"""Decisions whose candidates are kept: 100 of them take 7 kB."""
+
+
+_WORKING = "being worked out …"
+
+
+@runtime_checkable
+class Story(Protocol):
+    """Views in order, what they showed, and what was known after them."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of every view."""
+        ...
+
+    @property
+    def rows(self) -> Sequence[StepRow]:
+        """What the trace says of the views so far."""
+        ...
+
+    @property
+    def is_live(self) -> bool:
+        """Whether there may be more views later."""
+        ...
+
+    def image(self, step: int) -> np.ndarray:
+        """The picture of a view, [H, W, 3] uint8."""
+        ...
+
+    def moment(self, step: int) -> Moment:
+        """What was known after a view; for the worker's thread only."""
+        ...
+
+    def advance(self) -> bool:
+        """Prepares for later questions; False when there is nothing to prepare."""
+        ...
+
+    def offer(self, step: int) -> Offer | None:
+        """The candidates that a view was chosen from; None if they are not known."""
+        ...
+
+    def reason(self, step: int) -> Reason | str:
+        """What a view promised when it was chosen, or why that is not known."""
+        ...
+
+
+class RecordedStory:
+    """A run on disk."""
+
+    is_live = False
+
+    def __init__(self, run: Run):
+        """Opens it.
+
+        Raises:
+            RunError: as `Timeline`.
+        """
+        self._run, self._timeline = run, Timeline(run)
+        self._reasons: list[Reason | None] = []
+        self._problem = ""
+        self._explaining = self._explain()
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of every view."""
+        return self._run.camera
+
+    @property
+    def rows(self) -> Sequence[StepRow]:
+        """What the trace says of the views."""
+        return self._run.rows
+
+    def image(self, step: int) -> np.ndarray:
+        """The picture of a view, [H, W, 3] uint8.
+
+        Raises:
+            RunError: it is missing or broken.
+        """
+        return _recorded_image(self._run, step)
+
+    def moment(self, step: int) -> Moment:
+        """What was known after a view."""
+        return self._timeline.at(step)
+
+    def advance(self) -> bool:
+        """Replays one view more than ever before, and finds out why the next one was taken.
+
+        Raises:
+            RunError: a frame is missing or broken, or a setting of the policy is not known.
+        """
+        try:
+            self._reasons.append(next(self._explaining))
+        except StopIteration:
+            return False
+        except RunError as error:
+            self._problem = str(error)
+            raise
+        return True
+
+    def _explain(self) -> Iterator[Reason | None]:
+        """The reasons of all views, in order; nothing but the replay where others had a say."""
+        moments = self._timeline.follow()
+        if self._run.header.is_merged:
+            self._problem = "merged from runs that decided each on a map of its own"
+            return (None for _ in moments)
+        if self._run.header.is_of_team:
+            self._problem = "decided on what the others of a team had seen, too"
+            return (None for _ in moments)
+        return explain_run(self._run, ((m.map_state, m.grid) for m in moments))
+
+    def offer(self, step: int) -> Offer | None:
+        """The trace does not keep the candidates."""
+        del step
+        return None
+
+    def reason(self, step: int) -> Reason | str:
+        """What a view promised when it was chosen; known once the views before are replayed."""
+        if self._run.rows[step].choice is None:
+            return "the start: nothing was chosen"
+        reason = self._reasons[step] if step < len(self._reasons) else None
+        return reason or self._problem or _WORKING
+
+
+@dataclass(frozen=True)
+class NewView:
+    """What the loop hands over after a view: references, nothing is computed."""
+
+    row: StepRow
+    frame: Frame
+
+    map_state: MapState
+    """The frame is in it."""
+
+    grid: OccupancyGrid | None
+    """The frame is not in it yet; None: it is the first view."""
+
+    offer: Offer | None
+
+
+class LiveStory:
+    """A run that is going on. Of the map only the newest state is kept."""
+
+    is_live = True
+
+    def __init__(
+        self,
+        camera: Camera,
+        bounds: np.ndarray,
+        config: ExplorationConfig,
+        earlier: Run | None = None,
+    ):
+        """Knows the views that were recorded before, if any, but not their map.
+
+        Args:
+            camera: of every view.
+            bounds: of the scene, [2, 3] [m].
+            config: of the loop.
+            earlier: the run that is gone on with.
+        """
+        self._camera, self._bounds, self._config = camera, bounds, config
+        self._earlier = earlier
+        self._rows: list[StepRow] = [] if earlier is None else list(earlier.rows)
+        self._images: dict[int, np.ndarray] = {}
+        self._offers: dict[int, Offer] = {}
+        self._moment: Moment | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of every view."""
+        return self._camera
+
+    @property
+    def rows(self) -> Sequence[StepRow]:
+        """What the trace says of the views so far."""
+        return self._rows
+
+    def add(self, view: NewView) -> None:
+        """Takes in one view more; takes as long as a frame takes to join the grid."""
+        start = np.asarray(view.row.pose, np.float64)
+        grid = view.grid or first_grid(self._bounds, [start], self._config)
+        grid = add_to_grid(grid, view.frame, self._config)
+        image = np.rint(np.asarray(view.frame.rgb) * 255.0).astype(np.uint8)
+        step = max(1, max(image.shape[:2]) // _THUMBNAIL)
+        self._images[view.row.step] = np.ascontiguousarray(image[::step, ::step])
+        if view.offer is not None:
+            self._offers[view.row.step] = view.offer
+        self._offers.pop(view.row.step - _OFFERS_KEPT, None)
+        self._moment = Moment(view.row.step, view.map_state, grid)
+        self._rows.append(view.row)
+
+    def image(self, step: int) -> np.ndarray:
+        """The picture of a view, made smaller if it is new, [h, w, 3] uint8.
+
+        Raises:
+            RunError: one that was recorded before is missing or broken.
+        """
+        if step in self._images or self._earlier is None:
+            return self._images[step]
+        return _recorded_image(self._earlier, step)
+
+    def moment(self, step: int) -> Moment:
+        """What is known now: earlier maps are not kept.
+
+        Raises:
+            LookupError: before the first view.
+        """
+        del step
+        if self._moment is None:
+            raise LookupError("there is no view yet")
+        return self._moment
+
+    def advance(self) -> bool:
+        """There is nothing to prepare."""
+        return False
+
+    def offer(self, step: int) -> Offer | None:
+        """The candidates that a view was chosen from."""
+        return self._offers.get(step)
+
+    def reason(self, step: int) -> Reason | str:
+        """The map that a view was chosen on is not kept."""
+        del step
+        return "known when the run is over and opened again: r3jax view"
+
+
+def _recorded_image(run: Run, step: int) -> np.ndarray:
+    return run.images(step)[0]

@@ -1,0 +1,231 @@
+"""Which records of the benchmark may stand side by side, and their scores sorted by method.
+
+A record (`Cell`) is one line of `cells.jsonl`: scene x policy x seed at one snapshot of a budget.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+
+Cell = Mapping[str, Any]
+"""One record: the parsed JSON object."""
+
+POLICIES = (
+    "random", "uniform", "frontier", "unseen", "unseen-depth", "cover", "active-gamer",
+    "active-gs-no-depth", "active-gs", "ours", "ours-pano", "ours-ahead",
+)  # fmt: skip
+"""Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""
+
+EXPLORATION = {
+    "views": "views",
+    "seconds": "mission clock [s]",
+    "metres": "path [m]",
+    "known_share": "share of the box explored",
+    "mean_renderability": "mean renderability",
+}
+"""Quantities of a record's exploration, and their names on axes."""
+
+
+def method_name(cell: Cell) -> str:
+    """The policy with the settings it was given: `active-gs`, `ours (lambda1=0.3)`."""
+    settings = ", ".join(f"{name}={value}" for name, value in sorted(cell["settings"].items()))
+    return f"{cell['policy']} ({settings})" if settings else cell["policy"]
+
+
+def shared_settings(cells: Sequence[Cell]) -> dict[str, Any]:
+    """Settings that were given to the policies of all records alike, by name."""
+    first = cells[0]["settings"]
+    missing = object()
+    return {
+        name: value
+        for name, value in sorted(first.items())
+        if all(cell["settings"].get(name, missing) == value for cell in cells)
+    }
+
+
+def with_short_names(cells: Sequence[Cell]) -> list[Cell]:
+    """The same records, with names as short as this set of them allows.
+
+    Settings that all share leave the methods' names, and a scene from a file is called by the
+    file's name without folder and suffix, unless two scenes would then be called the same.
+    """
+    shared = shared_settings(cells)
+    titles = {scene: _scene_title(scene) for scene in scenes_of(cells)}
+    if len(set(titles.values())) < len(titles):
+        titles = {scene: scene for scene in titles}
+    return [
+        {
+            **cell,
+            "scene": titles[cell["scene"]],
+            "settings": {k: v for k, v in cell["settings"].items() if k not in shared},
+        }
+        for cell in cells
+    ]
+
+
+def _scene_title(scene: str) -> str:
+    kind, colon, path = scene.partition(":")
+    return PurePath(path).stem if colon and kind == "mesh" else scene
+
+
+def check_equal_terms(cells: Sequence[Cell], *, one_snapshot: bool = True) -> None:
+    """Refuses records that were not made on equal terms.
+
+    All must share the format, the clock, the resolutions of exploration and test views, the sensor
+    and the size of voxels and cells, the network of LPIPS, and all settings of training but its
+    seed; those of one scene also the scene itself and its test
+    views; and each scene, method, seed and snapshot may occur once.
+
+    Args:
+        cells: to stand in one table or figure.
+        one_snapshot: whether they must also be of the same snapshot.
+
+    Raises:
+        ValueError: there are no records, or two of them differ; names both and what differs.
+    """
+    if not cells:
+        raise ValueError("there are no records")
+    everywhere: dict[str, Callable[[Cell], object]] = {
+        "the format": lambda cell: cell["format"],
+        "the clock": lambda cell: cell["clock"],
+        "the resolution of exploration": lambda cell: cell["resolution"],
+        "the resolution of the test views": lambda cell: cell["test_views"]["resolution"],
+    }
+    everywhere["the network of LPIPS"] = lambda cell: cell["lpips_network"]
+    for name in sorted({name for cell in cells for name in cell["sensing"]}):
+        everywhere[f"the exploration's {name}"] = lambda cell, name=name: cell["sensing"].get(name)
+    if one_snapshot:
+        everywhere["the snapshot"] = lambda cell: cell["snapshot"]
+    for name in sorted({name for cell in cells for name in cell["training"]} - {"seed"}):
+        everywhere[f"training {name}"] = lambda cell, name=name: cell["training"].get(name)
+    in_a_scene: dict[str, Callable[[Cell], object]] = {
+        "the scene's hash": lambda cell: cell["scene_hash"],
+        "the hash of the test views": lambda cell: cell["test_views"]["hash"],
+        "the list of test views": lambda cell: list(cell["views"]["view"]),
+    }
+    _check_same(cells, everywhere)
+    for scene in scenes_of(cells):
+        _check_same([cell for cell in cells if cell["scene"] == scene], in_a_scene)
+    seen: set[str] = set()
+    for cell in cells:
+        if (name := _describe(cell)) in seen:
+            raise ValueError(f"{name} occurs twice: leave one of the records out")
+        seen.add(name)
+
+
+def _check_same(cells: Sequence[Cell], terms: Mapping[str, Callable[[Cell], object]]) -> None:
+    first = cells[0]
+    for what, of in terms.items():
+        for other in cells[1:]:
+            if of(other) != of(first):
+                raise ValueError(
+                    f"records cannot be compared: {what} is {_short(of(first))} for "
+                    f"{_describe(first)}, but {_short(of(other))} for {_describe(other)}. Make "
+                    "one table for each, or run the cells again on equal terms."
+                )
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _describe(cell: Cell) -> str:
+    return f"{cell['scene']}, {method_name(cell)}, seed {cell['seed']}, {cell['snapshot']}"
+
+
+def scenes_of(cells: Sequence[Cell]) -> list[str]:
+    """The scenes in alphabetical order."""
+    return sorted({cell["scene"] for cell in cells})
+
+
+def methods_of(cells: Sequence[Cell]) -> list[str]:
+    """The methods in the order of tables, whatever the order of the records.
+
+    Policies go as in `POLICIES` (those it does not know first), their settings alphabetically.
+    """
+    known = {policy: rank for rank, policy in enumerate(POLICIES)}
+    methods = {method_name(cell): known.get(cell["policy"], -1) for cell in cells}
+    return sorted(methods, key=lambda method: (methods[method], method))
+
+
+def snapshots_of(cells: Sequence[Cell]) -> list[str]:
+    """The snapshots (`views:30`, `seconds:120.5`, ...) by kind and size."""
+
+    def key(snapshot: str) -> tuple[str, float]:
+        kind, _, size = snapshot.partition(":")
+        return kind, float(size)
+
+    return sorted({cell["snapshot"] for cell in cells}, key=key)
+
+
+def snapshot_kind(cells: Sequence[Cell]) -> str:
+    """What the snapshots count: views, seconds or meters.
+
+    Raises:
+        ValueError: not all the same; then they are no points of one curve.
+    """
+    kinds = sorted({snapshot.partition(":")[0] for snapshot in snapshots_of(cells)})
+    if len(kinds) > 1:
+        raise ValueError(f"a curve has snapshots of one kind, got {' and '.join(kinds)}")
+    return kinds[0]
+
+
+def view_values(cell: Cell, metric: str) -> np.ndarray | None:
+    """One column of the record's test views, [V]; NaN for null, None if the column is null."""
+    column = cell["views"].get(metric)
+    return None if column is None else np.array(column, dtype=np.float64)
+
+
+def scores_by_method(cells: Sequence[Cell], metric: str) -> dict[str, dict[str, np.ndarray]]:
+    """Per method and scene the values of one metric, [seeds, views], seeds in ascending order.
+
+    Records without the metric are left out, and so are scenes and methods without records.
+
+    Args:
+        cells: of one snapshot, checked by `check_equal_terms`.
+        metric: column of `views`: psnr, psnr_measured, ssim, lpips.
+    """
+    rows: dict[str, dict[str, list[np.ndarray]]] = defaultdict(lambda: defaultdict(list))
+    for cell in sorted(cells, key=lambda cell: cell["seed"]):
+        values = view_values(cell, metric)
+        if values is not None and not np.isnan(values).all():
+            rows[method_name(cell)][cell["scene"]].append(values)
+    return {
+        method: {scene: np.stack(found) for scene, found in scenes.items()}
+        for method, scenes in rows.items()
+    }
+
+
+def seeds_by_method(cells: Sequence[Cell]) -> dict[str, dict[str, list[int]]]:
+    """Per method and scene the seeds there are, ascending; an empty list where there are none."""
+    scenes = scenes_of(cells)
+    seeds: dict[str, dict[str, list[int]]] = {
+        method: {scene: [] for scene in scenes} for method in methods_of(cells)
+    }
+    for cell in sorted(cells, key=lambda cell: cell["seed"]):
+        known = seeds[method_name(cell)][cell["scene"]]
+        if cell["seed"] not in known:  # it has other snapshots too
+            known.append(cell["seed"])
+    return seeds
+
+
+def values_by_seed(cells: Sequence[Cell], quantity: str) -> np.ndarray:
+    """A quantity of one method in one scene, [seeds, snapshots]; NaN where there is none.
+
+    Args:
+        cells: of one method and scene.
+        quantity: of `EXPLORATION`, or a column of the test views, then its mean.
+    """
+    seeds, snapshots = sorted({cell["seed"] for cell in cells}), snapshots_of(cells)
+    values = np.full((len(seeds), len(snapshots)), np.nan)
+    for cell in cells:
+        place = seeds.index(cell["seed"]), snapshots.index(cell["snapshot"])
+        if quantity in EXPLORATION:
+            values[place] = cell["exploration"][quantity]
+        elif (views := view_values(cell, quantity)) is not None and not np.isnan(views).all():
+            values[place] = np.nanmean(views)
+    return values

@@ -1,0 +1,78 @@
+"""Arrays from an NPZ file: no pickles, and no member that unpacks to more than it may."""
+
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular
+
+_SMALL = 256 << 20
+"""Files that unpack to no more are never bombs [bytes]."""
+
+_SQUEEZE = 200
+"""Larger ones are, if they were packed tighter than this: images reach a tenth of it."""
+
+
+def read_npz(path: str | Path, types: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """The arrays of an NPZ file.
+
+    Args:
+        path: the file.
+        types: what it must hold: the kind (`np.dtype.kind`) of every array by its name.
+
+    Raises:
+        ForeignFileError: not an NPZ, cut off, packed like a bomb; arrays that are missing, of
+            another kind, larger than what is stored of them, or not finite.
+        OSError: missing, or not permitted.
+    """
+    size = check_regular(path)
+    try:
+        with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
+            members = {info.filename: info for info in archive.infolist()}
+            wanted = {name: members.get(f"{name}.npy") for name in types}
+            missing = sorted(name for name, info in wanted.items() if info is None)
+            if missing:
+                raise ForeignFileError(f"these arrays are missing: {', '.join(missing)}")
+            infos = [info for info in wanted.values() if info is not None]
+            unpacked = sum(info.file_size for info in infos)
+            if unpacked > max(_SMALL, _SQUEEZE * size):
+                raise ForeignFileError(
+                    f"it has {size} bytes and claims to unpack to {unpacked}: not done"
+                )
+            arrays = {info.filename[:-4]: _read(archive, info) for info in infos}
+    except (ForeignFileError, FileNotFoundError, PermissionError):
+        raise
+    except Exception as error:  # zlib, struct, seeks before the beginning, ...
+        raise ForeignFileError(f"this is no NPZ file ({error!s:.200})") from None
+    for name, array in arrays.items():
+        if array.dtype.kind != types[name]:
+            raise ForeignFileError(f"the array {name!r} is of the type {array.dtype}")
+    return arrays
+
+
+def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One member; its header may not promise more than there is."""
+    with archive.open(info) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in ((1, 0), (2, 0)):
+            raise ForeignFileError(f"{info.filename} has the unknown version {version}")
+        head = (
+            np.lib.format.read_array_header_1_0
+            if version == (1, 0)
+            else np.lib.format.read_array_header_2_0
+        )
+        shape, is_fortran, dtype = head(file)
+        count = math.prod(shape)
+        if dtype.hasobject or min(shape, default=0) < 0:
+            raise ForeignFileError(f"{info.filename} holds no plain numbers or texts")
+        if count * dtype.itemsize != info.file_size - file.tell():
+            raise ForeignFileError(f"{info.filename} promises {count} numbers, others are there")
+        data = file.read(count * dtype.itemsize)
+    if len(data) != count * dtype.itemsize:
+        raise ForeignFileError(f"{info.filename} is cut off")
+    array = np.frombuffer(data, dtype).reshape(shape[::-1] if is_fortran else shape)
+    return array.T if is_fortran else array

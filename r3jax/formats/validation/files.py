@@ -1,0 +1,68 @@
+"""Reading bytes from a path that may be a pipe, a device or far too large."""
+
+import os
+import stat
+from pathlib import Path
+
+from r3jax.formats.validation.errors import ForeignFileError
+
+_SMALL = 1 << 20
+"""Files of /proc say that they are empty and are not [bytes]."""
+
+
+def check_regular(path: str | Path) -> int:
+    """Size of a regular file [bytes]; links are followed.
+
+    Opening a pipe would wait for ever, and a device such as /dev/zero has no end.
+
+    Raises:
+        ForeignFileError: a folder, a pipe, a device, or no name of a file at all.
+        OSError: missing, or not permitted.
+    """
+    try:
+        found = os.stat(path)
+    except ValueError as error:  # a zero byte in the name
+        raise ForeignFileError(f"this cannot be the name of a file ({error})") from None
+    if stat.S_ISDIR(found.st_mode):
+        raise ForeignFileError("this is a folder, a file should be here")
+    if not stat.S_ISREG(found.st_mode):
+        raise ForeignFileError("this is a pipe or a device, a file should be here")
+    return found.st_size
+
+
+def read_bytes(path: str | Path, limit: int) -> bytes:
+    """The whole content of a regular file.
+
+    Args:
+        path: the file.
+        limit: files larger than this are not what they claim to be [bytes].
+
+    Raises:
+        ForeignFileError: not a regular file, or too large.
+        OSError: missing, or not permitted.
+    """
+    size = check_regular(path)
+    if size > limit:
+        raise ForeignFileError(
+            f"the file has {size >> 20} MiB, more than {limit >> 20} MiB: it is something else"
+        )
+    with open(path, "rb") as file:
+        # Python makes room for all that is asked for, before it reads.
+        return file.read(min(limit, max(size, _SMALL)))
+
+
+def check_tree(folder: Path) -> None:
+    """Refuses a folder with pipes or devices below it: a library would wait for them for ever.
+
+    Raises:
+        ForeignFileError: says which.
+        OSError: not a folder, or not permitted.
+    """
+    for path in folder.rglob("*"):
+        if not path.is_dir():
+            try:
+                check_regular(path)
+            except FileNotFoundError:
+                raise ForeignFileError(f"{path.name} is a link that leads nowhere") from None
+            except ForeignFileError as error:
+                raise ForeignFileError(f"{path.name}: {error}") from None

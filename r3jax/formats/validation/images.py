@@ -1,0 +1,86 @@
+"""Images from a path: their size is known before a pixel is unpacked.
+
+Shape symbols: H, W image size.
+"""
+
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular
+
+MAX_PIXELS = 1 << 24
+"""Images with more pixels (4096 x 4096) come from no depth camera; as floats one takes 200 MB."""
+
+
+def image_size(path: Path, formats: Sequence[str]) -> tuple[int, int]:
+    """Width and height of an image [px].
+
+    Raises:
+        ForeignFileError: not an image of these formats, broken, or too large.
+        OSError: missing, or not permitted.
+    """
+    with _opened(path, formats) as image:
+        width, height = image.size
+    if width * height > MAX_PIXELS:
+        raise ForeignFileError(
+            f"the image is {width} x {height}: more than {MAX_PIXELS} pixels are not read"
+        )
+    return width, height
+
+
+def image_pixels(
+    path: Path,
+    formats: Sequence[str],
+    size: tuple[int, int],
+    modes: Sequence[str] = (),
+    wanted: str = "",
+) -> np.ndarray:
+    """The pixels of an image.
+
+    Args:
+        path: the file.
+        formats: those that Pillow may try, such as "PNG".
+        size: width and height that it must have [px].
+        modes: Pillow's modes that it may have; none: any, and it becomes RGB.
+        wanted: what to say of an image that has another mode.
+
+    Returns:
+        [H, W, 3] uint8 where no modes are given, else whatever the mode is.
+
+    Raises:
+        ForeignFileError: not an image of these formats, broken, of another size or mode.
+        OSError: missing, or not permitted.
+    """
+    with _opened(path, formats) as image:
+        if image.size != size:
+            raise ForeignFileError(f"the size is {image.size}, others are {size}")
+        if not modes:
+            return np.asarray(image.convert("RGB"))
+        if image.mode not in modes:
+            raise ForeignFileError(f"{wanted}, the image's mode is {image.mode}")
+        return np.asarray(image)
+
+
+@contextmanager
+def _opened(path: Path, formats: Sequence[str]) -> Generator[Any]:
+    """An open image; whatever Pillow says of a broken one becomes one kind of error."""
+    from PIL import Image
+
+    check_regular(path)
+    try:
+        # The size is compared by the caller: Pillow's own warning of bombs says nothing new.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path, formats=tuple(formats)) as image:
+                yield image
+    except (FileNotFoundError, ForeignFileError):
+        raise
+    except Exception as error:  # struct, zlib, syntax, overflow: every decoder has its own
+        reason = str(error).replace(str(path), "the file") or type(error).__name__
+        raise ForeignFileError(f"the image cannot be read ({reason[:200]})") from None

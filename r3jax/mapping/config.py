@@ -1,0 +1,60 @@
+"""Settings of the map and the grid. Plain numbers: they go into run.json as they are."""
+
+import math
+from dataclasses import dataclass
+
+MAX_CAPACITY = 1 << 27
+"""Rows of a map: 5 GB."""
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """How frames join a map and a grid.
+
+    Raises:
+        ValueError: a setting that cannot work.
+    """
+
+    voxel_size: float = 0.05
+    """Edge of a voxel of the map [m]."""
+
+    num_bins: int = 64
+    """Direction bins per voxel."""
+
+    capacity: int = 1 << 17
+    """Rows of the map at the start; a power of two."""
+
+    allow_growth: bool = True
+    """Double the table before it is 70 % full. If not, what finds no row is counted."""
+
+    drop_edges: bool = True
+    """Keep pixels on depth edges, whose color mixes two surfaces, out of the map."""
+
+    cell_size: float = 0.2
+    """Edge of a cell of the coarse grid [m]."""
+
+    max_range: float = 5.0
+    """Range of the depth sensor [m]."""
+
+    body_radius: float = 0.3
+    """Where the camera has been, this ball is free [m]."""
+
+    start_radius: float = 0.5
+    """The ball round the start that the operator vouches for [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuses what cannot work."""
+        for name in ("voxel_size", "cell_size", "max_range"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("voxel_size", "cell_size"):
+            if not 1e-3 <= getattr(self, name) <= 1e3:
+                raise ValueError(
+                    f"{name} must lie between 0.001 and 1000 m, got {getattr(self, name)}"
+                )
+        if self.num_bins < 1:
+            raise ValueError(f"num_bins must be at least 1, got {self.num_bins}")
+        if self.capacity < 2 or self.capacity & (self.capacity - 1):
+            raise ValueError(f"capacity must be a power of two >= 2, got {self.capacity}")
+        if self.capacity > MAX_CAPACITY:
+            raise ValueError(f"capacity must be at most {MAX_CAPACITY}, got {self.capacity}")

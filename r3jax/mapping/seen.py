@@ -1,0 +1,145 @@
+"""Marks voxels that a frame looked at, whether or not one of its pixels fell into them.
+
+A frame's points do not touch all that it sees: of a floor seen at a grazing angle one voxel in
+five, of what lies on a depth edge or behind glass none. Such a voxel would keep a low
+renderability however often one looks at it, and a planner would look for ever.
+
+Shape symbols: N capacity of the map; M voxels at a time; W words of bins; H W image size.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import invert_pose
+from r3jax.geometry.numerics import safe_norm
+from r3jax.geometry.sphere import nearest_bin
+from r3jax.mapping.state import MapState
+from r3jax.visibility.config import VisibilityConfig
+from r3jax.visibility.depth_buffer import seen_in
+from r3jax.visibility.selection import Selection, for_selected, select
+from r3jax.visibility.views import pinhole_view
+
+_Marks = tuple[UInt32[Array, "W N"], Float[Array, " N"]]
+"""A map's direction bins and best resolutions."""
+
+
+def bin_words(bins: Int[Array, " M"], num_words: int) -> UInt32[Array, "W M"]:
+    """Packs one direction bin per voxel into words of 32 bits."""
+    word = jnp.arange(num_words, dtype=jnp.int32)[:, None]
+    bit = jnp.uint32(1) << (bins % 32).astype(jnp.uint32)
+    return jnp.where(word == (bins // 32)[None, :], bit[None, :], jnp.uint32(0))
+
+
+def evidence_of_view(
+    state: MapState,
+    center: Float[Array, "3 M"],
+    position: Float[Array, " 3"] | Float[Array, "3 M"],
+    focal: Float[Array, ""],
+) -> tuple[UInt32[Array, "W M"], Float[Array, " M"]]:
+    """Computes what a look from a camera says of voxels: the direction bin and the resolution.
+
+    Args:
+        state: the map; of it, the number of bins.
+        center: of the voxels [m].
+        position: of the camera, one for all or one for each [m].
+        focal: its focal length [px].
+
+    Returns:
+        The bin towards the camera as one bit, and focal length over distance [px/m].
+    """
+    offset = (position if position.ndim == 2 else position[:, None]) - center
+    distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
+    bins = nearest_bin(offset / distance[None, :], state.num_bins)
+    return bin_words(bins, state.visited.shape[0]), focal / distance
+
+
+def mark_rows(
+    state: MapState, rows: Selection, position: Float[Array, " 3"], focal: Float[Array, ""]
+) -> MapState:
+    """Sets the direction bin of some rows and raises their best resolution, as seen from a camera.
+
+    Count and colors belong to pixels, and stay.
+
+    Args:
+        state: the map before.
+        rows: which of its rows a camera sees.
+        position: of the camera [m].
+        focal: its focal length [px].
+    """
+    num = state.capacity
+
+    def mark(index: Int[Array, " M"], valid: Bool[Array, " M"], marks: _Marks) -> _Marks:
+        visited, resolution = marks
+        row = jnp.where(valid, index, num)
+        words, sharper = evidence_of_view(state, state.center_of(index), position, focal)
+        # Rows are distinct: the order of the writes does not matter.
+        visited = visited.at[:, row].set(visited[:, index] | words, mode="drop")
+        return visited, resolution.at[row].max(sharper, mode="drop")
+
+    marks = for_selected(rows, mark, (state.visited, state.resolution))
+    return eqx.tree_at(lambda m: (m.visited, m.resolution), state, marks)
+
+
+def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]) -> MapState:
+    """Counts every voxel in view that nothing hides as seen from the frame's camera.
+
+    Voxels in front of the measured surface count too: the sensor's noise has put them there, and
+    there is no more to be seen of them.
+
+    Args:
+        state: the map, with the frame's pixels in it.
+        frame: the frame.
+        max_range: voxels farther from the camera than this are not seen [m].
+    """
+    seen = rows_in_view(state, frame, jnp.asarray(max_range, dtype=jnp.float32))
+    return mark_rows(state, select(seen), frame.position, frame.camera.focal)
+
+
+def rows_in_view(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:
+    """Finds the voxels within range that the frame shows.
+
+    Where it has a measurement, those whose center is no farther. Where it has none, those that no
+    other voxel hides: the color image shows what lies behind glass all the same, and whatever
+    the map does not know of is in front of it in every later view from here, too.
+    """
+    camera, T = frame.camera, invert_pose(frame.T_world_camera)
+    center = state.center
+
+    def along(i: int) -> Array:
+        return T[i, 0] * center[0] + T[i, 1] * center[1] + T[i, 2] * center[2] + T[i, 3]
+
+    x, y, z = along(0), along(1), along(2)
+    per_z = 1.0 / jnp.maximum(z, 1e-3)
+    u, v = camera.fx * x * per_z + camera.cx, camera.fy * y * per_z + camera.cy
+    is_in = state.occupied & (z > 1e-3) & (u >= 0.0) & (u < camera.width)
+    is_in &= (v >= 0.0) & (v < camera.height)
+    is_in &= x * x + y * y + z * z <= max_range * max_range
+    # On a slope the depth changes within a pixel: the farthest of its neighbors limits.
+    farthest = jax.lax.reduce_window(frame.depth, 0.0, jax.lax.max, (3, 3), (1, 1), "SAME")
+    farthest = jnp.where(frame.depth > 0.0, farthest, 0.0).reshape(-1)
+    column = jnp.clip(u, 0.0, camera.width - 1.0).astype(jnp.int32)
+    row = jnp.clip(v, 0.0, camera.height - 1.0).astype(jnp.int32)
+    pixel = row * camera.width + column
+    measured = farthest[pixel]
+    is_shown = (measured > 0.0) & (z <= measured + state.voxel_size)
+    is_hole = is_in & (frame.depth.reshape(-1)[pixel] == 0.0)
+    hidden_by_none = jax.lax.cond(
+        jnp.any(is_hole),
+        lambda: _hidden_by_none(state, frame, jnp.where(is_in, x * x + y * y + z * z, 0.0)),
+        lambda: jnp.zeros(state.capacity, dtype=bool),
+    )
+    return (is_in & is_shown) | (is_hole & hidden_by_none)
+
+
+def _hidden_by_none(
+    state: MapState, frame: Frame, squared_distance: Float[Array, " N"]
+) -> Bool[Array, " N"]:
+    """Voxels that the map itself shows in a frame's view, up to the farthest in it."""
+    farthest = jnp.sqrt(jnp.max(squared_distance)) + state.voxel_size
+    config = VisibilityConfig(max_range=farthest)
+    view = pinhole_view(frame.camera, frame.T_world_camera, config)
+    _, visible = seen_in(state, view, config)
+    return visible.mask

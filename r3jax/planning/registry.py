@@ -1,0 +1,105 @@
+"""Finds policies by name, makes them, and takes in those of others."""
+
+import importlib
+import inspect
+from dataclasses import fields
+from typing import Any, TypeVar
+
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.policies import HOMES, REGISTERED, home_of, known_names
+from r3jax.planning.policy import Policy
+
+PolicyClass = TypeVar("PolicyClass", bound=type)
+
+
+def register_policy(policy_class: PolicyClass) -> PolicyClass:
+    """Makes a policy known by its `name` in this process; a decorator.
+
+        @r3jax.register_policy
+        @dataclass(frozen=True)
+        class Highest(r3jax.GreedyPolicy): ...
+
+    A command, or a worker of a benchmark, is another process: give it `package.module:Class`, or
+    install the package with an entry point in the group `r3jax.policies`.
+
+    Raises:
+        ValueError: the class has no name, or that of a policy of this package.
+    """
+    name = getattr(policy_class, "name", None)
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{policy_class.__qualname__} needs a class attribute `name`")
+    if name in HOMES:
+        raise ValueError(f"a policy of this package is called {name!r}: choose another name")
+    REGISTERED[name] = policy_class
+    return policy_class
+
+
+def policy_names() -> tuple[str, ...]:
+    """Lists the names that `make_policy` knows."""
+    return known_names()
+
+
+def describe(name: str) -> str:
+    """Says what a policy does, in one line.
+
+    Raises:
+        ValueError: no policy has that name.
+    """
+    return inspect.cleandoc(policy_class(name).__doc__ or "").partition("\n")[0]
+
+
+def source_of(name: str) -> str:
+    """Says where a policy's rule comes from, in a phrase.
+
+    Raises:
+        ValueError: no policy has that name.
+    """
+    found = policy_class(name)
+    return getattr(found, "source", found.__module__)
+
+
+def config_class(name: str) -> type[PlannerConfig]:
+    """Finds the settings of a policy: its class attribute `Config`, or what all policies share.
+
+    Raises:
+        ValueError: no policy has that name.
+    """
+    return getattr(policy_class(name), "Config", PlannerConfig)
+
+
+def make_policy(name: str, **settings: Any) -> Policy:
+    """Makes a policy by name.
+
+    Args:
+        name: one of `policy_names()`, or `package.module:Class`.
+        **settings: fields of its `Config` that differ from their defaults.
+
+    Raises:
+        ValueError: no policy has that name, no setting has that name, or a value is impossible.
+    """
+    config = config_class(name)
+    known = [field.name for field in fields(config)]
+    unknown = [setting for setting in settings if setting not in known]
+    if unknown:
+        raise ValueError(
+            f"policy {name!r} has no setting {', '.join(unknown)}; known: {', '.join(known)}"
+        )
+    return policy_class(name)(config(**settings))
+
+
+def policy_class(name: str) -> Any:
+    """Imports the class of a policy.
+
+    Raises:
+        ValueError: no policy has that name, or its module has no such class.
+    """
+    if name in REGISTERED:
+        return REGISTERED[name]
+    module, _, kind = home_of(name).partition(":")
+    try:
+        found = getattr(importlib.import_module(module), kind)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"policy {name!r} cannot be imported: {error}") from error
+    if not isinstance(getattr(found, "name", None), str):
+        raise ValueError(f"policy {name!r}: {module}:{kind} has no class attribute `name`")
+    return found

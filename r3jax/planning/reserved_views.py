@@ -1,0 +1,147 @@
+"""A policy that decides as if views that others will take had been taken.
+
+Two cameras that know the same would want the same view. Whoever decides second takes the first
+one's view as taken: what it will show of the map is foreseen (`scoring.foresight`), and the
+unexplored cells in it are no longer worth a look. Nor are those that lie nearer to where the
+other goes, unless nothing else is left: two cameras that see a door go through it one after the
+other for nothing. All that holds for one decision: neither the map nor the grid that is kept
+learns of it.
+
+Shape symbols: X Y Z cells along the axes; K other cameras.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import (
+    LOG_ODDS_LIMIT,
+    OccupancyGrid,
+    frontier_unexplored,
+    squared_distance,
+)
+from r3jax.mapping.state import MapState
+from r3jax.planning.policy import Decision, PlanInfo, Policy
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.simulated import simulate_view
+from r3jax.scoring.utility import visible_unexplored
+
+
+@dataclass(frozen=True)
+class PromisedView:
+    """A view that somebody has decided to take, and nobody has seen yet."""
+
+    camera: Camera
+
+    T_world_camera: np.ndarray
+    """Its pose, [4, 4]."""
+
+
+@dataclass
+class ReservedViews:
+    """Decides as another policy does, on what will be known once the promised views are taken."""
+
+    policy: Policy
+    """Whose decisions are asked for."""
+
+    promised: tuple[PromisedView, ...]
+
+    scoring: ScoringConfig
+    """How far the promised views see."""
+
+    def __post_init__(self) -> None:
+        """Goes by the name of the policy, and by its settings."""
+        self.name, self.config = self.policy.name, getattr(self.policy, "config", None)
+
+    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Any:
+        """As the policy does."""
+        return self.policy.init(camera, grid, key=key)
+
+    def observe(self, state: Any, map_state: MapState, frame: Frame) -> Any:
+        """As the policy does."""
+        return self.policy.observe(state, map_state, frame)
+
+    def decide(
+        self,
+        state: Any,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, Any, PlanInfo]:
+        """The view that the policy would take if the promised ones had been taken."""
+        for view in self.promised:
+            pose = jnp.asarray(view.T_world_camera, dtype=jnp.float32)
+            map_state, grid = after_promise(map_state, grid, view.camera, pose, self.scoring)
+        others = jnp.asarray([view.T_world_camera[:3, 3] for view in self.promised], jnp.float32)
+        here = jnp.asarray(T_world_camera[:3, 3], dtype=jnp.float32)
+        grid = without_yielded(grid, here, others)
+        return self.policy.decide(state, map_state, grid, T_world_camera, key=key)
+
+    def follow(
+        self,
+        state: Any,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        waypoints: np.ndarray,
+    ) -> Any:
+        """As the policy does."""
+        return self.policy.follow(state, map_state, grid, T_world_camera, waypoints)
+
+
+@jax.jit
+def after_promise(
+    map_state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    scoring: ScoringConfig,
+) -> tuple[MapState, OccupancyGrid]:
+    """Map and grid for a decision that takes a view as taken.
+
+    The unexplored cells that the view would show are marked as occupied: they count for nothing,
+    and no way leads through them, as before.
+
+    Args:
+        map_state: the map.
+        grid: the coarse grid.
+        camera: of the promised view.
+        T_world_camera: its pose.
+        scoring: range and size of the depth buffer.
+    """
+    shown = visible_unexplored(map_state, grid, camera, T_world_camera, scoring)
+    log_odds = jnp.where(shown, LOG_ODDS_LIMIT, grid.log_odds)
+    after, _ = simulate_view(map_state, camera, T_world_camera, scoring)
+    return after, eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+
+
+@jax.jit
+def without_yielded(
+    grid: OccupancyGrid, here: Float[Array, " 3"], others: Float[Array, "K 3"]
+) -> OccupancyGrid:
+    """The grid for a decision that leaves to others what lies nearer to them.
+
+    Unexplored cells that are nearer to one of the others than to here are marked as occupied; none
+    is if that would leave nothing to explore.
+
+    Args:
+        grid: the coarse grid.
+        here: where the camera is [m].
+        others: where the others go [m].
+    """
+    nearest = functools.reduce(jnp.minimum, [squared_distance(grid, other) for other in others])
+    is_yielded = grid.unexplored & (nearest < squared_distance(grid, here))
+    log_odds = jnp.where(is_yielded, LOG_ODDS_LIMIT, grid.log_odds)
+    own = eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+    is_left = jnp.any(frontier_unexplored(own))
+    return eqx.tree_at(lambda g: g.log_odds, grid, jnp.where(is_left, log_odds, grid.log_odds))

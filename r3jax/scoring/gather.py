@@ -1,0 +1,105 @@
+"""What candidates may see at all, gathered once for all of them.
+
+Candidates of a step lie close together: what none of them can see is left out.
+
+Shape symbols: C candidates; n voxels; c cells.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.geometry.cameras import is_traced
+from r3jax.geometry.compaction import positions_of_set
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.scoring.cells import Cells, cells_of
+from r3jax.scoring.config import ScoringConfig
+from r3jax.visibility.views import Coordinates
+
+SMALLEST = 1 << 14
+"""Voxels at hand are padded to this or 4, 16, ... times as many: a run compiles once for each pair
+of sizes, of voxels and of cells, that it meets, which takes seconds and keeps some 40 MB for good.
+Absent ones cost little."""
+
+
+def gather_in_range(
+    state: MapState, grid: OccupancyGrid, positions: Float[Array, "C 3"], config: ScoringConfig
+) -> tuple[MapState, Cells, Int[Array, " n"]]:
+    """The voxels and unexplored cells that at least one of the positions may see.
+
+    Returns:
+        Voxels and cells, padded with absent ones, and each voxel's row in the map (N: padding).
+    """
+    if is_traced(state.key, positions):
+        raise TypeError("score_views and score_positions choose sizes: call them outside jit")
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    counts = np.asarray(_count_near(state, grid, low, high, config))
+    sizes = _sizes(int(counts[0]), int(counts[1]), state.capacity, grid.log_odds.size)
+    return _gather_near(state, grid, low, high, config, sizes)
+
+
+def _sizes(voxels: int, cells: int, capacity: int, num_cells: int) -> tuple[int, int]:
+    """Room for so many voxels and cells, in few different pairs.
+
+    The cells get as much as the voxels, or all that there are.
+    """
+    room = SMALLEST
+    while room < min(voxels, capacity):
+        room *= 4
+    return min(room, capacity), num_cells if cells > room else min(room, num_cells)
+
+
+def _masks(
+    voxels: MapState,
+    cells: Cells,
+    low: Float[Array, " 3"],
+    high: Float[Array, " 3"],
+    config: ScoringConfig,
+) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:
+    """Voxels and unexplored cells within range of a box."""
+
+    def is_near(points: Coordinates, margin: Float[Array, ""] | float) -> Bool[Array, " k"]:
+        gap = [
+            jnp.maximum(jnp.maximum(low[i] - points[i], points[i] - high[i]), 0.0) for i in range(3)
+        ]
+        reach = config.max_range + margin
+        return gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] <= reach * reach
+
+    near_voxels = voxels.present & is_near(voxels.center, voxels.voxel_size)
+    near_cells = cells.unexplored & is_near((cells.x, cells.y, cells.z), 0.0)
+    return near_voxels, near_cells
+
+
+@jax.jit
+def _count_near(
+    state: MapState,
+    grid: OccupancyGrid,
+    low: Float[Array, " 3"],
+    high: Float[Array, " 3"],
+    config: ScoringConfig,
+) -> Int[Array, " 2"]:
+    masks = _masks(state, cells_of(grid), low, high, config)
+    return jnp.stack([jnp.sum(mask, dtype=jnp.int32) for mask in masks])
+
+
+@functools.partial(jax.jit, static_argnames="sizes")
+def _gather_near(
+    state: MapState,
+    grid: OccupancyGrid,
+    low: Float[Array, " 3"],
+    high: Float[Array, " 3"],
+    config: ScoringConfig,
+    sizes: tuple[int, int],
+) -> tuple[MapState, Cells, Int[Array, " n"]]:
+    cells = cells_of(grid)
+    gathered, indices = [], []
+    masks = _masks(state, cells, low, high, config)
+    for items, mask, size in zip((state, cells), masks, sizes, strict=True):
+        index = positions_of_set(mask, size)
+        gathered.append(items.take(jnp.minimum(index, mask.shape[0] - 1), index < mask.shape[0]))
+        indices.append(index)
+    return *gathered, indices[0]

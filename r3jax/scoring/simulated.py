@@ -1,0 +1,94 @@
+"""A view that nobody has taken yet, as if it had been: what the map would know then.
+
+A hypothetical observation of every voxel that the view would show:
+
+    bins        the bin towards the camera joins them
+    resolution  focal / distance, if that is better
+    count       n + 1
+    m2          m2 n / (n - 1) for n > 1: the variance m2 / (n - 1) stays, as it would on average if
+                the new color scattered like the others. A view cannot talk noise away.
+
+Colors and surfaces stay: what nobody has seen cannot be foreseen. So no renderability ever falls,
+from wherever it is asked; and the order of hypothetical views does not matter.
+
+Shape symbols: N rows of the map; n voxels; c cells; M voxels at a time.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.seen import mark_rows
+from r3jax.mapping.state import MapState
+from r3jax.scoring.cells import Cells, visible_cells
+from r3jax.scoring.config import ScoringConfig
+from r3jax.visibility.depth_buffer import seen_in
+from r3jax.visibility.selection import Selection
+from r3jax.visibility.views import pinhole_view
+
+
+@jax.jit
+def simulate_view(
+    state: MapState,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+) -> tuple[MapState, Bool[Array, " N"]]:
+    """The map after a view that is only imagined.
+
+    Args:
+        state: the map before.
+        camera: of the view; its focal length in the unit that the map was made with.
+        T_world_camera: pose of the view.
+        config: range and size of the depth buffer.
+
+    Returns:
+        The map, and the voxels that the view shows.
+    """
+    _, visible = seen_in(state, pinhole_view(camera, T_world_camera, config), config)
+    return observed(state, visible, T_world_camera[:3, 3], camera.focal), visible.mask
+
+
+@jax.jit
+def simulate_view_near(
+    voxels: MapState,
+    cells: Cells,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+) -> tuple[MapState, Cells]:
+    """Voxels and cells at hand after a view that is only imagined.
+
+    The unexplored cells that the view shows are no longer unexplored.
+
+    Args:
+        voxels: those that hide or are seen; `scoring.gather.gather_in_range` gathers them.
+        cells: of the coarse grid.
+        camera: of the view.
+        T_world_camera: pose of the view.
+        config: range and size of the depth buffer.
+    """
+    view = pinhole_view(camera, T_world_camera, config)
+    buffer, visible = seen_in(voxels, view, config)
+    after = observed(voxels, visible, T_world_camera[:3, 3], camera.focal)
+    left = cells.unexplored & ~visible_cells(cells, view, buffer).mask
+    return after, eqx.tree_at(lambda c: c.unexplored, cells, left)
+
+
+def observed(
+    voxels: MapState, visible: Selection, position: Float[Array, " 3"], focal: Float[Array, ""]
+) -> MapState:
+    """The voxels with one more, imagined, observation of those that are visible.
+
+    Args:
+        voxels: before.
+        visible: which of them a camera sees.
+        position: its center [m].
+        focal: its focal length [px].
+    """
+    marked, shown, n = mark_rows(voxels, visible, position, focal), visible.mask, voxels.count
+    grows = shown & (n > 1.0)
+    m2 = jnp.where(grows, voxels.m2 * n / jnp.maximum(n - 1.0, 1.0), voxels.m2)
+    return eqx.tree_at(lambda v: (v.count, v.m2), marked, (n + shown.astype(n.dtype), m2))

@@ -1,0 +1,92 @@
+"""What a scene may be called, known without opening it."""
+
+from pathlib import Path
+
+from r3jax.formats.validation.choices import did_you_mean
+from r3jax.simulators.scenes import procedural, replica
+
+OUTSIDE = {
+    "mesh": ("the mesh file", "a file, as in mesh:house.glb"),
+    "replica": ("the Replica scene", "a scene, as in replica:office0"),
+    "habitat": ("Habitat-Sim on", "a scene of Replica, or a file, as in habitat:house.glb"),
+}
+"""What comes before a colon: how a description begins, and what must follow the colon."""
+
+MESH_SUFFIXES = (".glb", ".gltf", ".ply", ".obj")
+
+
+def outside_scenes() -> dict[str, str]:
+    """How to name scenes that are not embedded, each with a line about them."""
+    return {
+        "mesh:<file>": "any GLB, glTF, PLY or OBJ file",
+        "replica:<name>": "hotel0, office0 to office4, room0 to room2 of the Replica dataset; "
+        f"{replica.ROOT} names its folder",
+        "habitat:<scene>": "Habitat-Sim (conda) on a scene of Replica, or on a .glb, .ply or "
+        ".stage_config.json file; vertex colors of a PLY (so Replica's) come out dark in it, they "
+        "are the ray caster's instead",
+    }
+
+
+def split_name(spec: str) -> tuple[str, str]:
+    """What opens a scene (a key of `OUTSIDE`, or "embedded"), and its name or file there.
+
+    Raises:
+        ValueError: the scene is unknown; names the known ones, and the one that was meant.
+    """
+    kind, colon, rest = spec.partition(":")
+    if colon and kind in OUTSIDE:
+        if not rest:
+            raise ValueError(f"{spec} needs {OUTSIDE[kind][1]}")
+        return kind, rest
+    if spec not in procedural.names():
+        if Path(spec).suffix.lower() in MESH_SUFFIXES and not colon:
+            hint = f" (did you mean mesh:{spec}?)"
+        else:
+            outside = [f"{known}:{rest}" for known in OUTSIDE if colon]
+            hint = did_you_mean(spec, [*procedural.names(), *outside])
+        raise ValueError(
+            f"unknown scene {spec!r}{hint}; known are {', '.join(procedural.names())}, and "
+            f"{', '.join(outside_scenes())}"
+        )
+    return "embedded", spec
+
+
+def check_scale(spec: str, scale: float | int) -> None:
+    """Refuses a scale for a scene that has its own.
+
+    Raises:
+        ValueError: it is not a mesh file.
+    """
+    kind, _ = split_name(spec)
+    if scale == 1.0 or kind == "mesh":
+        return
+    if kind == "habitat":
+        raise ValueError(f"scale={scale!r}: Habitat scales nothing, apply it to the mesh file")
+    raise ValueError(f"scale={scale!r} is for mesh files (mesh:<file>); {spec!r} has metres")
+
+
+def check_scene(spec: str, scale: float | int = 1.0) -> None:
+    """Refuses a scene that cannot be opened, as far as its name and the disk tell.
+
+    Raises:
+        ValueError: the scene is unknown, its file is missing, or it takes no scale.
+    """
+    check_scale(spec, scale)
+    kind, rest = split_name(spec)
+    if kind == "mesh" and not Path(rest).is_file():
+        raise ValueError(f"no such mesh file: {rest} (give a GLB, glTF, PLY or OBJ file)")
+    if kind == "replica":
+        replica.mesh_file(rest)
+    elif kind == "habitat" and not habitat_file(rest).is_file():
+        raise ValueError(f"no such file for Habitat: {rest}")
+
+
+def habitat_file(rest: str) -> Path:
+    """The file that Habitat loads for what follows `habitat:`.
+
+    Raises:
+        ValueError: neither a file nor a scene of Replica; lists these.
+    """
+    path = Path(rest)
+    is_file = bool(path.suffix) or len(path.parts) > 1 or path.exists()
+    return path if is_file and rest not in replica.names() else replica.stage_file(rest)

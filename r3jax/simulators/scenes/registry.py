@@ -1,0 +1,130 @@
+"""Scenes by name: the embedded rooms, any mesh file, Replica's scenes, and Habitat-Sim."""
+
+import dataclasses
+
+import numpy as np
+
+from r3jax.geometry.cameras import Camera
+from r3jax.simulators.base import Simulator
+from r3jax.simulators.habitat import HabitatSimulator
+from r3jax.simulators.habitat_stage import read_stage
+from r3jax.simulators.meshes import load_world
+from r3jax.simulators.noise import NoisySimulator
+from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.scenes import procedural, replica
+from r3jax.simulators.scenes.names import (
+    OUTSIDE,
+    check_scale,
+    habitat_file,
+    outside_scenes,
+    split_name,
+)
+from r3jax.simulators.world import World
+
+__all__ = ["describe", "open_scene", "open_world", "outside_scenes", "scene_hash", "scene_names"]
+
+
+def scene_names() -> list[str]:
+    """Names of the embedded scenes; `outside_scenes` says what else can be opened."""
+    return list(procedural.names())
+
+
+def describe(name: str) -> str:
+    """One line about a scene.
+
+    Raises:
+        ValueError: the scene is unknown; the message lists the known ones.
+    """
+    kind, rest = split_name(name)
+    return f"{OUTSIDE[kind][0]} {rest}" if kind in OUTSIDE else procedural.describe(name)
+
+
+def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> World:
+    """The triangles and materials behind a scene's name.
+
+    Args:
+        spec: the name of an embedded scene, or one of `outside_scenes`. Of a Habitat scene this is
+            the mesh that it shows.
+        up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
+        scale: meters in a unit of a mesh file.
+
+    Raises:
+        ValueError: the scene is unknown, `up` or `scale` is given for a scene that is no mesh
+            file, or the mesh file is refused (see `load_world`) or missing.
+    """
+    kind, rest = split_name(spec)
+    if kind == "mesh":
+        return load_world(rest, up, scale)
+    check_scale(spec, scale)
+    if kind == "habitat":
+        return load_world(read_stage(habitat_file(rest)).mesh, up)
+    if up not in (None, "z"):
+        raise ValueError(f"up={up!r} is for mesh files; the scene {spec!r} is z-up")
+    if kind == "replica":
+        return dataclasses.replace(load_world(replica.mesh_file(rest)), name=spec)
+    return procedural.build(spec)
+
+
+def open_scene(
+    spec: str,
+    *,
+    up: str | None = None,
+    scale: float | int = 1.0,
+    cull_back_faces: bool = False,
+    camera: Camera | None = None,
+    noise: float | int = 0.01,
+    seed: int = 0,
+    max_range: float | int | None = 5.0,
+    start_pose: np.ndarray | None = None,
+) -> Simulator:
+    """Opens a scene for exploration.
+
+    Args:
+        spec: the name of an embedded scene, or one of `outside_scenes`.
+        up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
+        scale: meters in a unit of a mesh file: 0.001 for one in millimeters.
+        cull_back_faces: look through faces seen from behind, as Habitat always does.
+        camera: intrinsics; None: 512x512 pixels, 60 degrees.
+        noise: standard deviation of the depth as a share of the depth; 0: exact depth.
+        seed: of the noise, and of the search for a start where the scene has none.
+        max_range: reach of the depth sensor [m]; None: unlimited.
+        start_pose: `T_world_camera` at the start; None: the scene's own, or a search.
+
+    Raises:
+        ValueError: see `open_world`, `RaycastSimulator` and `HabitatSimulator`.
+        ImportError: a Habitat scene, and Habitat-Sim is not installed; says how to get it.
+    """
+    kind, rest = split_name(spec)
+    simulator: Simulator
+    if kind == "habitat":
+        check_scale(spec, scale)
+        simulator = HabitatSimulator(
+            habitat_file(rest),
+            camera,
+            up=up,
+            max_range=max_range,
+            start_pose=start_pose,
+            seed=seed,
+        )
+    else:
+        simulator = RaycastSimulator(
+            open_world(spec, up, scale),
+            camera,
+            max_range=max_range,
+            start_pose=start_pose,
+            cull_back_faces=cull_back_faces,
+            seed=seed,
+        )
+    return NoisySimulator(simulator, noise, seed) if noise != 0.0 else simulator
+
+
+def scene_hash(simulator: Simulator) -> str:
+    """SHA-256 of what a simulator from `open_scene` shows: geometry, colors, lamps, by whom.
+
+    Raises:
+        ValueError: the simulator does not come from `open_scene`.
+    """
+    inner = simulator.simulator if isinstance(simulator, NoisySimulator) else simulator
+    if not isinstance(inner, HabitatSimulator | RaycastSimulator):
+        raise ValueError(f"a {type(inner).__name__} has no world that could be hashed")
+    return inner.content_hash

@@ -1,0 +1,225 @@
+"""Where points of the world fall in a view: pinhole, or all directions round a position.
+
+The panoramic view is an octahedral map of the sphere: no poles, and its borders wrap in closed
+form.
+
+Besides its place every point gets scales: the sum of the absolute derivatives of a pixel coordinate
+along the world's three axes. Half of it times the edge of a voxel is how far the voxel's projection
+reaches, exactly to first order, whichever way the voxel is turned.
+
+Shape symbols: n points; h w size of the view.
+"""
+
+import math
+from collections.abc import Callable
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.geometry.cameras import Camera
+from r3jax.visibility.config import VisibilityConfig
+
+Coordinates = Float[Array, "3 n"] | tuple[Array, Array, Array]
+"""x, y and z of points [m], as one array or three."""
+
+
+class Placement(eqx.Module):
+    """Where points fall in a buffer."""
+
+    column: Float[Array, " n"]
+    """Continuous column [px]."""
+
+    row: Float[Array, " n"]
+    """Continuous row [px]."""
+
+    column_scale: Float[Array, " n"]
+    """Columns per meter [px/m]: the sum over the world's axes of |d column / d axis|."""
+
+    row_scale: Float[Array, " n"]
+    """The same of the row."""
+
+    sum_scale: Float[Array, " n"]
+    """The same of column + row."""
+
+    difference_scale: Float[Array, " n"]
+    """The same of column - row."""
+
+    distance: Float[Array, " n"]
+    """From the camera [m]."""
+
+    ahead: Bool[Array, " n"]
+    """False behind the camera, where the rest means nothing."""
+
+
+class PinholeView(eqx.Module):
+    """One view, at the size of its depth buffer."""
+
+    camera: Camera
+    """Intrinsics of the buffer."""
+
+    T_world_camera: Float[Array, "4 4"]
+    """Pose."""
+
+    max_range: Float[Array, ""]
+    """Nothing farther is visible [m]."""
+
+    wraps: ClassVar[bool] = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the buffer [px]."""
+        return self.camera.height, self.camera.width
+
+    @property
+    def pixel_angle(self) -> Float[Array, ""]:
+        """Angle that a pixel covers on the axis [rad]."""
+        return 1.0 / self.camera.focal
+
+    def in_camera(self, points: Coordinates) -> tuple[Array, Array, Array]:
+        """Coordinates in the camera's frame [m]."""
+        R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        offset = [points[i] - t[i] for i in range(3)]
+
+        def along(j: int) -> Array:
+            return R[0, j] * offset[0] + R[1, j] * offset[1] + R[2, j] * offset[2]
+
+        return along(0), along(1), along(2)
+
+    def may_see(self, points: Coordinates, margin: Float[Array, ""]) -> Bool[Array, " n"]:
+        """False only for points that lie outside the frustum by more than `margin` [m]."""
+        x, y, z = self.in_camera(points)
+        camera = self.camera
+        reach = self.max_range + margin
+        low_x, high_x = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
+        low_y, high_y = -camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
+        # Distance to a side plane x = k z is |x - k z| / sqrt(1 + k^2).
+        slack: Callable[[Array], Array] = lambda k: margin * jnp.sqrt(1.0 + k * k)
+        is_in = (x >= low_x * z - slack(low_x)) & (x <= high_x * z + slack(high_x))
+        is_in &= (y >= low_y * z - slack(low_y)) & (y <= high_y * z + slack(high_y))
+        return is_in & (z > -margin) & (x * x + y * y + z * z <= reach * reach)
+
+    def place(self, points: Float[Array, "3 n"]) -> Placement:
+        """Projects points of the world."""
+        x, y, z = self.in_camera(points)
+        is_ahead = z > 1e-3
+        inverse = 1.0 / jnp.where(is_ahead, z, 1.0)
+        R = self.T_world_camera[:3, :3]
+
+        def gradient(f: Array, j: int, slope: Array) -> list[Array]:
+            return [f * inverse * (R[i, j] - slope * R[i, 2]) for i in range(3)]
+
+        along_column = gradient(self.camera.fx, 0, x * inverse)
+        along_row = gradient(self.camera.fy, 1, y * inverse)
+
+        def total(parts: list[Array]) -> Array:
+            return jnp.abs(parts[0]) + jnp.abs(parts[1]) + jnp.abs(parts[2])
+
+        both = list(zip(along_column, along_row, strict=True))
+        return Placement(
+            column=self.camera.fx * x * inverse + self.camera.cx,
+            row=self.camera.fy * y * inverse + self.camera.cy,
+            column_scale=total(along_column),
+            row_scale=total(along_row),
+            sum_scale=total([a + b for a, b in both]),
+            difference_scale=total([a - b for a, b in both]),
+            distance=jnp.sqrt(x * x + y * y + z * z),
+            ahead=is_ahead,
+        )
+
+
+class PanoramaView(eqx.Module):
+    """All directions round a position, on an octahedral map."""
+
+    position: Float[Array, " 3"]
+    """[m], world."""
+
+    max_range: Float[Array, ""]
+    """Nothing farther is visible [m]."""
+
+    size: int = eqx.field(static=True)
+    """Side of the map [px]."""
+
+    wraps: ClassVar[bool] = True
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the buffer [px]."""
+        return self.size, self.size
+
+    @property
+    def pixel_angle(self) -> float:
+        """Angle that a pixel covers on average [rad]."""
+        return math.sqrt(4.0 * math.pi) / self.size
+
+    def may_see(self, points: Coordinates, margin: Float[Array, ""]) -> Bool[Array, " n"]:
+        """False only for points out of range by more than `margin` [m]."""
+        x, y, z = (points[i] - self.position[i] for i in range(3))
+        reach = self.max_range + margin
+        return x * x + y * y + z * z <= reach * reach
+
+    def place(self, points: Float[Array, "3 n"]) -> Placement:
+        """Projects points of the world on the map.
+
+        With L = |x| + |y| + |z| and u = x / L, the derivatives of u along the three axes sum to
+        (1 + |u|) / L; on the lower half of the sphere u and v swap.
+        """
+        x, y, z = (points[i] - self.position[i] for i in range(3))
+        distance = jnp.maximum(jnp.sqrt(x * x + y * y + z * z), 1e-6)
+        inverse = 1.0 / jnp.maximum(jnp.abs(x) + jnp.abs(y) + jnp.abs(z), 1e-6)
+        u, v = x * inverse, y * inverse
+        a, b = jnp.abs(u), jnp.abs(v)
+        sign: Callable[[Array], Array] = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
+        half = 0.5 * self.size
+        is_lower = z < 0.0
+        p, q = jnp.where(is_lower, b, a), jnp.where(is_lower, a, b)
+
+        def diagonal(w: Array, k: float) -> Array:
+            return jnp.abs(1.0 - w * sign(x)) + jnp.abs(k - w * sign(y)) + jnp.abs(w)
+
+        return Placement(
+            column=jnp.where(is_lower, (1.0 - b) * sign(u), u) * half + half,
+            row=jnp.where(is_lower, (1.0 - a) * sign(v), v) * half + half,
+            column_scale=half * inverse * (1.0 + p),
+            row_scale=half * inverse * (1.0 + q),
+            sum_scale=half * inverse * diagonal(u + v, 1.0),
+            difference_scale=half * inverse * diagonal(u - v, -1.0),
+            distance=distance,
+            ahead=jnp.ones(distance.shape, dtype=bool),
+        )
+
+
+View = PinholeView | PanoramaView
+
+
+def pinhole_view(
+    camera: Camera, T_world_camera: Float[Array, "4 4"], config: VisibilityConfig
+) -> PinholeView:
+    """The view of a camera; its longest side is reduced to `config.zbuffer_size` pixels.
+
+    Visibility is piecewise constant, so no derivative passes through the pose.
+    """
+    longest = max(camera.width, camera.height)
+    scale = min(1.0, config.zbuffer_size / longest)
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    pose = jax.lax.stop_gradient(T_world_camera)
+    return PinholeView(camera.resized(*size), pose, config.max_range)
+
+
+def panorama_view(position: Float[Array, " 3"], config: VisibilityConfig) -> PanoramaView:
+    """All directions from a position; no derivative passes through it."""
+    still = jax.lax.stop_gradient(position)
+    return PanoramaView(still, config.max_range, config.panorama_size)
+
+
+def wrap(
+    row: Int[Array, " n"], column: Int[Array, " n"], size: Int[Array, " n"]
+) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
+    """Pixels one step outside the octahedral map: its borders are glued to themselves, turned."""
+    crosses_column = (column < 0) | (column >= size)
+    crosses_row = (row < 0) | (row >= size)
+    turned_row = jnp.where(crosses_column, size - 1 - row, row)
+    turned_column = jnp.where(crosses_row, size - 1 - column, column)
+    return jnp.clip(turned_row, 0, size - 1), jnp.clip(turned_column, 0, size - 1)

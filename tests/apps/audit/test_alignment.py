@@ -1,0 +1,143 @@
+"""The audit's coordinates: there and back, upright whatever the capture calls up."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r3jax.apps.audit import alignment as real
+from r3jax.apps.audit.alignment import Alignment, estimated_up, rotation_to_z, up_of
+from r3jax.geometry.cameras import rigid_error
+from tests.formats.colmap_models import random_pose, random_rotation
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+
+seeds = st.integers(0, 10_000)
+
+
+def random_alignment(seed: int, kind: type[Alignment] = Alignment) -> Alignment:
+    rng = np.random.default_rng(seed)
+    return kind(random_rotation(rng), float(rng.uniform(0.1, 9.0)), rng.normal(0.0, 50.0, 3))
+
+
+@given(seeds)
+def test_points_poses_and_directions_come_back(seed):
+    law_back({"alignment": real}, seed)
+
+
+def law_back(modules: Modules, seed: int = 5) -> None:
+    found = random_alignment(seed, modules["alignment"].Alignment)
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0.0, 20.0, (5, 3))
+    np.testing.assert_allclose(found.points_back(found.points(points)), points, atol=1e-9)
+    poses = np.stack([random_pose(seed + i) for i in range(3)])
+    moved = found.poses(poses)
+    for pose in moved:
+        assert rigid_error(pose) is None
+    np.testing.assert_allclose(found.poses_back(moved), poses, atol=1e-9)
+    ahead = found.directions_back(moved[:, :3, 2])
+    np.testing.assert_allclose(ahead, poses[:, :3, 2], atol=1e-9)
+
+
+@given(seeds)
+def test_what_a_camera_sees_stays_where_it_is_in_the_image(seed):
+    law_same_image({"alignment": real}, seed)
+
+
+def law_same_image(modules: Modules, seed: int = 5) -> None:
+    """Coordinates in the camera change by the scale only, so pixels do not change."""
+    found = random_alignment(seed, modules["alignment"].Alignment)
+    points = np.random.default_rng(seed).normal(0.0, 20.0, (5, 3))
+    pose = random_pose(seed)
+    in_camera = lambda points, T: (points - T[:3, 3]) @ T[:3, :3]
+    before = in_camera(points, pose)
+    after = in_camera(found.points(points), found.poses(pose[None])[0])
+    np.testing.assert_allclose(after, found.scale * before, atol=1e-8)
+
+
+@given(seeds)
+def test_up_becomes_z_by_the_smallest_rotation(seed):
+    law_up({"alignment": real}, seed)
+
+
+def law_up(modules: Modules, seed: int = 5) -> None:
+    up = np.random.default_rng(seed).normal(size=3)
+    up /= np.linalg.norm(up)
+    R = modules["alignment"].rotation_to_z(up)
+    np.testing.assert_allclose(R @ up, [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) > 0
+    # The trace tells the angle; no rotation from `up` to z has a larger one.
+    assert np.trace(R) == pytest.approx(1.0 + 2.0 * up[2], abs=1e-6)
+
+
+def test_axes_become_z_without_rounding():
+    for name in ("x", "y", "z", "-x", "-y", "-z"):
+        R = rotation_to_z(up_of(name))
+        np.testing.assert_array_equal(R @ up_of(name), [0, 0, 1])
+        assert set(np.abs(R).ravel()) == {0.0, 1.0}
+    np.testing.assert_array_equal(rotation_to_z(up_of("y")) @ [1, 2, 3], [1, -3, 2])
+    with pytest.raises(ValueError, match="up must be one of"):
+        up_of("w")
+
+
+def held(num: int, up: np.ndarray, seed: int = 0, *, turns: bool = True) -> np.ndarray:
+    """Cameras held level in a world with that vertical, pitched down by 10 to 50 degrees."""
+    rng = np.random.default_rng(seed)
+    back = rotation_to_z(up).T
+    poses = np.tile(np.eye(4), (num, 1, 1))
+    for pose in poses:
+        azimuth, pitch = (rng.uniform(0, 6.28) if turns else 0.3), np.radians(rng.uniform(10, 50))
+        ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+        forward = np.cos(pitch) * ahead - np.sin(pitch) * np.array([0, 0, 1])
+        pose[:3, :3] = back @ np.stack([right, np.cross(forward, right), forward], axis=1)
+    return poses
+
+
+@given(seeds)
+def test_the_vertical_of_level_cameras_is_found_although_they_look_down(seed):
+    up = np.random.default_rng(seed).normal(size=3)
+    up /= np.linalg.norm(up)
+    found = estimated_up(held(12, up, seed))
+    assert np.degrees(np.arccos(min(1.0, float(found @ up)))) < 8.1  # near an axis: the axis
+
+
+@pytest.mark.parametrize("name", ["x", "y", "-y", "z", "-z"])
+def test_a_vertical_near_an_axis_is_the_axis(name):
+    wobble = np.random.default_rng(1).normal(0.0, 0.02, 3)
+    up = up_of(name) + wobble
+    found = estimated_up(held(20, up / np.linalg.norm(up)))
+    np.testing.assert_array_equal(found, up_of(name))
+
+
+def test_cameras_that_never_turn_leave_their_own_up():
+    up = np.array([0.36, -0.48, 0.8])
+    found = estimated_up(held(9, up, turns=False))
+    assert float(found @ up) > np.cos(np.radians(40))  # looking down by 30 on average
+    assert np.linalg.norm(estimated_up(np.stack([np.eye(4), np.diag([1.0, -1, -1, 1])]))) == 1.0
+
+
+CHAIN = ("r3jax.apps.audit.alignment",)
+MUTANTS = [
+    Mutant("alignment", "(points_capture - self.origin)", "(points_capture)", law_back),
+    Mutant("alignment", "= self.rotation.T @ moved", "= self.rotation @ moved", law_back),
+    Mutant("alignment", "self.scale * (points_capture", "(points_capture", law_same_image),
+    Mutant(
+        "alignment",
+        "directions_audit.astype(np.float64) @ self.rotation",
+        "directions_audit",
+        law_back,
+    ),
+    Mutant("alignment", "K @ K / (1.0 + c)", "K @ K / (1.0 - c)", law_up),
+]
+
+
+def test_laws_hold_without_a_fault():
+    modules = load(CHAIN)
+    for law in (law_back, law_same_image, law_up):
+        law(modules)
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)

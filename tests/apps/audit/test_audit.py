@@ -1,0 +1,324 @@
+"""Whole audits of a room in which it is known what is wrong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r3jax.apps.audit import seen
+from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.camera_paths import CameraPath
+from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
+from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
+from r3jax.apps.audit.regions import bad_regions, unseen_edges, unseen_regions
+from r3jax.apps.audit.sentences import method, verdict
+from r3jax.apps.audit.source import Source, source_of
+from r3jax.apps.audit.survey import MARGIN, Wishes, survey_of
+from r3jax.formats.colmap.reader import read_colmap
+from r3jax.formats.errors import FormatError
+from r3jax.formats.nerfstudio import read_transforms
+from r3jax.formats.ply_points import read_points
+from r3jax.formats.recordings import read_recording
+from tests.apps.audit.room import (
+    LENS,
+    SIZE,
+    pose_at,
+    round_poses,
+    write_colmap,
+    write_nerfstudio,
+    write_recording,
+)
+
+pytestmark = pytest.mark.full
+
+VOXEL = 0.15
+WISHES = Wishes(voxel_size=VOXEL, num_views=3, folds=4, num_places=16, num_standpoints=8)
+FEW_VIEWS = dataclasses.replace(WISHES, voxel_size=None, num_views=2)
+NO_VIEWS = dataclasses.replace(WISHES, num_views=0)
+
+
+def corner_poses() -> np.ndarray:
+    """All pictures from one corner of the room, towards the other half."""
+    targets = [[4, y, z] for y in (0.5, 1.5, 2.5) for z in (0.4, 2.0)] + [[2, 0, 1.2], [2, 3, 1.2]]
+    return np.stack([pose_at([0.5 + 0.05 * i, 0.6, 1.2], t) for i, t in enumerate(targets)])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_maps():
+    """A room needs no more rows: everything else is three times as quick."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(seen, "_CAPACITY", 1 << 13)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("captures")
+
+
+@pytest.fixture(scope="module")
+def corner(folder) -> Audit:
+    recording = read_recording(write_recording(folder / "corner", corner_poses()), "z")
+    return audit(source_of(recording, "corner"), WISHES)
+
+
+@pytest.fixture(scope="module")
+def cloud(folder) -> Audit:
+    images = read_transforms(write_nerfstudio(folder / "cloud", round_poses(), depth=False))
+    return audit(source_of(images, "cloud"), FEW_VIEWS)
+
+
+def centers(found: Audit) -> np.ndarray:
+    return np.asarray(found.seen.state.center, float).T
+
+
+def test_what_was_seen_from_one_side_only_is_seen_from_wrong_angles_or_from_afar(corner):
+    found = corner.diagnosis
+    judged = found.is_judged
+    far = judged & (centers(corner)[:, 0] > 3.0)
+    assert far.sum() > 100
+    bad = far & (found.value < FINE)
+    names = {CAUSES[i] for i in np.unique(found.cause[bad])}
+    assert names <= {"angle", "rare", "distance"}
+    assert found.share("noise") < 0.02  # nothing flickers there
+    assert sum(found.share(cause) for cause in CAUSES) == pytest.approx(1.0)
+
+
+def test_the_capture_ends_behind_its_cameras(corner):
+    """Nobody looked back into the corner."""
+    assert corner.unseen_area > 0.2
+    assert any(region.center[0] < 1.6 for region in corner.unseen)
+    total = sum(region.area for region in corner.unseen)
+    assert 0 < total <= corner.unseen_area + 1e-6
+    areas = [region.area for region in corner.unseen]
+    assert areas[0] >= 0.5 * max(areas)
+
+
+def test_suggested_views_are_in_the_open_and_promise_more_than_random_ones(corner):
+    views = corner.plan.views
+    assert len(views) == 3
+    means = [corner.diagnosis.mean, *(view.mean_after for view in views)]
+    assert (np.diff(means) >= -1e-6).all()  # an imagined view takes nothing away
+    assert means[-1] > corner.plan.random_mean[-1]
+    for view in views:
+        eye = view.pose[:3, 3]
+        assert (eye >= MARGIN - 0.02).all()
+        assert (eye <= SIZE - MARGIN + 0.02).all()
+        assert abs(view.pose[2, 0]) < 1e-6  # no roll
+        assert view.gain >= 1
+
+
+def test_a_gain_is_what_all_surfaces_gain_together(corner):
+    """Two ways to the same number: view by view, and standpoint by standpoint."""
+    judged = corner.diagnosis.is_judged.sum()
+    before = corner.diagnosis.mean
+    for view in corner.plan.views:
+        surfaces = (view.mean_after - before) * judged
+        cells = float(corner.config.lambda1) * len(view.cells)
+        # Voxels that are nearly perfect are left out of gains.
+        assert view.gain == pytest.approx(surfaces + cells, rel=0.03, abs=0.5)
+        before = view.mean_after
+
+
+def test_regions_hold_bad_voxels_and_do_not_overlap(corner):
+    found = corner.diagnosis
+    rows = [region.rows for region in corner.regions]
+    assert len(rows) > 1
+    joined = np.concatenate(rows)
+    assert len(np.unique(joined)) == len(joined)
+    assert (found.value[joined] < FINE).all()
+    for region in corner.regions:
+        place = centers(corner)[region.rows]
+        assert (np.ptp(place, axis=0) <= 1.0 + VOXEL).all()
+        assert region.area == pytest.approx(len(region.rows) * VOXEL**2, rel=1e-3)
+        assert 0 < region.bad_share <= 1
+    losses = [((1 - found.value)[r]).sum() for r in rows]
+    assert losses == sorted(losses, reverse=True)
+
+
+def test_nothing_bad_makes_no_region(corner):
+    found = corner.diagnosis
+    perfect = dataclasses.replace(found, value=np.ones_like(found.value))
+    assert bad_regions(corner.seen.state, perfect) == []
+    none = np.zeros(corner.seen.grid.log_odds.shape, bool)
+    assert unseen_regions(corner.seen.grid, none) == []
+    assert not unseen_edges(corner.seen.grid, none).any()
+
+
+def test_own_frames_are_judged_without_themselves(corner):
+    poses = corner.source.poses
+    path = CameraPath(poses, (LENS,) * len(poses))
+    whole = audit(corner.source, NO_VIEWS, path)
+    assert not whole.is_own_path
+    assert len(whole.frames) == len(corner.frames) == len(poses)
+    assert (whole.renderability >= corner.renderability - 1e-6).all()
+    assert whole.renderability.mean() > corner.renderability.mean() + 0.02
+    assert whole.plan.views == ()
+    np.testing.assert_allclose(whole.renderability.max(), 1.0, atol=0.2)
+
+
+def test_colors_that_contradict_are_noise(corner):
+    rng = np.random.default_rng(0)
+    gains = rng.uniform(0.3, 1.7, len(corner.source))
+
+    def flickering(index):
+        rgb, depth = corner.source.read(index)
+        return np.clip(rgb * gains[index], 0, 255).astype(np.uint8), depth
+
+    changed = dataclasses.replace(corner.source, read=flickering)
+    found = audit(changed, NO_VIEWS)
+    assert found.diagnosis.noise[found.diagnosis.is_judged].mean() < 0.9
+    calm = corner.diagnosis.noise[corner.diagnosis.is_judged].mean()
+    assert calm > 0.97
+    assert found.diagnosis.share("noise") > 0.05
+
+
+def test_the_dearest_term_is_the_cause():
+    value = np.array([0.9, 0.1, 0.1, 0.1, 0.1])
+    costs = np.array([[9, 5, 5, 1, 1], [1, 1, 1, 5, 1], [1, 1, 1, 1, 5]], float)
+    directions = np.array([9, 9, 2, 1, 1])
+    found = [CAUSES[i] for i in cause_of(value, costs, directions)]
+    assert found == ["fine", "angle", "rare", "noise", "distance"]
+
+
+def test_units_and_axes_of_a_capture_change_nothing_but_the_coordinates(cloud, folder):
+    """The same room in units of 4 cm, lying on its side: the same frames, the same views."""
+    side = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    poses = cloud.source.poses.copy()
+    poses[:, :3, :3] = side @ poses[:, :3, :3]
+    poses[:, :3, 3] = 25.0 * poses[:, :3, 3] @ side.T
+
+    def read(index):
+        rgb, depth = cloud.source.read(index)
+        return rgb, depth * 25.0
+
+    turned = dataclasses.replace(cloud.source, poses=poses, read=read)
+    other = audit(turned, FEW_VIEWS)
+    assert other.survey.unit == "u"
+    assert other.survey.median_depth == pytest.approx(25 * cloud.survey.median_depth, rel=1e-5)
+    np.testing.assert_allclose(other.renderability, cloud.renderability, atol=0.03)
+    assert other.diagnosis.mean == pytest.approx(cloud.diagnosis.mean, abs=0.03)
+    first = suggested_poses(other)[0][:3, 3] / 25.0 @ side
+    assert ((first > 0) & (first < SIZE)).all()
+
+
+def test_a_cloud_without_depth_has_no_free_space_and_stays_among_its_cameras(cloud):
+    assert cloud.survey.unit == "u"
+    assert cloud.unseen == ()
+    assert cloud.unseen_area == 0.0
+    cameras = cloud.survey.alignment.points(cloud.source.poses[:, :3, 3])
+    for view in cloud.plan.views:
+        gap = np.linalg.norm(cameras - view.pose[:3, 3], axis=1).min()
+        assert gap < 1.2 * cloud.survey.alignment.scale
+    walls = cloud.survey.alignment.points_back(
+        centers(cloud)[np.asarray(cloud.seen.state.occupied)]
+    )
+    off = np.minimum(np.abs(walls), np.abs(walls - SIZE)).min(axis=1)
+    # The map is the room, to the size of a voxel.
+    assert np.median(off) < 0.6 * cloud.survey.length(cloud.survey.voxel_size)
+
+
+def test_tracks_of_a_model_are_as_good_as_a_cloud(folder, cloud):
+    images = read_colmap(write_colmap(folder / "model", round_poses()))
+    source = source_of(images, "model")
+    assert (source.kind, source.is_metric, source.has_images) == ("tracks", False, True)
+    found = audit(source, dataclasses.replace(FEW_VIEWS, num_views=0))
+    np.testing.assert_allclose(found.renderability, cloud.renderability, atol=0.15)
+    assert found.diagnosis.fine_share > 0.3
+
+
+def test_a_model_without_images_is_audited_by_its_points(folder):
+    path = write_colmap(folder / "bare", round_poses(8))
+    for image in (path / "images").iterdir():
+        image.unlink()
+    source = source_of(read_colmap(path), "bare")
+    assert not source.has_images
+    found = audit(source, dataclasses.replace(FEW_VIEWS, num_views=0))
+    assert found.diagnosis.share("noise") == 0.0
+    assert "nothing can be said about noise" in method(found)[-1]
+
+
+def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
+    written = write_outputs(cloud, tmp_path)
+    poses = suggested_poses(cloud)
+    images = read_transforms(written["transforms"])
+    np.testing.assert_array_equal(images.poses, poses)
+    assert images.lenses[0].params == LENS.params
+    for pose in poses:
+        assert ((pose[:3, 3] > 0) & (pose[:3, 3] < SIZE)).all()
+    for name in ("renderability", "causes"):
+        points, _ = read_points(written[name])
+        off = np.minimum(np.abs(points), np.abs(points - SIZE)).min(axis=1)
+        assert np.median(off) < 0.6 * cloud.survey.length(cloud.survey.voxel_size)
+    record = record_of(cloud)
+    assert len(record["path"]["frames"]) == 16
+    assert record["surfaces"]["share"].keys() == set(CAUSES)
+    assert record["up"] == [0.0, 0.0, 1.0]
+    for text in (*verdict(cloud), *method(cloud)):
+        assert text[0].isupper() or text[0].isdigit()
+        assert text.endswith(".")
+
+
+def test_one_view_is_spoken_of_as_one(cloud):
+    assert len(cloud.plan.views) > 1
+    alone = dataclasses.replace(cloud.plan, views=cloud.plan.views[:1])
+    said = verdict(dataclasses.replace(cloud, plan=alone))[-1]
+    assert said.startswith("One further view would")
+    assert "; one at a random place 0." in said
+    assert verdict(cloud)[-1].startswith(f"{len(cloud.plan.views)} further views would")
+
+
+def test_what_points_leave_out_is_said(cloud, corner):
+    told = [any("plain walls" in text for text in verdict(found)) for found in (cloud, corner)]
+    assert told == [True, False]
+    remark = "2 of 3 pictures have a pose."
+    partial = dataclasses.replace(cloud, source=dataclasses.replace(cloud.source, remark=remark))
+    assert verdict(partial)[0] == remark
+
+
+def one_picture(depth: np.ndarray) -> Source:
+    rgb = np.zeros((36, 48, 3), np.uint8)
+    return Source("one", np.eye(4)[None], (LENS,), ("a",), "depth", True, None, 1,
+                  lambda index: (rgb, depth))  # fmt: skip
+
+
+def test_a_capture_without_any_depth_is_refused():
+    with pytest.raises(FormatError, match="no picture shows anything"):
+        survey_of(one_picture(np.zeros((36, 48), np.float32)), Wishes())
+
+
+@pytest.mark.parametrize(
+    ("depth", "range_in_metres"), [(3.0, 5.0), (20.0, 20.0), (0.5, 1.25), (4.9, 5.0)]
+)
+def test_a_capture_of_a_rooms_size_stays_as_it_is_and_others_are_scaled(depth, range_in_metres):
+    survey = survey_of(one_picture(np.full((36, 48), depth, np.float32)), Wishes(up="-y"))
+    assert survey.length(5.0) == pytest.approx(range_in_metres)
+    assert survey.alignment.scale == pytest.approx(5.0 / range_in_metres)
+    assert survey.length(survey.voxel_size) >= 0.01 * range_in_metres
+
+
+def test_a_median_depth_that_no_room_has_is_refused_unless_it_is_meant():
+    millimeters = one_picture(np.full((36, 48), 2000.0, np.float32))
+    with pytest.raises(ValueError, match=r"median depth is 2000 m: is its unit right"):
+        survey_of(millimeters, Wishes())
+    assert survey_of(millimeters, Wishes(up="-y", trust_depth=True)).median_depth == 2000.0
+
+
+@pytest.mark.parametrize(
+    ("wishes", "message"),
+    [
+        ({"voxel_size": 0.0}, "--voxel-size must be positive"),
+        ({"max_range": float("nan")}, "--max-range must be positive"),
+        ({"max_range": 5000.0}, "--max-range 5000 is far beyond what the pictures show"),
+        ({"voxel_size": 5.0}, "larger than a fifth of the range"),
+        ({"num_views": -1}, "--views must be at least 0"),
+        ({"num_views": 10**9}, "--views must be at most"),
+        ({"folds": 1}, "--folds must be at least 2"),
+        ({"max_frames": 0}, "--max-frames must be at least 2"),
+        ({"seed": -1}, "--seed must be at least 0"),
+        ({"up": "w"}, "up must be one of"),
+    ],
+)
+def test_wishes_without_sense_are_named(wishes, message):
+    with pytest.raises(ValueError, match=message):
+        survey_of(one_picture(np.ones((36, 48), np.float32)), Wishes(**wishes))

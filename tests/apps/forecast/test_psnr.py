@@ -1,0 +1,150 @@
+"""The PSNR of views from coverage and renderability: fitted, mixed, and left-out scenes."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r3jax.apps.forecast import psnr as real
+from r3jax.apps.forecast.calibration import default_calibration
+from r3jax.apps.forecast.psnr import PERCENTILES, Calibration, PsnrModel
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+
+CHAIN = ("r3jax.apps.forecast.psnr",)
+TRUE = PsnrModel((5.0, 20.0, -6.0, 8.0), (0.5, 0.4, -0.6), (-1.0, 0.0, 1.0))
+seeds = st.integers(0, 1000)
+
+
+def views_of(seed: int, num: int = 3000, offset: float = 0.0):
+    """Views whose PSNR follows a known model with normal noise: coverage, R, PSNR."""
+    rng = np.random.default_rng(seed)
+    coverage = rng.beta(2.0, 1.0, num)
+    renderability = coverage * rng.random(num)
+    mean = 5.0 + offset + 20.0 * coverage - 6.0 * coverage**2 + 8.0 * renderability
+    scale = np.exp(0.5 + 0.4 * coverage - 0.6 * renderability)
+    return coverage, renderability, mean + scale * rng.standard_normal(num)
+
+
+def law_of_the_fit(modules: Modules, seed: int = 0) -> None:
+    """Quantiles of the mixture are those of views drawn anew from the same law."""
+    model = modules["psnr"].fit(*views_of(seed))
+    coverage, renderability, truth = views_of(seed + 1, 20_000)
+    mixture = model.mixture(coverage, renderability)
+    assert mixture.shape == (20_000, len(model.residuals))
+    for name, tolerance in (("mean", 0.25), ("p10", 0.4), ("p50", 0.3), ("p90", 0.5)):
+        found = modules["psnr"].statistic(mixture, name)
+        assert found == pytest.approx(modules["psnr"].statistic(truth, name), abs=tolerance)
+    # What one view tells is as wide as its own noise, not as that of all views.
+    sure, unsure = model.mixture(np.array([0.9, 0.9]), np.array([0.9, 0.0]))
+    assert (sure - unsure).mean() == pytest.approx(8.0 * 0.9, abs=0.8)
+    wide = (np.percentile(unsure, 84) - np.percentile(unsure, 16)) / 2.0
+    narrow = (np.percentile(sure, 84) - np.percentile(sure, 16)) / 2.0
+    assert wide / narrow == pytest.approx(np.exp(0.6 * 0.9), rel=0.25)
+
+
+@given(seeds)
+def test_a_fit_finds_the_law_of_its_views(seed):
+    law_of_the_fit({"psnr": real}, seed)
+
+
+def test_a_mixture_by_hand():
+    mixture = TRUE.mixture(np.array([0.5]), np.array([0.25]))
+    mean, scale = 5.0 + 10.0 - 1.5 + 2.0, np.exp(0.5 + 0.2 - 0.15)
+    np.testing.assert_allclose(mixture, [[mean - scale, mean, mean + scale]])
+
+
+def law_of_the_left_out(modules: Modules) -> None:
+    """A scene that is 3 dB worse than all others is forecast 3 dB too high; the others suffer."""
+    parts = [views_of(seed, 600, offset) for seed, offset in enumerate((0.0, 0.0, -3.0))]
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    scenes = np.repeat(["a", "b", "worse"], 600).tolist()
+    models = np.repeat([f"model {i}" for i in range(6)], 300).tolist()
+    pairs = modules["psnr"].leave_one_out(*columns, scenes, models)
+    assert len(pairs) == 6
+    errors = np.array([pair["mean"][0] - pair["mean"][1] for pair in pairs])
+    np.testing.assert_allclose(errors[4:], 3.0, atol=0.6)
+    np.testing.assert_allclose(errors[:4], -1.5, atol=0.6)  # half of what they learn from is worse
+    sizes = modules["psnr"].errors_of(pairs)["mean"]
+    assert sizes == tuple(sorted(sizes))
+    np.testing.assert_allclose(sizes, np.sort(np.abs(errors)), atol=1e-4)
+
+
+def test_a_scene_left_out_is_not_learned_from():
+    law_of_the_left_out(load(CHAIN))
+
+
+def law_of_widths(modules: Modules) -> None:
+    errors = {name: (1.0, 2.0, 3.0) for name in real.STATISTICS}
+    errors |= {"p10": (2.0, 4.0, 6.0), "p25": (4.0, 6.0, 8.0)}
+    known = modules["psnr"].Calibration(TRUE, errors, "nothing")
+    assert known.half_width("mean", 0.5) == 2.0
+    assert known.half_width("mean", 1.0) == 3.0
+    assert known.half_width("p10", 0.5) == 4.0
+    assert known.half_width("p20", 0.5) == pytest.approx(4.0 + 2.0 * 10 / 15)  # between p10 and p25
+    assert known.half_width("p1", 0.5) == known.half_width("p5", 0.5)
+
+
+def test_a_width_between_percentiles_is_interpolated():
+    law_of_widths(load(CHAIN))
+
+
+MUTANTS = [
+    Mutant("psnr", "psnr / scale, rcond", "psnr, rcond", law_of_the_fit),
+    Mutant("psnr", "+ scale[:, None] * np", "+ scale.mean() * np", law_of_the_fit),
+    Mutant(
+        "psnr", "np.stack([np.ones_like(C), C, C * C, R]",
+        "np.stack([np.ones_like(C), C, C * C, 0 * R]", law_of_the_fit,
+    ),
+    Mutant("psnr", "x[scene_of != scene]", "x[scene_of != 'none']", law_of_the_left_out),
+    Mutant(
+        "psnr", "round(abs(pair[name][0] - pair[name][1]), 4)",
+        "round(pair[name][0] - pair[name][1], 4)", law_of_the_left_out,
+    ),
+    Mutant("psnr", "np.interp(percent_of(name), PERCENTILES, widths)", "widths[0]", law_of_widths),
+]  # fmt: skip
+
+
+def test_laws_hold_without_a_fault():
+    for law in (law_of_the_fit, law_of_the_left_out, law_of_widths):
+        law(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.2))
+def test_the_package_expects_more_of_more(coverage, share, more):
+    """More coverage, or more renderability, never lowers the expected PSNR of a view."""
+    model = default_calibration().model
+    expect = lambda C, R: model.mixture(np.array([C]), np.array([R])).mean()
+    before = expect(coverage, share * coverage)
+    wider = min(1.0, coverage + more)
+    assert expect(wider, share * coverage) >= before - 1e-9
+    assert expect(coverage, min(coverage, share * coverage + more)) >= before - 1e-9
+
+
+def test_the_package_knows_its_errors():
+    """Every error of the calibration is a size; a wider interval is of a higher level."""
+    known = default_calibration()
+    assert isinstance(known, Calibration)
+    for percent in PERCENTILES:
+        widths = [known.half_width(f"p{percent}", level) for level in (0.5, 0.8, 0.95)]
+        assert 0.0 < widths[0] < widths[1] < widths[2]
+
+
+@pytest.mark.parametrize("name", ["p0", "p100", "10", "pp", "median", "p-5", ""])
+def test_what_is_no_statistic_is_told(name):
+    with pytest.raises(ValueError, match="is no statistic of views"):
+        real.percent_of(name)
+
+
+def test_a_fit_refuses_what_it_cannot_use():
+    coverage, renderability, psnr = views_of(0, 200)
+    with pytest.raises(ValueError, match="at least 100 views"):
+        real.fit(coverage[:50], renderability[:50], psnr[:50])
+    with pytest.raises(ValueError, match="psnr must be finite, view 7 is not"):
+        real.fit(coverage, renderability, np.where(np.arange(200) == 7, np.nan, psnr))
+    with pytest.raises(ValueError, match="two are needed"):
+        real.leave_one_out(coverage, renderability, psnr, ["a"] * 200, ["m"] * 200)

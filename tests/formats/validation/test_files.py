@@ -1,0 +1,45 @@
+"""Only regular files within a limit are opened."""
+
+import os
+
+import pytest
+
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular, check_tree, read_bytes
+
+
+def test_a_file_and_a_link_to_it(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    (tmp_path / "b").symlink_to("a")
+    assert read_bytes(tmp_path / "a", 5) == read_bytes(tmp_path / "b", 5) == b"12345"
+    check_tree(tmp_path)
+    with pytest.raises(ForeignFileError, match="more than"):
+        read_bytes(tmp_path / "a", 4)
+    with pytest.raises(FileNotFoundError):
+        check_regular(tmp_path / "c")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "zero"])
+def test_what_is_no_file_is_not_opened(tmp_path, kind):
+    path = tmp_path / "x"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path = tmp_path / "x\0y"
+    with pytest.raises(ForeignFileError):
+        read_bytes(path, 100)
+
+
+def test_a_pipe_or_a_dead_link_in_a_folder(tmp_path):
+    (tmp_path / "deep").mkdir()
+    os.mkfifo(tmp_path / "deep" / "pipe")
+    with pytest.raises(ForeignFileError, match="pipe: this is a pipe"):
+        check_tree(tmp_path)
+    os.remove(tmp_path / "deep" / "pipe")
+    (tmp_path / "deep" / "link").symlink_to("nowhere")
+    with pytest.raises(ForeignFileError, match="leads nowhere"):
+        check_tree(tmp_path)

@@ -1,0 +1,161 @@
+"""Deciding beside others: what they promise counts as seen, what is nearer to them is theirs.
+
+Oracles: brute force over the cells of two small rooms, and what the same view is worth afterwards.
+"""
+
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid
+from r3jax.planning.reserved_views import PromisedView
+from r3jax.scoring.simulated import simulate_view
+from r3jax.scoring.utility import view_utility
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.planning.rooms import center, grid_of, pose_at, two_rooms
+from tests.scoring.test_simulated import CAMERA, CONFIG, poses_of, seen_map
+
+pytestmark = pytest.mark.full
+
+CHAIN = ("r3jax.planning.reserved_views",)
+WORLD = OccupancyGrid(
+    log_odds=jnp.zeros((20, 20, 16)).at[3:8].set(-3.0),
+    origin=jnp.asarray([-1.0, -2.0, -1.6]),
+    cell_size=jnp.asarray(0.2),
+)
+"""Round the map of `seen_map`; a slice of it is known to be free."""
+
+REAL = load(CHAIN)
+
+
+def half_explored() -> tuple[np.ndarray, OccupancyGrid]:
+    """Two rooms of which the far half is unexplored in each: known free cells, and the grid."""
+    free, occupied = two_rooms()
+    hidden = np.zeros_like(free)
+    hidden[1:5], hidden[20:24] = True, True
+    return free & ~hidden, grid_of(free & ~hidden, occupied & ~hidden)
+
+
+def law_yielded(modules: Modules, here=(9, 6, 4), others=((15, 6, 4),)) -> None:
+    free, grid = half_explored()
+    places = np.array([center(*cell) for cell in others])
+    own = modules["reserved_views"].without_yielded(
+        grid, jnp.asarray(center(*here), jnp.float32), jnp.asarray(places, jnp.float32)
+    )
+    before, after = np.asarray(grid.log_odds), np.asarray(own.log_odds)
+    for cell in np.ndindex(free.shape):
+        mine = np.linalg.norm(center(*cell) - center(*here))
+        theirs = np.linalg.norm(center(*cell) - places, axis=1).min()
+        if abs(mine - theirs) < 1e-4:
+            continue  # a tie but for rounding
+        is_theirs = bool(grid.unexplored[cell]) and theirs < mine
+        assert after[cell] == (LOG_ODDS_LIMIT if is_theirs else before[cell]), cell
+
+
+cells = st.tuples(st.integers(6, 11), st.integers(1, 12), st.integers(1, 8))
+
+
+@settings(max_examples=10)
+@given(cells, st.tuples(st.integers(13, 18), st.integers(1, 12), st.integers(1, 8)))
+def test_what_is_nearer_to_others_is_theirs(here, other):
+    law_yielded(REAL, here, (other,))
+
+
+def test_of_several_others_the_nearest_counts():
+    law_yielded(REAL, (9, 6, 4), ((15, 6, 4), (7, 11, 2)))
+
+
+def law_left(modules: Modules) -> None:
+    """Whoever would have nothing to explore leaves nothing to others."""
+    free, occupied = two_rooms()
+    hidden = np.zeros_like(free)
+    hidden[20:24] = True
+    grid = grid_of(free & ~hidden, occupied & ~hidden)
+    here, other = (jnp.asarray(center(*cell), jnp.float32) for cell in ((5, 6, 4), (17, 6, 4)))
+    after = modules["reserved_views"].without_yielded(grid, here, other[None])
+    np.testing.assert_array_equal(after.log_odds, grid.log_odds)
+
+
+def law_promise(modules: Modules) -> None:
+    """The same view explores nothing any more; the map is the foreseen one, and nothing else."""
+    state, (pose, _) = seen_map(), poses_of(3)
+    after, dark = modules["reserved_views"].after_promise(state, WORLD, CAMERA, pose, CONFIG)
+    first = view_utility(state, WORLD, CAMERA, pose, CONFIG)
+    again = view_utility(after, dark, CAMERA, pose, CONFIG)
+    assert first.exploration > 100.0
+    assert again.exploration == 0.0
+    assert again.rendering < first.rendering
+    foreseen, _ = simulate_view(state, CAMERA, pose, CONFIG)
+    for name in ("visited", "resolution", "count", "mean", "m2", "key"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(foreseen, name))
+    changed = np.asarray(dark.log_odds) != np.asarray(WORLD.log_odds)
+    assert changed.sum() == float(first.exploration)
+    assert set(np.asarray(dark.log_odds)[changed]) == {np.float32(LOG_ODDS_LIMIT)}
+
+
+@dataclass
+class Listener:
+    """Keeps what it was asked to decide on."""
+
+    name: str = "listener"
+    config: str = "settings"
+    heard: list = field(default_factory=list)
+
+    def decide(self, state, map_state, grid, T_world_camera, *, key):
+        self.heard.append((state, map_state, grid, T_world_camera, key))
+        return "decision", "state", "info"
+
+
+def law_decision(modules: Modules) -> None:
+    """The policy decides where the camera is, on every promise, and on what is left to it."""
+    promised, listener = modules["reserved_views"], Listener()
+    state, poses, pose = seen_map(), poses_of(3), pose_at(np.array([-0.5, -1.0, 0.0]))
+    views = tuple(PromisedView(CAMERA, np.asarray(T, np.float64)) for T in poses)
+    policy = promised.ReservedViews(listener, views, CONFIG)
+    assert (policy.name, policy.config) == ("listener", "settings")
+    answer = policy.decide("memory", state, WORLD, pose, key="key")
+    assert answer == ("decision", "state", "info")
+    ((memory, map_state, grid, T, key),) = listener.heard
+    assert (memory, key) == ("memory", "key")
+    np.testing.assert_array_equal(T, pose)
+    after, dark = state, WORLD
+    for view in poses:
+        after, dark = promised.after_promise(after, dark, CAMERA, view, CONFIG)
+    others = jnp.stack([view[:3, 3] for view in poses])
+    left = promised.without_yielded(dark, jnp.asarray(pose[:3, 3], jnp.float32), others)
+    np.testing.assert_array_equal(map_state.visited, after.visited)
+    np.testing.assert_array_equal(grid.log_odds, left.log_odds)
+
+
+def test_whoever_has_nothing_left_leaves_nothing():
+    law_left(REAL)
+
+
+def test_a_promised_view_has_nothing_more_to_explore():
+    law_promise(REAL)
+
+
+def test_a_policy_decides_on_what_others_leave():
+    law_decision(REAL)
+
+
+MUTANTS = [
+    Mutant("reserved_views", "(nearest < squared", "(nearest > squared", law_yielded),
+    Mutant("reserved_views", "grid.unexplored & (nearest", "(nearest", law_yielded),
+    Mutant("reserved_views", "jnp.where(is_left, log_odds, grid.log_odds)", "log_odds", law_left),
+    Mutant("reserved_views", "frontier_unexplored(own)", "frontier_unexplored(grid)", law_left),
+    Mutant("reserved_views", "after, _ = simulate_view(",
+           "after = map_state; simulate_view(", law_promise),
+    Mutant("reserved_views", "jnp.where(shown, LOG", "jnp.where(shown, -LOG", law_promise),
+    Mutant("reserved_views", "(T_world_camera[:3, 3]", "(T_world_camera[:3, 2]", law_decision),
+    Mutant("reserved_views", "in self.promised:", "in self.promised[:1]:", law_decision),
+]  # fmt: skip
+
+
+@each(MUTANTS)
+def test_mutants_are_caught(mutant):
+    assert_caught(CHAIN, mutant)
