@@ -4,6 +4,7 @@
 #   make test-all   also browsers, notebooks, fuzzing, whole runs of every policy
 #   make mutants    plants every listed fault and asks whether a law notices
 #   make stress     kill loops, thousands of damaged files, long runs: hours
+#   make docs       the documentation, to open from its folder
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -11,8 +12,10 @@ STAMP := $(VENV)/.installed
 # One compile cache for all targets, and the commands' own: the first command after the demo finds
 # what it needs.
 export JAX_COMPILATION_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/r3jax/jax
+# Python keeps what it compiled, too: a test process saves six seconds each time.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-all test-added mutants stress lint docs benchmark clean
+.PHONY: setup demo test test-all test-added mutants stress lint docs notebooks benchmark clean
 
 setup: $(STAMP)
 
@@ -47,11 +50,16 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
-	$(BIN)/codespell r3jax tests experiments examples docs README.md
+	$(BIN)/codespell r3jax tests experiments examples docs README.md CONTRIBUTING.md
 
 # The pages, into build/site; a reference that leads nowhere fails.
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "Open file://$(CURDIR)/build/site/index.html"
+
+# Runs the notebooks, and saves them with their pictures: the pages show what was saved.
+notebooks: setup
+	$(BIN)/python -m docs.figures.notebooks
 
 benchmark: setup
 	$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only --benchmark-columns=min,median,rounds

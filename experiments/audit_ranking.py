@@ -3,8 +3,8 @@
     python -m experiments.audit_ranking ../shared/recordings/hololens_lounge
     python -m experiments.audit_ranking runs/flat-ours-pano-seed0
 
-The frames are dealt into folds; for each fold a vanilla 3DGS is trained on the others and judged
-on its frames, and the audit judges the same frames by a map of the same others. Neither has seen
+The frames are dealt into folds; for each fold a vanilla 3DGS is trained on the others and evaluated
+on its frames, and the audit evaluates the same frames by a map of the same others. Neither has seen
 what it is asked about.
 """
 
@@ -20,7 +20,7 @@ import tyro
 from matplotlib.figure import Figure
 from scipy import stats
 
-from experiments.artifacts import (
+from experiments.pages.artifacts import (
     Origin,
     command_line,
     markdown_table,
@@ -29,17 +29,17 @@ from experiments.artifacts import (
     write_markdown,
 )
 from r3jax.apps.audit.audit import audit
-from r3jax.apps.audit.colors import COLOR_OF_CAUSE
+from r3jax.apps.audit.pages.audit_colors import COLOR_OF_CAUSE
 from r3jax.apps.audit.source import source_of
-from r3jax.apps.audit.survey import Wishes
+from r3jax.apps.audit.survey import AuditSettings
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.apps.report import style
-from r3jax.cli.captures import Capture, open_capture
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.statistics import partial_spearman, spearman
 from r3jax.files import write_atomic
-from r3jax.splatting.train import fit
-from r3jax.splatting.training_config import TrainConfig
+from r3jax.formats.captures import Capture, open_capture
+from r3jax.splatting.training.config import TrainConfig
+from r3jax.splatting.training.train import fit
 from r3jax.splatting.views import Views, load_views
 
 NAME = "audit_ranking"
@@ -74,7 +74,7 @@ class Options:
     """Steps of each training."""
 
     resolution: int = 160
-    """Longer side of the images that are trained on and judged [px]."""
+    """Longer side of the images that are trained on and evaluated [px]."""
 
     gaussians: int = 20_000
     """At the start of each training; there may be twice as many."""
@@ -130,7 +130,7 @@ def kept(
 
 def audited(capture: Capture, options: Options) -> list[dict[str, Any]]:
     """What the audit says of every frame, in order."""
-    everything = Wishes(folds=options.folds, num_views=0, max_frames=len(capture))
+    everything = AuditSettings(folds=options.folds, num_views=0, max_frames=len(capture))
     found = audit(source_of(capture.source, capture.name), everything)
     folds = found.seen.fold_of.tolist()
     return [
@@ -154,15 +154,15 @@ def fold_rows(
     config = TrainConfig(iterations=options.iterations, num_gaussians=options.gaussians)
     scene = fit(views.take(others), config).scene
     test = views.take(held_out)
-    judgment = evaluate(scene, test, numbers=held_out.tolist())
+    evaluation = evaluate(scene, test, numbers=held_out.tolist())
     near = nearness(poses, held_out, others)
     rows: list[dict[str, Any]] = []
     for i, number in enumerate(held_out.tolist()):
-        row = judgment.rows[i]
+        row = evaluation.rows[i]
         found = {
             "nearness": float(near[i]),
             "psnr": row.psnr,
-            "psnr_corrected": corrected_psnr(judgment.renders[i], np.asarray(test.rgb[i])),
+            "psnr_corrected": corrected_psnr(evaluation.renders[i], np.asarray(test.rgb[i])),
             "ssim": row.ssim,
         }
         rows.append(scores[number] | found)
@@ -213,7 +213,7 @@ def shift_p(score: np.ndarray, error: np.ndarray) -> float:
 
 
 def worst_found(score: np.ndarray, error: np.ndarray) -> tuple[int, int]:
-    """Of the worst quarter by error, how many are in the worst quarter by score; and how many."""
+    """Counts those of the worst quarter by error that are in the worst by score, and a quarter."""
     count = max(1, round(WORST * len(score)))
     worst = lambda x: set(np.argsort(x, kind="stable")[:count].tolist())
     return len(worst(score) & worst(error)), count

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.artifacts import Origin, markdown_table, write_csv, write_markdown
 from experiments.extensions import Options, requests_of
+from experiments.pages.artifacts import Origin, markdown_table, write_csv, write_markdown
 from experiments.suite import Records, by_method_and_scene, origin, run_requests
 from r3jax.evaluation.comparison import snapshots_of, with_short_names
 from r3jax.exploration.explain_run import explain_run
@@ -25,7 +25,7 @@ from r3jax.trace.reader import read_run
 NAME = "causes"
 
 PARTS = 3
-"""Of a run, one after the other."""
+"""Number of parts of a run, one after the other."""
 
 
 def main(options: Options) -> Path:

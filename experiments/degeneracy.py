@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.artifacts import (
+from experiments.pages.artifacts import (
     Origin,
     markdown_table,
     write_csv,
     write_figure,
     write_markdown,
 )
+from experiments.pages.positions_figure import positions_figure
 from experiments.suite import Options, Records, origin, run_suite
-from r3jax.apps.report.positions_figure import positions_figure
 from r3jax.evaluation.comparison import method_name, methods_of, snapshots_of, with_short_names
 from r3jax.trace.reader import read_run
 

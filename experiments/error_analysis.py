@@ -53,7 +53,7 @@ PER_MODEL: dict[str, Callable[..., np.ndarray]] = {
     "partial": error_statistics.partial_spearman,
     "ause": lambda x, y, weights: error_statistics.ause(x, -y, weights),
 }
-"""Of a prediction, a quality (higher is better), what is given, and the draws' weights."""
+"""Statistics of a prediction, a quality (higher is better), what is given, and draws' weights."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class SceneModels:
     """Who chose the views, [M]."""
 
     seeds: tuple[int, ...]
-    """Of each model, [M]."""
+    """Seed of each model, [M]."""
 
     snapshots: tuple[str, ...]
     """Budget of each model, [M]."""

@@ -1,11 +1,11 @@
-"""Rank statistics of many models judged by the same views, with intervals over both.
+"""Rank statistics of many models evaluated by the same views, with intervals over both.
 
 A statistic belongs to one model (scene, policy, seed, snapshot); a scene's number is its mean over
 models. Its interval is a bootstrap that draws views and explorations anew, independently (the
 pigeonhole bootstrap, Owen 2007): a view that is hard for one model is hard for all, so all models
-of a resample are judged by the same drawn views, and an exploration (policy and seed) brings all
+of a resample are evaluated by the same drawn views, and an exploration (policy and seed) brings all
 its snapshots along, which share their first frames. Drawing models x views one by one would take a
-hundred views judged fifty times for five thousand independent ones.
+hundred views evaluated fifty times for five thousand independent ones.
 
 A resample is a row of weights, how often it holds each view: ranks, correlations and areas have
 closed forms in them, so that a thousand resamples are a few array operations. The first row holds

@@ -22,9 +22,13 @@ from jaxtyping import Array, Float
 
 from experiments.seen_pixels import recorded, seen_pixels
 from r3jax.apps.benchmark.conditions import Conditions, snapshot_slug
-from r3jax.apps.benchmark.judging import JudgingViews, judging_path, read_judging_views
+from r3jax.apps.benchmark.reference_images import (
+    ReferenceImages,
+    read_reference_images,
+    reference_path,
+)
 from r3jax.evaluation.evaluate import evaluate
-from r3jax.evaluation.images import psnr
+from r3jax.evaluation.image_metrics import psnr
 from r3jax.evaluation.maps import map_of
 from r3jax.files import write_atomic
 from r3jax.frame import Frame
@@ -57,10 +61,10 @@ PRODUCTS: Mapping[str, tuple[str, ...]] = {
 """Terms of `Renderability` that are multiplied in every pixel, before the mean is taken."""
 
 SMALLEST_SHARE = 0.05
-"""Of seen pixels for which an image has a PSNR on seen pixels: fewer are an anecdote."""
+"""Least share of seen pixels for which an image has a PSNR on them: fewer are an anecdote."""
 
 FOLDER = "renderability_vs_error"
-"""Of what was computed, beside the benchmark's cells."""
+"""Folder of what was computed, beside the benchmark's cells."""
 
 
 def column(product: str, kappa: str) -> str:
@@ -147,15 +151,18 @@ def prediction_columns(
 
 
 def error_columns(
-    scene: GaussianScene, judging: JudgingViews, frames: Sequence[Frame], sensing: Mapping[str, Any]
+    scene: GaussianScene,
+    reference: ReferenceImages,
+    frames: Sequence[Frame],
+    sensing: Mapping[str, Any],
 ) -> dict[str, np.ndarray]:
     """The model's PSNR on seen pixels [dB], their share, and PSNR on all pixels, each [V]."""
-    views, seen_by = judging.views, recorded(frames)
+    views, seen_by = reference.views, recorded(frames)
     far = jnp.asarray(sensing["max_range"], jnp.float32)
     edge = jnp.asarray(sensing["voxel_size"], jnp.float32)
-    judgment = evaluate(scene, views)
+    evaluation = evaluate(scene, views)
     share, error = [], []
-    for i, render in enumerate(judgment.renders):
+    for i, render in enumerate(evaluation.renders):
         view = views.view(i)
         seen = seen_pixels(view, seen_by, far, edge)
         share.append(float(jnp.mean(seen.astype(jnp.float32))))
@@ -164,7 +171,7 @@ def error_columns(
     return {
         "psnr_seen": np.where(shares >= SMALLEST_SHARE, np.array(error), np.nan),
         "seen_share": shares,
-        "psnr_again": np.array([row.psnr for row in judgment.rows]),
+        "psnr_again": np.array([row.psnr for row in evaluation.rows]),
     }
 
 
@@ -207,19 +214,19 @@ def _compute(root: Path, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
     sensing, slug = record["sensing"], snapshot_slug(record["snapshot"])
     run = read_run(root / record["run"])
     frames = [run.frame(step) for step in range(record["exploration"]["views"])]
-    judging = _judging_views(root, record)
+    reference = _reference_images(root, record)
     state = map_of(frames, voxel_size=sensing["voxel_size"], max_range=sensing["max_range"])
     config = ScoringConfig(max_range=sensing["max_range"])
-    columns = prediction_columns(state, run.camera, judging.poses, config)
+    columns = prediction_columns(state, run.camera, reference.poses, config)
     scene = read_scene(run.path / "models" / slug / "scene.ply")
-    return columns | error_columns(scene, judging, frames, sensing)
+    return columns | error_columns(scene, reference, frames, sensing)
 
 
-def _judging_views(root: Path, record: Mapping[str, Any]) -> JudgingViews:
+def _reference_images(root: Path, record: Mapping[str, Any]) -> ReferenceImages:
     conditions = Conditions(
         resolution=record["resolution"],
         fov=record["sensing"]["fov"],
         train_resolution=record["training"]["resolution"],
     )
     found = record["scene_hash"], record["test_views"]["hash"]
-    return read_judging_views(judging_path(root, *found, conditions))
+    return read_reference_images(reference_path(root, *found, conditions))

@@ -1,4 +1,4 @@
-"""What goes beyond the paper, against `ours-pano` on equal budgets: quality, ways, revisits.
+"""What goes beyond the paper, against `ours-pano` on equal budgets: quality, paths, revisits.
 
     python -m experiments.extensions --size smoke
 
@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.artifacts import Origin, markdown_table, write_csv, write_markdown
 from experiments.degeneracy import missions, revisit_rate
+from experiments.pages.artifacts import Origin, markdown_table, write_csv, write_markdown
+from experiments.pages.table_formats import to_markdown
 from experiments.replica_dense import REFERENCE, tables_of
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import Records, by_method_and_scene, origin, request_of, run_requests
 from r3jax.apps.benchmark.conditions import parse_settings
 from r3jax.apps.benchmark.plan import Request
-from r3jax.apps.benchmark.results.table_formats import to_markdown
 from r3jax.evaluation.comparison import (
     methods_of,
     scores_by_method,
@@ -81,25 +81,25 @@ def parse_variant(text: str) -> tuple[str, dict[str, Any]]:
 
 
 def write_page(folder: Path, root: Path, records: Records, source: Origin) -> None:
-    """Writes the referee's tables at the whole budget, those of the ways, and the aim."""
+    """Writes the benchmark's tables at the whole budget, those of the paths, and the aim."""
     folder.mkdir(parents=True, exist_ok=True)
     last = snapshots_of(records)[-1]
     tables = tables_of([record for record in records if record["snapshot"] == last])
-    ways = ways_rows(missions(root, with_short_names(records)))
+    paths = path_rows(missions(root, with_short_names(records)))
     aims = aim_rows(records)
-    write_csv(folder / "ways.csv", ways, source)
+    write_csv(folder / "paths.csv", paths, source)
     write_csv(folder / "with_fewer_views.csv", aims, source)
     page = [
         *(to_markdown(table) for table in tables.values()),
-        "**Ways**, means over seeds; a view *revisits* as in `experiments.degeneracy`",
-        markdown_table(ways),
+        "**Paths**, means over seeds; a view *revisits* as in `experiments.degeneracy`",
+        markdown_table(paths),
         f"**Fewer views**: PSNR [dB] minus that of {REFERENCE} after {last}, the same test views",
         markdown_table([{k: _text(v) for k, v in row.items()} for row in aims]),
     ]
     write_markdown(folder / f"{NAME}.md", page, source)
 
 
-def ways_rows(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def path_rows(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """A line per method and scene: what it went and saw, means over the seeds."""
     records = [mission["record"] for mission in found]
     rows: list[dict[str, Any]] = []

@@ -6,7 +6,7 @@ The views of the trained models are those of `experiments.renderability_vs_error
 the calibration that they give is written beside the page: `r3jax forecast RUN --calibration`, and
 the package's own was made so. With `--runs`, the cells of that size are done (if they are not yet),
 and the whole forecast is put to the test: views where the grid lets them be, maps and grids after
-each budget, and a calibration without the scene, against the referee's test views.
+each budget, and a calibration without the scene, against the benchmark's test views.
 """
 
 import csv
@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from experiments.artifacts import (
+from experiments.pages.artifacts import (
     joint_origin,
     markdown_table,
     write_csv,
@@ -28,7 +28,6 @@ from experiments.artifacts import (
 )
 from experiments.suite import Options, run_suite
 from r3jax.apps.benchmark.record import machine, source_commit
-from r3jax.apps.forecast.calibration import write_calibration
 from r3jax.apps.forecast.forecast import forecast_map
 from r3jax.apps.forecast.psnr import (
     STATISTICS,
@@ -37,6 +36,7 @@ from r3jax.apps.forecast.psnr import (
     fit,
     leave_one_out,
     statistic,
+    write_calibration,
 )
 from r3jax.apps.report import style
 from r3jax.evaluation.comparison import method_name, view_values
@@ -45,7 +45,7 @@ from r3jax.trace.reader import read_run
 
 NAME = "forecast"
 LEVEL = 0.8
-"""Of the intervals whose coverage is measured."""
+"""Level of the intervals whose coverage is measured."""
 
 Pair = dict[str, tuple[float, float]]
 """Forecast and truth by statistic [dB]."""
@@ -83,14 +83,14 @@ class Known:
         return leave_one_out(self.coverage, self.renderability, self.psnr, self.scenes, self.models)
 
     def calibration(self) -> Calibration:
-        """Of all these views; the errors are those of `pairs`."""
+        """Calibration on all these views; the errors are those of `pairs`."""
         count, scenes = len(set(self.models)), sorted(set(self.scenes))
         source = f"{len(self.psnr)} views of {count} models in {', '.join(scenes)}"
         model = fit(self.coverage, self.renderability, self.psnr)
         return Calibration(model, errors_of(self.pairs()), source)
 
     def scene_of_models(self) -> list[str]:
-        """Of each model, in the order of `pairs`."""
+        """Scene of each model, in the order of `pairs`."""
         return list(dict(zip(self.models, self.scenes, strict=True)).values())
 
 
@@ -136,7 +136,7 @@ def write_page(folder: Path, known: Known, from_runs: Sequence[dict[str, Any]]) 
         parts += [
             "## From the maps of runs",
             "Nothing but the map and the grid after the views: the forecast's own views in the "
-            "space that may be free, against the test views of the referee.",
+            "space that may be free, against the test views of the benchmark.",
             markdown_table(list(from_runs)),
         ]
     write_markdown(folder / f"{NAME}.md", parts, source)
@@ -182,14 +182,14 @@ def error_row(
 
 
 def _rms_of_constant(name: str, pairs: Sequence[Pair], scenes: Sequence[str]) -> float:
-    """Of the guess that a scene comes out as the others did on average [dB]."""
+    """Error of the guess that a scene comes out as the others did on average [dB]."""
     truth, scene_of = np.array([pair[name][1] for pair in pairs]), np.array(scenes)
     guesses = np.array([truth[scene_of != scene].mean() for scene in scenes])
     return float(np.sqrt(np.mean((guesses - truth) ** 2)))
 
 
 def _half_width(others: Known, name: str) -> float:
-    """Of an interval for a scene, by the errors among the other scenes."""
+    """Half the width of an interval for a scene, by the errors among the other scenes."""
     if len(set(others.scenes)) < 2:
         return float("nan")
     return float(np.quantile(errors_of(others.pairs())[name], LEVEL))

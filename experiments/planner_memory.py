@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.artifacts import (
+from experiments.pages.artifacts import (
     markdown_table,
     origin_of,
     write_csv,
     write_figure,
     write_markdown,
 )
+from experiments.pages.benchmark_figures import memory_figure
 from experiments.planner_runs import Options, fly_all
-from r3jax.apps.benchmark.results.benchmark_figures import memory_figure
 
 NAME = "planner_memory"
 

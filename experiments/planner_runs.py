@@ -23,7 +23,7 @@ from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.state import LoopState, Mission, Stop, View
+from r3jax.exploration.state import LoopState, Mission, Stop, TakenView
 from r3jax.exploration.step import start_state, step
 from r3jax.files import write_atomic
 from r3jax.geometry.cameras import Camera
@@ -178,7 +178,7 @@ def _rows(state: LoopState, mission: Mission) -> Iterator[dict[str, Any]]:
             yield {"key_frames": key_frames} | _milliseconds(output) | _bytes(state)
 
 
-def _milliseconds(view: View) -> dict[str, float]:
+def _milliseconds(view: TakenView) -> dict[str, float]:
     """What the parts of a step took [ms]; 0 for parts that a policy does not have."""
     stages = {name: view.stages[stage] for name, stage in STAGES.items()}
     parts = {f"decide.{part}": view.stages.get(f"plan.{part}", 0.0) for part in PLANNING}

@@ -5,7 +5,6 @@ Shape symbols: P poses of the pool.
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +12,6 @@ import numpy as np
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.frame import Frame
 from r3jax.mapping.occupancy import (
-    LOG_ODDS_LIMIT,
     empty_grid,
     integrate_depth,
     mark_free_ball,
@@ -21,13 +19,18 @@ from r3jax.mapping.occupancy import (
 )
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_growing
-from r3jax.planning.candidates import host_generator, poses_along, random_directions
+from r3jax.planning.candidates import (
+    candidates_along,
+    host_generator,
+    poses_along,
+    random_directions,
+)
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.explorable import mask_unexplorable
-from r3jax.planning.policies.active_gamer import ActiveGamer, empty_share
+from r3jax.planning.policies.active_gamer.policy import ActiveGamer, empty_share
+from r3jax.planning.policy import Situation
 from r3jax.planning.registry import make_policy
-from r3jax.planning.situation import Situation
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.robot.explorable import mask_unexplorable
+from r3jax.planning.robot.travel import plan_travel
 from r3jax.scoring.pixels import score_pixels
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.free_space import GroundTruth
@@ -99,8 +102,7 @@ def choose(
             travel = plan_travel(grid, poses[chosen[-1], :3, 3], PlannerConfig().safety_margin)
             masked = mask_unexplorable(grid, reached)
             if known_cells:
-                known = jnp.full_like(masked.log_odds, -LOG_ODDS_LIMIT)
-                masked = eqx.tree_at(lambda g: g.log_odds, masked, known)
+                masked = masked.ignoring(np.ones(grid.log_odds.shape, dtype=bool))
             where = Situation(map_state, grid, masked, travel, simulator.camera, state.memory)
             totals = totals_of(policy, where, poses, key=jax.random.fold_in(key, best))
             totals[chosen] = -np.inf
@@ -123,5 +125,6 @@ def totals_of(policy: Any, where: Situation, poses: np.ndarray, *, key: jax.Arra
         return np.array(
             score_pixels(empty_share, state, grid, where.camera, flat, scoring), np.float64
         )
-    _, utilities = policy.score(where, poses, key=key)
+    candidates = candidates_along(poses[:, :3, 3], poses[:, :3, 2])
+    _, utilities = policy.score(where, candidates, key=key)
     return np.array(policy.weigh(utilities | {"path": np.zeros(len(poses))}), np.float64)

@@ -1,10 +1,10 @@
-"""The choice without the loop: what the utilities alone are worth.
+"""The choice without the loop: what the utilities alone achieve.
 
     python -m experiments.pool_selection --size smoke
 
 One pool of poses in the reachable free space of a scene, the same first views for all, and no path
 cost. A policy scores the whole pool, the best pose is taken, its frame joins the map, and so on.
-Vanilla 3DGS is then trained from scratch on each choice and judged on the scene's test views.
+Vanilla 3DGS is then trained from scratch on each choice and evaluated on the scene's test views.
 
 The pool comes from the ground truth, the same for all; pictures come only from poses that were
 chosen. What is left out has no score of a pose: `frontier`, and `ours-pano` and
@@ -23,16 +23,16 @@ from typing import Any, Literal
 import jax
 import tyro
 
-from experiments.artifacts import (
+from experiments.pages.artifacts import (
     markdown_table,
     origin_of,
     write_csv,
     write_figure,
     write_markdown,
 )
+from experiments.pages.pool_figure import pool_figure
+from experiments.pages.pool_table import gain_rows, mean_rows, result_rows
 from experiments.pool_choice import SCORED, choose, pool_of
-from experiments.pool_figure import pool_figure
-from experiments.pool_table import gain_rows, mean_rows, result_rows
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.scores import summarize
@@ -42,8 +42,8 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.scenes.registry import open_scene
-from r3jax.splatting import train
-from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.training import train
+from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.views import Views, load_views
 
 NAME = "pool_selection"
@@ -54,7 +54,7 @@ SizeName = Literal["smoke", "small", "paper"]
 
 @dataclass(frozen=True)
 class Size:
-    """How much is chosen, trained and judged."""
+    """How much is chosen, trained and evaluated."""
 
     scenes: tuple[str, ...]
     seeds: tuple[int, ...]
@@ -105,7 +105,7 @@ class Options:
     """Whose utility chooses."""
 
     known_cells: bool = False
-    """Leave unexplored cells out of every utility: what the terms on known surfaces are worth.
+    """Leave unexplored cells out of every utility: what the terms on known surfaces achieve.
     With them U_G decides most choices, as its weight is large in all policies."""
 
     out: Path = Path("experiments/results")
@@ -143,7 +143,7 @@ class Choice:
 
 
 def main(options: Options) -> Path:
-    """Chooses, trains and judges, writes the results, and returns their folder."""
+    """Chooses, trains and evaluates, writes the results, and returns their folder."""
     records = list(_records(options))
     folder = options.out / NAME / (options.size + ("-known-cells" if options.known_cells else ""))
     folder.mkdir(parents=True, exist_ok=True)
@@ -194,7 +194,7 @@ def _kept_or_made(work: Path, choice: Choice) -> dict[str, Any]:
 
 
 def make(choice: Choice, test_views: Path) -> dict[str, Any]:
-    """Chooses views, then trains and judges at every snapshot."""
+    """Chooses views, then trains and evaluates at every snapshot."""
     size, seed = choice.size, choice.seed
     camera = Camera.from_fov(size.resolution, size.resolution)
     simulator = open_scene(choice.scene, camera=camera, seed=seed)
@@ -211,11 +211,11 @@ def make(choice: Choice, test_views: Path) -> dict[str, Any]:
     )
     view_set = load_view_set(test_views, truth, max_views=size.test_views)
     tests = load_views(render_view_set(truth, view_set, size.resolution), size.train_resolution)
-    scores = {str(n): _train_and_judge(frames[:n], tests, choice) for n in size.snapshots}
+    scores = {str(n): _train_and_evaluate(frames[:n], tests, choice) for n in size.snapshots}
     return {"chosen": chosen, "scores": scores, "test_views_hash": view_set.hash}
 
 
-def _train_and_judge(frames: list[Frame], tests: Views, choice: Choice) -> dict[str, Any]:
+def _train_and_evaluate(frames: list[Frame], tests: Views, choice: Choice) -> dict[str, Any]:
     """Metrics of a model that is trained from scratch on the frames."""
     size = choice.size
     config = TrainConfig(

@@ -4,7 +4,7 @@
     python -m experiments.refine runs/apartment-ours-pano-seed0
 
 After every few views of a recorded run each policy decides twice, from the same map with the same
-key: as it is, and with its best candidates refined. What both views are worth is worked out anew by
+key: as it is, and with its best candidates refined. The utility of both views is worked out anew by
 `r3jax.view_utility`, for all policies: a choice by another measure than U (the paths
 of `ours-ahead`) need not gain in it. Decisions are made twice and the second is timed, so
 that compiling does not count.
@@ -21,7 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments.artifacts import Origin, command_line, markdown_table, write_csv, write_markdown
+from experiments.pages.artifacts import (
+    Origin,
+    command_line,
+    markdown_table,
+    write_csv,
+    write_markdown,
+)
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.exploration.replay import planner_config_of, states_of
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -52,7 +58,7 @@ class Options:
     """A decision after every so many views."""
 
     views: int = 40
-    """Of the run, at most."""
+    """Views of the run, at most."""
 
     out: Path = Path("experiments/results")
     """Folder of the results."""
@@ -90,9 +96,9 @@ def all_rows(run: Run, options: Options) -> Iterator[dict[str, Any]]:
         if (row.step + 1) % options.every == 0:
             for name in options.policies:
                 yield compared(name, policies, states, map_state, grid, pose, row.step, options)
-        way = np.stack([pose[:3, 3], pose[:3, 3]])
+        path = np.stack([pose[:3, 3], pose[:3, 3]])
         for who, policy in policies.items():
-            states[who] = policy.follow(states[who], map_state, grid, pose, way)
+            states[who] = policy.follow(states[who], map_state, grid, pose, path)
 
 
 def compared(
@@ -118,8 +124,8 @@ def compared(
         milliseconds = 1e3 * (time.perf_counter() - begin)
         config, state = policies[who].config, states[who]
         _, _, masked = prepare_decision(state, map_state, grid, pose, config)
-        worth = exact(map_state, masked, state.camera, decision, config)
-        row |= {f"{word}_utility": worth, f"{word}_ms": round(milliseconds, 2)}
+        utility = exact(map_state, masked, state.camera, decision, config)
+        row |= {f"{word}_utility": utility, f"{word}_ms": round(milliseconds, 2)}
     return row | {"gain": row["refined_utility"] / max(row["plain_utility"], 1e-9) - 1.0}
 
 
@@ -157,7 +163,7 @@ def page(rows: list[dict[str, Any]], run: Run, options: Options) -> list[str]:
         f"# Refining {options.refine} candidates: {run.path.name}",
         "The view that is chosen, with refinement against without, from the same map with the same "
         "key. U is that of the view alone: a refined view of another candidate may win for a "
-        "shorter way.",
+        "shorter path.",
         markdown_table(table),
         f"`{NAME}.csv` holds every decision.",
     ]

@@ -13,13 +13,6 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.artifacts import (
-    Origin,
-    markdown_table,
-    write_csv,
-    write_figure,
-    write_markdown,
-)
 from experiments.error_analysis import (
     COVER,
     COVERAGE,
@@ -31,7 +24,15 @@ from experiments.error_analysis import (
     scene_models,
     snapshots_of_models,
 )
-from experiments.error_figures import (
+from experiments.error_terms import PRODUCTS, SMALLEST_SHARE, column
+from experiments.pages.artifacts import (
+    Origin,
+    markdown_table,
+    write_csv,
+    write_figure,
+    write_markdown,
+)
+from experiments.pages.error_figures import (
     TITLES,
     budget_name,
     distribution_figure,
@@ -40,10 +41,9 @@ from experiments.error_figures import (
     term_figure,
     told,
 )
-from experiments.error_terms import PRODUCTS, SMALLEST_SHARE, column
 from experiments.suite import Options, origin, run_suite
 from r3jax.apps.benchmark.record import source_commit
-from r3jax.apps.benchmark.results.table_parts import notes
+from r3jax.apps.benchmark.tables import notes
 
 NAME = "renderability_vs_error"
 
@@ -117,7 +117,7 @@ the box test out of all factors. *COVER* is the mean of (1 + cos) / 2 to the nea
 true point lies within the sensor's range and no more than a voxel behind what the frame measured.
 The map has no say in it. PSNR on seen pixels is of these alone (views with less than
 {100 * SMALLEST_SHARE:.0f} % of them are left out), and is held against means over the pixels that
-show a voxel, so that coverage is in neither: what a term is worth there is its own. *Holes of the
+show a voxel, so that coverage is in neither: what a term predicts there is its own. *Holes of the
 scan left out* is another thing: pixels where the true depth is unknown.
 
 Coefficients are computed within a model (one scene, policy, seed and budget), over its test views,

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Literal
 
-from experiments.artifacts import Origin, write_markdown
+from experiments.pages.artifacts import Origin, write_markdown
+from experiments.pages.comparison_tables import difference_table, tail_table
+from experiments.pages.table_formats import to_csv, to_latex, to_markdown
 from experiments.suite import Options, Records, origin, run_suite
-from r3jax.apps.benchmark.results.table_formats import to_csv, to_latex, to_markdown
-from r3jax.apps.benchmark.results.table_parts import Table
-from r3jax.apps.benchmark.results.tables import difference_table, quality_table, tail_table
+from r3jax.apps.benchmark.tables import Table, quality_table
 from r3jax.evaluation.comparison import methods_of, snapshots_of
 from r3jax.files import write_atomic
 

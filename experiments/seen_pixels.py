@@ -1,7 +1,7 @@
 """Which pixels of a test view show a surface that a training frame has looked at.
 
 Decided by the true depth of the test view and the recorded depth of the frames, not by the map
-whose predictions are judged with it. The rule is that of `scoring.sighting`: a point is seen by a
+whose predictions are evaluated with it. The rule is that of the map's update: a point is seen by a
 frame if it is within range and projects onto a measurement that is no nearer.
 
 Shape symbols: n frames; h w their size; H W size of the test view.
@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, invert_pose, transform, unproject
-from r3jax.splatting.views import View
+from r3jax.splatting.views import PosedImage
 
 
 class Recorded(eqx.Module):
@@ -29,7 +29,7 @@ class Recorded(eqx.Module):
     """World to camera."""
 
     camera: Camera
-    """Of all frames."""
+    """Intrinsics of all frames."""
 
 
 @jax.jit
@@ -49,7 +49,7 @@ def recorded(frames: Sequence[Frame]) -> Recorded:
 
 @jax.jit
 def seen_pixels(
-    view: View, frames: Recorded, max_range: Float[Array, ""], tolerance: Float[Array, ""]
+    view: PosedImage, frames: Recorded, max_range: Float[Array, ""], tolerance: Float[Array, ""]
 ) -> Bool[Array, "H W"]:
     """True where a test view shows what at least one frame has looked at.
 

@@ -23,9 +23,9 @@ from typing import Any, Literal
 from r3jax.apps.benchmark.cells import Cell
 from r3jax.apps.benchmark.conditions import OWN_OF_LOOP, OWN_OF_TRAINER, Conditions
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.planning.lookahead import AheadConfig
+from r3jax.planning.policies.ahead.lookahead import AheadConfig
 from r3jax.scoring.config import ScoringConfig
-from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.training.config import TrainConfig
 
 Value = bool | int | float | str | None
 

@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from experiments.artifacts import Origin, joint_origin
+from experiments.pages.artifacts import Origin, joint_origin
 from r3jax.apps.benchmark.cells import Cell
 from r3jax.apps.benchmark.conditions import Conditions
-from r3jax.apps.benchmark.engines.events import Event
-from r3jax.apps.benchmark.engines.local import run_in_processes
+from r3jax.apps.benchmark.engines.local import Event, run_in_processes
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
 from r3jax.apps.benchmark.record import collect, read_records

@@ -5,7 +5,7 @@
     python -m experiments.sweep --vary lambda1=1..256:log --vary radius=0.3..2 --random 20
     python -m experiments.sweep --list
 
-Every point is explored, trained and judged in scenes for tuning, which are none of those that
+Every point is explored, trained and evaluated in scenes for tuning, which are none of those that
 the committed tables report: nothing is tuned on the test views of a table. The best point is the
 one with the highest mean PSNR over the test views at the end of the budget.
 """
@@ -16,12 +16,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from experiments.artifacts import markdown_table
+from experiments.pages.artifacts import markdown_table
+from experiments.pages.sweep_page import Sweep, write_page
 from experiments.settings import known_settings, with_settings
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import origin, request_of, run_cells
 from experiments.sweep_choice import Trial
-from experiments.sweep_page import Sweep, write_page
 from experiments.sweep_space import (
     Axis,
     Point,
@@ -55,7 +55,7 @@ class Options:
     """Try so many points at random instead of all combinations."""
 
     seed: int = 0
-    """Of the random points."""
+    """Seed of the random points."""
 
     policy: str = "ours-pano"
     """Who chooses the views."""
@@ -91,7 +91,7 @@ class _Size:
     seeds: tuple[int, ...]
     budget: str
     values: str
-    """Of lambda1."""
+    """Values of lambda1."""
 
 
 REPORTED = request_of(SuiteOptions(size="small"), "views").scenes

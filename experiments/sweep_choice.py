@@ -23,7 +23,7 @@ class Trial:
 
     point: Point
     records: Records
-    """Of one snapshot, at least one."""
+    """Records of one snapshot, at least one."""
 
     @property
     def scores(self) -> Scores:
@@ -86,7 +86,7 @@ def choose(trials: Sequence[Trial], default: Point) -> Choice:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One scene, judged by what all others chose."""
+    """One scene, evaluated by what all others chose."""
 
     scene: str
     best: int
@@ -97,9 +97,9 @@ class LeftOut:
 
 
 def leave_one_out(trials: Sequence[Trial], default: int) -> tuple[LeftOut, ...]:
-    """For every scene, the choice of the other scenes and what it is worth here.
+    """For every scene, the choice of the other scenes and what it achieves here.
 
-    Nothing here was chosen by the views that judge it: this is how much tuning really gains.
+    Nothing here was chosen by the views that evaluate it: this is how much tuning really gains.
     Empty with a single scene.
     """
     scores = [trial.scores for trial in trials]

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from experiments.artifacts import markdown_table, origin_of, write_csv, write_markdown
+from experiments.pages.artifacts import markdown_table, origin_of, write_csv, write_markdown
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.apps.team.team import Member, explore_team
 from r3jax.exploration.config import ExplorationConfig
@@ -36,7 +36,7 @@ from r3jax.simulators.start import level_pose, places_beside
 NAME = "team"
 
 SHARES = (0.8, 0.9, 0.95)
-"""Of what one camera knows at its end."""
+"""Shares of what one camera knows at its end."""
 
 MEASURES = ("known_share", "voxels")
 
@@ -62,7 +62,7 @@ class Size:
     scene: str
     seeds: tuple[int, ...]
     seconds: float
-    """Of the one camera's mission; that of two is two thirds as long."""
+    """Duration of the one camera's mission [s]; that of two is two thirds as long."""
 
     resolution: int = 128
     """Width and height of the images [px]."""

@@ -28,8 +28,8 @@ from .splatting.config import RasterConfig
 from .splatting.ply import read_scene, write_scene
 from .splatting.render import Rendering, render
 from .splatting.scene import GaussianScene
-from .splatting.train import FitResult, fit
-from .splatting.training_config import TrainConfig
+from .splatting.training.config import TrainConfig
+from .splatting.training.train import FitResult, fit
 from .splatting.views import Views, load_views
 
 __version__: str

@@ -22,27 +22,34 @@ _LOOK = 64
 def _as_image(image: ArrayLike) -> Array:
     """Half and double precision become float32; integers stay, to be refused by name."""
     array = jnp.asarray(image)
+    # Cast to float, 8-bit colors would be 255 times too bright and millimeters too far.
     return array.astype(jnp.float32) if jnp.issubdtype(array.dtype, jnp.floating) else array
 
 
 def _as_pose(pose: ArrayLike) -> Array:
     """Single precision; under jit, where it cannot be refused, a pose that is not rigid is NaN."""
     T = jnp.asarray(pose, dtype=jnp.float32)
+    # A wrong shape is refused by `_check_structure`, a known value by `_check_values`.
     if T.shape != (4, 4) or not is_traced(T):
         return T
+    # NaN spreads into every number made from the pose; 0 or the identity would look sound.
     return T * jnp.where(is_rigid(T), 1.0, jnp.nan)
 
 
 def _refuse_far(depth: ArrayLike) -> None:
     """Refuses depth that is surely in another unit, where it is known."""
+    # A wrong number of axes is named later, beside the shape that the camera wants.
     if is_traced(depth) or np.ndim(depth) != 2:
         return
     array = np.asarray(depth)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         return  # refused as what it is
+    # A sample is enough: millimeters taken for meters are off by 1000, not by a few percent.
     rows, columns = (max(1, size // _LOOK) for size in array.shape)
     some = array[::rows, ::columns].astype(np.float64)
+    # 0 and inf are messages, not distances: a picture full of either must not move the median.
     measured = some[(some > 0.0) & np.isfinite(some)]
+    # The median, not the maximum: a few stray pixels are no reason to refuse a frame.
     if len(measured) and (median := float(np.median(measured))) > FAR:
         raise ValueError(
             f"the median depth is {median:.4g} m: is it in millimeters? (Frame.from_arrays: "
@@ -85,6 +92,7 @@ class Frame(eqx.Module):
         """Takes the fields, and whether a median depth of more than 50 m is meant (`far`)."""
         self.rgb, self.depth = _as_image(rgb), _as_image(depth)
         self.T_world_camera, self.camera = _as_pose(T_world_camera), camera
+        # The argument, not the field: what lies on the host need not come back from a device.
         if not far:
             _refuse_far(depth)
 
@@ -124,6 +132,7 @@ class Frame(eqx.Module):
                 meant, whole numbers as depth without `depth_scale`, a matrix of other images.
             TypeError: what is not an array, or cannot be handed over.
         """
+        # Colors come first: a bare matrix of intrinsics has no image size of its own.
         colors = color_image(rgb)
         height, width = colors.shape[:2]
         return Frame(
@@ -136,6 +145,7 @@ class Frame(eqx.Module):
 
     def __check_init__(self) -> None:
         """Refuses what would become a NaN or a silent error later."""
+        # Shapes are known while tracing; values are not.
         self._check_structure()
         if not is_traced(self.rgb, self.depth, self.T_world_camera):
             self._check_values()
@@ -154,6 +164,7 @@ class Frame(eqx.Module):
             raise ValueError(
                 f"T_world_camera is a 4x4 matrix, got shape {self.T_world_camera.shape}"
             )
+        # Nothing is converted here: what an integer stands for, only the caller knows.
         for name, array in (("rgb", self.rgb), ("depth", self.depth)):
             if not jnp.issubdtype(array.dtype, jnp.floating):
                 raise ValueError(
@@ -162,10 +173,12 @@ class Frame(eqx.Module):
                 )
 
     def _check_values(self) -> None:
+        # NumPy: reading a recording of many image sizes must not compile a program for each.
         rgb, depth = np.asarray(self.rgb), np.asarray(self.depth)
         low, high = float(rgb.min()), float(rgb.max())  # NaN makes the comparison false
         if not (low >= 0.0 and high <= 1.0):
             raise ValueError(f"rgb must lie in [0, 1], got values from {low:.4g} to {high:.4g}")
+        # Written as what must hold: NaN fails it, while `< 0` would let NaN pass.
         if not float(depth.min()) >= 0.0:
             bad = np.argwhere(~(depth >= 0.0))
             row, column = (int(i) for i in bad[0])

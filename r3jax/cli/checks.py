@@ -13,24 +13,25 @@ from typing import Any
 from r3jax.apps.forecast.goal import parse_goal
 from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
 from r3jax.cli.options import (
-    Audit,
-    Benchmark,
-    Demo,
-    Evaluate,
-    Explore,
-    Export,
-    Forecast,
-    Info,
-    Merge,
-    Replay,
-    Team,
-    Train,
-    View,
+    AuditOptions,
+    BenchmarkOptions,
+    DemoOptions,
+    EvaluateOptions,
+    ExploreOptions,
+    ExportOptions,
+    ForecastOptions,
+    InfoOptions,
+    MergeOptions,
+    ReplayOptions,
+    TeamOptions,
+    TrainOptions,
+    ViewOptions,
 )
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.planning.motion import Motion, make_motion
+from r3jax.formats.errors import check_capture
 from r3jax.planning.policies import check_policy
+from r3jax.planning.robot.motion import Motion, make_motion
 from r3jax.simulators.scenes.names import check_scene
 
 DEFAULT_POLICY = "ours-pano"
@@ -38,6 +39,14 @@ DEFAULT_BUDGET = "views:100"
 
 LEAST_CAPACITY = 1 << 14
 """Rows that a map which may grow has at the start: all is compiled anew whenever it doubles."""
+
+
+_WITH_RESUME = ("resume", "budget", "until", "live", "port")
+_WITH_FORK = (
+    "fork", "at", "policy", "budget", "until", "name", "out", "overwrite", "candidates", "lambda1",
+    "lambda2", "refine", "live", "port",
+)  # fmt: skip
+"""Options that make sense beside these; all others are fixed by the recorded run."""
 
 
 def check_options(options: object) -> None:
@@ -59,24 +68,27 @@ def _check(options: object) -> None:
 
 
 @_check.register
-def _(options: Demo) -> None:
+def _(options: DemoOptions) -> None:
     parse_budget(f"views:{options.views}")
-    loop_of_options(Explore(resolution=options.resolution))
+    loop_of_options(ExploreOptions(resolution=options.resolution))
     check_resolution(options.train_resolution)
     _check_folder(options.out)
 
 
 @_check.register
-def _(options: Explore) -> None:
+def _(options: ExploreOptions) -> None:
     if options.name is not None:
         check_folder_name(options.name)
     if options.resume is not None and options.fork is not None:
         raise ValueError("--resume goes on with a run, --fork begins another one: give one of them")
     if (options.at is None) != (options.fork is None):
         raise ValueError("--fork RUN and --at VIEW belong together")
-    old = options.resume or options.fork
-    if old is not None:
-        _check_run(old)
+    if options.resume is not None:
+        _refuse_others(options, "--resume", _WITH_RESUME)
+        _check_run(options.resume)
+    elif options.fork is not None:
+        _refuse_others(options, "--fork", _WITH_FORK)
+        _check_run(options.fork)
     elif options.scene is None:
         raise ValueError("give a --scene, or --resume RUN; `r3jax info` lists the scenes")
     else:
@@ -93,12 +105,13 @@ def _(options: Explore) -> None:
 
 
 @_check.register
-def _(options: Team) -> None:
+def _(options: TeamOptions) -> None:
     if options.name is not None:
         check_folder_name(options.name)
     if options.budget is not None:
         parse_budget(options.budget)
     if options.resume is not None:
+        _refuse_others(options, "--resume", ("resume", "budget"))
         _check_run(options.resume / "0")
         return
     if options.scene is None:
@@ -113,7 +126,7 @@ def _(options: Team) -> None:
 
 
 @_check.register
-def _(options: Benchmark) -> None:
+def _(options: BenchmarkOptions) -> None:
     for scene in words(options.scenes):
         check_scene(scene, options.scale)
     for policy in words(options.policies):
@@ -121,18 +134,20 @@ def _(options: Benchmark) -> None:
     for budget in (options.budget, *words(options.snapshots or "")):
         parse_budget(budget)
     seeds_of(options)
+    if options.jobs < (1 if options.engine == "slurm" else 0):
+        raise ValueError(f"--jobs must not be negative (slurm: at least 1), got {options.jobs}")
     _check_folder(options.out)
 
 
 @_check.register
-def _(options: Train) -> None:
+def _(options: TrainOptions) -> None:
     check_folder_name(options.name)
     check_resolution(options.resolution)
     check_capture(options.path)
 
 
 @_check.register
-def _(options: Evaluate) -> None:
+def _(options: EvaluateOptions) -> None:
     check_folder_name(options.name)
     check_resolution(options.resolution)
     if options.worst < 0:
@@ -141,38 +156,67 @@ def _(options: Evaluate) -> None:
 
 
 @_check.register
-def _(options: Audit) -> None:
+def _(options: AuditOptions) -> None:
     check_capture(options.capture)
     if options.out is not None:
         _check_folder(options.out)
+        _check_replaceable(options.out)
     if options.path is not None and not options.path.exists():
         raise UserError(f"{options.path}: there is no such folder or file")
 
 
 @_check.register
-def _(options: Info) -> None:
+def _(options: InfoOptions) -> None:
     if options.path is not None:
         check_capture(options.path)
 
 
-@_check.register(Replay)
-@_check.register(Forecast)
-@_check.register(Export)
-def _(options: Replay | Forecast | Export) -> None:
+@_check.register(ReplayOptions)
+@_check.register(ForecastOptions)
+def _(options: ReplayOptions | ForecastOptions) -> None:
     _check_run(options.path)
 
 
 @_check.register
-def _(options: View) -> None:
+def _(options: ExportOptions) -> None:
+    _check_run(options.path)
+    _check_folder(options.out)
+    if options.out.is_dir() and any(options.out.iterdir()):
+        raise UserError(f"{options.out}: something is there already: give another folder")
+
+
+@_check.register
+def _(options: ViewOptions) -> None:
     _check_run(options.path)
     if options.name is not None:
         check_folder_name(options.name)
+    if options.video and options.export is None:
+        raise ValueError("--video belongs to --export FOLDER")
 
 
 @_check.register
-def _(options: Merge) -> None:
+def _(options: MergeOptions) -> None:
     for path in (options.first, options.second):
         _check_run(path)
+    if options.first.samefile(options.second):
+        raise UserError(
+            f"{options.first}: a run is not merged with itself: give two different runs"
+        )
+
+
+def _refuse_others(
+    options: ExploreOptions | TeamOptions, flag: str, allowed: tuple[str, ...]
+) -> None:
+    """A setting that would be ignored is a mistake.
+
+    Raises:
+        ValueError: one was given beside `flag`; names it.
+    """
+    fields = [field for field in dataclasses.fields(options) if field.name not in allowed]
+    given = [field.name for field in fields if getattr(options, field.name) != field.default]
+    if given:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise ValueError(f"{flag} takes these from the recorded run, leave them out: {names}")
 
 
 def _check_policy(name: str) -> None:
@@ -187,7 +231,7 @@ def _check_policy(name: str) -> None:
     check_policy(name)
 
 
-def loop_of_options(options: Explore) -> ExplorationConfig:
+def loop_of_options(options: ExploreOptions) -> ExplorationConfig:
     """What the loop of a new run is told.
 
     Raises:
@@ -214,7 +258,7 @@ def loop_of_options(options: Explore) -> ExplorationConfig:
     return config
 
 
-def motion_of_options(options: Explore) -> Motion:
+def motion_of_options(options: ExploreOptions) -> Motion:
     """What carries the camera: a preset, and what the options change of it.
 
     Raises:
@@ -224,7 +268,7 @@ def motion_of_options(options: Explore) -> Motion:
     return make_motion(options.motion, **{k: v for k, v in given.items() if v is not None})
 
 
-def default_name(options: Explore, scene: str, policy: str) -> str:
+def default_name(options: ExploreOptions, scene: str, policy: str) -> str:
     """A run's name where none is given."""
     kind, colon, rest = scene.partition(":")
     stem = Path(rest).stem if colon else scene
@@ -235,13 +279,13 @@ def default_name(options: Explore, scene: str, policy: str) -> str:
     return f"{stem}-{own}{motion}-seed{options.seed}"
 
 
-def team_folder(options: Team, scene: str) -> Path:
+def team_folder(options: TeamOptions, scene: str) -> Path:
     """The folder of a new team."""
     stem = Path(scene.partition(":")[2] or scene).stem
     return options.out / (options.name or f"{stem}-team{options.cameras}-seed{options.seed}")
 
 
-def singles_of(options: Team) -> list[Explore]:
+def singles_of(options: TeamOptions) -> list[ExploreOptions]:
     """The options of each camera as if it flew alone.
 
     Raises:
@@ -262,7 +306,7 @@ def singles_of(options: Team) -> list[Explore]:
         if field.name not in ("cameras", "policy", "fov", "resolution", "meet_every")
     }
     return [
-        Explore(
+        ExploreOptions(
             **shared,
             policy=options.policy[number % len(options.policy)],
             fov=options.fov[number % len(options.fov)],
@@ -277,7 +321,7 @@ def words(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
-def seeds_of(options: Benchmark) -> tuple[int, ...]:
+def seeds_of(options: BenchmarkOptions) -> tuple[int, ...]:
     """The seeds of a benchmark.
 
     Raises:
@@ -306,30 +350,15 @@ def _check_free(folder: Path, overwrite: bool) -> None:
         )
 
 
+def _check_replaceable(folder: Path) -> None:
+    """Refuses to write an audit over anything but an earlier one."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "audit.json").exists():
+        raise UserError(f"{folder} holds something that is no audit: give another --out")
+
+
 def _check_folder(path: Path) -> None:
     """Refuses a file where a folder is to be written, and what no folder can be called."""
     if "\0" in str(path):
         raise UserError("--out: this cannot be the name of a folder")
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: this is a file, --out is a folder")
-
-
-def check_capture(path: Path) -> None:
-    """Refuses what is neither a folder nor nerfstudio's file.
-
-    Raises:
-        UserError: says what a capture is.
-    """
-    if not path.exists():
-        raise UserError(f"{path}: there is no such folder")
-    if path.is_file() and path.suffix != ".json":
-        raise UserError(f"{path}: this is a file; {_advice(path)}")
-
-
-def _advice(path: Path) -> str:
-    if path.suffix.lower() == ".r3d":
-        return (
-            "the archives of Record3D are not read: make nerfstudio's transforms.json of it, with "
-            "a depth_file_path for every frame"
-        )
-    return "a capture is a folder, or nerfstudio's transforms.json"

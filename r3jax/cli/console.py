@@ -3,13 +3,13 @@
 Only this module imports rich, whose own classes read square brackets in any string as markup.
 """
 
+import shlex
 from typing import Any
 
 import rich.console
 import rich.progress
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     ProgressColumn,
     SpinnerColumn,
@@ -26,7 +26,6 @@ from r3jax.cli.errors import printable
 __all__ = [
     "BarColumn",
     "Console",
-    "MofNCompleteColumn",
     "Progress",
     "SpinnerColumn",
     "Table",
@@ -49,6 +48,10 @@ class Console(rich.console.Console):
     def say(self, text: str, style: str = "") -> None:
         """Prints text on one line however long it is: paths must stay whole for copying."""
         self.print(text, style=style or None, soft_wrap=True)
+
+    def next(self, command: str, *words: object) -> None:
+        """Names the command that comes next, to be copied into a shell."""
+        self.say(f"next      r3jax {shlex.join([command, *map(str, words)])}")
 
     def render_str(self, text: str, **settings: Any) -> Text:
         """Makes rich's text of a string: all that is printed comes through here."""

@@ -1,6 +1,7 @@
 """Errors that end a command with one line and no traceback."""
 
 import contextlib
+import importlib.util
 import shlex
 from collections.abc import Generator
 from pathlib import Path
@@ -31,6 +32,18 @@ def check_resolution(pixels: int | None) -> None:
     """
     if pixels is not None and pixels < 16:
         raise UserError(f"--resolution must be at least 16, got {pixels}")
+
+
+def check_viser() -> None:
+    """Refuses to go on without viser, which shows pages.
+
+    Raises:
+        UserError: it is not installed; the message says how to get it.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise UserError(
+            "the viewer needs viser, which is not installed: pip install 'r3jax[viewer]'"
+        )
 
 
 def resume_command(command: str, path: Path) -> str:

@@ -11,38 +11,38 @@ import tyro
 import r3jax
 from r3jax.cli.errors import UserError, one_line, printable
 from r3jax.cli.options import (
-    Audit,
-    Benchmark,
-    Demo,
-    Evaluate,
-    Explore,
-    Export,
-    Forecast,
-    Info,
-    Merge,
-    Policies,
-    Replay,
-    Team,
-    Train,
-    View,
+    AuditOptions,
+    BenchmarkOptions,
+    DemoOptions,
+    EvaluateOptions,
+    ExploreOptions,
+    ExportOptions,
+    ForecastOptions,
+    InfoOptions,
+    MergeOptions,
+    PoliciesOptions,
+    ReplayOptions,
+    TeamOptions,
+    TrainOptions,
+    ViewOptions,
 )
-from r3jax.cli.options.numbers import number_rules
+from r3jax.cli.options.parsing import number_rules, options_of, parser_class
 
 _COMMANDS = {
-    "demo": Demo,
-    "explore": Explore,
-    "team": Team,
-    "train": Train,
-    "evaluate": Evaluate,
-    "benchmark": Benchmark,
-    "replay": Replay,
-    "merge": Merge,
-    "export": Export,
-    "forecast": Forecast,
-    "audit": Audit,
-    "view": View,
-    "policies": Policies,
-    "info": Info,
+    "demo": DemoOptions,
+    "explore": ExploreOptions,
+    "team": TeamOptions,
+    "train": TrainOptions,
+    "evaluate": EvaluateOptions,
+    "benchmark": BenchmarkOptions,
+    "replay": ReplayOptions,
+    "merge": MergeOptions,
+    "export": ExportOptions,
+    "forecast": ForecastOptions,
+    "audit": AuditOptions,
+    "view": ViewOptions,
+    "policies": PoliciesOptions,
+    "info": InfoOptions,
 }
 
 INTERRUPTED = 130
@@ -72,22 +72,27 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _main(args: Sequence[str] | None) -> int:
-    if list(sys.argv[1:] if args is None else args) == ["--version"]:
+    words = list(sys.argv[1:] if args is None else args)
+    if words == ["--version"]:
         print(f"r3jax {r3jax.__version__}")
         return 0
-    command = tyro.extras.subcommand_cli_from_dict(
-        _COMMANDS,
+    # The list of commands says each in a sentence; a command's own --help begins with examples.
+    one = len(words) > 0 and words[0] in _COMMANDS
+    parsers = {name: parser_class(k, with_examples=one) for name, k in _COMMANDS.items()}
+    parsed = tyro.extras.subcommand_cli_from_dict(
+        parsers,
         prog="r3jax",
         description="Where to look next for 3D Gaussian splatting: explores a scene with an RGB-D "
         "camera, chooses every view by closed-form renderability, and leaves a data set. "
         "--version prints the version.",
-        args=args,
-        config=(tyro.conf.FlagCreatePairsOff,),
+        args=words,
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
         registry=number_rules(),
     )
+    (name,) = (name for name, parser in parsers.items() if isinstance(parsed, parser))
     _keep_compilations()
     try:
-        return _run(command)
+        return _run(name, options_of(_COMMANDS[name], parsed))
     except UserError as error:
         print(f"r3jax: {printable(one_line(error))}", file=sys.stderr)
         return USER_ERROR
@@ -97,16 +102,15 @@ def _main(args: Sequence[str] | None) -> int:
         return INTERRUPTED
 
 
-def _run(command: object) -> int:
-    """Checks the options, and calls `run_NAME` of `r3jax.cli.NAME` for the command NAME.
+def _run(name: str, options: object) -> int:
+    """Checks the options, and calls `run_NAME` of `r3jax.cli.commands.NAME` for the command NAME.
 
     Imports what the command needs and nothing else, so that --help does not wait for JAX.
     """
     from r3jax.cli.checks import check_options  # not for --help, which needs no NumPy
 
-    check_options(command)
-    (name,) = (name for name, kind in _COMMANDS.items() if kind is type(command))
-    return getattr(importlib.import_module(f"r3jax.cli.{name}"), f"run_{name}")(command)
+    check_options(options)
+    return getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}")(options)
 
 
 def _keep_compilations() -> None:

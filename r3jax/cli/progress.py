@@ -1,11 +1,12 @@
 """Tells the user what happens: a bar on a terminal, a few lines in a log."""
 
+from collections.abc import Iterable, Iterator
 from types import TracebackType
+from typing import TYPE_CHECKING, TypeVar
 
 from r3jax.cli.console import (
     BarColumn,
     Console,
-    MofNCompleteColumn,
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
@@ -14,6 +15,11 @@ from r3jax.cli.console import (
 )
 from r3jax.exploration.budget import Budget
 from r3jax.trace.rows import StepRow
+
+if TYPE_CHECKING:  # training imports what an exploration does not need
+    from r3jax.splatting.training.train import Progress
+
+T = TypeVar("T")
 
 _STAGES = {
     "forecast": "forecasting the quality",
@@ -24,7 +30,7 @@ _STAGES = {
     "record": "writing to disk",
 }
 _LOG_LINES = 10
-"""Lines that a run leaves in a log."""
+"""Lines that a run or a training leaves in a log."""
 
 
 class RunProgress:
@@ -92,26 +98,80 @@ class Stages:
 
     def __init__(self, console: Console):
         """Shows nothing before it is entered."""
-        self._console = console
+        self._console, self._stage = console, ""
         self._bar = progress_bar(
             console,
+            SpinnerColumn(),
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
-            MofNCompleteColumn(),
+            TextColumn("{task.fields[count]}"),
+            TimeElapsedColumn(),
             transient=True,
         )
-        self._task = self._bar.add_task("", total=None)
+        self._task = self._bar.add_task("", total=None, count="")
 
     def on_progress(self, stage: str, steps: int) -> None:
-        """A stage begins, or one of its steps is done (no name)."""
+        """A stage of so many steps begins (0: nobody knows), or some are done (no name)."""
         if not stage:
-            self._bar.advance(self._task, steps)
+            task = self._bar.tasks[0]
+            self.at(self._stage, int(task.completed) + steps, int(task.total or 0))
             return
-        self._bar.reset(self._task, description=stage, total=max(steps, 1))
+        self._stage = stage
+        self._bar.reset(self._task, description=stage, total=steps or None, count="")
         if not self._console.is_terminal:
             self._console.say(stage)
 
+    def at(self, stage: str, done: int, total: int) -> None:
+        """So many steps of a stage are done; it begins if it has not."""
+        if stage != self._stage:
+            self.on_progress(stage, total)
+        count = f"{done}/{total}" if total else ""
+        self._bar.update(self._task, completed=done, total=total or None, count=count)
+
+    def each(self, stage: str, items: Iterable[T], total: int) -> Iterator[T]:
+        """Passes items on, each a step of a stage."""
+        for done, item in enumerate(items):
+            self.at(stage, done, total)
+            yield item
+
     def __enter__(self) -> "Stages":
+        """Shows the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Takes the bar down."""
+        self._bar.stop()
+
+
+class TrainProgress:
+    """A bar on a terminal, ten lines in a log; hand `on_progress` to `fit`."""
+
+    def __init__(self, console: Console, iterations: int):
+        """Shows nothing before it is entered."""
+        self._console, self._logged = console, -1
+        self._bar = progress_bar(
+            console,
+            SpinnerColumn(),
+            TextColumn("step {task.completed:.0f}/{task.total:.0f}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[facts]}", style="dim"),
+        )
+        self._task = self._bar.add_task("", total=iterations, facts="compiling on first use")
+
+    def on_progress(self, progress: "Progress") -> None:
+        """Some steps are done."""
+        facts = (
+            f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, "
+            f"{progress.num_gaussians} Gaussians, {progress.seconds_left:.0f} s left"
+        )
+        self._bar.update(self._task, completed=progress.step, facts=facts)
+        line = progress.step * _LOG_LINES // progress.iterations
+        if not self._console.is_terminal and line > self._logged:
+            self._logged = line
+            self._console.print(f"step {progress.step}: {facts}")
+
+    def __enter__(self) -> "TrainProgress":
         """Shows the bar."""
         self._bar.start()
         return self

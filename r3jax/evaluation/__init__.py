@@ -1,1 +1,1 @@
-"""What a run achieved: figures and the report."""
+"""What a run achieved: metrics, test views and statistics, the evaluation protocol."""

@@ -1,4 +1,4 @@
-"""Judges a scene of Gaussians by test views: renders each, compares it with the true image.
+"""Evaluates a scene of Gaussians by test views: renders each, compares it with the true image.
 
 Shape symbols: v views; H, W size of every image.
 """
@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from r3jax.evaluation.batches import in_batches
-from r3jax.evaluation.images import psnr, ssim, to_8_bits
+from r3jax.evaluation.image_metrics import in_batches, psnr, ssim, to_8_bits
 from r3jax.evaluation.scores import ViewRow
 from r3jax.splatting.config import RasterConfig, fitting_budget
 from r3jax.splatting.render import render
@@ -38,7 +37,7 @@ class Evaluation:
     """One per view, in their order."""
 
     renders: np.ndarray
-    """The renders that were judged, [v, H, W, 3] uint8."""
+    """The renders that were evaluated, [v, H, W, 3] uint8."""
 
 
 def evaluate(
@@ -55,7 +54,7 @@ def evaluate(
     """Renders every view, rounds it to 8 bits and measures how far it is from the true image.
 
     Args:
-        scene: what is judged.
+        scene: what is evaluated.
         views: true images with poses, depth and intrinsics, of one size.
         config: the rasterizer; a budget of intersections left open is raised as needed.
         background: RGB behind everything, the one of the training; black by default.
@@ -74,7 +73,7 @@ def evaluate(
     """
     count = len(views)
     if count == 0:
-        raise ValueError("there are no views to judge")
+        raise ValueError("there are no views to evaluate")
     for name, given in (("renderability", renderability), ("numbers", numbers)):
         if given is not None and len(given) != count:
             raise ValueError(f"{name} has {len(given)} entries for {count} views")
@@ -108,7 +107,7 @@ def evaluate(
 
 
 def _check_scene(scene: GaussianScene) -> None:
-    """Rasterizers leave out what is not a number; judged like that, a broken scene looks whole."""
+    """Rasterizers leave out what is not a number; scored like that, a broken scene looks whole."""
     finite = np.ones(scene.capacity, dtype=bool)
     for values in jax.tree.leaves(scene):
         finite &= np.isfinite(np.asarray(values)).reshape(scene.capacity, -1).all(axis=1)

@@ -1,4 +1,4 @@
-"""The numbers of a judged scene: one row per view, and what they come to."""
+"""The numbers of an evaluated scene: one row per view, and what they come to."""
 
 import csv
 import dataclasses
@@ -83,7 +83,7 @@ class Summary:
     """Views that have a value."""
 
     mean: float
-    """Of the values per view."""
+    """Mean of the values per view."""
 
     interval: tuple[float, float]
     """95 % bootstrap interval of the mean, over views."""

@@ -1,4 +1,4 @@
-"""What the referee claims about many views: coefficients, areas and means, each with an interval.
+"""Statistics of many views: coefficients, areas and means, each with an interval.
 
 Intervals are percentile bootstraps (Efron 1979) at 95 %. Scenes are the fixed set that a table
 names: views and seeds are drawn anew, scenes never.
@@ -30,7 +30,7 @@ class Estimate:
     """A number from a sample, and how far the sample lets one trust it."""
 
     value: float
-    """Of the sample itself; NaN where it is not defined (a constant column, ...)."""
+    """Value of the sample itself; NaN where it is not defined (a constant column, ...)."""
 
     low: float
     """Lower end of the 95 % interval."""
@@ -191,7 +191,7 @@ def mean_over_scenes(scores: Scores, *, seed: int = 0, resamples: int = RESAMPLE
     """Mean over scenes of the mean over seeds and views, with a hierarchical interval.
 
     Every scene weighs the same, whatever its number of views. A resample draws, in each scene,
-    its seeds and (independently) its views with replacement; all drawn seeds are judged by the
+    its seeds and (independently) its views with replacement; all drawn seeds share the
     same drawn views, as in truth (the pigeonhole bootstrap, Owen 2007, over rows and columns).
     With few seeds the interval is too narrow for their part: it sees (S - 1) / S of their
     variance, and none of it with one seed.
@@ -227,7 +227,7 @@ def paired_difference(
 ) -> Estimate:
     """First minus second, as `mean_over_scenes` of the differences view by view.
 
-    The same test views judge all methods, so what makes a view hard cancels and the interval is
+    The same test views evaluate all methods, so what makes a view hard cancels and the interval is
     far narrower than that of either mean. Seeds are paired row by row.
 
     Raises:

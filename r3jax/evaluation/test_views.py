@@ -1,4 +1,4 @@
-"""The referee's test views of a scene: fixed, stored with a hash, the same for every method.
+"""The test views of a scene: fixed, stored with a hash, the same for every method.
 
 As in Replica-Dense: positions on a lattice of 1.0 x 1.0 x 0.75 m in the free space that a camera
 can reach from the start, and at each of them six views without roll along +x, -x, +y, -y, +z, -z.
@@ -53,12 +53,12 @@ _LEAST_SEEN = 0.5
 """A view with less surface than this share of the picture is left out."""
 
 _SEED = 0
-"""Of the choice among positions where `max_views` is given."""
+"""Seed of the choice among positions where `max_views` is given."""
 
 
 @runtime_checkable
 class Truth(Protocol):
-    """What the referee asks of a world (`r3jax.simulators.free_space.GroundTruth`)."""
+    """What the evaluation protocol asks of a world (`r3jax.simulators.free_space.GroundTruth`)."""
 
     @property
     def scene(self) -> str:
@@ -94,7 +94,7 @@ class ViewSet:
     """SHA-256 of what the scene shows: the views mean nothing in another one."""
 
     spacing: tuple[float, float, float]
-    """Of the lattice [m]."""
+    """Spacing of the lattice [m]."""
 
     margin: float
     """Least distance to every surface [m]."""

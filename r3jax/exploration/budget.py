@@ -22,10 +22,12 @@ class Budget:
     def spent_share(self, *, views: int, seconds: float, metres: float) -> float:
         """Share of the budget that such a mission has used, in [0, 1]."""
         spent = {"views": views, "seconds": seconds, "metres": metres}[self.unit]
+        # Mapping the last picture may exceed the budget: only its arrival has to lie within.
         return min(1.0, spent / self.amount)
 
     def __str__(self) -> str:
         """As `parse_budget` reads it."""
+        # `:g` reads well but keeps six digits: a resumed run must get the very same limit.
         short = f"{self.amount:g}"
         return f"{self.unit}:{short if float(short) == self.amount else repr(self.amount)}"
 

@@ -90,6 +90,7 @@ def timed(
     Returns:
         The result, ready, and the seconds it took.
     """
+    # Events, not a warm-up call: a table of the map that grows compiles anew in mid-mission.
     before = _compilations.count
     result, seconds = _measure(function, *args, **kwargs)
     if repeat_compiled and _compilations.count > before:
@@ -98,6 +99,7 @@ def timed(
 
 
 def _measure(function: Callable[..., T], *args: Any, **kwargs: Any) -> tuple[T, float]:
+    # JAX returns before the device is done: without the wait only the dispatch would be charged.
     start = time.perf_counter()
     result = jax.block_until_ready(function(*args, **kwargs))
     return result, time.perf_counter() - start

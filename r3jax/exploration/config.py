@@ -9,6 +9,7 @@ from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 
 ClockName = Literal["wall", "model"]
 
+# One step less: the largest stored value means "beyond the range", not a depth.
 LARGEST_DEPTH = (BEYOND_RANGE - 1) / DEPTH_STEPS_PER_METRE
 """What lies farther is recorded as beyond the range [m]."""
 
@@ -74,8 +75,10 @@ class ExplorationConfig(MappingConfig):
     def __post_init__(self) -> None:
         """Refuses what cannot work."""
         super().__post_init__()
+        # Written so that NaN fails, too: it would make every flight time and the clock NaN.
         if not 0.0 < self.speed < math.inf:
             raise ValueError(f"speed must be positive, got {self.speed}")
+        # Two of them divide the number of views: a zero would fail a run after its first view.
         for name in ("num_probes", "checkpoint_every", "max_still_views", "until_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")

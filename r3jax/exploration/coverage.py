@@ -42,9 +42,11 @@ def view_renderability(
 @functools.lru_cache(maxsize=4)
 def _probe_sequence(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple[np.ndarray, ...]:
     """Positions [n, 3] and directions [n, 3], evenly spread, the same for every run."""
+    # Not scrambled: equal runs must write equal rows, and runs of one scene share their probes.
     unit = qmc.Sobol(d=5, scramble=False).random(_NUM_DRAWN)
     positions = np.asarray(lower) + unit[:, :3] * (np.asarray(upper) - np.asarray(lower))
     azimuth = 2.0 * np.pi * unit[:, 3]
+    # Uniform in the sine of the elevation is uniform on the sphere; in the angle it is not.
     z = (2.0 * unit[:, 4] - 1.0) * np.sin(_MAX_ELEVATION)
     level = np.sqrt(1.0 - z * z)
     return positions, np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=1)
@@ -64,10 +66,12 @@ def probe_poses(grid: OccupancyGrid, num: int) -> np.ndarray:
     Returns:
         `T_world_camera`, [P, 4, 4] float32, P <= num.
     """
+    # On the host: the number of free probes changes with every view, and would compile anew.
     origin, size = np.asarray(grid.origin, np.float64), float(grid.cell_size)
     shape = np.asarray(grid.log_odds.shape)
     positions, directions = _probe_sequence(tuple(origin), tuple(origin + shape * size))
     roomy = ndimage.binary_erosion(np.asarray(grid.free), np.ones((3, 3, 3)))
+    # Rounding may put a point on the upper face, one cell past the array.
     cells = np.minimum((positions - origin) / size, shape - 1).astype(int)
     chosen = np.flatnonzero(roomy[tuple(cells.T)])[:num]
     return _poses_along(positions[chosen], directions[chosen])
@@ -75,6 +79,7 @@ def probe_poses(grid: OccupancyGrid, num: int) -> np.ndarray:
 
 def _poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """`geometry.cameras.pose_along` for many on the host, where their number may vary freely."""
+    # Camera axes: x right and level, y down, z forward.
     right = np.stack([directions[:, 1], -directions[:, 0], np.zeros(len(directions))], axis=1)
     right /= np.linalg.norm(right, axis=1, keepdims=True)  # never 0: no probe looks straight up
     poses = np.tile(np.eye(4, dtype=np.float32), (len(positions), 1, 1))
@@ -91,6 +96,7 @@ def mean_renderability(map_state: MapState, grid: OccupancyGrid, camera: Camera,
     # Padded to one length, so that one compilation serves the whole run.
     padded = np.concatenate([poses, np.repeat(poses[:1], num - len(poses), axis=0)])
     values = _renderability_of_views(map_state, camera, jnp.asarray(padded))
+    # Without the padding, which would count the first probe several times.
     return float(np.asarray(values)[: len(poses)].mean())
 
 

@@ -75,6 +75,7 @@ def explain_run(
     Raises:
         RunError: the run was merged, a setting of it is not known, a frame is missing or broken.
     """
+    # First: rebuilding the map takes minutes, and would show a map nobody decided on.
     check_decided_alone(run)
     config = planner_config_of(run)
     after_views = iter(states_of(run) if states is None else states)
@@ -86,6 +87,7 @@ def explain_run(
             pose, (map_state, grid) = before
             memory = memory or initial_state(run.camera, grid, motion=config.motion)
             choice = row.choice
+            # The memory goes from view to view: cells that were given up count for nothing later.
             memory, explanation = explain_way(
                 memory, map_state, grid, pose, choice.pose, choice.waypoints, config
             )

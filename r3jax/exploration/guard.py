@@ -25,15 +25,18 @@ class GuardedSimulator:
             simulator: the world.
             views: pictures of the run that were taken before, by a process that was killed.
         """
+        # In a closure: an attribute would hand the whole world to a policy that finds the guard.
         render = simulator.render
 
         def render_committed(T_world_camera: np.ndarray) -> Frame:
             self._check(T_world_camera)
+            # Spent before the world is asked: a picture that fails is not asked for again, either.
             self._pose = None
             self.views += 1
             return render(T_world_camera)
 
         self._render = render_committed
+        # Copies, here and below: nobody who holds such an array can move the box or the start.
         self._camera, self._bounds = simulator.camera, np.array(simulator.bounds)
         self._start_pose = np.array(simulator.start_pose)
         self._pose: np.ndarray | None = None
@@ -86,6 +89,7 @@ class GuardedSimulator:
                 f"a picture from {_place(pose)} was asked for while the camera is under way: only "
                 "the loop looks, once from each pose that was decided on"
             )
+        # Exact: the loop renders the array it committed; a tolerance would let peeks through.
         if not np.array_equal(pose, self._pose):
             raise OracleReadError(
                 f"a picture from {_place(pose)} was asked for, but the camera is at "

@@ -78,15 +78,18 @@ def explore(
         OracleReadError: something beside the loop asked the simulator for a picture.
     """
     config = config or ExplorationConfig()
+    # run.json records the goal as text: a rule without it could not be repeated by a resume.
     if (config.until is None) != (is_enough is None):
         raise ValueError(
             f"config.until is {config.until!r}, is_enough is "
-            f"{'given' if is_enough else 'not given'}: r3jax.apps.forecast.stopping.stopping_rule "
+            f"{'given' if is_enough else 'not given'}: r3jax.apps.forecast.forecast.stopping_rule "
             "makes the one of the other"
         )
     budget = parse_budget(budget) if isinstance(budget, str) else budget
+    # Apart: how a policy starts must not change what it draws later.
     init_key, key = jax.random.split(jax.random.key(seed))
     mission = Mission(
+        # A resumed run reads its old pictures from the disk: the guard counts them as taken.
         GuardedSimulator(simulator, views=0 if resume is None else len(resume.rows)),
         policy,
         budget,
@@ -96,6 +99,8 @@ def explore(
         is_enough,
         on_stage=on_stage or (lambda stage: None),
     )
+    # Also for a resume: it gives the arrays of a checkpoint their structure, and is where to
+    # begin again if no checkpoint can be used.
     state = start_state(mission, init_key)
     rows: list[StepRow] = []
     if resume is not None:
@@ -118,18 +123,24 @@ def _go(
         while stop is None:
             after, output = step(state, mission)
             if isinstance(output, Stop):
+                # The state after a stop is dropped: with a larger budget a resume asks the policy
+                # again from the last view, as a run with that budget would have done.
                 stop = output
                 continue
             if recorder is not None:
                 mission.on_stage("record")
                 record_view(recorder, output, after, mission.config)
+            # Only once it is recorded: a disk that is full ends the run at what is on it.
             state = after
             rows.append(output.row)
             on_step(output.row)
+    # The view under way is dropped; if its row is on the disk already, a resume finds it there.
     except KeyboardInterrupt:
         stop = Stop(StopReason.INTERRUPTED, f"interrupted by the user after {len(rows)} views")
+    # Before `Exception`, of which it is one: a full disk ends a run without being its failure.
     except RecordingStopped as error:
         stop = Stop(StopReason.RECORDING_STOPPED, str(error))
+    # The record of a failure ends properly, too; the error itself goes on to the caller.
     except Exception as error:
         if recorder is not None:
             record_end(recorder, state, Stop(StopReason.FAILED, f"{type(error).__name__}: {error}"))

@@ -1,7 +1,7 @@
 """Recorded frames rebuild the map and the grid of a run, and those of several runs together."""
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import jax
@@ -12,9 +12,9 @@ from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.config import FORMER_SETTINGS, PlannerConfig
-from r3jax.planning.motion import motion_of_record
 from r3jax.planning.planner import add_frame, first_grid
 from r3jax.planning.registry import config_class
+from r3jax.planning.robot.motion import motion_of_record
 from r3jax.scoring.config import ScoringConfig
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run, read_run
@@ -41,6 +41,7 @@ def config_of(run: Run) -> ExplorationConfig:
         RunError: a setting that this version does not know, or cannot work with.
     """
     try:
+        # A setting that is not known may have shaped the map: it is refused, not left out.
         return ExplorationConfig(**run.header.config)
     except (TypeError, ValueError) as error:
         raise RunError(run.path / "run.json", f"a setting of the loop: {error}") from None
@@ -75,6 +76,7 @@ def planner_config_of(run: Run) -> PlannerConfig:
         scoring = ScoringConfig(**settings.pop("scoring", {}))
         motion = motion_of_record(settings.pop("motion", None))
         kind = _config_class(run)
+        # Runs of all policies once recorded settings of one: dropped where they mean nothing.
         own = {field.name for field in fields(kind)}
         settings = {k: v for k, v in settings.items() if k in own or k not in FORMER_SETTINGS}
         return kind(scoring=scoring, motion=motion, **settings)
@@ -82,16 +84,20 @@ def planner_config_of(run: Run) -> PlannerConfig:
         raise RunError(run.path / "run.json", f"a setting of the policy: {error}") from None
 
 
-def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, OccupancyGrid]:
+def rebuild(
+    runs: Sequence[Run], views: int | None = None, on_frame: Callable[[], None] = lambda: None
+) -> tuple[MapState, OccupancyGrid]:
     """The map and the grid that have seen what the runs have seen, one run after the other.
 
     Args:
         runs: of one scene: the same box, cells, voxels and range.
         views: of each run at most so many; None: all.
+        on_frame: called after every frame that has entered the map.
 
     Raises:
         RunError: the runs do not fit together, or a frame is missing or broken.
     """
+    # Before the first frame: mapping takes minutes, and a misfit is told at once.
     for run in runs[1:]:
         check_alike(runs[0], run)
     config = config_of(runs[0])
@@ -99,6 +105,7 @@ def rebuild(runs: Sequence[Run], views: int | None = None) -> tuple[MapState, Oc
     for run in runs:
         for frame in _frames(run, views):
             map_state, grid = add_frame(map_state, grid, frame, config)
+            on_frame()
     return map_state, grid
 
 
@@ -113,6 +120,7 @@ def team_of(run: Run) -> list[Run]:
         raise RunError(run.path, "it flew in no team")
     team = [read_run(run.path.parent / name) for name in names]
     for member in team:
+        # Only the last meeting brings every frame into the stored maps: until then they differ.
         if member.end is None:
             raise RunError(
                 member.path,
@@ -132,6 +140,7 @@ def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
         check_alike(runs[0], run)
     config = config_of(runs[0])
     map_state, grid = _nothing_known(runs)
+    # The order in which the team shared them, ties by number: another one gives other bits.
     steps = [(row.seconds, n, row.step) for n, run in enumerate(runs) for row in run.rows]
     for _, number, step in sorted(steps):
         map_state, grid = add_frame(map_state, grid, runs[number].frame(step), config)
@@ -158,6 +167,7 @@ def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
         RunError: a run without a view, or settings that cannot work.
     """
     bounds = np.asarray(runs[0].header.bounds, dtype=np.float64)
+    # Every start before any frame: each camera stood in free space that no image shows.
     starts = [pose for run in runs for pose in starts_of(run)]
     try:
         return first_grid(bounds, starts, config_of(runs[0]))
@@ -182,10 +192,16 @@ def _nothing_known(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
     return empty_map(config.capacity, config.voxel_size, config.num_bins), grid_before(runs)
 
 
-def differences(run: Run) -> tuple[int, list[Difference]]:
+def differences(
+    run: Run, on_frame: Callable[[], None] = lambda: None
+) -> tuple[int, list[Difference]]:
     """Where the newest stored map and grid are not those that the frames rebuild.
 
     Those of a run that flew in a team are rebuilt from the frames of all its members.
+
+    Args:
+        run: with a stored map.
+        on_frame: called after every frame that has entered the map, where the run flew alone.
 
     Returns:
         The views that were compared, and every array that differs.
@@ -193,13 +209,14 @@ def differences(run: Run) -> tuple[int, list[Difference]]:
     Raises:
         RunError: no checkpoint, or one or a frame that cannot be read; a team that was cut off.
     """
+    # It may be older than the last row: checkpoints are left out while one is being written.
     step, stored_map, stored_grid = run.checkpoint()
     team = [run]
     if run.header.is_of_team:
         team = team_of(run)
         map_state, grid = rebuild_team(team)
     else:
-        map_state, grid = rebuild([run], step + 1)
+        map_state, grid = rebuild([run], step + 1, on_frame)
     found: list[Difference | None] = []
     for table, stored, rebuilt in (("map", stored_map, map_state), ("grid", stored_grid, grid)):
         for name, array in vars(stored).items():
@@ -213,9 +230,11 @@ def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | N
     a, b = np.asarray(stored), np.asarray(rebuilt)
     if a.shape != b.shape:
         return Difference(name, -1, float("inf"))
+    # No tolerance: frames enter the map as they are stored, so a rebuilt map is equal bit by bit.
     different = a != b
     if not different.any():
         return None
+    # As float64: unsigned integers would wrap round, and Booleans cannot be subtracted.
     gap = np.abs(a.astype(np.float64) - b.astype(np.float64))
     return Difference(name, int(different.sum()), float(gap.max()))
 
@@ -229,6 +248,7 @@ def starts_of(run: Run) -> list[np.ndarray]:
     """Where a run began; a merged one began several times."""
     if not run.rows:
         raise RunError(run.path, "the run has no view")
+    # The last part begins no other: its sum would be one past the last row.
     begins = itertools.accumulate(parts_of(run)[:-1], initial=0)
     return [np.asarray(run.rows[step].pose, dtype=np.float64) for step in begins]
 
@@ -244,6 +264,7 @@ def check_alike(first: Run, other: Run) -> None:
         ("the scene", a.scene.get("hash"), b.scene.get("hash")),
         ("the box", a.bounds, b.bounds),
     ]
+    # What decides how a pixel enters the map or the grid; speed, budget and clock do not.
     for name in ("voxel_size", "num_bins", "cell_size", "max_range", "drop_edges"):
         terms.append((name, a.config.get(name), b.config.get(name)))
     for name, mine, others in terms:

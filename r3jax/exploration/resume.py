@@ -37,12 +37,16 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
     Raises:
         ValueError: a table or an array is missing or of another kind.
     """
+    # Not `policy`: a policy that remembers nothing has no such table.
     missing = sorted({"map", "grid", "loop"} - set(tables))
     if missing:
         raise ValueError(f"the checkpoint lacks {', '.join(missing)}")
     arrays = dict(tables["map"])
+    # No array of the map, so `fill` would not notice: with other bins the visited bits of a row
+    # stand for other directions.
     if int(arrays.pop("num_bins", -1)) != like.map_state.num_bins:
         raise ValueError("the checkpoint's map has other direction bins than the run")
+    # Through `fill`, so that totals come back as plain numbers and are summed as before.
     rest = {name: getattr(like, name) for name in _LOOP}
     planner = replace(
         like.planner,
@@ -75,7 +79,9 @@ def continued(run: Run, mission: Mission, start: LoopState, *, decided_from: int
 
 def _newest(run: Run, start: LoopState) -> LoopState:
     """The newest usable checkpoint; the start if there is none."""
+    # Newest first: every view after a checkpoint costs one more mapping and decision.
     for step in reversed(run.checkpoint_steps()):
+        # The trace was cut before it: its map holds views that the run no longer has.
         if step >= len(run.rows):
             continue
         try:
@@ -89,6 +95,7 @@ def _newest(run: Run, start: LoopState) -> LoopState:
 
 def _agrees(state: LoopState, row: Any) -> bool:
     """Whether a checkpoint belongs to a row of the trace."""
+    # Exact: JSON and checkpoints hold every float as it is, so any difference is a mismatch.
     return (
         state.views == row.step + 1
         and np.array_equal(np.asarray(state.T_world_camera, np.float32), row.pose)

@@ -90,7 +90,7 @@ class LoopState:
 
 
 @dataclass(frozen=True)
-class View:
+class TakenView:
     """A view that was taken: what to record beside the state."""
 
     row: StepRow
@@ -117,6 +117,7 @@ class Mission:
     simulator: GuardedSimulator
     policy: Policy
     budget: Budget
+    # Never advanced: every step folds its number in, so a resume needs none of its history.
     key: jax.Array
     config: ExplorationConfig
     clock: Clock

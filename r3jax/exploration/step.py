@@ -13,14 +13,14 @@ import numpy as np
 
 from r3jax.exploration.clock import timed
 from r3jax.exploration.coverage import measure_coverage, view_renderability
-from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, View
+from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, TakenView
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import angle_between
 from r3jax.mapping.occupancy import MAX_CELLS
-from r3jax.planning.limits import begin_at
-from r3jax.planning.motion import motion_of
 from r3jax.planning.planner import decide, follow, observe, start
 from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.planning.robot.limits import begin_at
+from r3jax.planning.robot.motion import motion_of
 from r3jax.trace.images import frame_hash, stored_form
 from r3jax.trace.rows import StepRow, make_choice
 
@@ -51,12 +51,15 @@ def start_state(
     simulator, config = mission.simulator, mission.config
     pose = np.asarray(simulator.start_pose, dtype=np.float64)
     lower, upper = np.asarray(simulator.bounds, dtype=np.float64)
+    # The grid ends just beyond the box: outside it no cell is there to fly through.
     if not np.all((pose[:3, 3] >= lower) & (pose[:3, 3] <= upper)):
         raise ValueError(
             f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
             f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
         )
+    # Before the grid is made: its own refusal names no scale that would mend the mesh.
     check_world(simulator.bounds, config.cell_size)
+    # The start must be a view that the robot could take itself.
     pose = begin_at(motion_of(mission.policy), pose)
     planner = start(
         simulator.camera,
@@ -88,10 +91,12 @@ def check_world(bounds: np.ndarray, cell_size: float) -> None:
         if _LEAST_HOUSE <= scale * extent.max() <= _LARGEST_HOUSE
     ]
     hint = hints[0] if hints else ""
+    # Each check is written so that NaN fails it, too.
     if not extent.max() >= _LEAST_EXTENT:
         raise ValueError(f"{size}: too small for a camera with {_LEAST_EXTENT / 2:g} m free{hint}")
     if not extent.min() >= _LEAST_HEIGHT:
         raise ValueError(f"{size}: it is flat, there is no space to explore")
+    # The grid has a cell more on every side, as walls lie on the faces of the box.
     cells = float(np.prod(extent / cell_size + 2.0))
     if not cells <= MAX_CELLS:
         raise ValueError(
@@ -102,7 +107,7 @@ def check_world(bounds: np.ndarray, cell_size: float) -> None:
 
 def step(
     state: LoopState, mission: Mission, *, exchange: float = 0.0
-) -> tuple[LoopState, View | Stop]:
+) -> tuple[LoopState, TakenView | Stop]:
     """One view: decide where to go (the first view is taken at the start), fly, look, map.
 
     Args:
@@ -117,14 +122,18 @@ def step(
     """
     charged = {"exchange": exchange} if exchange else {}
     if state.views == 0:
+        # Free of charge: the camera stands there already, and nobody chose the view.
         before = {"planning": 0.0} | charged
         return _look(state, mission, state.T_world_camera, None, {}, before)
+    # Before deciding: a spent budget must not pay for a decision that cannot be carried out.
     stop = _spent(state, mission, seconds=exchange, metres=0.0)
+    # After the budget: a forecast takes most of a second, and a spent run needs none.
     if stop is None:
         stop = _good_enough(state, mission)
     if stop is not None:
         return state, stop
     mission.on_stage("plan")
+    # By the number of the view, so that a resumed run draws what it would have drawn.
     key = jax.random.fold_in(mission.key, state.views)
     (decision, planner, info), measured = timed(
         decide, state.planner, state.T_world_camera, key, repeat_compiled=mission.clock.measures
@@ -136,6 +145,7 @@ def step(
     planning = mission.clock.charge("planning", measured)
     flight = _flight(decision, mission)
     seconds = exchange + planning + flight
+    # And after it: the view has to arrive within the budget, its path included.
     stop = _spent(state, mission, seconds=seconds, metres=decision.length)
     if stop is not None:
         return state, stop
@@ -167,6 +177,7 @@ def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float)
         views=state.views + 1, seconds=state.seconds + seconds, metres=state.metres + metres
     ):
         return Stop(StopReason.BUDGET, f"{spent}: the next view would exceed {mission.budget}")
+    # A policy that only turns spends no meters: such a budget alone would never end the run.
     if state.still_views >= mission.config.max_still_views:
         return Stop(
             StopReason.STUCK, f"{spent}: the last {state.still_views} views were taken on one spot"
@@ -190,7 +201,7 @@ def _look(
     choice: tuple[Decision, PlanInfo] | None,
     stages: dict[str, float],
     before: dict[str, float],
-) -> tuple[LoopState, View]:
+) -> tuple[LoopState, TakenView]:
     """Takes the view at a pose, integrates it and measures what is known now.
 
     `before` holds what is charged for the time until the camera begins to fly [s].
@@ -198,9 +209,13 @@ def _look(
     mission.on_stage("render")
     begin = time.perf_counter()
     pose = np.asarray(T_world_camera, dtype=np.float64)
+    # Announced first, so that a picture that nobody chose is noticed.
     mission.simulator.commit(state.views, pose)
+    # Rounded as it will be on disk before the map sees it: a replay integrates the same bits.
     frame = stored_form(mission.simulator.render(pose))
+    # Read here: what follows is bookkeeping, which the simulator must not be blamed for.
     rendered = time.perf_counter()
+    # Of the map before the frame: what had been promised of this view.
     arrival = view_renderability(state.map_state, frame.camera, frame.T_world_camera)
     stages = stages | {"render": rendered - begin}
 
@@ -223,6 +238,7 @@ def _look(
     )
     row = StepRow(
         step=state.views - 1,
+        # The frame's float32, not what was asked for: a replay has no other pose.
         pose=np.asarray(frame.T_world_camera),
         sha256=frame_hash(frame),
         choice=None if choice is None else make_choice(*choice),
@@ -233,7 +249,7 @@ def _look(
         coverage=coverage,
     )
     stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
-    return state, View(row, frame, stages)
+    return state, TakenView(row, frame, stages)
 
 
 def relive(
@@ -252,6 +268,8 @@ def relive(
     """
     if row.choice is not None:
         if decides:
+            # Only its memory is used: the row knows the pose and what was charged, and a decision
+            # timed again would put other seconds on the mission clock.
             key = jax.random.fold_in(mission.key, state.views)
             _, planner, _ = decide(state.planner, state.T_world_camera, key)
         else:
@@ -271,8 +289,10 @@ def _arrive(state: LoopState, frame: Frame, length: float, charged: dict[str, fl
         state,
         views=state.views + 1,
         T_world_camera=pose,
+        # One sum per view, as when it was flown: `_agrees` compares the clock bit by bit.
         seconds=state.seconds + sum(charged.values()),
         metres=state.metres + length,
         radians=state.radians + angle_between(state.T_world_camera, pose),
+        # Below a centimeter a path is rounding: turning on the spot does not count as moving.
         still_views=state.still_views + 1 if length < 0.01 else 0,
     )

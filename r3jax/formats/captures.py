@@ -1,188 +1,89 @@
-"""Posed images: what a transforms.json or a COLMAP model says of a capture.
+"""What can be trained on, judged or audited: runs, recordings, posed images, opened in one way."""
 
-Poses and points stay in the capture's own coordinates: nothing is turned, centered or scaled. A
-COLMAP model without known positions is not in meters, and its world may be upside down.
-
-Shape symbols: n images; m points; t observations.
-"""
-
-import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-import jax.numpy as jnp
-import numpy as np
-
-from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.lenses import Lens
-from r3jax.formats.validation.images import image_pixels, image_size
+from r3jax.formats.colmap.reader import find_model, read_colmap
+from r3jax.formats.errors import FormatError, check_capture
+from r3jax.formats.nerfstudio import read_transforms
+from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.recordings import Recording, is_recording, read_recording
+from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
+from r3jax.formats.sequences.seven_scenes import is_seven_scenes, read_seven_scenes
+from r3jax.formats.sequences.tum import is_tum, read_tum
 from r3jax.frame import Frame
+from r3jax.trace.reader import Run, read_run
 
-IMAGE_FORMATS = ("PNG", "JPEG")
-"""What Pillow may try."""
+_FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ...] = (
+    (is_replica_slam, read_replica_slam),
+    (is_tum, read_tum),
+    (is_seven_scenes, read_seven_scenes),
+    (lambda path: (path / "transforms.json").exists(), read_transforms),
+    (lambda path: find_model(path) is not None, read_colmap),
+)
+"""Folders of posed images: what each looks like, and its reader."""
 
-_DEPTH_MODES = ("I;16", "I;16B", "I")
-
-
-@dataclass(frozen=True)
-class SparsePoints:
-    """Points that a structure from motion found, and which image sees which."""
-
-    xyz: np.ndarray
-    """Positions in the capture's coordinates, [m, 3] float64."""
-
-    rgb: np.ndarray
-    """Colors, [m, 3] uint8."""
-
-    seen_point: np.ndarray
-    """Of every observation the index of its point, [t] int64, ascending."""
-
-    seen_image: np.ndarray
-    """Of every observation the index of its image, [t] int64."""
-
-    def __len__(self) -> int:
-        """Number of points."""
-        return len(self.xyz)
-
-    def seen_by(self, image: int) -> np.ndarray:
-        """Indices of the points that an image sees, ascending."""
-        return np.unique(self.seen_point[self.seen_image == image])
+_KNOWN = (
+    "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json, a COLMAP "
+    "model (cameras.bin or cameras.txt, here or in sparse/0), a scene of Replica-SLAM (traj.txt, "
+    "results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes (frame-*.color.png or .jpg)"
+)
 
 
 @dataclass(frozen=True)
-class DepthUnit:
-    """What the whole numbers in a depth image mean; 0 is no measurement."""
-
-    metres_per_step: float = 0.001
-    """Units of the capture per step."""
-
-    beyond_range: int | None = None
-    """Stored where nothing lies within the sensor's range; None: there is no such number."""
-
-    invalid: int | None = None
-    """Stored, beside 0, where there is no measurement; None: there is no such number."""
-
-
-@dataclass(frozen=True)
-class PosedImages:
-    """Images with their cameras and poses. Whether the files exist shows when they are read."""
+class Capture:
+    """Posed pictures on disk; with depth, unless they are posed images without."""
 
     path: Path
-    """The file or folder that says all this."""
+    source: Run | Recording | PosedImages
 
-    image_paths: tuple[Path, ...]
-    """One per image; not all of them need to exist."""
+    @property
+    def run(self) -> Run | None:
+        """The run, if it is one."""
+        return self.source if isinstance(self.source, Run) else None
 
-    lenses: tuple[Lens, ...]
-    """One per image."""
-
-    poses: np.ndarray
-    """`T_world_camera`, [n, 4, 4] float64: OpenCV axes, the capture's own coordinates."""
-
-    depth_paths: tuple[Path | None, ...]
-    """One per image; None where there is no depth image."""
-
-    depth_unit: DepthUnit = DepthUnit()
-    """Of all depth images."""
-
-    points: SparsePoints | None = None
-    """None where the capture comes without."""
-
-    points_path: Path | None = None
-    """A PLY with further points, of which nothing says who sees them: see `read_points`."""
-
-    T_capture_original: np.ndarray | None = None
-    """Where the program that wrote the capture moved it: takes points [4, 4] from the coordinates
-    it was given to those of the poses; None: it does not say."""
-
-    remark: str | None = None
-    """What else is there but not among the images, a sentence; None: nothing is left out."""
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        path = self.path.resolve()
+        return path.parent.name if path.is_file() else path.name
 
     def __len__(self) -> int:
-        """Number of images."""
-        return len(self.image_paths)
-
-    def with_depth(self, folder: Path, unit: DepthUnit) -> "PosedImages":
-        """The same images with the depth images of a folder: 16-bit PNGs of the same names.
-
-        For formats that have no place for depth. Images without a PNG there have no depth.
-        """
-        candidates = [folder / f"{path.stem}.png" for path in self.image_paths]
-        found = tuple(path if path.is_file() else None for path in candidates)
-        return dataclasses.replace(self, depth_paths=found, depth_unit=unit)
-
-    def frame(self, index: int) -> Frame:
-        """One image with its depth. A depth image of another size is sampled at its nearest pixels.
-
-        Raises:
-            FormatError: the image has distortion (undistort it first), there is no depth image,
-                or a file is missing, broken, of another size, or of another unit of depth.
-        """
-        lens, path = self.lenses[index], self.image_paths[index]
-        if not lens.is_pinhole:
-            raise FormatError(
-                path,
-                f"the image is distorted ({lens.model}): undistort the capture first, for example "
-                "by COLMAP's image_undistorter",
-            )
-        depth_path = self.depth_paths[index]
-        if depth_path is None:
-            raise FormatError(path, "there is no depth image that belongs to it")
-        rgb, depth = self.rgb(index), self.depth(index)
-        try:
-            return Frame(
-                rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
-                depth=jnp.asarray(depth),
-                T_world_camera=jnp.asarray(self.poses[index], dtype=jnp.float32),
-                camera=lens.camera,
-            )
-        except ValueError as error:
-            raise FormatError(depth_path, str(error)) from None
-
-    def rgb(self, index: int) -> np.ndarray:
-        """The pixels of one image as they are, distortion included, [H, W, 3] uint8.
-
-        Raises:
-            FormatError: the file is missing, broken or of another size.
-        """
-        path, lens = self.image_paths[index], self.lenses[index]
-        with naming(path):
-            image_size(path, IMAGE_FORMATS)  # refuses what would not fit into memory
-            return image_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
-
-    def depth(self, index: int) -> np.ndarray | None:
-        """The depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
-
-        0 is no measurement, inf nothing within range.
-
-        Raises:
-            FormatError: the file is missing, broken, or no 16-bit image.
-        """
-        path, lens = self.depth_paths[index], self.lenses[index]
-        if path is None:
-            return None
-        return _read_depth(path, (lens.width, lens.height), self.depth_unit)
+        return len(self.source.rows if isinstance(self.source, Run) else self.source)
 
     def frames(self) -> Iterator[Frame]:
         """Every frame in order, read one by one."""
-        return (self.frame(index) for index in range(len(self)))
+        return self.source.frames()
+
+    @property
+    def models(self) -> Path:
+        """Folder of the models; somebody else's capture stays untouched."""
+        if self.run is not None:
+            return self.path / "models"
+        return Path("runs") / self.name / "models"
 
 
-def _read_depth(path: Path, size: tuple[int, int], unit: DepthUnit) -> np.ndarray:
-    """z-depth [H, W] float32; 0 no measurement, inf beyond the range."""
-    with naming(path):
-        stored = image_size(path, IMAGE_FORMATS)
-        wanted = "depth must be a 16-bit PNG"
-        steps = image_pixels(path, IMAGE_FORMATS, stored, _DEPTH_MODES, wanted)
-    rows, columns = (
-        ((np.arange(now) + 0.5) * there / now).astype(np.int64)
-        for now, there in zip(size[::-1], stored[::-1], strict=True)
-    )
-    steps = steps[rows[:, None], columns[None, :]]
-    depth = (steps.astype(np.float64) * unit.metres_per_step).astype(np.float32)
-    if unit.invalid is not None:
-        depth = np.where(steps == unit.invalid, np.float32(0.0), depth)
-    if unit.beyond_range is None:
-        return depth
-    return np.where(steps == unit.beyond_range, np.float32(np.inf), depth)
+def open_capture(path: Path, up: Literal["y", "z"] = "y") -> Capture:
+    """Opens a run, a recording, or posed images of any format.
+
+    Args:
+        path: the folder; of nerfstudio also the file.
+        up: axis of a recording's world that points up; the others stay as they are.
+
+    Raises:
+        FormatError: it is none of them, or one that is broken.
+        RunError: it is a run, but broken.
+    """
+    if path.is_file() and path.suffix == ".json":
+        return Capture(path, read_transforms(path))
+    if (path / "run.json").exists():
+        return Capture(path, read_run(path))
+    if is_recording(path):
+        return Capture(path, read_recording(path, up))
+    for fits, read in _FORMATS:
+        if fits(path):
+            return Capture(path, read(path))
+    check_capture(path)
+    raise FormatError(path, f"this is neither {_KNOWN}")

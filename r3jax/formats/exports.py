@@ -12,6 +12,7 @@ import json
 import os
 import secrets
 import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -19,11 +20,18 @@ import numpy as np
 
 from r3jax.files import write_atomic
 from r3jax.formats.colmap.binary import write_binary
-from r3jax.formats.colmap.export import model_of
+from r3jax.formats.colmap.model import (
+    ColmapImage,
+    ColmapModel,
+    ColmapPoints,
+    colmap_pose,
+    points_without_tracks,
+)
 from r3jax.formats.colmap.text import write_text
 from r3jax.formats.errors import FormatError
-from r3jax.formats.pointcloud import voxel_points, write_points
-from r3jax.formats.transforms import transforms_of
+from r3jax.formats.lenses import Lens, pinhole_lens
+from r3jax.formats.nerfstudio import transforms_of
+from r3jax.formats.points import voxel_points, write_points
 from r3jax.trace.reader import Run
 
 Format = Literal["nerfstudio", "colmap", "colmap-text"]
@@ -31,13 +39,16 @@ Format = Literal["nerfstudio", "colmap", "colmap-text"]
 _POINTS = "points.ply"
 
 
-def export_run(run: Run, out: Path, kind: Format) -> int:
+def export_run(
+    run: Run, out: Path, kind: Format, on_view: Callable[[], None] = lambda: None
+) -> int:
     """Writes the folder; it is complete or not there.
 
     Args:
         run: a run with at least one view.
         out: a folder that does not exist yet, or is empty.
         kind: what to write.
+        on_view: called after every view that is copied.
 
     Returns:
         The number of points: centers of the map's voxels; 0 where the run has no stored map.
@@ -60,7 +71,7 @@ def export_run(run: Run, out: Path, kind: Format) -> int:
         out.parent.mkdir(parents=True, exist_ok=True)
     partial.mkdir()
     try:
-        _fill(partial, run, kind, xyz, rgb)
+        _fill(partial, run, kind, (xyz, rgb), on_view)
         os.replace(partial, out)  # takes the place of an empty folder
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -73,7 +84,14 @@ def _map_points(run: Run) -> tuple[np.ndarray, np.ndarray]:
     return voxel_points(run.checkpoint()[1])
 
 
-def _fill(out: Path, run: Run, kind: Format, xyz: np.ndarray, rgb: np.ndarray) -> None:
+def _fill(
+    out: Path,
+    run: Run,
+    kind: Format,
+    points: tuple[np.ndarray, np.ndarray],
+    on_view: Callable[[], None],
+) -> None:
+    xyz, rgb = points
     for name in ("images", "depth"):
         (out / name).mkdir()
     for row in run.rows:
@@ -81,6 +99,7 @@ def _fill(out: Path, run: Run, kind: Format, xyz: np.ndarray, rgb: np.ndarray) -
         image = run.image_path(row.step)
         shutil.copyfile(image, out / "images" / image.name)
         shutil.copyfile(run.depth_path(row.step), out / "depth" / image.name)
+        on_view()
     if len(xyz):
         write_points(out / _POINTS, xyz, rgb)
     if kind == "nerfstudio":
@@ -98,3 +117,37 @@ def _write_transforms(out: Path, run: Run, points: str | None) -> None:
         name = run.image_path(row.step).name
         frame |= {"file_path": f"images/{name}", "depth_file_path": f"depth/{name}"}
     write_atomic(out / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
+
+
+def posed_model(
+    lens: Lens, names: Sequence[str], poses: np.ndarray, points: ColmapPoints
+) -> ColmapModel:
+    """A model of images from one camera, without keypoints; everything is numbered from 1.
+
+    Args:
+        lens: the camera of all images.
+        names: n paths of the images, relative to the folder of the images.
+        poses: `T_world_camera`, [n, 4, 4].
+        points: the points.
+    """
+    images: list[ColmapImage] = []
+    for number, (name, pose) in enumerate(zip(names, poses, strict=True), start=1):
+        quaternion, translation = colmap_pose(pose)
+        none = np.zeros((0, 2))
+        images.append(
+            ColmapImage(number, name, 1, quaternion, translation, none, np.zeros(0, np.int64))
+        )
+    return ColmapModel({1: lens}, tuple(images), points)
+
+
+def model_of(run: Run, xyz: np.ndarray, rgb: np.ndarray) -> ColmapModel:
+    """The model of a run: its views, its one camera, and points that no view is known to see.
+
+    Args:
+        run: a run.
+        xyz: points in the world, such as the map's voxels, [m, 3] [m].
+        rgb: their colors, [m, 3] uint8.
+    """
+    names = [run.image_path(row.step).name for row in run.rows]
+    poses = np.stack([row.pose for row in run.rows]).astype(np.float64)
+    return posed_model(pinhole_lens(run.camera), names, poses, points_without_tracks(xyz, rgb))

@@ -76,7 +76,7 @@ class Lens:
     """Rows [px]."""
 
     params: tuple[float, ...]
-    """In the order of `MODELS`."""
+    """Parameters in the order of `MODELS`."""
 
     def __post_init__(self) -> None:
         """Refuses what is no camera."""

@@ -1,29 +1,50 @@
-"""Reads nerfstudio's transforms.json, also as instant-ngp, Blender and phone apps write it.
+"""Reads nerfstudio's transforms.json, as many programs write it, and writes that of a run.
 
-Poses are in OpenGL axes and in the coordinates of the file, as are the points of `ply_file_path`:
-those are the capture's own, and suggested cameras have to come back in them. `applied_transform`
-says how they were made of the coordinates of an earlier program; it is kept and not undone.
-(https://docs.nerf.studio/quickstart/data_conventions.html)
+instant-ngp, Blender and phone apps write it too, each with some fields of its own.
+
+OpenGL camera axes (x right, y up, z backward), camera to world, pixel centers at +0.5
+(https://docs.nerf.studio/quickstart/data_conventions.html).
+
+Read, poses stay in the coordinates of the file, as do the points of `ply_file_path`: those are the
+capture's own, and suggested cameras have to come back in them. `applied_transform` says how they
+were made of the coordinates of an earlier program; it is kept and not undone.
+
+Written, they are in meters, world z up. Depth images are uint16; one step is
+`depth_unit_scale_factor` meters; 0 is no measurement and `depth_beyond_range_value` means that
+nothing lies within the sensor's range.
 """
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from r3jax.formats.captures import IMAGE_FORMATS, DepthUnit, PosedImages
+from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import Lens
+from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.transforms import OPENGL_FROM_OPENCV
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.fields import check_fields, check_type
 from r3jax.formats.validation.files import read_bytes
 from r3jax.formats.validation.images import image_size
 from r3jax.formats.validation.json_text import parse_json
 from r3jax.formats.validation.names import below
+from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
+from r3jax.trace.reader import Run
+from r3jax.trace.rows import StepRow
+
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns the camera's axes: `T_world_opengl = T_world_opencv @ this`; its own inverse."""
+
+_DEPTH = {
+    "depth_unit_scale_factor": 1.0 / DEPTH_STEPS_PER_METRE,
+    "depth_beyond_range_value": BEYOND_RANGE,
+}
+"""What the depth images of a run mean."""
 
 _MAX_BYTES = 256 << 20
 """A frame takes a kilobyte."""
@@ -214,3 +235,76 @@ def _focal_lengths(fields: _Fields, width: int, height: int) -> tuple[float, flo
     if not found:
         raise ForeignFileError("there is no focal length (fl_x) and no camera_angle_x")
     return found[0], found[-1]
+
+
+def transforms_of(run: Run, points: str | None = None) -> dict[str, Any]:
+    """The content of transforms.json.
+
+    Args:
+        run: a run with at least one view.
+        points: path of a point cloud relative to the run folder, where there is one.
+    """
+    content = (
+        {"camera_model": "OPENCV"}
+        | _lens_fields(run)
+        | _DEPTH
+        | {"frames": [_frame_fields(run, row, run.path) for row in run.rows]}
+    )
+    return content if points is None else content | {"ply_file_path": points}
+
+
+def write_transforms(run: Run, points: str | None = None) -> Path:
+    """Writes transforms.json into the run folder.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    return _write(run.path, transforms_of(run, points))
+
+
+def write_team_transforms(folder: Path, runs: Sequence[Run], points: str | None = None) -> Path:
+    """Writes one transforms.json for runs in a folder; each frame has the lens that took it.
+
+    Args:
+        folder: that holds the run folders.
+        runs: in it; of one world, with cameras that may differ.
+        points: path of a point cloud relative to the folder, where there is one.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    frames = [
+        _frame_fields(run, row, folder) | _lens_fields(run) for run in runs for row in run.rows
+    ]
+    content = {"camera_model": "OPENCV"} | _DEPTH | {"frames": frames}
+    return _write(folder, content if points is None else content | {"ply_file_path": points})
+
+
+def _lens_fields(run: Run) -> dict[str, Any]:
+    camera = run.camera
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": float(camera.fx),
+        "fl_y": float(camera.fy),
+        "cx": float(camera.cx),
+        "cy": float(camera.cy),
+        "k1": 0.0,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+    }
+
+
+def _frame_fields(run: Run, row: StepRow, folder: Path) -> dict[str, Any]:
+    return {
+        "file_path": run.image_path(row.step).relative_to(folder).as_posix(),
+        "depth_file_path": run.depth_path(row.step).relative_to(folder).as_posix(),
+        "transform_matrix": (row.pose.astype(np.float64) @ OPENGL_FROM_OPENCV).tolist(),
+    }
+
+
+def _write(folder: Path, content: dict[str, Any]) -> Path:
+    path = folder / "transforms.json"
+    write_atomic(path, (json.dumps(content, indent=1) + "\n").encode())
+    return path

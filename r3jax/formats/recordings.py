@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.numbers import read_numbers
-from r3jax.formats.poses import mend_pose
+from r3jax.formats.poses import mend_pose, read_numbers
 from r3jax.formats.validation.images import image_pixels, image_size
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera

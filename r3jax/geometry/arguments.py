@@ -24,6 +24,7 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorates a call with checks of arguments, by their names. Defaults are not checked."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        # Worked out once, while decorating: a call then pays for no reflection.
         order = list(inspect.signature(function).parameters)
         usage = f"{getattr(function, '__name__', '')}({', '.join(order)})"
         places = [(order.index(name), name, check) for name, check in checks.items()]
@@ -36,10 +37,12 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 elif name in kwargs:
                     value = kwargs[name]
                 else:
+                    # Left to its default, or missing, which the call itself reports.
                     continue
                 try:
                     check(name, value)
                 except TypeError as error:
+                    # A wrong kind often means a wrong order, where the usage helps.
                     raise TypeError(f"{error}; the call is {usage}") from None
             return function(*args, **kwargs)
 
@@ -66,6 +69,7 @@ def one(kind: type, hint: str, leaf: str = "", ndim: int = 0) -> Check:
             raise TypeError(
                 f"{name} must be an r3jax.{kind.__name__} ({hint}), got {describe(value)}"
             )
+        # A vmapped constructor makes one object of stacked arrays: only the axes give it away.
         if leaf and (found := np.ndim(getattr(value, leaf))) != ndim:
             raise ValueError(
                 f"{name} must be one {kind.__name__}, but its {leaf} has {found} axes instead of "
@@ -100,6 +104,7 @@ def a_pose(name: str, value: Any) -> None:
         raise ValueError(
             f"{name} must be one pose, a 4x4 matrix, got shape {shape}{_stacked(shape, (4, 4))}"
         )
+    # Under jit the value is not known: there `sound` makes the score NaN instead.
     if not is_traced(value) and (problem := rigid_error(np.asarray(value))) is not None:
         raise ValueError(f"{name}: {problem}")
 
@@ -137,12 +142,14 @@ def describe(value: Any) -> str:
 
 
 def _shape(name: str, value: Any, wanted: str) -> tuple[int, ...]:
+    # Asked by attributes: tracers and the arrays of any library pass, lists do not.
     if not hasattr(value, "shape") or not hasattr(value, "dtype"):
         raise TypeError(f"{name} must be an array {wanted}, got {describe(value)}")
     return tuple(value.shape)
 
 
 def _stacked(shape: tuple[int, ...], wanted: tuple[int, ...]) -> str:
+    # Of all wrong shapes a batch has a cure that the error can name.
     if shape[1:] == wanted:
         return f": the call takes one at a time, use jax.vmap over the {shape[0]}"
     return ""

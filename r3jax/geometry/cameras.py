@@ -52,9 +52,11 @@ class Camera(eqx.Module):
         """Refuses intrinsics whose rays would be infinite or NaN."""
         if self.width < 1 or self.height < 1:
             raise ValueError(f"a camera's image needs pixels, got {self.width} x {self.height}")
+        # Under jit values are not known; `sound` marks what they spoil.
         if is_traced(self.fx, self.fy, self.cx, self.cy):
             return
         for name, value in (("fx", float(self.fx)), ("fy", float(self.fy))):
+            # Written as what must hold: NaN fails it, too.
             if not 0.0 < value < np.inf:
                 raise ValueError(f"{name} must be positive and finite [px], got {value}")
         for name, value in (("cx", float(self.cx)), ("cy", float(self.cy))):
@@ -68,16 +70,19 @@ class Camera(eqx.Module):
             raise ValueError(
                 f"horizontal_fov_deg must lie between 0 and 180, got {horizontal_fov_deg}"
             )
+        # The angle spans the image's edges; the outermost pixel centers lie half a pixel inside.
         focal = 0.5 * width / np.tan(0.5 * np.deg2rad(horizontal_fov_deg))
         return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
 
     @property
     def focal(self) -> Float[Array, ""]:
         """Geometric mean of the two focal lengths [px]."""
+        # The geometric mean keeps the solid angle of a pixel, 1 / (fx fy).
         return jnp.sqrt(self.fx * self.fy)
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same field of view sampled by another number of pixels."""
+        # Edges lie at 0 and at the size, so the principal point scales without half-pixel shifts.
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
@@ -96,6 +101,7 @@ def project(
         camera; their pixel coordinates are finite but mean nothing.
     """
     x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
+    # Divided by a safe number before the choice: the gradient of 1 / 0 would be NaN.
     z_safe = jnp.where(z > 0.0, z, 1.0)
     pixels = jnp.stack(
         [camera.fx * x / z_safe + camera.cx, camera.fy * y / z_safe + camera.cy], axis=-1
@@ -107,6 +113,7 @@ def pixel_rays(camera: Camera) -> Float[Array, "H W 3"]:
     """Rays through the pixel centers in the camera's frame, scaled to z = 1 (not to length 1)."""
     u = (jnp.arange(camera.width, dtype=jnp.float32) + 0.5 - camera.cx) / camera.fx
     v = (jnp.arange(camera.height, dtype=jnp.float32) + 0.5 - camera.cy) / camera.fy
+    # At z = 1 a ray times the z-depth is the point, without a square root.
     shape = (camera.height, camera.width)
     return jnp.stack(
         [
@@ -125,6 +132,7 @@ def unproject(camera: Camera, depth: Float[Array, "H W"]) -> Float[Array, "H W 3
 
 def transform(T: Float[Array, "4 4"], points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Applies a rigid transform to points."""
+    # Reshaped, not broadcast: the tests let JAX raise on implicit rank promotion.
     return jnp.einsum("ij,...j->...i", T[:3, :3], points) + T[:3, 3].reshape(
         (1,) * (points.ndim - 1) + (3,)
     )
@@ -132,6 +140,7 @@ def transform(T: Float[Array, "4 4"], points: Float[Array, "*n 3"]) -> Float[Arr
 
 def invert_pose(T: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
     """Inverse of a rigid transform, by transposing its rotation."""
+    # The transpose, not a solver: exact for rotations, and no pivots under vmap.
     R_inverse = T[:3, :3].T
     t_inverse = -R_inverse @ T[:3, 3]
     top = jnp.concatenate([R_inverse, t_inverse[:, None]], axis=1)
@@ -159,12 +168,17 @@ def pose_along(
     position, direction = _point("position", position), _point("direction", direction)
     if not is_traced(direction) and not np.any(np.asarray(direction)):
         raise ValueError("direction has no length: there is nothing to look at")
+    # Only jit lets a zero direction pass: its pose is finite but not rigid, which `sound` notices.
     forward = direction / jnp.maximum(safe_norm(direction), 1e-12)
+    # The product of forward and up, so that its z is 0 exactly: level at every pitch.
     right = jnp.stack([forward[1], -forward[0], jnp.zeros_like(forward[0])])
     length = safe_norm(right)
+    # Below this, float32 cannot tell which way is level.
     is_vertical = length < 1e-6
+    # Replaced before the division: the gradient of the branch not taken must be finite, too.
     length_safe = jnp.where(is_vertical, 1.0, length)
     right = jnp.where(is_vertical, jnp.array([1.0, 0.0, 0.0]), right / length_safe)
+    # In this order the axes are right-handed: x right, y down, z forward.
     down = jnp.cross(forward, right)
     R = jnp.stack([right, down, forward], axis=1)
     top = jnp.concatenate([R, position[:, None]], axis=1)
@@ -180,6 +194,7 @@ def look_at(
         ValueError: shapes other than [3], what is not finite, or one and the same point.
     """
     position, target = _point("position", position), _point("target", target)
+    # Refused here, where both points can be named: `pose_along` would see a zero direction only.
     if not is_traced(position, target) and np.array_equal(position, target):
         raise ValueError("position and target are the same point: there is nothing to look at")
     return pose_along(position, target - position)
@@ -197,6 +212,7 @@ def _point(name: str, value: ArrayLike) -> Float[Array, " 3"]:
 
 def angle_between(first: np.ndarray, second: np.ndarray) -> float:
     """Angle of the rotation between two poses, [4, 4] each [rad]. On the host."""
+    # Clipped below: rounding may put the cosine of no turn above 1.
     cosine = 0.5 * (np.trace(first[:3, :3].T @ second[:3, :3]) - 1.0)
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
@@ -212,8 +228,10 @@ def rigid_error(T: np.ndarray) -> str | None:
     """Says what is wrong with a 4x4 pose, or None if it is rigid and finite. On the host."""
     if T.shape != (4, 4):
         return f"a pose is a 4x4 matrix, got shape {T.shape}"
+    # First: every comparison below is False for NaN, and the pose would pass.
     if not np.all(np.isfinite(T)):
         return "the pose has entries that are not finite"
+    # In double precision the product's own rounding stays far below the tolerance.
     R = T[:3, :3].astype(np.float64)
     deviation = float(np.abs(R @ R.T - np.eye(3)).max())
     if deviation > RIGID_TOLERANCE:
@@ -221,6 +239,7 @@ def rigid_error(T: np.ndarray) -> str | None:
             f"the pose is not rigid: its rotation deviates from orthonormal by {deviation:.3g} "
             "(is a scale mixed in, or is it transposed?)"
         )
+    # Checked after orthonormality: only then is a negative determinant a mirror.
     if np.linalg.det(R) < 0:
         return "the pose mirrors (its rotation has determinant -1): check the axes convention"
     if np.abs(T[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > _LAST_ROW_TOLERANCE:
@@ -245,6 +264,7 @@ def sound(
     positive = jnp.stack([camera.fx, camera.fy, *lengths])
     is_sound = jnp.all((positive > 0.0) & jnp.isfinite(positive))
     is_sound &= jnp.isfinite(camera.cx) & jnp.isfinite(camera.cy) & is_rigid(T_world_camera)
+    # A factor, not a branch: times 1 a score keeps its bits and its gradient.
     return jnp.where(is_sound, 1.0, jnp.nan)
 
 
@@ -257,6 +277,7 @@ def is_rigid(T: Float[Array, "4 4"]) -> Bool[Array, ""]:
     return (
         jnp.all(jnp.isfinite(T))
         & jnp.all(jnp.abs(deviation) <= RIGID_TOLERANCE)
+        # The triple product is the determinant, without the pivots of a solver.
         & (jnp.dot(R[:, 0], jnp.cross(R[:, 1], R[:, 2])) > 0.0)
         & jnp.all(jnp.abs(last) <= _LAST_ROW_TOLERANCE)
     )

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+# Larger blocks cost more additions per element, smaller ones more levels of recursion.
 _BLOCK = 64
 
 SPARE = 64
@@ -28,6 +29,7 @@ def spare_places(size: int, num: int) -> Int[Array, " n"]:
 
 def running_count(flags: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Number of set flags up to and including each place. n < 2^24."""
+    # float32 has every integer up to 2^24; beyond, counts would be rounded.
     if flags.shape[0] >= 1 << 24:
         raise ValueError(f"running_count is exact below 2^24 flags, got {flags.shape[0]}")
     return _inclusive_sum(flags.astype(jnp.float32)).astype(jnp.int32)
@@ -42,6 +44,7 @@ def _inclusive_sum(x: Array) -> Array:
     triangle = jnp.asarray(np.triu(np.ones((_BLOCK, _BLOCK), dtype=np.float32)))
     # "highest": a GPU's reduced-precision products would count wrongly.
     within = jnp.matmul(blocks, triangle, precision="highest")
+    # Inclusive minus own is the exclusive sum, without a shift that would have to be padded.
     before = _inclusive_sum(within[:, -1]) - within[:, -1]
     return (within + before[:, None]).reshape(-1)[:n]
 
@@ -52,6 +55,7 @@ def positions_of_set(flags: Bool[Array, " n"], size: int) -> Int[Array, " M"]:
     Like `jnp.nonzero(flags, size=size, fill_value=n)`, but quick.
     """
     n = flags.shape[0]
+    # Set flags past `size` fall behind the end as well: into the spare places, or dropped.
     target = jnp.where(flags, running_count(flags) - 1, spare_places(size, n))
     empty = jnp.full(size + SPARE, n, dtype=jnp.int32)
     return empty.at[target].min(jnp.arange(n, dtype=jnp.int32), mode="drop")[:size]

@@ -8,6 +8,8 @@ def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Euclidean length along `axis`; the gradient at the zero vector is 0, not NaN."""
     squared = jnp.sum(x * x, axis=axis)
     is_zero = squared == 0.0
+    # Replaced before the root, not after: the gradient of sqrt at 0 is infinite, and times the
+    # zero of the branch not taken that is NaN.
     squared_safe = jnp.where(is_zero, 1.0, squared)
     return jnp.where(is_zero, 0.0, jnp.sqrt(squared_safe))
 
@@ -19,8 +21,10 @@ def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Floa
     `log(0)`). Here both gradients are 0 there: the value is the constant 0 (or 1) nearby in
     every direction that the callers can move.
     """
+    # Rounding may leave a base just below 0, whose logarithm is NaN.
     is_zero = base <= 0.0
     base_safe = jnp.where(is_zero, 1.0, base)
+    # With log 1 = 0 the branch not taken has finite gradients in both arguments.
     power = jnp.exp(exponent * jnp.log(base_safe))
     at_zero = jnp.where(exponent == 0.0, 1.0, 0.0)
     return jnp.where(is_zero, at_zero, power)
@@ -31,5 +35,6 @@ def safe_divide(
 ) -> Float[Array, "..."]:
     """`numerator / denominator`, and 0 where the denominator is 0."""
     is_zero = denominator == 0.0
+    # An infinite quotient in the branch not taken would make the gradient NaN.
     denominator_safe = jnp.where(is_zero, 1.0, denominator)
     return jnp.where(is_zero, 0.0, numerator / denominator_safe)

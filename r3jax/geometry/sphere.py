@@ -16,11 +16,14 @@ GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 
 @functools.cache
 def _lattice(num: int) -> np.ndarray:
+    # In double precision: the azimuth grows with k, and float32 would lose digits of its turn.
     k = np.arange(num, dtype=np.float64)
+    # The half step keeps the first and the last point off the poles, where azimuth means nothing.
     z = 1.0 - 2.0 * (k + 0.5) / num
     azimuth = 2.0 * np.pi * k / GOLDEN_RATIO
     radius = np.sqrt(1.0 - z * z)
     points = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+    # Cached and shared by all callers: nobody may write into it.
     points.flags.writeable = False
     return points
 
@@ -55,13 +58,16 @@ def octahedral_cell(directions: Float[Array, "3 n"], size: int) -> Int[Array, " 
     the lower half its four corners (Cigolle et al. 2014). Directions need not have length 1.
     """
     x, y, z = directions
+    # The floor gives the zero vector a cell instead of NaN.
     inverse = 1.0 / jnp.maximum(jnp.abs(x) + jnp.abs(y) + jnp.abs(z), 1e-20)
     u, v = x * inverse, y * inverse
+    # Not `jnp.sign`: its 0 at 0 would put the lower pole on the upper one.
     sign: Callable[[Array], Array] = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
     u_folded = jnp.where(z < 0.0, (1.0 - jnp.abs(v)) * sign(u), u)
     v_folded = jnp.where(z < 0.0, (1.0 - jnp.abs(u)) * sign(v), v)
 
     def place(value: Array) -> Array:
+        # A coordinate of exactly 1 would fall one cell past the last.
         return jnp.clip(((value * 0.5 + 0.5) * size).astype(jnp.int32), 0, size - 1)
 
     return place(v_folded) * size + place(u_folded)
@@ -69,6 +75,7 @@ def octahedral_cell(directions: Float[Array, "3 n"], size: int) -> Int[Array, " 
 
 def octahedral_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Unit directions, [..., 3], of points (u, v) in [-1, 1]^2 of the octahedral map."""
+    # Negative z is the lower half: its triangles are folded out over the edges.
     z = 1.0 - np.abs(u) - np.abs(v)
     fold = np.maximum(-z, 0.0)
     x = u - np.where(u >= 0.0, fold, -fold)
@@ -77,6 +84,7 @@ def octahedral_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
 
 
+# A finer map leaves fewer candidates to compare, in a table that is larger and slower to build.
 _MAP_SIZE = 128
 
 
@@ -95,13 +103,16 @@ def _nearest_candidates(num: int) -> np.ndarray:
         corner[i:, j:][:_MAP_SIZE, :_MAP_SIZE].reshape(-1, 3) for i in (0, 1) for j in (0, 1)
     ]
     cosines = np.stack([np.sum(center * c, axis=1) for c in corners])
+    # The margin covers float32 directions that land in the cell beside their own, and rounding.
     radius = np.arccos(np.clip(cosines.min(axis=0), -1.0, 1.0)) + 1e-4
     angle = np.arccos(np.clip(center @ fibonacci_lattice(num).T, -1.0, 1.0))
     is_candidate = angle <= (angle.min(axis=1) + 2.0 * radius)[:, None]
+    # Padding repeats the nearest, so that every row of the table may be tried.
     order = np.argsort(np.where(is_candidate, angle, np.inf), axis=1)
     width = int(is_candidate.sum(axis=1).max())
     best = order[:, :1]
     table = np.where(np.take_along_axis(is_candidate, order, axis=1), order, best)[:, :width]
+    # Candidates first: `nearest_bin` reads one row of the table at a time.
     return np.ascontiguousarray(table.T.astype(np.int32))
 
 
@@ -111,11 +122,14 @@ def nearest_bin(directions: Float[Array, "3 n"], num: int) -> Int[Array, " n"]:
     A table over the octahedral map leaves a few candidates per direction, so that the cost does
     not grow with `num`.
     """
+    # A few candidates per cell are compared exactly, so that no bin is off by rounding of the map.
     table = jnp.asarray(_nearest_candidates(num))
     lattice = jnp.asarray(fibonacci_lattice(num).T, dtype=jnp.float32)
     cell = octahedral_cell(directions, _MAP_SIZE)
+    # Below every cosine, rounded or not: the first candidate always wins.
     best = jnp.full(cell.shape, -2.0, dtype=jnp.float32)
     chosen = jnp.zeros(cell.shape, dtype=jnp.int32)
+    # Unrolled: XLA fuses the few steps, and no array of all candidates is written.
     for k in range(table.shape[0]):
         candidate = table[k, cell]
         cosine = sum(lattice[axis, candidate] * directions[axis] for axis in range(3))

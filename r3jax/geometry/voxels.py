@@ -20,8 +20,10 @@ def voxel_index(
     coordinates: Float[Array, "..."], voxel_size: Float[Array, ""]
 ) -> Int[Array, "..."]:
     """Index of the voxel along each coordinate: floor(p / size), voxel 0 spanning [0, size)."""
+    # Truncation would make the voxel at 0 twice as wide, reaching to both sides.
     index = jnp.floor(coordinates / voxel_size)
     limit = float(INDEX_LIMIT)
+    # Clipped before the cast: an index of more than 21 bits would spill into its neighbor's bits.
     return jnp.clip(index, -limit, limit - 1.0).astype(jnp.int32)
 
 
@@ -34,9 +36,11 @@ def pack(
     x: Int[Array, "*n"], y: Int[Array, "*n"], z: Int[Array, "*n"]
 ) -> tuple[UInt32[Array, "*n"], UInt32[Array, "*n"]]:
     """Packs a voxel index into two words (low, high): 21 bits each of x, y and z."""
+    # Shifted to be non-negative: no sign bits to spread over the other fields.
     ux = (x + INDEX_LIMIT).astype(jnp.uint32)
     uy = (y + INDEX_LIMIT).astype(jnp.uint32)
     uz = (z + INDEX_LIMIT).astype(jnp.uint32)
+    # y straddles the words, 11 bits in the low one and 10 in the high one; the top bit stays 0.
     low = ux | (uy << 21)
     high = (uy >> 11) | (uz << 10)
     return low, high

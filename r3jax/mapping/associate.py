@@ -64,6 +64,7 @@ def group_by_voxel(
     # Always zero, but only known once the leaders are: XLA would otherwise lay out the colors
     # first, and scratch memory above 32 MB costs more in page faults than all the arithmetic.
     zero = jnp.minimum(leader[0], 0).astype(rgb.dtype)
+    # A fourth channel of ones counts the points in the same pass.
     rows = jnp.concatenate([rgb, jnp.ones((num, 1), dtype=rgb.dtype)], axis=1) + zero
     # One scatter of rows of four is as quick as a scatter of scalars.
     sums = jnp.broadcast_to(zero, (num, 4)).at[leader].add(rows, mode="drop")
@@ -73,6 +74,7 @@ def group_by_voxel(
 
 def group_means(groups: Groups, values: Float[Array, "P k"]) -> Float[Array, "P k"]:
     """Mean of something over the points of each voxel: at the leaders, elsewhere 0."""
+    # The points take the places of their leaders; those that take no part have leader P, dropped.
     sums = jnp.zeros_like(values).at[groups.leader].add(values, mode="drop")
     return sums / jnp.maximum(groups.rgb_sum[:, 3:], 1.0)
 
@@ -91,6 +93,7 @@ def points_of_pixels(frame: Frame, depth: Float[Array, "H W"]) -> Float[Array, "
 
 
 def _torus_slot(x: Int[Array, " P"], y: Int[Array, " P"], z: Int[Array, " P"]) -> Int[Array, " P"]:
+    # Low bits, not a hash: neighbors never collide, so one round settles a frame of room size.
     bx, by, bz = _SCRATCH_BITS
     low_bits: Callable[[Array, int], Array] = lambda value, bits: value & ((1 << bits) - 1)
     return low_bits(x, bx) | (low_bits(y, by) << bx) | (low_bits(z, bz) << (bx + by))
@@ -111,8 +114,11 @@ def _leaders(
         slot: Int[Array, " P"], leader: Int[Array, " P"], waiting: Bool[Array, " P"]
     ) -> tuple[Int[Array, " P"], Bool[Array, " P"]]:
         scratch = jnp.full(num_slots, -1, dtype=jnp.int32)
+        # `max` commutes: who leads does not depend on the order of the scatter.
         scratch = scratch.at[jnp.where(waiting, slot, num_slots)].max(point, mode="drop")
+        # Slots for which nobody waits hold -1, which would read from the end.
         elected = jnp.maximum(scratch[slot], 0)
+        # Voxels may share a slot: only points with the winner's very key follow it.
         agrees = waiting & (low[elected] == low) & (high[elected] == high)
         return jnp.where(agrees, elected, leader), waiting & ~agrees
 
@@ -164,6 +170,7 @@ def _breaks(
     depth: Float[Array, "H W"], around: list[Float[Array, "H W"]], limit: Float[Array, "..."]
 ) -> Bool[Array, "H W"]:
     """Where the surface breaks by more than a limit [m], along its row or its column."""
+    # The floor keeps holes finite: infinity minus infinity would be NaN.
     inverse: Callable[[Array], Array] = lambda value: 1.0 / jnp.maximum(value, 1e-4)
     is_break = jnp.zeros(depth.shape, dtype=bool)
     for before, after in ((around[3], around[5]), (around[1], around[7])):
@@ -190,6 +197,7 @@ def _median9(values: list[Float[Array, "H W"]]) -> Float[Array, "H W"]:
     Of sorted triples: the median of the largest minimum, the median of the medians and the
     smallest maximum.
     """
+    # Minima and maxima of whole images vectorize; sorting nine values per pixel does not.
     triples = [_sort3(*values[i : i + 3]) for i in (0, 3, 6)]
     smallest = jnp.maximum(jnp.maximum(triples[0][0], triples[1][0]), triples[2][0])
     middle = _sort3(triples[0][1], triples[1][1], triples[2][1])[1]

@@ -54,6 +54,7 @@ class MappingConfig:
                 )
         if self.num_bins < 1:
             raise ValueError(f"num_bins must be at least 1, got {self.num_bins}")
+        # Hashes are masked with capacity - 1, and probes visit all slots of such sizes only.
         if self.capacity < 2 or self.capacity & (self.capacity - 1):
             raise ValueError(f"capacity must be a power of two >= 2, got {self.capacity}")
         if self.capacity > MAX_CAPACITY:

@@ -63,7 +63,9 @@ def combine_moments(a: Moments, b: Moments) -> Moments:
     """
     (n_a, mean_a, m2_a), (n_b, mean_b, m2_b) = a, b
     n = n_a + n_b
+    # Padding has n = 0 on both sides, and must not become NaN.
     weight = n_b / jnp.maximum(n, 1.0)
+    # About the means: sums of squares minus squared sums would cancel in float32.
     d = mean_b - mean_a
     return n, mean_a + d * weight[None, :], m2_a + m2_b + jnp.sum(d * d, axis=0) * n_a * weight
 
@@ -74,13 +76,16 @@ def join(state: MapState, new: Statistics) -> MapState:
     Bins unite, the best resolution wins, and moments are combined.
     """
     key, row = find_or_insert(state.key, new.key, new.valid)
+    # Padding and lost voxels have row N: they read zeros here and are dropped by `put`.
     at: Callable[[Array], Array] = lambda x: x.at[..., row].get(mode="fill", fill_value=0)
 
     def put(x: Array, value: Array) -> Array:
         return x.at[..., row].set(value, mode="drop")  # rows are distinct
 
+    # New rows read zeros here: an empty row has zero moments, so joining is inserting.
     before = at(state.count), at(state.mean), at(state.m2)
     count, mean, m2 = combine_moments(before, (new.count, new.mean, new.m2))
+    # Counted, not raised: inside jit a full table can only be told of.
     is_lost = new.valid & (row >= state.capacity)
     return MapState(
         key=key,
@@ -98,6 +103,7 @@ def join(state: MapState, new: Statistics) -> MapState:
 @jax.jit
 def _join_map(state: MapState, other: MapState) -> MapState:
     """Joins every row of `other`, in chunks: scratch memory does not grow with the map."""
+    # Both are powers of two: whole chunks cover the table, and no slice is shifted back.
     size = min(CHUNK, other.capacity)
 
     def join_chunk(i: Int[Array, ""], state: MapState) -> MapState:
@@ -118,6 +124,7 @@ def _join_map(state: MapState, other: MapState) -> MapState:
         )
 
     state = jax.lax.fori_loop(0, other.capacity // size, join_chunk, state)
+    # What `other` had lost before is missing from the union as well.
     return eqx.tree_at(lambda m: m.dropped, state, state.dropped + other.dropped)
 
 
@@ -133,6 +140,7 @@ def merge(a: MapState, b: MapState) -> MapState:
     """
     if a.num_bins != b.num_bins:
         raise ValueError(f"the maps have {a.num_bins} and {b.num_bins} direction bins")
+    # Other lattices cannot be joined exactly: no nearest voxel would be the right one.
     sizes = (a.voxel_size, b.voxel_size)
     if not is_traced(*sizes) and float(sizes[0]) != float(sizes[1]):
         raise ValueError(f"the maps have voxels of {float(sizes[0])} m and {float(sizes[1])} m")
@@ -149,5 +157,6 @@ def grow(state: MapState, capacity: int) -> MapState:
     if capacity < state.capacity:
         raise ValueError(f"cannot shrink a map of {state.capacity} rows to {capacity}")
     larger = empty_map(capacity, float(state.voxel_size), state.num_bins)
+    # The very bits: a rounded edge would move voxel borders.
     larger = eqx.tree_at(lambda m: m.voxel_size, larger, state.voxel_size)
     return _join_map(larger, state)

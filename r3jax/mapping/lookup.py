@@ -24,7 +24,9 @@ def lookup(state: MapState, points_world: Float[Array, "*n 3"]) -> Int[Array, "*
         ValueError: points without three coordinates.
     """
     points = points_world.reshape(-1, 3)
+    # An edge that is NaN marks a map that an unsound pose has spoiled: nothing is found in it.
     is_finite = jnp.all(jnp.isfinite(points), axis=1) & jnp.isfinite(state.voxel_size)
+    # NaN has no integer: such points ask for voxel 0, and the answer is masked.
     index = voxel_index(jnp.where(is_finite[:, None], points, 0.0), state.voxel_size)
     low, high = pack(index[:, 0], index[:, 1], index[:, 2])
     row = find(state.key, jnp.stack([low, high]), is_finite)

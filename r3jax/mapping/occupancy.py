@@ -21,6 +21,7 @@ Shape symbols: X Y Z cells along the axes; H W image size; h w blocks; n points.
 """
 
 import math
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -72,6 +73,9 @@ class OccupancyGrid(eqx.Module):
     cell_size: Float[Array, ""]
     """Edge of a cell [m]."""
 
+    worth_a_look: Bool[Array, "X Y Z"] | None = None
+    """Mask of the cells that count as unexplored while nothing is known of them; None: all."""
+
     @property
     def free(self) -> Bool[Array, "X Y Z"]:
         """Cells known to be free."""
@@ -84,8 +88,21 @@ class OccupancyGrid(eqx.Module):
 
     @property
     def unexplored(self) -> Bool[Array, "X Y Z"]:
-        """Cells that are neither."""
-        return ~(self.free | self.occupied)
+        """Cells that are neither, and worth a look."""
+        # The mask never makes a known cell unexplored, only an unknown one not worth a look.
+        unknown = ~(self.free | self.occupied)
+        return unknown if self.worth_a_look is None else unknown & self.worth_a_look
+
+    def ignoring(self, cells: Bool[Array | np.ndarray, "X Y Z"]) -> "OccupancyGrid":
+        """Masks cells out for one decision: they are not worth a look, whatever they hold.
+
+        What is known of them stays: a planner that wrote them as occupied would have a robot's
+        body collide with space that nobody has seen.
+        """
+        left = ~jnp.asarray(cells)
+        if self.worth_a_look is not None:
+            left = left & self.worth_a_look
+        return replace(self, worth_a_look=left)
 
 
 a_grid = one(OccupancyGrid, "r3jax.empty_grid makes one", leaf="log_odds", ndim=3)
@@ -116,6 +133,7 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
         raise ValueError(f"cell_size must be positive [m], got {cell_size}")
     # The small tolerance keeps a side of exactly 12 cells from becoming 13 by rounding.
     cells = np.ceil((box[1] - box[0]) / cell_size - 1e-6) + 2.0
+    # Counted in floats: the product of absurd bounds would overflow integers.
     if float(np.prod(cells)) > MAX_CELLS:
         raise ValueError(
             f"bounds {box.tolist()} at {cell_size} m make {np.prod(cells):.3g} cells, more than "
@@ -130,6 +148,7 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
 
 def world_to_cell(grid: OccupancyGrid, points_world: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
     """The cell that holds each point; outside the grid the index lies outside its shape."""
+    # Reshaped, not broadcast: the tests let JAX raise on implicit rank promotion.
     origin = grid.origin.reshape((1,) * (points_world.ndim - 1) + (3,))
     index = jnp.floor((points_world - origin) / grid.cell_size)
     # Far outside, an int32 would wrap round and could land inside.
@@ -153,6 +172,7 @@ def log_odds_at(
     """Log-odds of the cell that holds each point; `outside` for points beyond the grid."""
     index = world_to_cell(grid, points_world)
     inside = _inside(grid, index)
+    # Cell 0 stands in: a negative index would read from the far side of the grid.
     x, y, z = (jnp.where(inside, index[..., i], 0) for i in range(3))
     return jnp.where(inside, grid.log_odds[x, y, z], outside)
 
@@ -182,6 +202,7 @@ def mark_free_ball(
         radius: its radius [m].
     """
     is_in_ball = _distance(grid, center) <= jnp.asarray(radius, dtype=jnp.float32)
+    # The minimum: what measurements have made freer than the caller's word stays so.
     vouched = jnp.where(
         is_in_ball & ~grid.occupied, jnp.minimum(grid.log_odds, VOUCHED_LOG_ODDS), grid.log_odds
     )
@@ -211,12 +232,15 @@ def integrate_depth(
     """
     reach = jnp.asarray(max_range, dtype=jnp.float32)
     hit = _hit_cells(grid, frame, reach)
+    # A point in a cell outweighs any number of rays through it: matter may be thin.
     passed = _passed_cells(grid, frame, reach) & ~hit
     # A point within range may lie in a cell whose center is not: its step is that of the range.
     distance = jnp.minimum(_distance(grid, frame.position), reach)
+    # A look from afar says less: beyond 10 m it would say nothing.
     step = STEP * jnp.clip(1.0 - STEP_DECAY * distance, 0.0, 1.0)
     change = jnp.where(hit, step, jnp.where(passed, -step, 0.0))
     log_odds = jnp.clip(grid.log_odds + change, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
+    # Under jit nothing can be refused: NaN makes every later score say so.
     cell_size = grid.cell_size * sound(frame.camera, frame.T_world_camera)
     return eqx.tree_at(lambda g: (g.log_odds, g.cell_size), grid, (log_odds, cell_size))
 
@@ -227,7 +251,9 @@ def _hit_cells(
     """Cells that hold at least one measured point within range."""
     x, y = _ray_slopes(frame.camera)
     is_measured = (frame.depth > 0.0) & jnp.isfinite(frame.depth)
+    # Replaced before the arithmetic: inf times a slope of 0 is NaN.
     z = jnp.where(is_measured, frame.depth, 1.0)
+    # Range is straight from the camera's center, depth along its axis.
     is_hit = is_measured & (z * z * (x * x + y * y + 1.0) <= max_range * max_range)
     # One axis at a time: as [H, W, 3] arrays the same arithmetic takes four times as long.
     T = frame.T_world_camera
@@ -236,6 +262,7 @@ def _hit_cells(
         point = (T[axis, 0] * x + T[axis, 1] * y + T[axis, 2]) * z + T[axis, 3]
         cell = jnp.floor((point - grid.origin[axis]) / grid.cell_size)
         is_hit = is_hit & (cell >= 0.0) & (cell < n)
+        # Meaningless, perhaps wrapped round, for points outside: they are replaced below.
         flat = flat * n + cell.astype(jnp.int32)
     # Out of range on purpose where there is no hit: scatters drop it, but -1 would wrap around.
     flat = jnp.where(is_hit, flat, grid.log_odds.size).reshape(-1)
@@ -254,6 +281,7 @@ def _passed_cells(
 ) -> Bool[Array, "X Y Z"]:
     """Cells of which at least four octants' centers were seen through."""
     camera = frame.camera
+    # The whole grid is turned into the camera's frame, since cells are asked, not rays.
     T_camera_world = invert_pose(frame.T_world_camera)
     R = T_camera_world[:3, :3]
     shift = R @ grid.origin + T_camera_world[:3, 3]
@@ -264,6 +292,7 @@ def _passed_cells(
     width, height = camera.width / block, camera.height / block
     indices = [jnp.arange(n, dtype=jnp.float32) for n in grid.log_odds.shape]
     count = jnp.zeros(grid.log_odds.shape, dtype=jnp.int32)
+    # One octant at a time: all at once would take eight times the scratch memory.
     for octant in _OCTANTS:
         along = [
             (index + 0.5 + o) * grid.cell_size for index, o in zip(indices, octant, strict=True)
@@ -282,6 +311,7 @@ def _passed_cells(
         in_range = x * x + y * y + z * z <= max_range * max_range
         column = jnp.clip(u, 0.0, num_columns - 1.0).astype(jnp.int32)
         row = jnp.clip(v, 0.0, num_rows - 1.0).astype(jnp.int32)
+        # The nearest of its block: a ray beside a thin object must not carve it away.
         wall = nearest.reshape(-1)[row * num_columns + column]
         is_before = z + 0.25 * grid.cell_size <= wall
         count = count + (in_view & in_range & is_before).astype(jnp.int32)
@@ -299,8 +329,10 @@ def _nearest_by_block(
     window = (block, block)
     # Blocks start at pixel (0, 0); only the last row and column may stick out.
     padding = [(0, -size % block) for size in depth.shape]
+    # Holes must not win the minimum, or one lost pixel would close its whole block.
     measured = jnp.where(depth > 0.0, depth, jnp.inf)
     nearest = jax.lax.reduce_window(measured, jnp.inf, jax.lax.min, window, window, padding)
+    # The minimum is inf for a block of holes and for one that looks into the open: this parts them.
     any_measured = jax.lax.reduce_window(depth, 0.0, jax.lax.max, window, window, padding)
     return jnp.where(any_measured > 0.0, nearest, 0.0), block
 
@@ -327,11 +359,13 @@ def squared_distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Ar
         )
         for axis, n in enumerate(grid.log_odds.shape)
     )
+    # Three short vectors and one sum over the grid, not an array of centers.
     return x[:, None, None] + y[None, :, None] + z[None, None, :]
 
 
 def _has_face_neighbor(mask: Bool[Array, "X Y Z"]) -> Bool[Array, "X Y Z"]:
     """Cells with a face neighbor in the mask; beyond the grid there is none."""
+    # Padded, not rolled: opposite faces of the grid are no neighbors.
     padded = jnp.pad(mask, 1)
     return (
         padded[:-2, 1:-1, 1:-1]

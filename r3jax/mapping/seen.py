@@ -51,8 +51,10 @@ def evidence_of_view(
         The bin towards the camera as one bit, and focal length over distance [px/m].
     """
     offset = (position if position.ndim == 2 else position[:, None]) - center
+    # A camera inside a voxel has no direction to it, and must not divide by zero.
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     bins = nearest_bin(offset / distance[None, :], state.num_bins)
+    # The paper's resolution is one over the distance; the focal length makes cameras comparable.
     return bin_words(bins, state.visited.shape[0]), focal / distance
 
 
@@ -73,6 +75,7 @@ def mark_rows(
 
     def mark(index: Int[Array, " M"], valid: Bool[Array, " M"], marks: _Marks) -> _Marks:
         visited, resolution = marks
+        # Padding holds the index of a real row, and must not write to it.
         row = jnp.where(valid, index, num)
         words, sharper = evidence_of_view(state, state.center_of(index), position, focal)
         # Rows are distinct: the order of the writes does not matter.
@@ -112,20 +115,26 @@ def rows_in_view(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> 
         return T[i, 0] * center[0] + T[i, 1] * center[1] + T[i, 2] * center[2] + T[i, 3]
 
     x, y, z = along(0), along(1), along(2)
+    # At and behind the camera any finite factor will do: those voxels are masked.
     per_z = 1.0 / jnp.maximum(z, 1e-3)
     u, v = camera.fx * x * per_z + camera.cx, camera.fy * y * per_z + camera.cy
     is_in = state.occupied & (z > 1e-3) & (u >= 0.0) & (u < camera.width)
     is_in &= (v >= 0.0) & (v < camera.height)
+    # Straight from the camera, as the grid and the scores have it; depth alone is along the axis.
     is_in &= x * x + y * y + z * z <= max_range * max_range
     # On a slope the depth changes within a pixel: the farthest of its neighbors limits.
     farthest = jax.lax.reduce_window(frame.depth, 0.0, jax.lax.max, (3, 3), (1, 1), "SAME")
+    # A hole stays a hole: what its neighbors measure says nothing of its own ray.
     farthest = jnp.where(frame.depth > 0.0, farthest, 0.0).reshape(-1)
+    # Clipped before the cast: voxels out of the image lie anywhere, and are masked.
     column = jnp.clip(u, 0.0, camera.width - 1.0).astype(jnp.int32)
     row = jnp.clip(v, 0.0, camera.height - 1.0).astype(jnp.int32)
     pixel = row * camera.width + column
     measured = farthest[pixel]
+    # One edge of slack: a surface may lie anywhere within its voxel.
     is_shown = (measured > 0.0) & (z <= measured + state.voxel_size)
     is_hole = is_in & (frame.depth.reshape(-1)[pixel] == 0.0)
+    # A branch: a depth buffer of the whole map is needed only where depth has failed.
     hidden_by_none = jax.lax.cond(
         jnp.any(is_hole),
         lambda: _hidden_by_none(state, frame, jnp.where(is_in, x * x + y * y + z * z, 0.0)),
@@ -138,6 +147,7 @@ def _hidden_by_none(
     state: MapState, frame: Frame, squared_distance: Float[Array, " N"]
 ) -> Bool[Array, " N"]:
     """Voxels that the map itself shows in a frame's view, up to the farthest in it."""
+    # No farther than the voxels asked for: what lies behind them all hides none of them.
     farthest = jnp.sqrt(jnp.max(squared_distance)) + state.voxel_size
     config = VisibilityConfig(max_range=farthest)
     view = pinhole_view(frame.camera, frame.T_world_camera, config)

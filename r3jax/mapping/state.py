@@ -60,6 +60,7 @@ class MapState(eqx.Module):
     @property
     def occupied(self) -> Bool[Array, " N"]:
         """True for rows that describe a voxel."""
+        # One word decides: the top bit of a packed key's high word is 0.
         return self.key[1] != jnp.uint32(EMPTY_WORD)
 
     @property

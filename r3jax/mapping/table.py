@@ -28,6 +28,7 @@ _Bidding = tuple[Int[Array, ""], Int[Array, " N"], Int[Array, " n"], Bool[Array,
 
 def hash_key(low: UInt32[Array, " n"], high: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
     """Mixes a packed key to 32 well-spread bits (the finalizer of MurmurHash3, twice)."""
+    # One word after the other: a plain xor of both would let distant voxels cancel to one hash.
     h = _mix(low ^ jnp.uint32(0x9E3779B9))
     return _mix(h ^ (high * jnp.uint32(0x85EBCA6B)))
 
@@ -52,6 +53,7 @@ def find(
 
     def is_unfinished(carry: _Search) -> Bool[Array, ""]:
         probe, _, searching = carry
+        # Bounded: in a full table a key that is absent meets no empty slot.
         return jnp.any(searching) & (probe < MAX_PROBES)
 
     def look(carry: _Search) -> _Search:
@@ -59,6 +61,7 @@ def find(
         slot = _slot(hashed, probe, capacity)
         low, high = table[0, slot], table[1, slot]
         is_found = searching & (low == keys[0]) & (high == keys[1])
+        # Nothing is ever deleted, so an empty slot ends the probe sequence for good.
         is_empty = high == jnp.uint32(EMPTY_WORD)
         return probe + 1, jnp.where(is_found, slot, row), searching & ~is_found & ~is_empty
 
@@ -84,6 +87,7 @@ def find_or_insert(
     capacity = table.shape[1]
     found = find(table, keys, valid)
     is_new = valid & (found == capacity)
+    # Searched before anything is claimed: a key must not get a second row.
     claimed = _claim(table[1] == jnp.uint32(EMPTY_WORD), hash_key(keys[0], keys[1]), is_new)
     table = table.at[:, claimed].set(keys, mode="drop")  # distinct: one winner a slot
     return table, jnp.where(is_new, claimed, found)
@@ -110,6 +114,7 @@ def _claim(
         return probe + 1, owner, jnp.where(is_won, slot, won), wanting & ~is_won
 
     nothing = jnp.full(num_items, capacity, dtype=jnp.int32)
+    # Owners beyond every item: a taken slot never opens again.
     owner = jnp.where(is_empty, -1, num_items)
     start = (jnp.zeros((), jnp.int32), owner, nothing, wants)
     return jax.lax.while_loop(is_unfinished, bid, start)[2]

@@ -41,6 +41,7 @@ def observe_voxels(
     focal: Float[Array, ""],
 ) -> Statistics:
     """Makes one observation of each voxel from a camera: direction bin, resolution, mean color."""
+    # From the voxel's center, not the points': bins must not depend on how pixels fall.
     center = voxel_center(jnp.stack(unpack(key[0], key[1])), state.voxel_size)
     words, resolution = evidence_of_view(state, center, camera_position, focal)
     return Statistics(
@@ -48,6 +49,7 @@ def observe_voxels(
         valid=valid,
         count=valid.astype(jnp.float32),
         mean=jnp.where(valid[None, :], rgb, 0.0),
+        # One observation has no spread of its own: the join adds what lies between observations.
         m2=jnp.zeros(valid.shape, dtype=jnp.float32),
         visited=words,
         resolution=resolution,
@@ -70,15 +72,17 @@ def integrate_groups(
     """
     num = groups.is_leader.shape[0]
     size = min(num, CHUNK)
+    # Rounded up to whole chunks, so that the last slice is never shifted back.
     leaders = positions_of_set(groups.is_leader, -(-num // size) * size)
     num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
 
-    # Chunks are counted one by one, as in `scoring.chunks`: XLA miscounts other steps.
+    # Chunks are counted one by one, as in `visibility.selection`: XLA miscounts other steps.
     def join_chunk(chunk: Int[Array, ""], state: MapState) -> MapState:
         index = jax.lax.dynamic_slice_in_dim(leaders, chunk * size, size)
         valid = index < num
         index = jnp.minimum(index, num - 1)
         sums = groups.rgb_sum[index].T
+        # Padding may gather a point that leads nothing, whose number is 0.
         rgb = sums[:3] / jnp.maximum(sums[3:], 1.0)
         position = camera_position[index].T if camera_position.ndim == 2 else camera_position
         seen = observe_voxels(state, groups.key[:, index], valid, rgb, position, focal)
@@ -93,6 +97,7 @@ def integrate_pixels(
     """Adds the frame's measured pixels to the map: the part of `integrate` that counts colors."""
     depth = frame.depth
     factor = sound(frame.camera, frame.T_world_camera)
+    # An unsound pose makes the factor NaN, and NaN > 0 is False: the frame adds nothing.
     is_measured = (depth > 0.0) & jnp.isfinite(depth) & (depth <= max_range) & (factor > 0.0)
     # A branch, not a select: XLA would compute the medians again in each of their consumers.
     valid = jax.lax.cond(
@@ -100,18 +105,22 @@ def integrate_pixels(
         lambda: is_measured & ~edge_pixels(depth, state.voxel_size),
         lambda: is_measured,
     )
+    # 1 m stands for what is not measured: inf would make NaN of the points.
     points = points_of_pixels(frame, jnp.where(is_measured, depth, 1.0))
     groups = group_by_voxel(points, frame.rgb.reshape(-1, 3), valid.reshape(-1), state.voxel_size)
     after = integrate_groups(state, groups, frame.position, frame.camera.focal)
+    # NaN in the edge reaches every later score, and no later frame can undo it.
     return eqx.tree_at(lambda m: m.voxel_size, after, factor * after.voxel_size)
 
 
 def _integrate(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
+    # Pixels first: new voxels hide what lies behind them in this very frame.
     return mark_seen(integrate_pixels(state, frame, max_range, drop_edges), frame, max_range)
 
 
+# Two programs: whether an argument is donated is fixed when a function is jitted.
 _integrate_jitted = jax.jit(_integrate)
 _integrate_donating = jax.jit(_integrate, donate_argnums=0)
 
@@ -149,6 +158,7 @@ def integrate(
         ValueError: a range that is not positive (where it is known, that is outside jit); several
             maps or frames at once, without `jax.vmap`.
     """
+    # Only where values are known can they be refused.
     if not is_traced(max_range) and not float(max_range) > 0.0:
         raise ValueError(f"max_range must be positive [m], got {float(max_range)}")
     max_range = jnp.asarray(max_range, dtype=jnp.float32)
@@ -193,12 +203,15 @@ def update_growing(
     Raises:
         ValueError: it would become larger.
     """
+    # Tried first, grown after: almost every frame fits, and asking costs as much as adding.
     after = update(state)
+    # Also while something was dropped: a long probe sequence may fail below the limit.
     while int(after.num_occupied) > _MAX_LOAD * after.capacity or int(after.dropped) > int(
         state.dropped
     ):
         if most_rows is not None and state.capacity >= most_rows:
             raise ValueError(f"the map would need more than {most_rows} rows")
+        # From the state before the update: what was dropped is then not lost.
         state = grow(state, 2 * state.capacity)
         after = update(state)
     return after
@@ -216,6 +229,7 @@ def _integrate_points(
     valid = valid & jnp.all(jnp.isfinite(points_world), axis=1)
     if camera_position.ndim == 2:
         valid = valid & jnp.all(jnp.isfinite(camera_position), axis=1)
+    # NaN in padding would poison gradients and indices even where it is masked.
     points = jnp.where(valid[:, None], points_world, 0.0)
     groups = group_by_voxel(points.T, rgb, valid, state.voxel_size)
     if camera_position.ndim == 2:
@@ -262,10 +276,12 @@ def integrate_points(
     _check_shapes(points_world, rgb, camera_position, focal)
     num = points_world.shape[0]
     mask = jnp.ones(num, dtype=bool) if valid is None else jnp.asarray(valid)
+    # Integers are refused: indices of points would pass for a mask otherwise.
     if mask.shape != (num,) or mask.dtype != jnp.bool_:
         raise ValueError(f"valid must be [{num}] bool, got {mask.dtype} of shape {mask.shape}")
     if not is_traced(points_world, rgb, camera_position, focal, mask):
         _check_values(points_world, rgb, camera_position, focal, np.asarray(mask))
+    # Chunks of no points would divide by zero.
     if num == 0:
         return state
     rgb = rgb.astype(jnp.float32)
@@ -297,6 +313,7 @@ def _check_values(
             f"{is_bad.sum()} of {len(is_bad)} points are not finite, the first is number "
             f"{int(is_bad.argmax())}: leave out points without a measurement"
         )
+    # Padding may hold anything: only what counts is checked.
     colors = np.asarray(rgb)[valid]
     if colors.size and not (colors.min() >= 0.0 and colors.max() <= 1.0):
         raise ValueError(

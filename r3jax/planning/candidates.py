@@ -1,20 +1,22 @@
-"""Where the next view could be taken from. On the host: NumPy.
+"""Views on offer, and where they could be taken from. On the host: NumPy.
 
 Positions lie in cells where the robot may stop (`Travel.goals`), away from the cell's faces: at
 most a quarter of a cell from its center.
 
-Shape symbols: X Y Z cells along the axes; n candidates; c places to choose from; p places chosen.
+Shape symbols: X Y Z cells along the axes; C candidates; n positions; c places to choose from; p
+places chosen.
 """
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import pose_along
-from r3jax.planning.travel import Travel, segment_is_inside
+from r3jax.planning.robot.travel import Travel, segment_is_inside
 
 JITTER = 0.25
 """Positions lie at most this far from their cell's center, along each axis [cells]."""
@@ -24,12 +26,77 @@ _NEIGHBORS = 256
 
 _poses_along = jax.jit(jax.vmap(pose_along))  # compiled once per number of candidates
 
+_AHEAD = (1.0, 0.0, 0.0)
+"""Direction of a candidate that has none yet: what scores panoramas turns it."""
+
 VIEW_DISTANCE = (0.3, 2.0)
 """A region of interest is looked at from between these distances [m] (Active-GS)."""
 
 
+class Candidates(eqx.Module):
+    """Views on offer, without roll, from drawing to choice; 4x4 matrices are made at the edges.
+
+    A run scores the same number in every decision, so that scoring compiles once: where fewer can
+    be drawn, `padded` adds rows that are not valid.
+    """
+
+    position: Float[np.ndarray, "C 3"]
+    """Camera centers in the world [m]; float64, because a path ends exactly there."""
+
+    direction: Float[np.ndarray, "C 3"]
+    """Lines of sight, world, of any length but 0: whoever scales them rounds them."""
+
+    valid: Bool[np.ndarray, " C"]
+    """False for padding: it repeats views that are valid, and is never chosen."""
+
+    @property
+    def axis(self) -> Float[np.ndarray, "C 3"]:
+        """Unit vectors along the lines of sight."""
+        # Worked out on demand: the directions themselves keep the bits they were drawn with.
+        return self.direction / np.linalg.norm(self.direction, axis=1, keepdims=True)
+
+    @property
+    def num_valid(self) -> int:
+        """Number of views that are on offer."""
+        return int(np.count_nonzero(self.valid))
+
+    @property
+    def T_world_camera(self) -> Float[np.ndarray, "C 4 4"]:
+        """Poses for the host, float64, at the very positions."""
+        return poses_along(self.position, self.direction)
+
+    def poses_on_device(self) -> Float[Array, "C 4 4"]:
+        """Poses for scoring, float32."""
+        return _poses_along(
+            jnp.asarray(self.position, dtype=jnp.float32),
+            jnp.asarray(self.direction, dtype=jnp.float32),
+        )
+
+    def take(self, index: np.ndarray) -> "Candidates":
+        """Gathers rows by index or mask."""
+        return jax.tree.map(lambda x: x[index], self)
+
+    def padded(self, num: int) -> "Candidates":
+        """Repeats rows up to `num` in all; the repeats are not valid."""
+        rows = np.arange(num)
+        # Repeats, not zeros: padding must not widen the box that voxels are gathered for.
+        repeated = self.take(rows % len(self.valid))
+        return eqx.tree_at(lambda c: c.valid, repeated, repeated.valid & (rows < len(self.valid)))
+
+
+def candidates_along(positions: np.ndarray, directions: np.ndarray) -> Candidates:
+    """Makes candidates at positions [C, 3] that look along directions [C, 3] of any length."""
+    return Candidates(positions, directions, np.ones(len(positions), dtype=bool))
+
+
+def candidates_at(positions: np.ndarray) -> Candidates:
+    """Makes candidates at positions [C, 3] whose directions are not chosen yet."""
+    return candidates_along(positions, np.tile(_AHEAD, (len(positions), 1)))
+
+
 def host_generator(key: Array) -> np.random.Generator:
     """NumPy's generator, seeded by a JAX key: host code draws many small arrays of odd sizes."""
+    # Both kinds of JAX keys are welcome, old arrays of words and typed ones.
     is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     return np.random.default_rng(np.asarray(jax.random.key_data(key) if is_typed else key))
 
@@ -45,18 +112,24 @@ def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -
         [num, 3] float64 [m]; [0, 3] if there is no such cell.
     """
     rng = host_generator(key)
+    # Drawn by cell, not by volume: free space is made of cells, however odd its shape.
     cells = np.argwhere(travel.goals)
+    # With a small radius even the center of the robot's own cell may lie outside of it.
     is_own = np.all(cells == np.array(travel.start_cell), axis=1)
     offset = travel.centers(cells) - travel.start
     is_near = is_own | (np.linalg.norm(offset, axis=1) <= radius)
     cells, is_own = cells[is_near], is_own[is_near]
     if len(cells) == 0:
         return np.zeros((0, 3))
+    # With repetition: near walls there may be fewer cells than candidates.
     chosen = rng.integers(len(cells), size=num)
+    # Stops, not centers: a carrier with a range of heights cannot be at every center.
     centers = travel.stops(cells[chosen])
     positions = _jitter(centers, travel.cell_size, rng)
     is_far = np.linalg.norm(positions - travel.start, axis=1) > radius
+    # Jitter may leave the radius: the center of the cell never does.
     positions[is_far] = centers[is_far]
+    # In a cell that is too tight for the margin, only the present place is known to fit.
     if not travel.safe[travel.start_cell]:
         positions[is_own[chosen]] = travel.start
     return positions
@@ -99,7 +172,7 @@ def region_of_interest(
 
 
 def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
-    """Of the nearest cells where the robot may stop, those at a distance to look at `target`.
+    """Nearest cells where the robot may stop, if they lie at a distance to look at `target`.
 
     Asks a window round the target only: the work does not grow with the scene.
 
@@ -108,11 +181,14 @@ def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
     """
     closest, farthest = VIEW_DISTANCE
     reach = int(np.ceil(farthest / travel.cell_size))
+    # Not past the array: a negative start of a slice would count from its end.
     low = np.maximum(target - reach, 0)
     window = tuple(slice(a, b) for a, b in zip(low, target + reach + 1, strict=True))
     cells = np.argwhere(travel.goals[window]) + low
     distance = np.linalg.norm(cells - target, axis=1) * travel.cell_size
+    # Stable, so that ties fall in the order of the cells on every machine.
     nearest = np.argsort(distance, kind="stable")[:_NEIGHBORS]
+    # Cut after the nearest are taken, so that a near wall leaves few places, not far ones.
     is_apart = (distance[nearest] >= closest) & (distance[nearest] <= farthest)
     return cells[nearest[is_apart]]
 
@@ -128,6 +204,7 @@ def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.7
         [n, 3] float64 [m], each where the camera stands in its cell, no cell twice.
     """
     shape = travel.usable.shape
+    # Half a step inside the box: cells at its faces do not keep the usual margin.
     axes = [
         np.arange(0.5 * step, n * travel.cell_size, step)
         for n, step in zip(shape, spacing, strict=True)
@@ -135,6 +212,7 @@ def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.7
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     # The nudge puts points that lie on a border of cells on the same side of it.
     cells = np.unique(np.floor(points / travel.cell_size + 1e-3).astype(np.int64), axis=0)
+    # Nudged, a point at the very end of the box would lie past the array.
     cells = cells[np.all(cells < np.array(shape), axis=1)]
     return travel.stops(cells[travel.goals[tuple(cells.T)]])
 
@@ -149,6 +227,7 @@ def spread(places: np.ndarray, num: int) -> np.ndarray:
         places: [c, 3], c >= 1.
         num: p at most.
     """
+    # The middle, not a random place: the choice must not depend on a seed or an order.
     first = int(np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1)))
     chosen = [first]
     gap = np.linalg.norm(places - places[first], axis=1)
@@ -157,6 +236,7 @@ def spread(places: np.ndarray, num: int) -> np.ndarray:
         if gap[farthest] <= 0.0:
             break  # the rest repeats what is there
         chosen.append(farthest)
+        # Only the newest place can shorten a gap: p passes over c places, no table of all pairs.
         gap = np.minimum(gap, np.linalg.norm(places - places[farthest], axis=1))
     return np.asarray(chosen)
 
@@ -173,12 +253,14 @@ def random_directions(num: int, *, key: Array) -> np.ndarray:
     Not bounded in elevation: floors and ceilings are part of the scene, and test views look
     straight up and down too.
     """
+    # Normal numbers favor no direction; uniform angles would crowd at the poles.
     directions = host_generator(key).normal(size=(num, 3))
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Roll-free poses at positions [n, 3] that look along directions [n, 3]; [n, 4, 4] float64."""
+    # The function that scoring uses, too: a second formula would differ in the last bits.
     poses = _poses_along(
         jnp.asarray(positions, dtype=jnp.float32), jnp.asarray(directions, dtype=jnp.float32)
     )
@@ -187,19 +269,28 @@ def poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return exact
 
 
-def best_views(positions: np.ndarray, panorama: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The views that look along the best directions of panoramas, and their scores.
+def best_views(candidates: Candidates, panorama: Any) -> tuple[Candidates, np.ndarray]:
+    """Turns candidates along the best directions of their panoramas.
 
     Args:
-        positions: [n, 3] [m].
-        panorama: their `scoring.panorama.Panorama`, fields of shape [n, ...].
+        candidates: positions that were scored.
+        panorama: their `scoring.panorama.Panorama`, fields of shape [C, ...].
 
     Returns:
-        Poses [n, 4, 4] and scores [n], float64.
+        The candidates, and the scores of those directions, [C] float64.
     """
-    poses = np.array(panorama.T_world_camera, dtype=np.float64)
-    poses[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
-    return poses, np.asarray(panorama.best_score, dtype=np.float64)
+    # As the panorama has it, not scaled again: the pose is then bit for bit the one it scored.
+    direction = np.asarray(panorama.best_direction, dtype=np.float64)
+    turned = eqx.tree_at(lambda c: c.direction, candidates, direction)
+    return turned, np.asarray(panorama.best_score, dtype=np.float64)
+
+
+def path_lengths(travel: Travel, candidates: Candidates) -> np.ndarray:
+    """Measures the path to each candidate, [C] [m]; inf where there is none, and for padding."""
+    # Padding is not asked about: it is never chosen, and each length walks through the grid.
+    lengths = np.full(len(candidates.valid), np.inf)
+    lengths[candidates.valid] = travel.lengths(candidates.position[candidates.valid])
+    return lengths
 
 
 def _jitter(centers: np.ndarray, cell_size: float, rng: np.random.Generator) -> np.ndarray:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
-from r3jax.planning.motion import Motion
+from r3jax.planning.robot.motion import Motion
 from r3jax.scoring.config import ScoringConfig
 
 MAX_CANDIDATES = 1_000_000
@@ -46,7 +46,7 @@ class PlannerConfig:
 
     refine: int = 0
     """So many of the best candidates of `ours`, `ours-pano` and `ours-ahead` climb
-    the utility by its gradient (`planning.refine`); 0: none."""
+    the utility by its gradient (`planning.refinement.refine`); 0: none."""
 
     refine_radius: float = 0.4
     """A climb ends at this distance along each axis [m]; 0: it turns the view and no more."""
@@ -59,6 +59,7 @@ class PlannerConfig:
 
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""
+        # Refused here, where the setting still has a name, not in a shape deep in a kernel.
         if not 1 <= self.num_candidates <= MAX_CANDIDATES:
             raise ValueError(
                 f"num_candidates must lie between 1 and {MAX_CANDIDATES}, got {self.num_candidates}"
@@ -73,6 +74,7 @@ class PlannerConfig:
                 f"refine must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.refine}"
             )
+        # An infinite lambda2, times a path of no length, would be NaN.
         for name in ("radius", "refine_radius", "lambda2", "safety_margin"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):

@@ -15,9 +15,12 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import (
+    Candidates,
+    candidates_along,
+    candidates_at,
     host_generator,
     local_random,
-    poses_along,
+    path_lengths,
     random_directions,
     region_of_interest,
 )
@@ -32,11 +35,10 @@ from r3jax.planning.decision import (
     prepare_decision,
     select_best,
 )
-from r3jax.planning.limits import Limits
-from r3jax.planning.policy import Decision, PlanInfo
-from r3jax.planning.refine import refine_best
-from r3jax.planning.situation import Situation
-from r3jax.planning.travel import Travel
+from r3jax.planning.policy import Decision, PlanInfo, Situation
+from r3jax.planning.refinement.refine import refine_best
+from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.travel import Travel
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.pixels import Value, score_pixels
 
@@ -45,8 +47,8 @@ from r3jax.scoring.pixels import Value, score_pixels
 class Drawn:
     """The candidates of one decision."""
 
-    poses: np.ndarray
-    """[C, 4, 4] float64; C = 0: there is none."""
+    candidates: Candidates
+    """Views on offer; none of them valid: there is nothing to choose from."""
 
     memory: Any
     """What the policy keeps beside the map, after drawing."""
@@ -88,8 +90,8 @@ class GreedyPolicy(ABC):
 
     @abstractmethod
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """The candidates, turned if the policy turns them, and `utility` [C] among others."""
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
@@ -97,10 +99,14 @@ class GreedyPolicy(ABC):
         return net_utility(utilities["utility"], utilities["path"], self.config.lambda2)
 
     def conclude(
-        self, situation: Situation, poses: np.ndarray, utilities: dict[str, np.ndarray], best: int
+        self,
+        situation: Situation,
+        candidates: Candidates,
+        utilities: dict[str, np.ndarray],
+        best: int,
     ) -> Any:
         """The memory after candidate `best` was chosen."""
-        del poses, utilities, best
+        del candidates, utilities, best
         return situation.memory
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
@@ -125,11 +131,13 @@ class GreedyPolicy(ABC):
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
         """The candidate with the greatest total, of those that the carrier may take."""
         stopwatch = Stopwatch()
+        # Two keys: a policy that draws more must not change the lots of its scores.
         draw_key, score_key = jax.random.split(key)
         with stopwatch.part("travel"):
             state, travel, masked = prepare_decision(
                 state, map_state, grid, T_world_camera, self.config
             )
+        # float64 on the host: waypoints begin exactly where the robot is.
         pose = np.asarray(T_world_camera, dtype=np.float64)
         limits = Limits(self.config.motion, pose, travel.heights)
         with stopwatch.part("candidates"):
@@ -137,28 +145,39 @@ class GreedyPolicy(ABC):
                 map_state, grid, masked, travel, state.camera, state.memory, limits
             )
             drawn = self.draw(situation, key=draw_key)
-            if len(drawn.poses) == 0:
+            # No view on offer is an outcome, not an error: the loop ends with the reason.
+            if not drawn.candidates.valid.any():
                 decision, info = no_decision(travel, self.config, stopwatch)
+                # What drawing noted is kept, so that a resumed run remembers the same.
                 return decision, replace(state, memory=drawn.memory), info
             situation = replace(situation, memory=drawn.memory, notes=drawn.notes)
         with stopwatch.part("scoring"):
-            poses, utilities = self.score(
-                situation, limits.project_to_feasible(drawn.poses), key=score_key
+            # Before scoring, so that what is scored is what is taken; after it, because a score
+            # may have turned the views.
+            candidates, utilities = self.score(
+                situation, limits.project_to_feasible(drawn.candidates), key=score_key
             )
-            poses = limits.project_to_feasible(poses)
+            candidates = limits.project_to_feasible(candidates)
         with stopwatch.part("travel"):
-            lengths = travel.lengths(poses[:, :3, 3])
-            utilities = utilities | {"path": limits.path_costs(lengths, poses)}
+            # After the projection, which may change heights: the ways lead to views on offer.
+            lengths = path_lengths(travel, candidates)
+            path = limits.path_costs(lengths, candidates.direction)
+            utilities = utilities | {"path": path}
         if self.climbs and self.config.refine:
             with stopwatch.part("refining"):
                 first = (utilities["utility"], utilities["path"])
+                # The sums stay those of the candidates as drawn: a view that rises must not
+                # lower the others' shares.
                 weigh = partial(net_utility, lambda2=self.config.lambda2, among=first)
-                poses, utilities = refine_best(situation, poses, utilities, self.config, weigh)
+                candidates, utilities = refine_best(
+                    situation, candidates, utilities, self.config, weigh
+                )
+        # Last, so that views that have climbed compete with their new utility and path.
         utilities = utilities | {"total": self.weigh(utilities)}
         best, decision, state, info = select_best(
-            state, travel, poses, utilities, limits, stopwatch
+            state, travel, candidates, utilities, limits, stopwatch
         )
-        memory = self.conclude(situation, poses, utilities, best)
+        memory = self.conclude(situation, candidates, utilities, best)
         return decision, replace(state, memory=memory), info
 
     def follow(
@@ -173,17 +192,16 @@ class GreedyPolicy(ABC):
         return follow_way(state, map_state, grid, T_world_camera, waypoints, self.config)
 
 
-def free_views(situation: Situation, num: int, radius: float, *, key: Array) -> np.ndarray:
-    """`num` views from safe places within `radius` of the robot, looking anywhere.
+def free_views(situation: Situation, num: int, radius: float, *, key: Array) -> Candidates:
+    """Draws `num` views from safe places within `radius` of the robot, looking anywhere.
 
     Returns:
-        [num, 4, 4] float64; [0, 4, 4] if the robot can stop nowhere.
+        `num` candidates; none if the robot can stop nowhere.
     """
     position_key, direction_key = jax.random.split(key)
     positions = local_random(situation.travel, num, radius, key=position_key)
-    if len(positions) == 0:
-        return np.zeros((0, 4, 4))
-    return poses_along(positions, random_directions(num, key=direction_key))
+    directions = random_directions(len(positions), key=direction_key)
+    return candidates_along(positions, directions)
 
 
 def draw_lots(num: int, *, key: Array) -> dict[str, np.ndarray]:
@@ -194,7 +212,7 @@ def draw_lots(num: int, *, key: Array) -> dict[str, np.ndarray]:
 def score_by_pixels(
     situation: Situation,
     value: Value,
-    poses: np.ndarray,
+    candidates: Candidates,
     scoring: ScoringConfig,
     rows: Any = (),
     reach: float | None = None,
@@ -205,7 +223,7 @@ def score_by_pixels(
         situation.map_state,
         situation.scoring_grid,
         situation.camera,
-        poses.astype(np.float32),
+        candidates.poses_on_device(),
         scoring,
         rows,
         reach,
@@ -213,23 +231,35 @@ def score_by_pixels(
     return [np.asarray(number, dtype=np.float64) for number in numbers]
 
 
-def random_views(situation: Situation, config: PlannerConfig, *, key: Array) -> np.ndarray:
-    """C poses: local ones look anywhere, those drawn for the frontier look at it."""
+def random_views(situation: Situation, config: PlannerConfig, *, key: Array) -> Candidates:
+    """Draws C views: local ones look anywhere, those drawn for the frontier look at it."""
     position_key, direction_key = jax.random.split(key)
     positions, aims = draw_positions(
         situation.travel, situation.scoring_grid, config, key=position_key
     )
-    if len(positions) == 0:
-        return np.zeros((0, 4, 4))
     directions = random_directions(len(positions), key=direction_key)
+    # Directions are drawn for all rows, aimed or not: recorded runs hold to this stream.
     is_aimed = np.isfinite(aims[:, :1])
-    return poses_along(positions, np.where(is_aimed, aims - positions, directions))
+    drawn = candidates_along(positions, np.where(is_aimed, aims - positions, directions))
+    # An empty draw cannot be padded: it has no row to repeat.
+    return drawn.padded(config.num_candidates) if len(positions) else drawn
+
+
+def random_places(situation: Situation, config: PlannerConfig, *, key: Array) -> Candidates:
+    """Draws the positions of `random_views` for a score that finds the directions."""
+    # The same half of the key as there: both draw the same positions.
+    position_key, _ = jax.random.split(key)
+    positions, _ = draw_positions(
+        situation.travel, situation.scoring_grid, config, key=position_key
+    )
+    drawn = candidates_at(positions)
+    return drawn.padded(config.num_candidates) if len(positions) else drawn
 
 
 def draw_positions(
     travel: Travel, scoring_grid: OccupancyGrid, config: PlannerConfig, *, key: Array
 ) -> tuple[np.ndarray, np.ndarray]:
-    """C positions: up to `num_frontier` in sight of the frontier, the others local.
+    """Draws n positions: up to `num_frontier` in sight of the frontier, the others local.
 
     Args:
         travel: where the robot can go.
@@ -238,21 +268,21 @@ def draw_positions(
         key: source of randomness.
 
     Returns:
-        Positions [C, 3] and the frontier cell each one is meant for [C, 3] (NaN for local
-        ones), float64 [m]; [0, 3] if the robot can stop nowhere.
+        Positions [n, 3] and the frontier cell each one is meant for [n, 3] (NaN for local
+        ones), float64 [m]; fewer than `num_candidates` if there is no local one, [0, 3] if the
+        robot can stop nowhere.
     """
     frontier_key, local_key = jax.random.split(key)
+    # Of the masked grid: a frontier that nobody can get beyond is none.
     targets = np.asarray(frontier(scoring_grid))
     positions, aims = region_of_interest(travel, targets, config.num_frontier, key=frontier_key)
+    # What the frontier leaves goes to local positions: every decision scores the same number.
     local = local_random(
         travel, config.num_candidates - len(positions), config.radius, key=local_key
     )
-    positions = np.concatenate([positions, local])
+    # Local views have no aim; NaN keeps the two arrays row by row alike.
     aims = np.concatenate([aims, np.full_like(local, np.nan)])
-    if 0 < len(positions) < config.num_candidates:  # nothing local: repeat, to keep the shape
-        repeats = np.arange(config.num_candidates) % len(positions)
-        positions, aims = positions[repeats], aims[repeats]
-    return positions, aims
+    return np.concatenate([positions, local]), aims
 
 
 ScoreViews = Callable[..., Any]

@@ -1,7 +1,7 @@
 """Several next views at once, each chosen as if those before it had been taken.
 
 The utility of a view never rises by another view: what that one shows renders no worse, and its
-unexplored cells are found (`scoring.foresight`). So the value of a set of views, the sum of what
+unexplored cells are found (`scoring.simulated`). So the value of a set of views, the sum of what
 each adds when it is taken, is the same kind of sum that greedy choice is good for, and an old score
 is a bound on the new one: only the candidates whose bound is the greatest are scored again
 (lazy greedy, Minoux 1978). The views chosen are those of scoring all of them every time.
@@ -21,10 +21,10 @@ from r3jax.geometry.arguments import a_camera, checked
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, centers_on_host
 from r3jax.mapping.state import MapState, a_map
-from r3jax.planning.candidates import best_views, spread
+from r3jax.planning.candidates import best_views, candidates_at, spread
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.explorable import mask_unexplorable
-from r3jax.planning.travel import safe_cells
+from r3jax.planning.robot.explorable import mask_unexplorable
+from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.batch import cache_positions_near, score_cached_near, score_views_near
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.gather import gather_in_range
@@ -85,7 +85,9 @@ def next_views(
         raise ValueError(f"k must be at least 1, got {k}")
     checked = None if poses is None else _checked(poses, k)
     positions = _positions_in(grid, safe, config) if checked is None else checked[:, :3, 3]
+    # Without any safe cell nothing can be reached, and the mask would leave nothing to see.
     known_grid = mask_unexplorable(grid, safe) if safe.any() else grid
+    # Gathered once: views that are taken change what is known, not what is in range.
     places = jnp.asarray(positions, dtype=jnp.float32)
     voxels, cells, _ = gather_in_range(state, known_grid, places, config.scoring)
     if checked is None:
@@ -93,6 +95,7 @@ def next_views(
     else:
         ask = _score_as_given(checked, camera, config)
         first = ask(voxels, cells, np.arange(len(checked)))
+    # A position may serve several views, each in another direction; a given pose only once.
     left = np.full(len(positions), k if checked is None else 1)
     return _lazy_greedy(ask, first, voxels, cells, camera, left, k, config)
 
@@ -106,6 +109,7 @@ def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) 
             f"{config.safety_margin} m: integrate a frame with depth, or give poses"
         )
     centers = centers_on_host(grid, cells)
+    # Spread, not drawn: the same map gives the same list, and no seed is asked for.
     return centers[spread(centers, config.num_candidates)]
 
 
@@ -115,6 +119,7 @@ def _checked(poses: ArrayLike, k: int) -> np.ndarray:
         raise ValueError(f"poses must have shape [C, 4, 4], got {checked.shape}")
     if len(checked) < k:
         raise ValueError(f"{k} views cannot be chosen from {len(checked)} poses, each at most once")
+    # A pose that is not rigid would be scored all the same, and the number would mean nothing.
     for i, pose in enumerate(checked):
         if (error := rigid_error(pose)) is not None:
             raise ValueError(f"pose {i}: {error}")
@@ -135,14 +140,17 @@ def _score_turned(
 ) -> tuple[Ask, tuple[np.ndarray, np.ndarray]]:
     start, scoring = (voxels, cells), config.scoring
     places = jnp.asarray(positions, dtype=jnp.float32)
+    # Kept: taking a view moves no surface, so that each position goes on seeing the same.
     panorama, kept = cache_positions_near(*start, camera, places, scoring)
 
     def ask(voxels: MapState, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         some, after = jnp.asarray(ids), (voxels, cells)
         again = score_cached_near(kept.at(some), start, after, camera, places[some], scoring)
-        return best_views(positions[ids], again)
+        turned, utility = best_views(candidates_at(positions[ids]), again)
+        return turned.T_world_camera, utility
 
-    return ask, best_views(positions, panorama)
+    turned, utility = best_views(candidates_at(positions), panorama)
+    return ask, (turned.T_world_camera, utility)
 
 
 def _lazy_greedy(
@@ -162,18 +170,22 @@ def _lazy_greedy(
     worth: list[float] = []
     while True:
         best = int(np.argmax(np.where(left > 0, bound, -np.inf)))
+        # Bounds only fall, so a fresh one at the top beats all stale ones below it (Minoux 1978).
         if not is_new[best]:
             stale = np.flatnonzero(~is_new & (left > 0))
             ids = stale[np.argsort(-bound[stale], kind="stable")][:_AT_ONCE]
+            # One shape, so that renewing compiles once.
             padded = ids[np.arange(_AT_ONCE) % len(ids)]
             turned, values = ask(voxels, cells, padded)
             poses[ids], bound[ids], is_new[ids] = turned[: len(ids)], values[: len(ids)], True
             continue
+        # A copy: the row is turned again when its bound is renewed.
         taken.append(poses[best].copy())
         worth.append(float(bound[best]))
         if len(taken) == k:
             return NextViews(np.stack(taken), np.asarray(worth))
         left[best] -= 1
+        # A view was taken: every other score is a bound from here on.
         is_new[:] = False
         T = jnp.asarray(poses[best], dtype=jnp.float32)
         voxels, cells = simulate_view_near(voxels, cells, camera, T, config.scoring)

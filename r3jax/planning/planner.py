@@ -82,6 +82,7 @@ def start(
     """
     config = MappingConfig() if config is None else config
     policy = make_policy(policy) if isinstance(policy, str) else policy
+    # A fixed default: a plug-in without a seed still decides the same way twice.
     key = jax.random.key(0) if key is None else key
     grid = first_grid(np.asarray(bounds, dtype=np.float64), starts, config)
     map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
@@ -117,6 +118,7 @@ def decide(
         The decision, or None if there is no view to take; the planner, which remembers it; and what
         happened, with the reason in `outcome`.
     """
+    # float64: the path begins at this very position.
     pose = np.asarray(T_world_camera, dtype=np.float64)
     decision, policy_state, info = planner.policy.decide(
         planner.policy_state, planner.map_state, planner.grid, pose, key=key
@@ -154,6 +156,7 @@ def first_grid(
         starts: start poses, [4, 4] each; several cameras may start at several places.
         config: size of the cells and of the ball.
     """
+    # No image shows the ball round the start; without it the robot stands in the unknown.
     grid = empty_grid(bounds, config.cell_size)
     for pose in starts:
         position = jnp.asarray(np.asarray(pose)[:3, 3], dtype=jnp.float32)
@@ -177,5 +180,6 @@ def add_frame(
 
 def add_to_grid(grid: OccupancyGrid, frame: Frame, config: MappingConfig) -> OccupancyGrid:
     """Adds a frame to a grid: what its rays went through, and where the camera stands."""
+    # Depth before the body: a hit measured in this frame must not be vouched away.
     grid = _integrate_depth(grid, frame, config.max_range)
     return _mark_free_ball(grid, frame.position, config.body_radius)

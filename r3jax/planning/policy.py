@@ -11,9 +11,11 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.travel import Travel
 
 
-class Outcome(enum.Enum):
+class DecisionOutcome(enum.Enum):
     """How a decision ended. Anything but MOVED ends the run, with the reason in the trace."""
 
     MOVED = "moved"
@@ -58,11 +60,41 @@ class Decision:
 class PlanInfo:
     """What happened while deciding."""
 
-    outcome: Outcome
+    outcome: DecisionOutcome
     num_candidates: int = 0
     num_reachable: int = 0
     stage_seconds: dict[str, float] = field(default_factory=dict[str, float])
     """Wall time per part of the decision (`candidates`, `travel`, `scoring`) [s]."""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """All that a decision may depend on: what is known, where the robot is and can go."""
+
+    map_state: MapState
+
+    grid: OccupancyGrid
+    """Grid as it is; for travel."""
+
+    scoring_grid: OccupancyGrid
+    """The same with a mask of the cells that are worth a look (`prepare_decision`); for
+    utilities."""
+
+    travel: Travel
+    """Where the robot can go from here."""
+
+    camera: Camera
+    """Camera of every frame to come."""
+
+    memory: Any
+    """What the policy keeps beside the map."""
+
+    limits: Limits = field(default_factory=Limits)
+    """What the carrier of the camera may do next. Candidates need not lie within them: `decide`
+    sees to that."""
+
+    notes: Any = None
+    """What `draw` noted of the candidates."""
 
 
 @runtime_checkable

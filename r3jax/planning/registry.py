@@ -28,6 +28,7 @@ def register_policy(policy_class: PolicyClass) -> PolicyClass:
     name = getattr(policy_class, "name", None)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{policy_class.__qualname__} needs a class attribute `name`")
+    # A policy of this package cannot be replaced: recorded runs name it.
     if name in HOMES:
         raise ValueError(f"a policy of this package is called {name!r}: choose another name")
     REGISTERED[name] = policy_class
@@ -78,6 +79,7 @@ def make_policy(name: str, **settings: Any) -> Policy:
         ValueError: no policy has that name, no setting has that name, or a value is impossible.
     """
     config = config_class(name)
+    # Checked here: the error of the dataclass itself would not list the settings there are.
     known = [field.name for field in fields(config)]
     unknown = [setting for setting in settings if setting not in known]
     if unknown:
@@ -93,9 +95,11 @@ def policy_class(name: str) -> Any:
     Raises:
         ValueError: no policy has that name, or its module has no such class.
     """
+    # This process first: who registers a class wants that one, not an installed one.
     if name in REGISTERED:
         return REGISTERED[name]
     module, _, kind = home_of(name).partition(":")
+    # Imported only now: names are listed without loading JAX.
     try:
         found = getattr(importlib.import_module(module), kind)
     except (ImportError, AttributeError) as error:

@@ -1,7 +1,7 @@
 """A policy that decides as if views that others will take had been taken.
 
 Two cameras that know the same would want the same view. Whoever decides second takes the first
-one's view as taken: what it will show of the map is foreseen (`scoring.foresight`), and the
+one's view as taken: what it will show of the map is foreseen (`scoring.simulated`), and the
 unexplored cells in it are no longer worth a look. Nor are those that lie nearer to where the
 other goes, unless nothing else is left: two cameras that see a door go through it one after the
 other for nothing. All that holds for one decision: neither the map nor the grid that is kept
@@ -14,7 +14,6 @@ import functools
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,12 +21,7 @@ from jaxtyping import Array, Float
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import (
-    LOG_ODDS_LIMIT,
-    OccupancyGrid,
-    frontier_unexplored,
-    squared_distance,
-)
+from r3jax.mapping.occupancy import OccupancyGrid, frontier_unexplored, squared_distance
 from r3jax.mapping.state import MapState
 from r3jax.planning.policy import Decision, PlanInfo, Policy
 from r3jax.scoring.config import ScoringConfig
@@ -59,6 +53,7 @@ class ReservedViews:
 
     def __post_init__(self) -> None:
         """Goes by the name of the policy, and by its settings."""
+        # Others ask a policy for them, `motion_of` for one: they get what the inner one plans with.
         self.name, self.config = self.policy.name, getattr(self.policy, "config", None)
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Any:
@@ -79,11 +74,13 @@ class ReservedViews:
         key: Array,
     ) -> tuple[Decision | None, Any, PlanInfo]:
         """The view that the policy would take if the promised ones had been taken."""
+        # One after the other: what the first promises to show, the second cannot promise again.
         for view in self.promised:
             pose = jnp.asarray(view.T_world_camera, dtype=jnp.float32)
             map_state, grid = after_promise(map_state, grid, view.camera, pose, self.scoring)
         others = jnp.asarray([view.T_world_camera[:3, 3] for view in self.promised], jnp.float32)
         here = jnp.asarray(T_world_camera[:3, 3], dtype=jnp.float32)
+        # After the promises, so that "nothing left" counts what they leave.
         grid = without_yielded(grid, here, others)
         return self.policy.decide(state, map_state, grid, T_world_camera, key=key)
 
@@ -109,8 +106,7 @@ def after_promise(
 ) -> tuple[MapState, OccupancyGrid]:
     """Map and grid for a decision that takes a view as taken.
 
-    The unexplored cells that the view would show are marked as occupied: they count for nothing,
-    and no way leads through them, as before.
+    The unexplored cells that the view would show are not worth a look.
 
     Args:
         map_state: the map.
@@ -120,9 +116,8 @@ def after_promise(
         scoring: range and size of the depth buffer.
     """
     shown = visible_unexplored(map_state, grid, camera, T_world_camera, scoring)
-    log_odds = jnp.where(shown, LOG_ODDS_LIMIT, grid.log_odds)
     after, _ = simulate_view(map_state, camera, T_world_camera, scoring)
-    return after, eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+    return after, grid.ignoring(shown)
 
 
 @jax.jit
@@ -131,17 +126,17 @@ def without_yielded(
 ) -> OccupancyGrid:
     """The grid for a decision that leaves to others what lies nearer to them.
 
-    Unexplored cells that are nearer to one of the others than to here are marked as occupied; none
-    is if that would leave nothing to explore.
+    Cells that are nearer to one of the others than to here are not worth a look, unless that would
+    leave nothing to explore.
 
     Args:
         grid: the coarse grid.
         here: where the camera is [m].
         others: where the others go [m].
     """
+    # Two arrays at a time, never [K, X, Y, Z]; and squares order as distances do, without roots.
     nearest = functools.reduce(jnp.minimum, [squared_distance(grid, other) for other in others])
-    is_yielded = grid.unexplored & (nearest < squared_distance(grid, here))
-    log_odds = jnp.where(is_yielded, LOG_ODDS_LIMIT, grid.log_odds)
-    own = eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
-    is_left = jnp.any(frontier_unexplored(own))
-    return eqx.tree_at(lambda g: g.log_odds, grid, jnp.where(is_left, log_odds, grid.log_odds))
+    is_yielded = nearest < squared_distance(grid, here)
+    # Asked of the frontier: cells that no free cell borders on are no work for anybody.
+    is_left = jnp.any(frontier_unexplored(grid.ignoring(is_yielded)))
+    return grid.ignoring(is_yielded & is_left)

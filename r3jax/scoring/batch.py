@@ -134,6 +134,7 @@ def _all_if_none(
 ) -> Bool[Array, "C B"]:
     """The axes that are allowed, or all."""
     if allowed is None:
+        # All true, not None: the same compiled program then serves calls with and without a choice.
         allowed = np.ones((positions.shape[0], config.panorama_bins), dtype=bool)
     return jnp.asarray(allowed)
 
@@ -147,6 +148,8 @@ def _score_views(
     poses: Float[Array, "C 4 4"],
 ) -> ViewUtility:
     score = functools.partial(utility_of_view, voxels, cells, camera, config=config)
+    # One by one: `vmap` would hold all depth buffers at once, and run the loops of unknown length
+    # for every candidate until the longest has ended.
     return jax.lax.map(score, poses)
 
 
@@ -209,13 +212,17 @@ def map_over_devices(
     if len(devices) > 1:
         scores = score_on_devices(score.func, score.args, candidates, devices)
         return jax.tree.map(lambda x: x[:num], jax.device_put(scores, devices[0]))
+    # The cores this process may use, which a scheduler may keep below those of the machine.
     workers = min(len(os.sched_getaffinity(0)), num) if jax.default_backend() == "cpu" else 1
     if workers < 2:
         return score(candidates)
+    # Shares of one size: one compiled program serves all threads.
     padded = padded_to(workers, candidates)
     size = jax.tree.leaves(padded)[0].shape[0] // workers
     cuts = [slice(i * size, (i + 1) * size) for i in range(workers)]
     shares = [jax.tree.map(operator.itemgetter(cut), padded) for cut in cuts]
+    # Threads share the map, and XLA runs outside of Python's lock. Each waits for its own share:
+    # a dispatch alone may return before the work is done.
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda part: jax.block_until_ready(score(part)), shares))
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays)[:num], *parts)

@@ -69,6 +69,7 @@ def unexplored_by_direction(
         index: Int[Array, " n"], valid: Bool[Array, " n"], total: Float[Array, " B"]
     ) -> Float[Array, " B"]:
         points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
+        # Asked again: cells may have been explored since the selection was made.
         weight = (valid & cells.unexplored[index]).astype(jnp.float32)
         return total + sum_by_direction(points, weight, position, num_bins)
 
@@ -82,6 +83,7 @@ def visible_cells(
 
     def test(index: Int[Array, " n"]) -> Bool[Array, " n"]:
         points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
+        # Before the surface itself: the slack behind it is for voxels that belong to it.
         return is_visible(view, view.place(points), buffer.distance)
 
     if among is None:

@@ -77,6 +77,7 @@ def _deficit(
     num_bins: int,
 ) -> Float[Array, " B"]:
     lack = 1.0 - score_voxels(voxels, position, focal, forms).value
+    # Absent voxels have R = 0: each would count as a whole voxel that renders badly.
     lack = jnp.where(visible & voxels.present, lack, 0.0)
     return sum_by_direction(voxels.center, lack, position, num_bins)
 
@@ -90,6 +91,7 @@ def sum_by_direction(
     """Sums weights into the bins in which points lie, seen from a position; 1 bin sums all."""
     if num_bins == 1:
         return jnp.sum(weight, keepdims=True)
+    # The choice of the bin is piecewise constant: no derivative passes through it.
     offset = jax.lax.stop_gradient(points - position[:, None])
     direction = offset / jnp.maximum(safe_norm(offset, axis=0), 1e-6)[None, :]
     bins = nearest_bin(direction, num_bins)

@@ -103,10 +103,13 @@ def _scan(
     # Tangent axes: a = up x r = (-y, x, 0), or the x axis at the poles; b = r x a.
     a_x, a_y = jnp.where(is_pole, 1.0, -y), jnp.where(is_pole, 0.0, x)
     b_x, b_y, b_z = -z * a_y, z * a_x, x * a_y - y * a_x
+    # A voxel without bins keeps -1, which the clamp turns into 0: nothing resembles the new view.
     lowest, zero = jnp.full_like(x, -1.0), jnp.zeros_like(x)
     best, nearest = lowest, (zero, zero, zero)
+    # Empty boxes are turned inside out: the origin lies in none of them.
     a_low = b_low = jnp.full_like(x, jnp.inf)
     a_high = b_high = jnp.full_like(x, -jnp.inf)
+    # Python's floats: the lattice becomes literals of the program, and no gather is needed.
     for k, (q_x, q_y, q_z) in enumerate(fibonacci_lattice(num_bins).astype("float32").tolist()):
         is_visited = (visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
         cosine = jnp.where(is_visited, q_x * x + q_y * y + q_z * z, -1.0)
@@ -117,6 +120,7 @@ def _scan(
                 for q, old in zip((q_x, q_y, q_z), nearest, strict=True)
             )
         best = jnp.maximum(best, cosine)
+        # By the paper's text the bins on the camera's side of the tangent plane span the box.
         is_ahead = cosine > 0.0
         a = q_x * a_x + q_y * a_y
         b = q_x * b_x + q_y * b_y + q_z * b_z

@@ -40,11 +40,11 @@ class Explanation(eqx.Module):
     """What a view promises (`ViewUtility`), by cause, in the order of `CAUSES`."""
 
     totals: Float[Array, " 4"]
-    """Of the whole view; they sum to its utility lambda1 U_G + U_R."""
+    """Shares of the whole view; they sum to its utility lambda1 U_G + U_R."""
 
     shares: Float[Array, "3 N"]
-    """Of each row of the map: too oblique, inconsistent, too far. They sum to the 1 - R of a row
-    that the view sees, and are 0 for the others."""
+    """Shares of each row of the map: too oblique, inconsistent, too far. They sum to the 1 - R of
+    a row that the view sees, and are 0 for the others."""
 
     visible: Bool[Array, " N"]
     """Rows that the view sees."""
@@ -76,6 +76,7 @@ def explain_view(
     """
     config = ScoringConfig() if config is None else config
     view = pinhole_view(camera, T_world_camera, config)
+    # The steps of `view_utility`, one by one: the parts must sum to its total.
     buffer, visible = seen_in(state, view, config)
     unseen = visible_cells(cells_of(grid), view, buffer).mask
     position = T_world_camera[:3, 3]
@@ -129,4 +130,5 @@ def divide_lack(lack: Float[Array, " n"], factors: Float[Array, "F n"]) -> Float
     cost = -jnp.log(jnp.where(is_zero, 1.0, factors))
     weight = jnp.where(jnp.any(is_zero, axis=0)[None, :], is_zero.astype(factors.dtype), cost)
     total = jnp.sum(weight, axis=0)
+    # Nothing lacks where all weights are 0, and 0 / 0 must not become NaN.
     return weight * (lack / jnp.where(total > 0.0, total, 1.0))[None, :]

@@ -36,7 +36,9 @@ def gather_in_range(
     """
     if is_traced(state.key, positions):
         raise TypeError("score_views and score_positions choose sizes: call them outside jit")
+    # The box round all positions: one test per voxel, however many candidates there are.
     low, high = positions.min(axis=0), positions.max(axis=0)
+    # Counted first, on the host: the shapes of what is gathered must be known beforehand.
     counts = np.asarray(_count_near(state, grid, low, high, config))
     sizes = _sizes(int(counts[0]), int(counts[1]), state.capacity, grid.log_odds.size)
     return _gather_near(state, grid, low, high, config, sizes)
@@ -63,12 +65,14 @@ def _masks(
     """Voxels and unexplored cells within range of a box."""
 
     def is_near(points: Coordinates, margin: Float[Array, ""] | float) -> Bool[Array, " k"]:
+        # To the box it is no farther than to a position in it: nothing in range is lost.
         gap = [
             jnp.maximum(jnp.maximum(low[i] - points[i], points[i] - high[i]), 0.0) for i in range(3)
         ]
         reach = config.max_range + margin
         return gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] <= reach * reach
 
+    # With the margin of `candidates_of`: the same voxels hide as if the whole map were at hand.
     near_voxels = voxels.present & is_near(voxels.center, voxels.voxel_size)
     near_cells = cells.unexplored & is_near((cells.x, cells.y, cells.z), 0.0)
     return near_voxels, near_cells

@@ -32,7 +32,7 @@ class Panorama(eqx.Module):
     """Per camera axis q_k: the sum of the bins inside the camera's field of view."""
 
     best_direction: Float[Array, " 3"]
-    """Of the axes that are allowed, the one with the largest score; unit length."""
+    """The allowed axis with the largest score; unit length."""
 
     best_score: Float[Array, ""]
     """Its score: lambda1 U_G + U_R (or the gain) of that view, to the resolution of the bins."""
@@ -116,6 +116,7 @@ def panorama_of_bins(
     """The panorama whose bins have these scores."""
     num_bins = config.panorama_bins
     directions = bins_in_view(camera, num_bins) @ bins
+    # Of equal scores the first wins: the choice can be repeated.
     best = jnp.argmax(directions if allowed is None else jnp.where(allowed, directions, -jnp.inf))
     axis = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)[best]
     return Panorama(bins, directions, axis, directions[best], pose_along(position, axis))

@@ -1,6 +1,6 @@
 """Panoramas that are kept, to be scored again after views that are only imagined.
 
-Such views (`scoring.foresight`) change what voxels are worth and which cells are left to explore,
+Such views (`scoring.simulated`) change what voxels are worth and which cells are left to explore,
 but no surface: what a position sees stays, and finding that is most of what a panorama takes. So
 a search over paths finds it once, and again adds up only what has changed.
 
@@ -62,6 +62,7 @@ class Changes(eqx.Module):
 
 def changes_between(before: tuple[MapState, Cells], after: tuple[MapState, Cells]) -> Changes:
     """What differs; `after` comes of `before` by `simulate_view_near`, any number of times."""
+    # The count tells: an imagined view adds to it in just the voxels that it shows.
     shown = after[0].count > before[0].count
     explored = before[1].unexplored & ~after[1].unexplored
     return Changes(before, after, select(shown), select(explored))
@@ -80,6 +81,7 @@ def cached_panorama(
     buffer, visible = seen_in(voxels, view, config)
     seen = visible_cells(cells, view, buffer)
     bins = bins_of_seen(voxels, visible, cells, seen, position, camera.focal, config)
+    # Bits, not bytes: a search keeps these of many positions.
     kept = PanoramaCache(bins, jnp.packbits(visible.mask), jnp.packbits(seen.mask))
     return panorama_of_bins(bins, camera, position, config, allowed), kept
 
@@ -109,6 +111,7 @@ def panorama_from_cache(
     was = deficit_per_bin(voxels, shown, position, focal, forms, num_bins)
     now = deficit_per_bin(voxels_after, shown, position, focal, forms, num_bins)
     gone = unexplored_by_direction(cells, explored, position, num_bins)
+    # A difference of sums may end just below 0 by rounding, which no bin is worth.
     bins = jnp.maximum(kept.bin_scores + (now - was) - config.lambda1 * gone, 0.0)
     return panorama_of_bins(bins, camera, position, config, allowed)
 

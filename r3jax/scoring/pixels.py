@@ -127,9 +127,11 @@ def pixel_view(
     center = voxels.center_of(item.reshape(-1)).reshape(3, *item.shape)
     offset = T_world_camera[:3, 3][:, None, None] - center
     axis = T_world_camera[:3, 2][:, None, None]
+    # In the view of the sensor's range: what it cannot measure stays unexplored.
     count, distance = _unexplored(cells, view, buffer)
     return PixelView(
         hit=hit,
+        # The offset points towards the camera, the axis away from it: hence the sign.
         depth=jnp.where(hit, -jnp.sum(offset * axis, axis=0), jnp.inf),
         offset=offset,
         rows=jax.tree.map(lambda x: x[..., item], rows),

@@ -58,6 +58,7 @@ def consistency(
     `pairwise` is its text, one minus the mean squared difference over pairs, which equals
     1 - 2 tr(M) / (n - 1). Both are clipped to [0, 1], and are 1 for n <= 1.
     """
+    # The unbiased estimate; the floor only keeps a first observation from dividing by zero.
     variance = m2 / jnp.maximum(count - 1.0, 1.0)
     spread = 2.0 * variance if form == "pairwise" else jnp.sqrt(2.0 / 1.5 * variance)
     return jnp.where(count > 1.0, jnp.clip(1.0 - spread, 0.0, 1.0), 1.0)
@@ -78,14 +79,18 @@ def score_voxels(
         forms: of kappa and delta.
     """
     delta = consistency(voxels.count, voxels.m2, forms.delta)
+    # From the voxel to the camera, as the visited bins were recorded.
     offset = camera_position[:, None] - voxels.center
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     direction = offset / distance[None, :]
     cosine, inside = seen_directions(voxels.visited, direction, voxels.num_bins)
     is_one = (inside > 0.0) | (forms.kappa == "one")
     kappa_value = jnp.where(is_one, 1.0, 2.0)
+    # kappa is 1 or 2: a product will do, and no power whose gradient could fail at 0.
     bias = jnp.where(is_one, cosine, cosine * cosine)
+    # delta may be exactly 0, where the gradient of a plain power is infinite or NaN.
     noise = safe_power(delta, kappa_value * (1.0 - bias))
+    # rho_max / rho with rho = f / d: to come closer than ever costs, to stay farther does not.
     ratio = jnp.minimum(voxels.resolution * distance / focal, 1.0)
     resolution = safe_power(ratio, 1.0 - delta * bias)
     blank: Callable[[Array], Array] = lambda term: jnp.where(voxels.present, term, 0.0)
@@ -113,6 +118,7 @@ def _score_present(
         target = jnp.where(valid, index, num)
         return jax.tree.map(lambda all, new: all.at[target].set(new, mode="drop"), terms, part)
 
+    # What absent rows keep: kappa 2, delta 1, and 0 for R and its factors.
     zeros, ones = jnp.zeros(num), jnp.ones(num)
     return for_selected(
         select(voxels.present), score, Renderability(2.0 * ones, zeros, ones, zeros, zeros, zeros)

@@ -59,6 +59,7 @@ def score_on_devices(
     mesh = Mesh(np.asarray(devices), (_AXIS,))
     apart = NamedSharding(mesh, PartitionSpec(_AXIS))
     everywhere = NamedSharding(mesh, PartitionSpec())
+    # There may be a function among them (`score_pixels`), which no device can hold.
     numbers, others = eqx.partition(known, eqx.is_array_like)
     numbers = jax.device_put(numbers, everywhere)
     shares = jax.device_put(padded_to(len(devices), candidates), apart)

@@ -88,6 +88,7 @@ def observed(
         position: its center [m].
         focal: its focal length [px].
     """
+    # Bins and resolution by the code of real frames, so that both count alike.
     marked, shown, n = mark_rows(voxels, visible, position, focal), visible.mask, voxels.count
     grows = shown & (n > 1.0)
     m2 = jnp.where(grows, voxels.m2 * n / jnp.maximum(n - 1.0, 1.0), voxels.m2)

@@ -73,7 +73,7 @@ class Surrogate(eqx.Module):
     """What may be seen from a box of positions, and what it is worth from its nodes."""
 
     x: Float[Array, " m"]
-    """Of the points: voxels, then cells [m]."""
+    """Coordinate of the points: voxels, then cells [m]."""
 
     y: Float[Array, " m"]
     """[m]."""
@@ -85,7 +85,7 @@ class Surrogate(eqx.Module):
     """w at the nodes: the middle, then the lower and the upper side along x, y and z."""
 
     middle: Float[Array, " 3"]
-    """Of the box [m]."""
+    """Center of the box [m]."""
 
     half: Float[Array, " 3"]
     """From the middle to the sides [m]."""
@@ -109,6 +109,7 @@ def soft_utility(
     """
     offset = [p - position[i] for i, p in enumerate((around.x, around.y, around.z))]
     x, y, z = (sum(R[i, j] * offset[i] for i in range(3)) for j in range(3))
+    # Added under the root: at the camera itself the gradient stays finite.
     inverse = 1.0 / jnp.sqrt(x * x + y * y + z * z + 1e-6)
     inside = jnp.ones_like(x)
     for along, focal, center, size in (
@@ -116,6 +117,7 @@ def soft_utility(
         (y, camera.fy, camera.cy, camera.height),
     ):
         for side, k in ((1.0, -center / focal), (-1.0, (size - center) / focal)):
+            # Distance to the side's plane over that to the camera: a sine, smooth at the border.
             sine = side * (along - k * z) * inverse / jnp.sqrt(1.0 + k * k)
             inside = inside * jax.nn.sigmoid(sine / softness.angle)
     return jnp.sum(inside * _worth_at(around, position))
@@ -154,6 +156,7 @@ def surrogate_of(
         return pinhole_view(wide, T_world_camera.at[:3, 3].set(position), config)
 
     sight = _look_about(voxels, cells, nodes, safe_norm(half), view_from, config)
+    # What any node sees: it may come into sight on the way.
     row, is_row, each = _sample(jnp.any(sight.seen, axis=0), MOST_VOXELS)
     part, center = voxels.take(row, is_row), voxels.center_of(row)
     cell, is_cell, each_cell = _sample(jnp.any(sight.empty, axis=0), MOST_CELLS)
@@ -202,6 +205,7 @@ def _look_about(
 ) -> _Sight:
     """Looks from every node, at what can be seen from within `reach` [m] of the first."""
     middle = view_from(nodes[0])
+    # Culled once: with the reach as margin nothing that another node sees is lost.
     near_voxels = select(voxels.present & middle.may_see(voxels.center, voxels.voxel_size + reach))
     near_cells = select(cells.unexplored & middle.may_see((cells.x, cells.y, cells.z), reach))
 
@@ -270,6 +274,7 @@ def _sample(
     num = chosen.shape[0]
     order = positions_of_set(chosen, num)
     count = jnp.sum(chosen, dtype=jnp.float32)
+    # What each stands for: the sum over the sample keeps the size of that over all.
     each = jnp.maximum(count / most, 1.0)
     number = jnp.arange(min(most, num), dtype=jnp.float32)
     index = order[jnp.minimum((number * each).astype(jnp.int32), num - 1)]

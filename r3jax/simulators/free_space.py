@@ -1,4 +1,4 @@
-"""What the referee may know of a world: its free space, and pictures from anywhere.
+"""What the evaluation protocol may know of a world: its free space, and pictures from anywhere.
 
 The free space is sampled by nodes a tenth of a meter apart. A node is free if every surface is at
 least the margin away; the nodes that a camera can reach are those connected to its start. Two
@@ -23,9 +23,9 @@ from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.clearance import cut_triangles, point_triangle
-from r3jax.simulators.noise import NoisySimulator
-from r3jax.simulators.raycast import RaycastSimulator
-from r3jax.simulators.rays import TriangleScene
+from r3jax.simulators.depth_noise import NoisySimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
+from r3jax.simulators.raycast.rays import TriangleScene
 
 _STEP = 0.1
 """Nodes are no farther apart along an axis, nor farther than the margin [m]."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.simulators.clearance import SurfaceDistance
-from r3jax.simulators.rays import Hits, TriangleScene
+from r3jax.simulators.raycast.rays import Hits, TriangleScene
 
 MIN_CLEARANCE = 0.3
 """A start nearer to the mesh than this is an error [m]."""

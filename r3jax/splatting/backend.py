@@ -99,7 +99,7 @@ def find_backend(name: str) -> Rasterize:
     elif name == "splax":
         from r3jax.splatting.backends.splax import rasterize
     elif name == "reference":
-        from r3jax.splatting.reference import rasterize
+        from r3jax.splatting.backends.reference import rasterize
     else:
         raise ValueError(
             f"there is no rasterizer backend {name!r}: choose auto, numba, xla, splax or reference"

@@ -39,7 +39,7 @@ _MAX_HEADER_LINES = 10_000
 """A header longer than this is something else."""
 
 _BLOCK = 1 << 22
-"""Of a text that is read at once [bytes]."""
+"""Length of a text that is read at once [bytes]."""
 
 _LONGEST_WORD = 400
 """A number with more digits is something else."""

@@ -16,7 +16,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.splatting.errors import ViewsError
 
 
-class View(eqx.Module):
+class PosedImage(eqx.Module):
     """One view, as the loss wants it."""
 
     rgb: Float[Array, "H W 3"]
@@ -66,9 +66,9 @@ class Views(eqx.Module):
         """Columns of every image [px]."""
         return self.rgb.shape[2]
 
-    def view(self, index: int | Int[Array, ""]) -> View:
+    def view(self, index: int | Int[Array, ""]) -> PosedImage:
         """One view; the index may be traced."""
-        return View(
+        return PosedImage(
             rgb=self.rgb[index].astype(jnp.float32) / 255.0,
             depth=self.depth[index],
             T_world_camera=self.T_world_camera[index],

@@ -28,6 +28,7 @@ def fill(template: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     names = [_name(path) for path, _ in leaves]
+    # One array too many means another version of the policy: its memory would be half understood.
     if set(names) != set(arrays):
         odd = sorted(set(names) ^ set(arrays))
         raise ValueError(f"these arrays are missing or of no use: {', '.join(odd)}")
@@ -44,6 +45,7 @@ def _name(path: tuple[Any, ...]) -> str:
 def _like(leaf: Any, array: np.ndarray, name: str) -> Any:
     """The array as the kind of thing that the leaf is: a device array, NumPy, or a number."""
     wanted = np.asarray(leaf)
+    # Sizes may differ, as tables double; a type or an axis may not, as compiled code rests on them.
     if array.dtype != wanted.dtype or array.ndim != wanted.ndim:
         raise ValueError(
             f"{name} is {array.dtype} with {array.ndim} axes, expected {wanted.dtype} with "
@@ -53,4 +55,5 @@ def _like(leaf: Any, array: np.ndarray, name: str) -> Any:
         return jnp.asarray(array)
     if isinstance(leaf, np.ndarray | np.generic):
         return array
+    # A Python number: as an array it would be traced where the loop wants a plain value.
     return type(leaf)(array.item())

@@ -28,6 +28,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
 
+# Not one: if the newest is damaged, an older one still saves most of the mapping.
 KEPT = 3
 """Older checkpoints are deleted."""
 
@@ -42,7 +43,8 @@ class CheckpointWriter:
             OSError: the folder is a link, or cannot be made.
         """
         make_folder(folder)
-        self._folder = folder.resolve()
+        self._folder = folder.resolve()  # the thread may outlive a change of folder
+        # One thread: two checkpoints at a time would discard each other's elders.
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._under_way: Future[None] | None = None
 
@@ -63,9 +65,11 @@ class CheckpointWriter:
         Raises:
             OSError: the one before, or with `wait` this one, could not be written.
         """
+        # Leaving one out costs some frames at a resume; waiting would cost time of the mission.
         if self._under_way is not None and not wait and not self._under_way.done():
             return False
-        self.wait()
+        self.wait()  # it is done, but may have failed: this is where the loop hears of it
+        # Orbax refuses a tree without leaves, such as the memory of a policy that keeps none.
         tree = {name: _storable(table) for name, table in tables.items() if table}
         self._under_way = self._thread.submit(self._write, step, tree)
         if wait:
@@ -78,18 +82,21 @@ class CheckpointWriter:
         Raises:
             OSError: it could not be written.
         """
+        # Forgotten before it is asked: one failure is told once, not at every view that follows.
         under_way, self._under_way = self._under_way, None
         if under_way is not None:
             under_way.result()
 
     def _write(self, step: int, tree: dict[str, dict[str, np.ndarray]]) -> None:
         """In the thread: writes one and discards all but the newest three."""
+        # The new one is whole before an old one goes, so that there is always one to resume from.
         write_checkpoint(self._folder / f"{step:06d}", tree)
         for old in numbered(self._folder)[:-KEPT]:
             discard(old)
 
     def close(self) -> None:
         """Waits and ends the thread. What `wait` would say of the last one is lost."""
+        # Nothing is lost with it: frames and rows rebuild the state.
         with contextlib.suppress(OSError):
             self.wait()
         self._thread.shutdown()
@@ -114,6 +121,7 @@ def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]
             path,
             f"the checkpoint cannot be read ({error}); resuming the run makes it anew",
         ) from None
+    # Orbax restores any tree; only two levels are tables of arrays.
     if not all(isinstance(table, dict) for table in tables.values()):
         raise RunError(path, "the checkpoint does not hold tables of arrays")
     return {name: _stored(table) for name, table in tables.items()}
@@ -152,6 +160,7 @@ def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
     tables = load_checkpoint(folder, steps[-1])
     try:
         arrays: dict[str, Any] = {name: jnp.asarray(x) for name, x in tables["map"].items()}
+        # It is static in MapState, a part of what is compiled, and no array there.
         num_bins = int(arrays.pop("num_bins"))
         grid = {name: jnp.asarray(x) for name, x in tables["grid"].items()}
         return steps[-1], MapState(**arrays, num_bins=num_bins), OccupancyGrid(**grid)

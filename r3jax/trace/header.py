@@ -19,9 +19,9 @@ from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
 from r3jax.formats.validation.names import check_relative
 from r3jax.formats.validation.versions import VersionError, check_version
 from r3jax.geometry.cameras import Camera
-from r3jax.planning.motion import Motion
 from r3jax.planning.policies import HOMES
 from r3jax.planning.policy import Policy
+from r3jax.planning.robot.motion import Motion
 from r3jax.trace.errors import RunError
 
 FORMAT = "r3jax-run"
@@ -94,6 +94,7 @@ class RunHeader:
     @property
     def intrinsics(self) -> Camera:
         """The camera of every frame."""
+        # The size shapes what is compiled and is static; the rest is traced.
         size = {name: int(self.camera[name]) for name in ("width", "height")}
         return Camera(**size, **{name: self.camera[name] for name in _LENS})  # pyright: ignore[reportArgumentType]
 
@@ -106,6 +107,7 @@ def camera_fields(camera: Camera) -> dict[str, int | float]:
 
 def plain_settings(settings: Any) -> Any:
     """Nested settings (dataclasses, modules, arrays) as what JSON can hold."""
+    # vars, not asdict: that would copy arrays and stop at modules.
     if isinstance(settings, eqx.Module) or dataclasses.is_dataclass(settings):
         return {name: plain_settings(value) for name, value in vars(settings).items()}
     if isinstance(settings, str | bool | int | float | None):
@@ -130,6 +132,7 @@ def settings_of(policy: object) -> dict[str, Any]:
     what their absence has always meant.
     """
     settings = plain_settings(getattr(policy, "config", {}))
+    # Left out where it changes nothing: headers from before there was this setting stay equal.
     if settings.get("motion") == plain_settings(Motion()):
         del settings["motion"]
     if settings.get("refine") == 0:
@@ -139,7 +142,7 @@ def settings_of(policy: object) -> dict[str, Any]:
 
 def package_versions() -> dict[str, str]:
     """Versions of what shapes the result on this machine."""
-    import jax
+    import jax  # only here is a device asked for
 
     versions: dict[str, str] = {
         "python": platform.python_version(),
@@ -148,14 +151,16 @@ def package_versions() -> dict[str, str]:
     for name in _PACKAGES:
         try:
             versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
+        except importlib.metadata.PackageNotFoundError:  # run from its source
             versions[name] = "not installed as a package"
     return versions
 
 
 def header_to_json(header: RunHeader) -> str:
     """The text of run.json."""
+    # Format and version come first, for those who open the file by hand.
     plain = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(header)}
+    # NaN would become a word that `parse_json` refuses: the run could never be read.
     return json.dumps(sealed(plain), indent=2, allow_nan=False) + "\n"
 
 
@@ -173,12 +178,14 @@ def read_header(path: Path) -> RunHeader:
         raise RunError(path, f"the file cannot be read ({error})") from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         raise RunError(path, f"the file does not describe a run (no format {FORMAT!r})")
+    # Before the seal and the fields: a newer version may seal and name them otherwise.
     try:
         check_version(plain.get("version"), VERSION)
     except VersionError as error:
         raise RunError(path, f"the run has {error}") from None
     try:
         fields = unsealed(plain)
+        # They are of the file, not of the run, and `build` refuses what it does not know.
         del fields["format"], fields["version"]
         header = build(RunHeader, fields)
         _check(header)
@@ -193,6 +200,7 @@ def _check(header: RunHeader) -> None:
     Raises:
         ValueError: says which setting makes no sense.
     """
+    # `camera`, `scene` and `policy` are dictionaries, of which `build` checks no names.
     for name, kind in (("width", int), ("height", int), *dict.fromkeys(_LENS, float).items()):
         check_type(f"camera.{name}", header.camera.get(name), kind)
     check_type("scene.name", header.scene.get("name"), str)
@@ -200,6 +208,7 @@ def _check(header: RunHeader) -> None:
     if header.is_of_team:
         _check_team(header.parent or {})
     camera = header.intrinsics
+    # Sizes from a file become sizes of arrays: a damaged one must not take all memory.
     if camera.width * camera.height > MAX_PIXELS:
         raise ForeignFileError(f"images of {camera.width} x {camera.height} pixels are not read")
     if [len(corner) for corner in header.bounds] != [3, 3]:
@@ -219,5 +228,6 @@ def _check_team(parent: dict[str, Any]) -> None:
     check_type("parent.meet_every", parent.get("meet_every"), float)
     if not parent["team"] or parent["meet_every"] < 0.0:
         raise ForeignFileError("`parent` names a team without members, or that met before it began")
+    # The others' runs are opened by these names: they may not lead out of the team's folder.
     for name in parent["team"]:
         check_relative(name)

@@ -29,7 +29,9 @@ def to_integers(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Color [H, W, 3] uint8 and depth [H, W] uint16 in steps of 0.2 mm."""
     rgb = np.rint(np.asarray(frame.rgb) * np.float32(255.0)).astype(np.uint8)
     depth = np.asarray(frame.depth)
+    # inf times a number is inf, and its integer is undefined: it gets its own value below.
     finite = np.where(np.isfinite(depth), depth, 0.0)
+    # In float64 the product is exact; float32 would round it once more, before `rint` does.
     steps = np.rint(finite.astype(np.float64) * DEPTH_STEPS_PER_METRE)
     # A surface closer than half a step is still a surface, not a missing measurement.
     steps = np.where((finite > 0.0) & (steps < 1.0), 1.0, steps)
@@ -59,6 +61,7 @@ def stored_form(frame: Frame) -> Frame:
 def content_hash(rgb: np.ndarray, depth: np.ndarray) -> str:
     """SHA-256 over the stored pixels; it does not depend on the PNG compressor."""
     digest = hashlib.sha256(np.ascontiguousarray(rgb).tobytes())
+    # Little-endian by name: the hash must be the same on every machine.
     digest.update(np.ascontiguousarray(depth).astype("<u2").tobytes())
     return digest.hexdigest()
 
@@ -70,7 +73,7 @@ def frame_hash(frame: Frame) -> str:
 
 def encode_png(image: np.ndarray) -> bytes:
     """A PNG of [H, W, 3] uint8 or [H, W] uint16."""
-    from PIL import Image
+    from PIL import Image  # a run is read without pictures more often than with them
 
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="png", compress_level=_PNG_LEVEL)

@@ -80,6 +80,7 @@ class Run:
         size = (self.camera.width, self.camera.height)
         rgb = read_png(self.image_path(step), *size, is_depth=False)
         depth = read_png(self.depth_path(step), *size, is_depth=True)
+        # PNG has a checksum of its own, but not against a file of another run or an edited one.
         if content_hash(rgb, depth) != self.rows[step].sha256:
             raise RunError(self.image_path(step), "the pixels differ from those recorded")
         return rgb, depth
@@ -120,6 +121,7 @@ def read_run(path: Path | str) -> Run:
             row = from_json(line)
         except ForeignFileError as error:
             raise RunError(path / "trace.jsonl", f"line {number}: {error}") from None
+        # Rows of views are numbered, so that a lost line is noticed; the end has no number.
         if isinstance(row, EndRow):
             end = row
         elif row.step != len(rows):
@@ -146,19 +148,24 @@ def complete_lines(path: Path) -> list[str]:
         raise RunError(path, f"the file cannot be read ({error.strerror})") from None
     except ForeignFileError as error:
         raise RunError(path, str(error)) from None
+    # Counted before it is split: as strings, short lines take many times the room of their bytes.
     if data.count(b"\n") > _MAX_LINES:
         raise RunError(path, f"the file has more than {_MAX_LINES} lines: it is no trace")
+    # Replaced, not refused: the line that is damaged is told by its number, by who parses it.
+    # Split at \n alone: `splitlines` would also break at separators inside a text.
     return data.decode("utf-8", errors="replace").split("\n")[:-1]
 
 
 def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
     """Timings are a by-product: what cannot be read of them is left out."""
+    # Merged runs have none, and a process may have been killed before it wrote any.
     if not path.exists():
         return ()
     timings: list[dict[str, float]] = []
     for line in complete_lines(path):
         try:
             plain = parse_json(line)
+            # Twice: the seal is a text among the numbers, and goes in between.
             check_type("timings", plain, dict[str, Any])
             plain = unsealed(plain)
             check_type("timings", plain, dict[str, float])

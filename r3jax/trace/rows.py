@@ -123,6 +123,7 @@ class EndRow:
 def make_choice(decision: Decision, info: PlanInfo) -> Choice:
     """What the trace keeps of a decision."""
     total = np.asarray(decision.utilities.get("total", np.zeros(0)), dtype=np.float64)
+    # Unreachable candidates have no utility; stable, so that equal ones keep the order of drawing.
     best = np.argsort(-np.where(np.isfinite(total), total, -np.inf), kind="stable")
     best = best[:TOP_CANDIDATES]
     top = {
@@ -149,6 +150,7 @@ def to_json(row: StepRow | EndRow) -> str:
     """One line of trace.jsonl, keys in a fixed order."""
     kind = "step" if isinstance(row, StepRow) else "end"
     plain = {"kind": kind, **dataclasses.asdict(row, dict_factory=_plain_dict)}
+    # No blanks and a fixed order: under the model clock equal runs are equal bytes.
     return json.dumps(sealed(plain), allow_nan=False, separators=(",", ":"))
 
 
@@ -162,9 +164,11 @@ def from_json(line: str) -> StepRow | EndRow:
     plain = parse_json(line)
     if not isinstance(plain, dict) or plain.get("kind") not in ("step", "end"):
         raise ForeignFileError("a row is an object with the kind `step` or `end`")
+    # The seal comes before the fields: a flipped digit is told as damage, not as an odd number.
     plain = unsealed(plain)
     if plain.pop("kind") == "end":
         return build(EndRow, plain)
+    # Arrays and nested records are made here, as `build` knows what JSON knows.
     row = build(
         StepRow,
         plain,
@@ -172,12 +176,14 @@ def from_json(line: str) -> StepRow | EndRow:
         choice=None if plain.get("choice") is None else _choice(plain["choice"]),
         coverage=build(Coverage, plain.get("coverage")),
     )
+    # It becomes a file name and an index, where -1 would be the last.
     if row.step < 0:
         raise ForeignFileError(f"`step` must not be negative, got {row.step}")
     return row
 
 
 def _choice(plain: Any) -> Choice:
+    # What is no object is refused by `build`, which says so.
     known: dict[str, Any] = plain if isinstance(plain, dict) else {}
     waypoints = _numbers("waypoints", known.get("waypoints"), (-1, 3))
     return build(Choice, plain, pose=_pose("choice.pose", known.get("pose")), waypoints=waypoints)
@@ -185,6 +191,7 @@ def _choice(plain: Any) -> Choice:
 
 def _pose(name: str, values: Any) -> np.ndarray:
     pose = _numbers(name, values, (4, 4))
+    # A matrix that scales or mirrors would still project, to wrong places.
     problem = rigid_error(pose)
     if problem is not None:
         raise ForeignFileError(f"`{name}`: {problem}")
@@ -198,6 +205,7 @@ def _numbers(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
             table = np.asarray(values, dtype=np.float32)
     except (ValueError, TypeError):
         raise ForeignFileError(f"`{name}` must be a table of numbers") from None
+    # An empty list has one axis; a path without waypoints has two.
     if table.size == 0 and shape[0] < 0:
         table = table.reshape(0, shape[1])
     if table.ndim != 2 or table.shape[1] != shape[1] or shape[0] not in (-1, len(table)):
@@ -211,6 +219,7 @@ def shortest_floats(array: np.ndarray) -> list[Any]:
     """Nested lists of the shortest decimals that read back as the same float32 numbers."""
     if array.ndim > 1:
         return [shortest_floats(part) for part in array]
+    # str of a float32 is its shortest decimal; as a float64 it would drag along digits of noise.
     return [float(str(value)) for value in array.astype(np.float32)]
 
 

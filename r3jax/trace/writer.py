@@ -38,6 +38,7 @@ _ROOM_BYTES = 64 << 10
 _BEGUN = ("lock", "trace.jsonl", "frames", "report", _ROOM)
 """What there may be before run.json is."""
 
+# By name, never a whole tree: what users put into a run survives `overwrite`.
 _OWN = (
     "trace.jsonl",
     "timings.jsonl",
@@ -113,14 +114,16 @@ class RunWriter:
         Raises:
             RunError: not a run, damaged, being written by another process, or not writable.
         """
+        # Not by `__init__`, which would clear the run away.
         writer = cls.__new__(cls)
         writer.path = Path(path)
         read_header(writer.path / "run.json")  # says what is wrong before anything is touched
         try:
             with writer._locked():
+                # Read under the lock: until now another process may have added views.
                 run = read_run(writer.path)
                 writer._checkpoints = CheckpointWriter(writer.path / "checkpoints")
-                _mend(writer.path)
+                _mend(writer.path)  # after the read, which refuses a trace that cannot be mended
                 if header is not None:
                     write_atomic(writer.path / "run.json", header_to_json(header).encode())
                 writer._begin(header or run.header, views=len(run.rows))
@@ -128,11 +131,13 @@ class RunWriter:
             raise RunError(
                 writer.path, f"cannot go on with the run ({error.strerror or error})"
             ) from error
+        # It has not ended any more.
         return writer, replace(run, header=header or run.header, end=None)
 
     @contextlib.contextmanager
     def _locked(self):
         """Takes the lock, and keeps it unless the block fails."""
+        # The lock is kept beyond this block, by the writer; only a failure in it gives it back.
         try:
             self._lock = lock_folder(self.path)
         except BlockingIOError:
@@ -152,6 +157,7 @@ class RunWriter:
             "budget": header.budget,
             "packages": package_versions(),
         }
+        # The time of day is here and nowhere else: equal runs shall write equal traces.
         append_line(self.path / "history.jsonl", json.dumps(begin))
         # No zeros: some file systems store them in no room at all.
         write_atomic(self.path / _ROOM, os.urandom(_ROOM_BYTES))
@@ -191,16 +197,20 @@ class RunWriter:
         self._store(row, rgb, depth)
 
     def _store(self, row: StepRow, rgb_png: bytes, depth_png: bytes) -> None:
+        # Images, then their names, then the row: whatever moment the power fails at, every row
+        # that is there has its images.
         stem = self.path / "frames" / f"{row.step:06d}"
         with self._guarded():
             write_atomic(stem.with_suffix(".png"), rgb_png)
             write_atomic(stem.with_suffix(".depth.png"), depth_png)
             sync_folder(stem.parent)
             append_line(self.path / "trace.jsonl", to_json(row))
+            # Counted last: the end row must not count a view whose row the disk refused.
             self.views += 1
 
     def add_timings(self, step: int, stages: dict[str, float]) -> None:
         """Stores what the stages of one view really took [s], outside the mission clock too."""
+        # In a file of its own, and rounded to microseconds: it differs from run to run.
         line = sealed({"step": step, **{k: round(v, 6) for k, v in stages.items()}})
         with self._guarded():
             append_line(self.path / "timings.jsonl", json.dumps(line))
@@ -223,7 +233,9 @@ class RunWriter:
             RecordingStopped: the disk refused this, or a checkpoint that was under way.
         """
         with self._guarded(), contextlib.ExitStack() as afterwards:
+            # Also if the row fails: a checkpoint that is under way is told of, and not dropped.
             afterwards.callback(self._checkpoints.wait)
+            # Freed first: on a full disk this room is all there is for the row.
             (self.path / _ROOM).unlink(missing_ok=True)
             append_line(self.path / "trace.jsonl", to_json(EndRow(outcome, message, self.views)))
 
@@ -241,7 +253,9 @@ class RunWriter:
     def close(self) -> None:
         """Frees the threads and the lock."""
         try:
+            # Before the lock goes: a thread that still writes would meet the next process.
             self._checkpoints.close()
+            # A disk that has become read-only refuses this; the run is whole all the same.
             with contextlib.suppress(OSError):
                 (self.path / _ROOM).unlink(missing_ok=True)
         finally:
@@ -269,10 +283,13 @@ def _mend(path: Path) -> None:
         if isinstance(from_json(line), StepRow):
             views.append(line)
         else:
+            # How the run ended before is kept: the trace holds one end, and only as its last row.
             append_line(path / "history.jsonl", line)
+    # A trace that is whole is not touched.
     whole = "".join(f"{line}\n" for line in views).encode()
     if trace.read_bytes() != whole:
         write_atomic(trace, whole)
+    # Only its torn end: the next line would be glued to it, and both would be lost.
     timings = path / "timings.jsonl"
     if timings.exists() and not timings.read_bytes().endswith(b"\n"):
         write_atomic(timings, "".join(f"{line}\n" for line in complete_lines(timings)).encode())
@@ -293,6 +310,7 @@ def _check_free(path: Path, *, overwrite: bool) -> None:
     if (path / "run.json").exists():
         if not overwrite:
             raise RunError(path, "the run exists already: choose another name or give --overwrite")
+    # Without run.json it is ours only if a process that began a run may have left all of it.
     elif not all(_is_begun(entry) for entry in path.iterdir()):
         raise RunError(path, "the folder holds something that is not a run: choose another name")
 
@@ -313,6 +331,7 @@ def _is_begun(entry: Path) -> bool:
 def _clear(path: Path) -> None:
     """Deletes the run that is there, but for run.json, which the new one replaces."""
     for folder in (path / "checkpoints", *path.glob("models/*/checkpoints")):
+        # A link on the way leads to what was perhaps never ours.
         if folder.resolve() == path.resolve() / folder.relative_to(path):
             for old in numbered(folder):
                 discard(old)

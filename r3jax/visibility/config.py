@@ -29,5 +29,6 @@ class VisibilityConfig(eqx.Module):
 
     def __check_init__(self) -> None:
         """Refuses a side that the octahedral map cannot have."""
+        # Powers of two halve exactly, so that the borders of every level of the pyramid wrap alike.
         if self.panorama_size < 2 or self.panorama_size & (self.panorama_size - 1):
             raise ValueError(f"panorama_size must be a power of two, got {self.panorama_size}")

@@ -23,6 +23,7 @@ from r3jax.visibility.views import Placement, View, wrap
 _CORNER = 0.6
 """Where visibility is tested, in edges from a voxel's center along columns and rows."""
 
+# The largest word: every voxel wins the minimum against it.
 _NOTHING = 0xFFFFFFFF
 
 
@@ -53,6 +54,7 @@ def depth_buffer(
     for height, width in shapes:
         offsets.append(offsets[-1] + height * width)
     num = candidates.num
+    # As many bits for the index as it needs; all others sharpen the distance.
     item_bits = max(1, (num - 1).bit_length())
 
     def splat(
@@ -60,17 +62,22 @@ def depth_buffer(
     ) -> UInt32[Array, " p"]:
         place = view.place(voxels.center_of(index))
         valid = valid & place.ahead & (place.distance <= view.max_range)
+        # As a share of the range: the bits left beside the index cover the distances that occur.
         packed = _pack(place.distance / view.max_range, index, item_bits)
         for target in footprint(place, valid, voxels.voxel_size, shapes, offsets, wraps=view.wraps):
+            # A minimum commutes: the result does not depend on the order of the scatter.
             pixels = pixels.at[target].min(packed, mode="drop")
         return pixels
 
+    # All levels in one flat array: one scatter serves voxels of every size.
     blank = jnp.full(offsets[-1] + SPARE, _NOTHING, dtype=jnp.uint32)
     finest = _push_down(for_selected(candidates, splat, blank), shapes, offsets)
     is_hit = finest != jnp.uint32(_NOTHING)
     item = jnp.where(is_hit, (finest & jnp.uint32((1 << item_bits) - 1)).astype(jnp.int32), num)
     share = (finest >> item_bits).astype(jnp.float32) / _num_steps(item_bits)
+    # Rounded down to a step of the share: the fewer voxels there are, the finer the steps.
     distance = jnp.where(is_hit, share * view.max_range, jnp.inf)
+    # A slanting wall has voxels behind one another that are one surface.
     limit = surface_limit(distance, view.pixel_angle, config.tolerance * voxels.voxel_size)
     return DepthBuffer(item, distance, limit)
 
@@ -107,6 +114,7 @@ def voxels_in_pixels(
     item = depth_buffer(voxels, candidates_of(voxels, view), view, config).item
     flat = item.reshape(-1)
     is_hit = flat < voxels.present.shape[0]
+    # Row 0 stands in where nothing is shown, marked absent, so that the gather stays in bounds.
     return voxels.take(jnp.where(is_hit, flat, 0), is_hit), item
 
 
@@ -141,6 +149,7 @@ def corner_margin(
         for i in (-1.0, 1.0)
         for j in (-1.0, 1.0)
     ]
+    # The best of four corners: a voxel is hidden only if it is hidden as a whole.
     reach = jnp.maximum(
         jnp.maximum(farthest[0], farthest[1]), jnp.maximum(farthest[2], farthest[3])
     )
@@ -150,6 +159,7 @@ def corner_margin(
 def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
     """True for points that fall into the image, at whatever distance."""
     height, width = view.shape
+    # Half-open: a point on the far border belongs to a pixel that is not there.
     is_in = (place.column >= 0.0) & (place.column < width) & place.ahead
     return is_in & (place.row >= 0.0) & (place.row < height)
 
@@ -169,6 +179,7 @@ def _at_pixel(
     height, width = image.shape
 
     def whole(value: Array, size: int) -> Array:
+        # Clipped before it becomes an integer: far outside, int32 would wrap round.
         return jnp.floor(jnp.clip(value, -1.0, float(size))).astype(jnp.int32)
 
     r, c = whole(row, height), whole(column, width)
@@ -179,6 +190,7 @@ def _at_pixel(
 
 
 def _num_steps(item_bits: int) -> float:
+    # The largest value of the bits that the index leaves: a share of 1 must still fit.
     return float((1 << (32 - item_bits)) - 1)
 
 
@@ -186,6 +198,7 @@ def _pack(
     share: Float[Array, " n"], index: Int[Array, " n"], item_bits: int
 ) -> UInt32[Array, " n"]:
     """Distance in the high bits, index in the low ones: `min` keeps the nearest voxel."""
+    # Points that are not valid are packed as well: unclipped, theirs could be a cast out of range.
     steps = (jnp.clip(share, 0.0, 1.0) * _num_steps(item_bits)).astype(jnp.uint32)
     packed = (steps << item_bits) | index.astype(jnp.uint32)
     return jnp.minimum(packed, jnp.uint32(_NOTHING - 1))  # all ones would read as "nothing"
@@ -196,9 +209,11 @@ def _push_down(
 ) -> UInt32[Array, "h w"]:
     """The minimum over all levels, at the finest."""
     level: Callable[[int], Array] = lambda i: pixels[offsets[i] : offsets[i + 1]].reshape(shapes[i])
+    # From coarse to fine, each pixel once: a near voxel was written to four pixels at most.
     combined = level(len(shapes) - 1)
     for i in range(len(shapes) - 2, -1, -1):
         height, width = shapes[i]
+        # Odd sizes: the last coarse pixel sticks out and is cut off.
         enlarged = jnp.repeat(jnp.repeat(combined, 2, axis=0), 2, axis=1)[:height, :width]
         combined = jnp.minimum(level(i), enlarged)
     return combined

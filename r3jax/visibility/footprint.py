@@ -32,6 +32,7 @@ def pyramid(shape: tuple[int, int]) -> list[tuple[int, int]]:
     shapes = [shape]
     while max(shapes[-1]) > 1:
         height, width = shapes[-1]
+        # Rounded up: every pixel of the finer level needs a parent.
         shapes.append((-(-height // 2), -(-width // 2)))
     return shapes
 
@@ -61,21 +62,25 @@ def footprint(
     half = voxel_size * (_HALF_WIDTH + _NEAR * voxel_size / place.distance)
     widths = [2.0 * half * x for x in (place.column_scale, place.row_scale)]
     widest = jnp.maximum(jnp.maximum(widths[0], widths[1]), 1e-6)
+    # Half the width before the logarithm: on its level a footprint is at most two pixels wide.
     level = jnp.clip(jnp.ceil(jnp.log2(0.5 * widest)), 0.0, len(shapes) - 1.0)
     scale = jnp.exp2(-level)
     level = level.astype(jnp.int32)
     table: Callable[[list[int]], Array] = lambda values: jnp.asarray(values, dtype=jnp.int32)[level]
+    # Voxels side by side may lie on different levels, so sizes and offsets are gathered for each.
     height, width = table([s[0] for s in shapes]), table([s[1] for s in shapes])
     offset = table(offsets[:-1])
     begins_level = (level > 0) & (0.5 * widest * scale < _SEAM)
     spread = jnp.where(begins_level, 0.25, 0.0)
     columns = _covered(place.column * scale, 0.5 * widths[0] * scale + spread)
     rows = _covered(place.row * scale, 0.5 * widths[1] * scale + spread)
+    # The octagon's slanted sides: a cube seen at an edge does not fill its bounding rectangle.
     slanted = [half * w * scale + 2.0 * spread for w in (place.sum_scale, place.difference_scale)]
     nowhere = spare_places(offsets[-1], level.shape[0])
     indices: list[Int[Array, " n"]] = []
     for r, covers_row, down in rows:
         for c, covers_column, right in columns:
+            # A far voxel may reach no pixel center at all, and must show in its own pixel still.
             is_own = (jnp.abs(right) <= 0.5) & (jnp.abs(down) <= 0.5)
             covers = (jnp.abs(right + down) <= slanted[0]) & (jnp.abs(right - down) <= slanted[1])
             is_in = valid & covers_row & covers_column & (covers | is_own)
@@ -95,6 +100,7 @@ def _covered(
 
     The pixel that holds the coordinate is always covered.
     """
+    # Clipped before it becomes an integer: far outside, int32 would wrap round.
     first = jnp.floor(jnp.clip(middle, -2.0, 1e6) - 0.5)
     reach = jnp.maximum(reach, 0.5)
     return [

@@ -40,6 +40,7 @@ class Selection(eqx.Module):
     @property
     def mask(self) -> Bool[Array, " n"]:
         """True for the selected items."""
+        # The padding, n, is out of range and dropped.
         return jnp.zeros(self.num, dtype=bool).at[self.order].set(True, mode="drop")
 
 
@@ -47,6 +48,7 @@ def select(selected: Bool[Array, " n"]) -> Selection:
     """The places where a mask is set."""
     num = selected.shape[0]
     size = min(CHUNK, num)
+    # Rounded up to whole chunks, so that the last slice is never shifted back.
     order = positions_of_set(selected, -(-num // size) * size)
     return Selection(order, jnp.sum(selected, dtype=jnp.int32), num)
 
@@ -85,7 +87,9 @@ def narrow(
         order, count = kept
         passes = valid & test(index)
         place = running_count(passes)
+        # Those that fail are written to spare room past the end: one scatter, no branch.
         target = jnp.where(passes, count + place - 1, spare_places(room, size))
+        # The last running count is the number that passed: no second sum.
         return order.at[target].set(index, mode="drop"), count + place[size - 1]
 
     nothing = jnp.full(room + SPARE, selection.num, dtype=jnp.int32)

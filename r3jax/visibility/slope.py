@@ -43,8 +43,11 @@ def surface_limit(
         for step in _STRIDES:
             steepest = jnp.maximum(steepest, _slope(capped, padded, step, axis))
         squared = squared + steepest * steepest
+    # Meters of depth per pixel, over the meters that a pixel spans there.
     tangent = jnp.sqrt(squared) / (pixel_angle * jnp.maximum(capped, 1e-6))
+    # 1 / cos a = sqrt(1 + tan^2 a); uncapped, a wall seen edge on would hide nothing.
     stretch = jnp.minimum(jnp.sqrt(1.0 + tangent * tangent), _MAX_STRETCH)
+    # On the uncapped distance: where there is nothing, the limit stays infinite.
     return distance + allowance * stretch
 
 

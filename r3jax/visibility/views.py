@@ -80,6 +80,7 @@ class PinholeView(eqx.Module):
 
     def in_camera(self, points: Coordinates) -> tuple[Array, Array, Array]:
         """Coordinates in the camera's frame [m]."""
+        # Coordinates apart, as long vectors: no [n, 3] array, and R's transpose is its inverse.
         R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         offset = [points[i] - t[i] for i in range(3)]
 
@@ -93,6 +94,7 @@ class PinholeView(eqx.Module):
         x, y, z = self.in_camera(points)
         camera = self.camera
         reach = self.max_range + margin
+        # Slopes of the image's borders, which differ where the principal point is off center.
         low_x, high_x = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
         low_y, high_y = -camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
         # Distance to a side plane x = k z is |x - k z| / sqrt(1 + k^2).
@@ -104,10 +106,13 @@ class PinholeView(eqx.Module):
     def place(self, points: Float[Array, "3 n"]) -> Placement:
         """Projects points of the world."""
         x, y, z = self.in_camera(points)
+        # Not z > 0: right at the camera's plane the scales would grow without bound.
         is_ahead = z > 1e-3
+        # Behind the camera any finite number will do: those points are masked.
         inverse = 1.0 / jnp.where(is_ahead, z, 1.0)
         R = self.T_world_camera[:3, :3]
 
+        # Quotient rule along each world axis, with the slope x / z or y / z that is at hand.
         def gradient(f: Array, j: int, slope: Array) -> list[Array]:
             return [f * inverse * (R[i, j] - slope * R[i, 2]) for i in range(3)]
 
@@ -117,6 +122,7 @@ class PinholeView(eqx.Module):
         def total(parts: list[Array]) -> Array:
             return jnp.abs(parts[0]) + jnp.abs(parts[1]) + jnp.abs(parts[2])
 
+        # Added with their signs, before the absolute value: the sum of both scales is a bound only.
         both = list(zip(along_column, along_row, strict=True))
         return Placement(
             column=self.camera.fx * x * inverse + self.camera.cx,
@@ -152,6 +158,7 @@ class PanoramaView(eqx.Module):
     @property
     def pixel_angle(self) -> float:
         """Angle that a pixel covers on average [rad]."""
+        # The whole sphere, 4 pi, over size^2 pixels, and of that the root.
         return math.sqrt(4.0 * math.pi) / self.size
 
     def may_see(self, points: Coordinates, margin: Float[Array, ""]) -> Bool[Array, " n"]:
@@ -167,15 +174,20 @@ class PanoramaView(eqx.Module):
         (1 + |u|) / L; on the lower half of the sphere u and v swap.
         """
         x, y, z = (points[i] - self.position[i] for i in range(3))
+        # At the position itself there is no direction: the floors keep both quotients finite.
         distance = jnp.maximum(jnp.sqrt(x * x + y * y + z * z), 1e-6)
         inverse = 1.0 / jnp.maximum(jnp.abs(x) + jnp.abs(y) + jnp.abs(z), 1e-6)
         u, v = x * inverse, y * inverse
         a, b = jnp.abs(u), jnp.abs(v)
+        # Not `jnp.sign`: its 0 at 0 would put the lower pole on the upper one.
         sign: Callable[[Array], Array] = lambda value: jnp.where(value >= 0.0, 1.0, -1.0)
         half = 0.5 * self.size
         is_lower = z < 0.0
+        # On the lower half of the map u and v swap places, and so do their slopes.
         p, q = jnp.where(is_lower, b, a), jnp.where(is_lower, a, b)
 
+        # w = u + k v has the derivatives (1 - w sign x) / L, (k - w sign y) / L, -w sign z / L.
+        # Folding the lower half only flips the signs of u + v and u - v: no choice is needed.
         def diagonal(w: Array, k: float) -> Array:
             return jnp.abs(1.0 - w * sign(x)) + jnp.abs(k - w * sign(y)) + jnp.abs(w)
 
@@ -202,6 +214,7 @@ def pinhole_view(
     Visibility is piecewise constant, so no derivative passes through the pose.
     """
     longest = max(camera.width, camera.height)
+    # Never enlarged: more pixels than the camera has show nothing more.
     scale = min(1.0, config.zbuffer_size / longest)
     size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     pose = jax.lax.stop_gradient(T_world_camera)
@@ -220,6 +233,8 @@ def wrap(
     """Pixels one step outside the octahedral map: its borders are glued to themselves, turned."""
     crosses_column = (column < 0) | (column >= size)
     crosses_row = (row < 0) | (row >= size)
+    # Crossing one border mirrors the other coordinate: the square's edges are folded in half.
     turned_row = jnp.where(crosses_column, size - 1 - row, row)
     turned_column = jnp.where(crosses_row, size - 1 - column, column)
+    # A corner crosses both borders and is turned out again; points to be left out lie anywhere.
     return jnp.clip(turned_row, 0, size - 1), jnp.clip(turned_column, 0, size - 1)

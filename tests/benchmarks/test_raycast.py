@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from r3jax.simulators.meshes import load_world
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 
 pytestmark = pytest.mark.full
 

@@ -17,5 +17,7 @@ def explore(room: str, out: Path, *words: str, report: bool = False) -> int:
 
 def main_without_report(words: list[str]) -> int:
     """Runs a command that would write a report, which takes longer than a small run."""
-    with mock.patch("r3jax.cli.explore.write_report", lambda run, *_: run.path / "report.html"):
+    with mock.patch(
+        "r3jax.cli.commands.explore.write_report", lambda run, *_: run.path / "report.html"
+    ):
         return main(words)

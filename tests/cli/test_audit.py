@@ -6,12 +6,12 @@ import json
 import numpy as np
 import pytest
 
-from r3jax.apps.audit import seen
+from r3jax.apps.audit import capture_maps
 from r3jax.apps.audit.camera_paths import write_camera_path
-from r3jax.apps.audit.survey import Wishes
-from r3jax.cli import audit as command
-from r3jax.cli.captures import open_capture
+from r3jax.apps.audit.survey import AuditSettings
+from r3jax.cli.commands import audit as command
 from r3jax.cli.main import main
+from r3jax.formats.captures import open_capture
 from r3jax.formats.nerfstudio import read_transforms
 from tests.apps.audit.room import (
     LENS,
@@ -26,10 +26,10 @@ from tests.apps.audit.room import (
 @pytest.fixture(scope="module", autouse=True)
 def _little_work():
     """Few places and small maps: the room is small."""
-    few = functools.partial(Wishes, num_places=16, num_standpoints=8)
+    few = functools.partial(AuditSettings, num_places=16, num_standpoints=8)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command, "Wishes", few)
-        patch.setattr(seen, "_CAPACITY", 1 << 13)
+        patch.setattr(command, "AuditSettings", few)
+        patch.setattr(capture_maps, "_CAPACITY", 1 << 13)
         yield
 
 

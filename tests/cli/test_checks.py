@@ -8,8 +8,8 @@ import pytest
 
 from r3jax.cli.checks import loop_of_options
 from r3jax.cli.main import main
-from r3jax.cli.options import Explore
-from r3jax.cli.options.numbers import whole_number
+from r3jax.cli.options import ExploreOptions
+from r3jax.cli.options.parsing import whole_number
 from r3jax.trace.writer import RunWriter
 from tests.trace.runs import make_header
 
@@ -75,11 +75,11 @@ def test_names_budgets_and_paths_are_refused_before_jax_is_imported(tmp_path):
 
 
 def test_a_map_that_may_grow_begins_with_room():
-    assert loop_of_options(Explore(capacity=2)).capacity == 1 << 14
-    assert loop_of_options(Explore(capacity=2, fixed_capacity=True)).capacity == 2
-    assert loop_of_options(Explore(capacity=1 << 15)).capacity == 1 << 15
+    assert loop_of_options(ExploreOptions(capacity=2)).capacity == 1 << 14
+    assert loop_of_options(ExploreOptions(capacity=2, fixed_capacity=True)).capacity == 2
+    assert loop_of_options(ExploreOptions(capacity=1 << 15)).capacity == 1 << 15
     with pytest.raises(ValueError, match="power of two"):
-        loop_of_options(Explore(capacity=1000))
+        loop_of_options(ExploreOptions(capacity=1000))
 
 
 @pytest.mark.parametrize(

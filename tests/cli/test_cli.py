@@ -8,10 +8,12 @@ import sys
 
 import pytest
 import trimesh
+import tyro
 
 from r3jax.cli.main import _COMMANDS, main
+from r3jax.cli.options.parsing import number_rules, options_of, parser_class
 from r3jax.exploration.budget import parse_budget
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.box_room import write_room
@@ -34,7 +36,7 @@ def run_folder(room, tmp_path_factory):
 
 @pytest.mark.parametrize("name", _COMMANDS)
 def test_every_command_has_what_runs_it(name):
-    assert callable(getattr(importlib.import_module(f"r3jax.cli.{name}"), f"run_{name}"))
+    assert callable(getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}"))
 
 
 def test_a_run_leaves_data_set_and_report(run_folder):
@@ -149,7 +151,9 @@ def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monke
     assert "interrupted" in (tmp_path / "box" / "report" / "report.html").read_text()
 
 
-@pytest.mark.parametrize("place", ["exploration.loop.start_state", "cli.explore.write_data_set"])
+@pytest.mark.parametrize(
+    "place", ["exploration.loop.start_state", "cli.commands.explore.write_data_set"]
+)
 def test_ctrl_c_names_what_goes_on_at_any_moment(room, tmp_path, monkeypatch, capsys, place):
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -177,6 +181,22 @@ def test_the_demo_overwrites_its_own_folder_only(tmp_path):
     assert len(demo.rows) == 4
     assert "PSNR" in (tmp_path / "demo" / "report" / "report.html").read_text()
     assert read_run(tmp_path / "other").header == make_header()
+
+
+@pytest.mark.parametrize("name", _COMMANDS)
+def test_help_begins_with_examples_that_parse_and_shows_no_default_of_none(name, capsys):
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    said = capsys.readouterr().out
+    assert "None" not in said
+    examples = [line.split() for line in said.splitlines() if line.startswith("    r3jax ")]
+    assert examples
+    parser = parser_class(_COMMANDS[name], with_examples=True)
+    for program, command, *words in examples:
+        assert (program, command) == ("r3jax", name)
+        config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+        parsed = tyro.cli(parser, args=words, config=config, registry=number_rules())
+        assert isinstance(options_of(_COMMANDS[name], parsed), _COMMANDS[name])
 
 
 @pytest.mark.parametrize("words", [["--help"], ["explore", "--help"], ["info", "--help"]])

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import r3jax
+from r3jax.cli.commands.benchmark import print_results
 from r3jax.cli.console import Console, Table, TextColumn, progress_bar
 from r3jax.cli.main import main
-from r3jax.cli.results import print_results
 from r3jax.trace.writer import RunWriter
 from tests.evaluation.records import record
 from tests.trace.runs import make_header, make_view

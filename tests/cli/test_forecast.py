@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from r3jax.apps.forecast.calibration import default_calibration, write_calibration
+from r3jax.apps.forecast.psnr import default_calibration, write_calibration
 from r3jax.cli.main import main
 from r3jax.trace.reader import read_run
 from tests.box_room import write_room

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from r3jax.apps.runs.settings import open_run_scene
 from r3jax.cli.main import main
-from r3jax.cli.setup import simulator_of_run
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
 from r3jax.trace.reader import read_run
 from tests.box_room import write_room
@@ -87,12 +87,12 @@ def test_a_recorded_run_opens_its_scene_at_its_scale(tmp_path):
     scene = run.header.scene
     assert (scene["scale"], scene["cull_backfaces"]) == (0.001, True)
     np.testing.assert_allclose(np.ptp(run.header.bounds, axis=0), [4.0, 3.0, 2.4], atol=1e-6)
-    assert simulator_of_run(run).bounds.tolist() == run.header.bounds  # and it has the same hash
+    assert open_run_scene(run).bounds.tolist() == run.header.bounds  # and it has the same hash
     plain = open_scene(meters)
     older = {name: scene[name] for name in ("up", "noise", "max_range", "start")}
     scene.clear()  # headers did not always say the scale
     scene.update(older, name=meters, hash=scene_hash(plain))
-    np.testing.assert_array_equal(simulator_of_run(run).bounds, plain.bounds)
+    np.testing.assert_array_equal(open_run_scene(run).bounds, plain.bounds)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])

@@ -247,10 +247,10 @@ def test_a_fork_that_was_cut_off_while_it_took_views_over_is_refused(runs, tmp_p
 
 
 def test_an_interrupt_that_nobody_catches_is_no_traceback(part, monkeypatch, capsys):
-    def interrupted(run):
+    def interrupted(run, on_frame):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("r3jax.cli.replay.differences", interrupted)
+    monkeypatch.setattr("r3jax.cli.commands.replay.differences", interrupted)
     assert main(["replay", str(part)]) == 130
     assert "r3jax: interrupted" in capsys.readouterr().err
 

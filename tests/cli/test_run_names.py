@@ -3,7 +3,7 @@
 import pytest
 
 from r3jax.cli.checks import default_name
-from r3jax.cli.options import Explore
+from r3jax.cli.options import ExploreOptions
 
 
 @pytest.mark.parametrize(
@@ -17,4 +17,4 @@ from r3jax.cli.options import Explore
     ],
 )
 def test_default_names(scene, expected):
-    assert default_name(Explore(seed=3), scene, "ours") == f"{expected}-ours-seed3"
+    assert default_name(ExploreOptions(seed=3), scene, "ours") == f"{expected}-ours-seed3"

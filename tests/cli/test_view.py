@@ -119,7 +119,7 @@ def test_pictures_are_written_without_viser_and_the_run_stays_as_it_is(
 
 def test_a_page_is_shown_until_it_is_interrupted(path, capsys, monkeypatch):
     pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
-    from r3jax.cli import view
+    from r3jax.cli.commands import view
 
     def interrupt():
         raise KeyboardInterrupt

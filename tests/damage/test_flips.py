@@ -12,21 +12,19 @@ import jax
 import numpy as np
 import pytest
 
-from r3jax.apps.report.model_report import read_judged_model
-from r3jax.cli.captures import open_capture
-from r3jax.cli.errors import UserError
+from r3jax.apps.models.folder import find_model
+from r3jax.apps.report.model_report import read_evaluated_model
+from r3jax.apps.runs.settings import open_run_scene, settings_of_run
 from r3jax.cli.main import main
-from r3jax.cli.options import Evaluate
-from r3jax.cli.selection import find_training
-from r3jax.cli.setup import plan_of_run, simulator_of_run
 from r3jax.exploration import explore
 from r3jax.exploration.resume import state_tables
-from r3jax.splatting.checkpoints import read_checkpoint, settings_record
+from r3jax.formats.captures import open_capture
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import empty_scene
-from r3jax.splatting.train import scene_extent
-from r3jax.splatting.train_step import start_state
-from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.training.checkpoints import read_checkpoint, settings_record
+from r3jax.splatting.training.config import TrainConfig
+from r3jax.splatting.training.train import scene_extent
+from r3jax.splatting.training.train_step import start_state
 from r3jax.splatting.views import load_views, split_views
 from r3jax.trace.reader import read_run
 from r3jax.trace.rows import to_json
@@ -45,9 +43,9 @@ class Reading:
     def __init__(self, run: Path):
         """Reads what does not change: the scene and the plan."""
         self.path, self.recorded = run, read_run(run)
-        self.plan = plan_of_run(self.recorded)
-        self.simulator = simulator_of_run(self.recorded)
-        config = find_training(Evaluate(run), open_capture(run)).record["config"]
+        self.plan = settings_of_run(self.recorded)
+        self.simulator = open_run_scene(self.recorded)
+        config = find_model(open_capture(run)).record["config"]
         views, _ = split_views(len(self.recorded.rows), 4)
         self.views = load_views(self.recorded.frames(), 48).take(views)
         self.config = TrainConfig(iterations=20, num_gaussians=200, capacity=config["capacity"])
@@ -97,7 +95,7 @@ class Reading:
 
     def training(self) -> object:
         """What is known of the training."""
-        return repr(find_training(Evaluate(self.path), open_capture(self.path)))
+        return repr(find_model(open_capture(self.path)))
 
     def training_state(self) -> object:
         """What a resumed training goes on from."""
@@ -107,7 +105,7 @@ class Reading:
 
     def judged(self) -> object:
         """The evaluation that the report shows."""
-        return repr(read_judged_model(read_run(self.path)))
+        return repr(read_evaluated_model(read_run(self.path)))
 
 
 PARTS = [name for name in vars(Reading) if not name.startswith("_")]
@@ -172,7 +170,7 @@ def test_damage_is_refused_repaired_or_without_effect(run):
             for part in _readers(name):
                 try:
                     found = getattr(reading, part)()
-                except (ValueError, OSError, UserError):
+                except (ValueError, OSError):
                     refused += 1
                     continue
                 if not _agrees(part, found, whole[part]):

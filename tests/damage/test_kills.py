@@ -112,7 +112,7 @@ class Benchmark(Target):
 
 class Train(Target):
     def command(self):
-        return [sys.executable, "-m", "tests.splatting.killed_training", str(self.folder)]
+        return [sys.executable, "-m", "tests.splatting.training.killed_training", str(self.folder)]
 
     def beginnings(self):
         return self.progress()

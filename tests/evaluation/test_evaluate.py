@@ -1,4 +1,4 @@
-"""Judging: a scene against its own renders, damaged ones, and skimage and NumPy in between."""
+"""Evaluation: a scene against its own renders, damaged ones, and skimage and NumPy in between."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from r3jax.evaluation.evaluate import evaluate
-from r3jax.evaluation.images import MAX_PSNR
+from r3jax.evaluation.image_metrics import MAX_PSNR
 from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
 from r3jax.evaluation.scores import worst_rows
 from r3jax.frame import Frame
@@ -21,7 +21,7 @@ from r3jax.splatting.views import Views
 from tests.mutants import Mutant, assert_caught, each, load
 from tests.splatting.clouds import random_cloud, view
 
-CHAIN = ("r3jax.evaluation.batches", "r3jax.evaluation.images", "r3jax.evaluation.evaluate")
+CHAIN = ("r3jax.evaluation.image_metrics", "r3jax.evaluation.evaluate")
 WIDTH, HEIGHT, COUNT = 34, 31, 4
 SLOW = RasterConfig(backend="reference")
 SCENE = random_cloud(0, 60, sh_degree=1)
@@ -59,28 +59,28 @@ def damaged(own):
     return eqx.tree_at(lambda views: views.rgb, own, jnp.asarray(rgb))
 
 
-def judged(views, module=None, **more):
+def evaluated(views, module=None, **more):
     call = module.evaluate if module else evaluate
     return call(SCENE, views, SLOW, background=WHITE, **more)
 
 
 def test_its_own_renders_are_perfect(own):
-    judgment = judged(own)
-    for row in judgment.rows:
+    evaluation = evaluated(own)
+    for row in evaluation.rows:
         # Another compilation may round a borderline value to the other byte: 1 of 3162 values
         # off by one is 83 dB.
         assert 75.0 < row.psnr <= MAX_PSNR
         assert row.ssim > 0.9999
-    assert judgment.renders.dtype == np.uint8
-    assert np.abs(judgment.renders.astype(int) - np.asarray(own.rgb)).max() <= 1
+    assert evaluation.renders.dtype == np.uint8
+    assert np.abs(evaluation.renders.astype(int) - np.asarray(own.rgb)).max() <= 1
 
 
 def law_numbers(modules, own, damaged) -> None:
     """Each row equals scikit-image on that view's bytes; holes are left out, infinity is not."""
-    judgment = judged(damaged, modules["evaluate"])
+    evaluation = evaluated(damaged, modules["evaluate"])
     truth, depth = np.asarray(damaged.rgb) / 255.0, np.asarray(damaged.depth)
-    for i, row in enumerate(judgment.rows):
-        render = judgment.renders[i] / 255.0
+    for i, row in enumerate(evaluation.rows):
+        render = evaluation.renders[i] / 255.0
         psnr = np.inf if row.psnr == MAX_PSNR else row.psnr
         if i in (1, 2):
             assert psnr < 35.0
@@ -93,16 +93,16 @@ def law_numbers(modules, own, damaged) -> None:
         )  # fmt: skip
         np.testing.assert_allclose(row.ssim, ssim, atol=1e-5)
         np.testing.assert_allclose(row.measured, np.mean(depth[i] > 0.0), rtol=1e-6)
-    assert judgment.rows[1].psnr_measured > 75.0  # all that differs is the hole
-    assert np.isnan(judgment.rows[2].psnr_measured)
+    assert evaluation.rows[1].psnr_measured > 75.0  # all that differs is the hole
+    assert np.isnan(evaluation.rows[2].psnr_measured)
 
 
 def law_order(modules, own, damaged) -> None:
     """Rows follow the views whatever the batches, and carry the names that were given."""
     module = modules["evaluate"]
-    whole = judged(damaged, module, numbers=[5, 3, 8, 1], renderability=[0.1, 0.2, 0.3, 0.4])
+    whole = evaluated(damaged, module, numbers=[5, 3, 8, 1], renderability=[0.1, 0.2, 0.3, 0.4])
     module._PIXELS_AT_A_TIME = 3 * WIDTH * HEIGHT
-    cut = judged(damaged, module, numbers=[5, 3, 8, 1], renderability=[0.1, 0.2, 0.3, 0.4])
+    cut = evaluated(damaged, module, numbers=[5, 3, 8, 1], renderability=[0.1, 0.2, 0.3, 0.4])
     assert [row.view for row in cut.rows] == [5, 3, 8, 1]
     assert [row.renderability for row in cut.rows] == [0.1, 0.2, 0.3, 0.4]
     for one, other in zip(whole.rows, cut.rows, strict=True):
@@ -114,7 +114,7 @@ def law_order(modules, own, damaged) -> None:
 
 
 def test_damaged_views_are_the_worst(damaged):
-    assert {row.view for row in worst_rows(judged(damaged).rows, 2)} == {1, 2}
+    assert {row.view for row in worst_rows(evaluated(damaged).rows, 2)} == {1, 2}
 
 
 def test_lpips_gets_renders_and_truth_in_unit_range(damaged):
@@ -124,22 +124,22 @@ def test_lpips_gets_renders_and_truth_in_unit_range(damaged):
         seen.append((np.asarray(images), np.asarray(truth)))
         return np.arange(len(images), dtype=np.float32)
 
-    rows = judged(damaged, lpips=metric).rows
+    rows = evaluated(damaged, lpips=metric).rows
     assert [row.lpips for row in rows] == [0.0, 1.0, 2.0, 3.0]
     ((images, truth),) = seen
     np.testing.assert_allclose(truth, np.asarray(damaged.rgb) / 255.0, rtol=1e-6)
     np.testing.assert_allclose(images * 255.0, np.rint(images * 255.0), atol=1e-3)
-    assert judged(damaged).rows[0].lpips is None
+    assert evaluated(damaged).rows[0].lpips is None
 
 
 def test_coverage_is_the_mean_opacity(own):
     rendering = render(SCENE, own.view(0).camera, own.T_world_camera[0], WHITE, SLOW)
-    np.testing.assert_allclose(judged(own).rows[0].coverage, rendering.alpha.mean(), rtol=1e-5)
+    np.testing.assert_allclose(evaluated(own).rows[0].coverage, rendering.alpha.mean(), rtol=1e-5)
 
 
 def test_the_background_is_the_trainings(own):
     black = evaluate(SCENE, own, SLOW).rows[0]
-    assert black.psnr < judged(own).rows[0].psnr - 20.0
+    assert black.psnr < evaluated(own).rows[0].psnr - 20.0
 
 
 def test_too_small_a_budget_is_raised_or_named(own):
@@ -162,17 +162,17 @@ def test_too_small_a_budget_is_raised_or_named(own):
 
 def test_progress_counts_the_views(own):
     counted = []
-    judged(own, on_view=counted.append)
+    evaluated(own, on_view=counted.append)
     assert counted == [1, 2, 3, 4]
 
 
 def test_mistakes_are_named(own):
     with pytest.raises(ValueError, match="no views"):
-        judged(own.take(np.zeros(0, dtype=int)))
+        evaluated(own.take(np.zeros(0, dtype=int)))
     with pytest.raises(ValueError, match="renderability has 1 entries for 4 views"):
-        judged(own, renderability=[0.5])
+        evaluated(own, renderability=[0.5])
     with pytest.raises(ValueError, match="numbers has 2 entries for 4 views"):
-        judged(own, numbers=[1, 2])
+        evaluated(own, numbers=[1, 2])
     for value in (jnp.nan, jnp.inf):
         broken = eqx.tree_at(lambda s: s.sh, SCENE, SCENE.sh.at[9:11, 2, 1].set(value))
         with pytest.raises(ValueError, match=r"2 of 60 Gaussians have parameters.*row 9"):
@@ -227,8 +227,8 @@ MUTANTS = [
     Mutant("evaluate", "jnp.round(to_8_bits(rgb) * 255.0)", "(to_8_bits(rgb) * 254.0)",
            law_numbers),
     Mutant("evaluate", "float(table[i, 1])", "float(table[0, 1])", law_numbers),
-    Mutant("batches", "(part)[start - first :]", "(part)", law_order),
-    Mutant("batches", "array[first : first + batch]", "array[:batch]", law_order),
+    Mutant("image_metrics", "(part)[start - first :]", "(part)", law_order),
+    Mutant("image_metrics", "array[first : first + batch]", "array[:batch]", law_order),
 ]  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from r3jax.evaluation.test_views import (
 )
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.simulators.free_space import GroundTruth
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from tests import mutants
 from tests.simulators.rooms import box_room, facing_x
 

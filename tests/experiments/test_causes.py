@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments import causes
-from experiments.artifacts import Origin
+from experiments.pages.artifacts import Origin
 from tests.box_room import write_room
 from tests.cli.small_runs import explore
 from tests.evaluation.records import record

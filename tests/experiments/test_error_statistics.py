@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from experiments.error_statistics import Draws
-from r3jax.apps.benchmark.results.areas import sparsification
+from r3jax.evaluation.areas import sparsification
 from r3jax.evaluation.statistics import partial_spearman
 from tests.mutants import Mutant, assert_caught, each, load
 
@@ -108,7 +108,7 @@ def interval(modules, samples, explorations, num_views, num, resamples=3000):
 
 
 def law_drawn_alike(modules) -> None:
-    """All models are judged by one draw of views: a hundred copies of a model are no evidence."""
+    """All models share one draw of views: a hundred copies of a model are no evidence."""
     rng, num = np.random.default_rng(0), 60
     views = rng.normal(size=num)
     mean_of = lambda draws: (draws.views * views).mean(axis=1)

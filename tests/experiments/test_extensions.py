@@ -1,4 +1,4 @@
-"""What goes beyond the paper against the reference: variants, ways, and the aim, by hand."""
+"""What goes beyond the paper against the reference: variants, paths, and the aim, by hand."""
 
 import csv
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from experiments import extensions
-from experiments.artifacts import Origin
 from experiments.degeneracy import revisit_rate
+from experiments.pages.artifacts import Origin
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.evaluation.records import record
@@ -66,7 +66,7 @@ def test_the_aim_compares_fewer_views_with_all_of_the_reference(records):
     )
 
 
-def test_the_page_holds_quality_ways_and_aim(records, tmp_path):
+def test_the_page_holds_quality_paths_and_aim(records, tmp_path):
     with RunWriter(tmp_path / "run", make_header()) as writer:
         for step in range(3):
             writer.add(*make_view(step))
@@ -74,7 +74,7 @@ def test_the_page_holds_quality_ways_and_aim(records, tmp_path):
     page = (tmp_path / "out" / "beyond.md").read_text()
     assert SOURCE.commit in page
     assert "| ours-pano (refine=4) | views:2 | +1.50 |" in page
-    lines = (tmp_path / "out" / "ways.csv").read_text().splitlines()
+    lines = (tmp_path / "out" / "paths.csv").read_text().splitlines()
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     assert [(row["method"], row["scene"]) for row in rows] == [
         (method, scene)

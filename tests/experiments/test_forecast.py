@@ -7,8 +7,7 @@ import pytest
 
 from experiments import forecast as experiment
 from experiments.forecast import Known, error_row, read_views, write_page
-from r3jax.apps.forecast.calibration import read_calibration
-from r3jax.apps.forecast.psnr import STATISTICS
+from r3jax.apps.forecast.psnr import STATISTICS, read_calibration
 
 
 def known_views(offsets=(0.0, 0.5, -0.5)) -> Known:

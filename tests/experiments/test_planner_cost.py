@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from experiments import planner_latency, planner_memory, planner_runs
-from experiments.artifacts import Origin, markdown_table, write_csv
+from experiments.pages.artifacts import Origin, markdown_table, write_csv
 from experiments.planner_runs import Options, Size, bucket_of, fly, size_of
 
 pytestmark = pytest.mark.full

@@ -8,11 +8,11 @@ import pytest
 from PIL import Image
 
 from experiments import error_analysis, renderability_vs_error
-from experiments.artifacts import Origin
 from experiments.error_analysis import COVERAGE, PREDICTORS, from_columns
-from experiments.error_figures import budget_name, told
 from experiments.error_terms import PRODUCTS, on_seen
-from r3jax.apps.benchmark.results.areas import ause
+from experiments.pages.artifacts import Origin
+from experiments.pages.error_figures import budget_name, told
+from r3jax.evaluation.areas import ause
 from r3jax.evaluation.statistics import Estimate, kendall, partial_spearman, spearman
 from tests.evaluation.records import record
 

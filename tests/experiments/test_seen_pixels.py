@@ -6,7 +6,7 @@ import pytest
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.splatting.views import View
+from r3jax.splatting.views import PosedImage
 from tests.mutants import Mutant, assert_caught, each, load
 
 CHAIN = ("experiments.seen_pixels",)
@@ -26,7 +26,7 @@ def frame(pose, depth):
 
 def view(pose, depth):
     depth = jnp.broadcast_to(jnp.asarray(depth, jnp.float32), (SIZE, SIZE))
-    return View(jnp.full((SIZE, SIZE, 3), 0.5), depth, pose, CAMERA)
+    return PosedImage(jnp.full((SIZE, SIZE, 3), 0.5), depth, pose, CAMERA)
 
 
 def asked(modules):

@@ -9,11 +9,11 @@ import tyro
 from PIL import Image
 
 from experiments import suite, sweep
-from experiments.artifacts import Origin
+from experiments.pages.artifacts import Origin
+from experiments.pages.sweep_page import Sweep, setting_figure, write_page
 from experiments.settings import known_settings
 from experiments.sweep import Options
 from experiments.sweep_choice import Trial, choose, leave_one_out
-from experiments.sweep_page import Sweep, setting_figure, write_page
 from r3jax.apps.benchmark.conditions import Conditions
 from r3jax.apps.benchmark.engines.local import run_here
 from r3jax.apps.benchmark.plan import Request
@@ -87,7 +87,7 @@ def test_a_gain_that_may_be_chance_is_not_chosen():
 
 
 def test_every_scene_is_left_out_in_turn():
-    """A scene is judged by the choice of the others, worked out by hand."""
+    """A scene is evaluated by the choice of the others, worked out by hand."""
     scenes = ("loft", "kitchen", "library")
     trials = [
         trial(4.0, (9.0, 0.0, 0.0), scenes=scenes),  # the loft's own favorite

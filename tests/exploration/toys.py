@@ -9,7 +9,7 @@ import numpy as np
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.planning.policy import Decision, Outcome, PlanInfo
+from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 
 LOWER, UPPER = np.zeros(3), np.array([4.0, 3.0, 2.4])
 
@@ -65,7 +65,7 @@ class Wander:
 
     def decide(self, state, map_state, grid, T_world_camera, *, key):
         if state["decisions"] == self.last_step:
-            return None, state, PlanInfo(Outcome.NO_REACHABLE_CANDIDATE, 9, 0)
+            return None, state, PlanInfo(DecisionOutcome.NO_REACHABLE_CANDIDATE, 9, 0)
         numbers = np.asarray(jax.random.uniform(key, (5, 6)), dtype=np.float64)
         here = T_world_camera[:3, 3]
         places = np.clip(here + self.reach * (2 * numbers[:, :3] - 1), LOWER + 0.5, UPPER - 0.5)
@@ -84,7 +84,7 @@ class Wander:
             candidates=candidates,
             utilities={"total": numbers[:, 0], "path": np.full(5, length)},
         )
-        info = PlanInfo(Outcome.MOVED, 5, 5, {"scoring": 0.01})
+        info = PlanInfo(DecisionOutcome.MOVED, 5, 5, {"scoring": 0.01})
         return decision, state | {"decisions": state["decisions"] + 1}, info
 
     def follow(self, state, map_state, grid, T_world_camera, waypoints):

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from r3jax.cli.main import USER_ERROR, main
-from r3jax.formats.captures import DepthUnit
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.exports import export_run
 from r3jax.formats.nerfstudio import read_transforms
-from r3jax.formats.ply_points import read_points
+from r3jax.formats.points import read_points
+from r3jax.formats.posed_images import DepthUnit
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
 from r3jax.simulators.meshes import load_world
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 from r3jax.trace.checkpoints import map_tables
 from r3jax.trace.header import camera_fields
@@ -188,7 +188,8 @@ def test_what_cannot_be_exported_is_said_in_a_line(run, tmp_path, capsys):
     assert main(["export", str(copy), *words]) == USER_ERROR
     (copy / "trace.jsonl").write_text("")
     assert main(["export", str(copy), *words]) == USER_ERROR
-    lines = capsys.readouterr().err.splitlines()
+    said = capsys.readouterr().err.splitlines()
+    lines = [line for line in said if line.startswith("r3jax: ")]
     for line, words in zip(lines, ("no such folder", "000001.png", "no views"), strict=True):
         assert words in line
     assert not (tmp_path / "out").exists()
@@ -206,13 +207,12 @@ def test_a_run_without_a_map_has_no_points(run, tmp_path):
 
 CHAIN = (
     "r3jax.formats.lenses",
-    "r3jax.formats.captures",
-    "r3jax.formats.transforms",
+    "r3jax.formats.posed_images",
     "r3jax.formats.nerfstudio",
     "r3jax.formats.colmap.model",
     "r3jax.formats.colmap.binary",
     "r3jax.formats.colmap.text",
-    "r3jax.formats.colmap.export",
+    "r3jax.formats.exports",
     "r3jax.formats.colmap.reader",
 )
 _STAGE: dict[str, object] = {}
@@ -229,10 +229,10 @@ def stage(run, simulator, tmp_path):
 def pixels_law(modules: Modules) -> None:
     """The writers under test write for the true readers, the readers under test read the true."""
     run, simulator, folder = (_STAGE[name] for name in ("run", "simulator", "folder"))
-    model = modules["export"].model_of(run, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    model = modules["exports"].model_of(run, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     (folder / "sparse").mkdir()
     modules["binary"].write_binary(folder / "sparse", model)
-    (folder / "transforms.json").write_text(json.dumps(modules["transforms"].transforms_of(run)))
+    (folder / "transforms.json").write_text(json.dumps(modules["nerfstudio"].transforms_of(run)))
     export_run(run, folder / "true", "nerfstudio")
     export_run(run, folder / "true model", "colmap")
     first = simulator.render(run.rows[0].pose)
@@ -246,12 +246,12 @@ def pixels_law(modules: Modules) -> None:
 
 
 MUTANTS = [
-    Mutant("transforms", "np.diag([1.0, -1.0, -1.0, 1.0])", "np.eye(4)", pixels_law),
-    Mutant("transforms", "[1.0, -1.0, -1.0, 1.0]", "[-1.0, -1.0, 1.0, 1.0]", pixels_law),
+    Mutant("nerfstudio", "np.diag([1.0, -1.0, -1.0, 1.0])", "np.eye(4)", pixels_law),
+    Mutant("nerfstudio", "[1.0, -1.0, -1.0, 1.0]", "[-1.0, -1.0, 1.0, 1.0]", pixels_law),
     Mutant("nerfstudio", "matrix @ OPENGL_FROM_OPENCV", "OPENGL_FROM_OPENCV @ matrix", pixels_law),
     Mutant("nerfstudio", "found[0], found[-1]", "found[-1], found[0]", pixels_law),
     Mutant("model", "pose[:3, :3] = R.T", "pose[:3, :3] = R", pixels_law),
-    Mutant("export", "colmap_pose(pose)", "colmap_pose(np.linalg.inv(pose))", pixels_law),
+    Mutant("exports", "colmap_pose(pose)", "colmap_pose(np.linalg.inv(pose))", pixels_law),
     Mutant("lenses", "camera.fx, camera.fy,", "camera.fy, camera.fx,", pixels_law),
     Mutant("lenses", "camera.cx, camera.cy)", "camera.cx - 0.5, camera.cy - 0.5)", pixels_law),
 ]

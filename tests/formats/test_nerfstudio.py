@@ -9,8 +9,7 @@ from hypothesis import given
 from PIL import Image
 
 from r3jax.formats.errors import FormatError
-from r3jax.formats.nerfstudio import read_transforms
-from r3jax.formats.transforms import OPENGL_FROM_OPENCV, write_transforms
+from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV, read_transforms, write_transforms
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.formats.colmap_models import random_pose, seeds

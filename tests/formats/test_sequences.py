@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from r3jax.cli.captures import open_capture
+from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
-from r3jax.formats.replica_slam import is_replica_slam, read_replica_slam
-from r3jax.formats.seven_scenes import is_seven_scenes, read_seven_scenes
-from r3jax.formats.tum import is_tum, nearest, read_tum
+from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
+from r3jax.formats.sequences.seven_scenes import is_seven_scenes, read_seven_scenes
+from r3jax.formats.sequences.tum import is_tum, nearest, read_tum
 from tests.formats import sequences
 from tests.formats.sequences import HEIGHT, NUM, WIDTH, pixels, poses
 from tests.fuzz.tree import lay_out

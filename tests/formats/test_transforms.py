@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.formats.pointcloud import voxel_points, write_points
-from r3jax.formats.transforms import OPENGL_FROM_OPENCV, write_transforms
+from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV, write_transforms
+from r3jax.formats.points import voxel_points, write_points
 from r3jax.geometry.cameras import invert_pose, project, transform
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points

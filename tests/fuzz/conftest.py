@@ -2,10 +2,10 @@
 
 import pytest
 
-from tests.fuzz.referee import Referee
+from tests.fuzz.harness import Harness
 
 
 @pytest.fixture(scope="session")
-def referee(tmp_path_factory):
-    with Referee(tmp_path_factory.mktemp("fuzz")) as referee:
-        yield referee
+def harness(tmp_path_factory):
+    with Harness(tmp_path_factory.mktemp("fuzz")) as harness:
+        yield harness

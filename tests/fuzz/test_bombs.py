@@ -27,7 +27,7 @@ MODULES = (
     "calibrations",
     "camera_paths",
     "colmap",
-    "judging_views",
+    "reference_images",
     "models",
     "nerfstudio",
     "recordings",
@@ -191,13 +191,13 @@ def meshes() -> Iterator[tuple[str, bytes]]:
     yield "stl", b"solid a\n" + b"vertex 0 0 0\n" * 150_000 + b"endsolid a\n"
 
 
-def test_a_mesh_that_is_a_bomb_is_read_or_refused_in_little_memory(referee):
-    referee.check_crafted(f"{__name__}:BOMBS_meshes", warm="tests.fuzz.test_meshes")
+def test_a_mesh_that_is_a_bomb_is_read_or_refused_in_little_memory(harness):
+    harness.check_crafted(f"{__name__}:BOMBS_meshes", warm="tests.fuzz.test_meshes")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("module", MODULES)
-def test_a_bomb_is_read_or_refused_in_little_memory(referee, module):
+def test_a_bomb_is_read_or_refused_in_little_memory(harness, module):
     name, colon, attribute = module.partition(":")
     warm = f"tests.fuzz.test_{name}{colon}{attribute}"
-    referee.check_crafted(f"{__name__}:BOMBS_{module}", warm=warm)
+    harness.check_crafted(f"{__name__}:BOMBS_{module}", warm=warm)

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r3jax.apps.forecast.calibration import read_calibration
-from r3jax.apps.forecast.psnr import STATISTICS
-from tests.fuzz.referee import CASES_SLOW
+from r3jax.apps.forecast.psnr import STATISTICS, read_calibration
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
@@ -36,11 +35,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (ValueError, FileNotFoundError))
 
 
-def test_damaged_calibrations_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_calibrations_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_calibrations(referee):
+def test_many_damaged_calibrations(harness):
     """`pytest -m slow tests/fuzz/test_calibrations.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

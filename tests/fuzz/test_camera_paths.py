@@ -12,7 +12,7 @@ import pytest
 from r3jax.apps.audit.camera_paths import is_camera_path, read_camera_path
 from r3jax.formats.errors import FormatError
 from r3jax.geometry.cameras import rigid_error
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
@@ -46,11 +46,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (FormatError,))
 
 
-def test_damaged_camera_paths_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_camera_paths_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_camera_paths(referee):
+def test_many_damaged_camera_paths(harness):
     """`pytest -m slow tests/fuzz/test_camera_paths.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

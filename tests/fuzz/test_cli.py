@@ -1,6 +1,6 @@
 """The command line with odd words, on whole and on damaged folders.
 
-The work itself (exploring, mapping, training, judging, planning a benchmark) is left out: a case
+The work itself (exploring, mapping, training, evaluating, planning a benchmark) is left out: a case
 ends where it would begin. What was asked is refused with one line and exit code 2, or makes sense.
 
 All 2,000 cases: `pytest -m slow tests/fuzz/test_cli.py`.
@@ -19,16 +19,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from r3jax.apps.models import judge
 from r3jax.apps.report import revisits
-from r3jax.cli import audit, benchmark, evaluate, explore, merge, options, replay, train
-from r3jax.cli.main import main
+from r3jax.cli.commands import audit, benchmark, explore, replay, train
+from r3jax.cli.main import _COMMANDS, main
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.mapping.join import merge
 from r3jax.simulators.meshes import load_world
 from r3jax.trace.header import header_to_json
 from tests.fuzz import test_models, test_recordings, test_runs, test_splats
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.mutate import mutate
 from tests.fuzz.numbers import NUMBER_TEXTS
-from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Entry, Files
 from tests.fuzz.worker import Reader
 from tests.trace.runs import make_header
@@ -69,14 +71,9 @@ COMMANDS = (
 )
 
 OPTIONS = {
-    name: [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(kind)]
-    for name, kind in {
-        "info": options.Info, "policies": options.Policies, "explore": options.Explore,
-        "train": options.Train, "evaluate": options.Evaluate, "benchmark": options.Benchmark,
-        "replay": options.Replay, "merge": options.Merge, "export": options.Export,
-        "audit": options.Audit,
-    }.items()
-}  # fmt: skip
+    name: [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(_COMMANDS[name])]
+    for name in sorted({words[0] for words in COMMANDS})
+}
 """The options of each command."""
 
 WORDS = (
@@ -185,25 +182,25 @@ def with_work_left_out() -> None:
     audit.audit = begin
     explore.explore = begin
     train.train.fit = begin
-    evaluate.evaluate = begin
+    judge.evaluate = begin
     benchmark.make_plan = begin
     merge.rebuild = begin
     replay.differences = begin
-    evaluate.map_of = begin
+    judge.map_of = begin
     revisits.follow_recording = begin
 
 
 READER = Reader(seeds, read, (Refused,), names_file=False, make=make)
 
 
-def test_odd_words_are_refused_or_make_sense(referee):
-    referee.check(__name__, CASES)
+def test_odd_words_are_refused_or_make_sense(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_odd_words(referee):
+def test_many_odd_words(harness):
     """`pytest -m slow tests/fuzz/test_cli.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)
 
 
 VALUES = {
@@ -249,5 +246,5 @@ def crafted() -> list[Files]:
 CRAFTED = Reader(crafted, read, (Refused,), names_file=False)
 
 
-def test_values_without_sense_are_refused(referee):
-    referee.check_crafted(f"{__name__}:CRAFTED")
+def test_values_without_sense_are_refused(harness):
+    harness.check_crafted(f"{__name__}:CRAFTED")

@@ -15,8 +15,8 @@ from r3jax.formats.colmap.text import write_text
 from r3jax.formats.errors import FormatError
 from r3jax.geometry.cameras import rigid_error
 from tests.formats.colmap_models import random_model
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.numbers import INT_WORDS
-from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files, Link, pick_up
 from tests.fuzz.worker import Reader
 
@@ -82,15 +82,15 @@ def crafted() -> list[Files]:
 CRAFTED = Reader(crafted, read, (FormatError,))
 
 
-def test_damaged_models_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_models_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
-def test_hostile_counts_and_names(referee):
-    referee.check_crafted(f"{__name__}:CRAFTED")
+def test_hostile_counts_and_names(harness):
+    harness.check_crafted(f"{__name__}:CRAFTED")
 
 
 @pytest.mark.slow
-def test_many_damaged_models(referee):
+def test_many_damaged_models(harness):
     """`pytest -m slow tests/fuzz/test_colmap.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

@@ -14,10 +14,10 @@ import trimesh
 from PIL import Image
 
 from r3jax.geometry.cameras import Camera
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import open_world
 from tests.fuzz.containers import zipped
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Fifo, Files
 from tests.fuzz.worker import Reader
 
@@ -109,14 +109,14 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (ValueError,))
 
 
-def test_damaged_meshes_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_meshes_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_meshes(referee):
+def test_many_damaged_meshes(harness):
     """`pytest -m slow tests/fuzz/test_meshes.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)
 
 
 def edited(edit: Callable[[dict[str, Any]], None]) -> bytes:
@@ -175,5 +175,5 @@ def crafted() -> dict[str, Files]:
 CRAFTED = Reader(lambda: list(crafted().values()), read, (ValueError,))
 
 
-def test_crafted_meshes_are_refused_or_read(referee):
-    referee.check_crafted(f"{__name__}:CRAFTED")
+def test_crafted_meshes_are_refused_or_read(harness):
+    harness.check_crafted(f"{__name__}:CRAFTED")

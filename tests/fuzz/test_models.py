@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r3jax.apps.models.folder import find_model
+from r3jax.apps.models.test_sets import choose_views, mapped_views
 from r3jax.apps.report.model_report import (
     quality_note,
     quality_table,
-    read_judged_model,
+    read_evaluated_model,
     training_figure,
 )
-from r3jax.cli.captures import open_capture
-from r3jax.cli.errors import UserError
-from r3jax.cli.options import Evaluate
-from r3jax.cli.selection import choose_views, find_training, mapped_views
+from r3jax.formats.captures import open_capture
+from r3jax.formats.errors import FormatError
 from r3jax.trace.errors import RunError
 from tests.fuzz import test_runs
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.mutate import mutate
-from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
@@ -69,15 +69,14 @@ def make(rng: np.random.Generator, files: Files) -> tuple[Files, str]:
 
 
 def read(folder: Path) -> None:
-    options = Evaluate(folder)
     capture = open_capture(folder)
-    training = find_training(options, capture)
-    test = choose_views(options, capture, training)
+    trained = find_model(capture)
+    test = choose_views("heldout", capture, trained)
     assert all(0 <= number < len(capture) for number in test.numbers)
-    assert all(0 <= n < len(capture) for n in mapped_views(training, test, capture))
-    assert np.isfinite(training.background).all()
+    assert all(0 <= n < len(capture) for n in mapped_views(trained, test, capture))
+    assert np.isfinite(trained.background).all()
     assert capture.run is not None
-    model = read_judged_model(capture.run)
+    model = read_evaluated_model(capture.run)
     if model is not None:
         # What is accepted can be shown: nothing breaks later.
         assert "nan" not in quality_table(model.evaluation)
@@ -86,14 +85,14 @@ def read(folder: Path) -> None:
             training_figure(model.history)
 
 
-READER = Reader(seeds, read, (UserError, RunError), make=make)
+READER = Reader(seeds, read, (FormatError, RunError), make=make)
 
 
-def test_damaged_models_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_models_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_models(referee):
+def test_many_damaged_models(harness):
     """`pytest -m slow tests/fuzz/test_models.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

@@ -13,8 +13,8 @@ from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.geometry.cameras import rigid_error
 from tests.fuzz import containers
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.json_trees import HOSTILE_NAMES
-from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.test_recordings import encoded
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
@@ -85,15 +85,15 @@ def crafted() -> list[Files]:
 CRAFTED = Reader(crafted, read, (FormatError,))
 
 
-def test_damaged_files_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_files_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
-def test_hostile_names_and_pictures(referee):
-    referee.check_crafted(f"{__name__}:CRAFTED")
+def test_hostile_names_and_pictures(harness):
+    harness.check_crafted(f"{__name__}:CRAFTED")
 
 
 @pytest.mark.slow
-def test_many_damaged_files(referee):
+def test_many_damaged_files(harness):
     """`pytest -m slow tests/fuzz/test_nerfstudio.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

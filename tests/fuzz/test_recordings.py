@@ -14,7 +14,7 @@ from r3jax.formats.errors import FormatError
 from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import rigid_error
 from tests.conftest import SHARED
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
@@ -79,11 +79,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (FormatError,))
 
 
-def test_damaged_recordings_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_recordings_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_recordings(referee):
+def test_many_damaged_recordings(harness):
     """`pytest -m slow tests/fuzz/test_recordings.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

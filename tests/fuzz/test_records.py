@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from r3jax.apps.benchmark.record import read_records
+from r3jax.cli.commands.benchmark import print_results
 from r3jax.cli.console import Console
-from r3jax.cli.results import print_results
 from tests.evaluation.records import record
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
@@ -46,11 +46,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (ValueError, FileNotFoundError))
 
 
-def test_damaged_records_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_records_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_records(referee):
+def test_many_damaged_records(harness):
     """`pytest -m slow tests/fuzz/test_records.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

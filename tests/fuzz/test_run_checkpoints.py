@@ -14,7 +14,7 @@ from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
 from r3jax.trace.checkpoints import CheckpointWriter, load_checkpoint, map_tables, read_checkpoint
 from r3jax.trace.errors import RunError
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files, pick_up, unsealed
 from tests.fuzz.worker import Reader
 
@@ -45,11 +45,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (RunError,))
 
 
-def test_damaged_checkpoints_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_checkpoints_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_checkpoints(referee):
+def test_many_damaged_checkpoints(harness):
     """`pytest -m slow tests/fuzz/test_run_checkpoints.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

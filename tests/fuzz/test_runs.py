@@ -15,7 +15,7 @@ from r3jax.trace.header import header_to_json
 from r3jax.trace.images import encode_png, to_integers
 from r3jax.trace.reader import read_run
 from r3jax.trace.rows import EndRow, to_json
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files, unsealed
 from tests.fuzz.worker import Reader
 from tests.trace.runs import make_header, make_view
@@ -69,11 +69,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (RunError,))
 
 
-def test_damaged_runs_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_runs_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_runs(referee):
+def test_many_damaged_runs(harness):
     """`pytest -m slow tests/fuzz/test_runs.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

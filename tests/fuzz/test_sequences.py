@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r3jax.formats.captures import PosedImages
 from r3jax.formats.errors import FormatError
-from r3jax.formats.replica_slam import read_replica_slam
-from r3jax.formats.seven_scenes import read_seven_scenes
-from r3jax.formats.tum import read_tum
+from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.sequences.replica_slam import read_replica_slam
+from r3jax.formats.sequences.seven_scenes import read_seven_scenes
+from r3jax.formats.sequences.tum import read_tum
 from r3jax.geometry.cameras import rigid_error
 from tests.formats import sequences
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
@@ -55,12 +55,12 @@ NAMES = ("REPLICA_SLAM", "TUM", "SEVEN_SCENES")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_damaged_sequences_are_refused_or_read(referee, name):
-    referee.check(f"{__name__}:{name}", CASES)
+def test_damaged_sequences_are_refused_or_read(harness, name):
+    harness.check(f"{__name__}:{name}", CASES)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_many_damaged_sequences(referee, name):
+def test_many_damaged_sequences(harness, name):
     """`pytest -m slow tests/fuzz/test_sequences.py`."""
-    referee.check(f"{__name__}:{name}", CASES_SLOW)
+    harness.check(f"{__name__}:{name}", CASES_SLOW)

@@ -13,7 +13,7 @@ import pytest
 from r3jax.splatting.errors import SceneFileError
 from r3jax.splatting.ply import read_scene, write_scene
 from r3jax.splatting.scene import GaussianScene
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files, pick_up, unsealed
 from tests.fuzz.worker import Reader
 
@@ -58,11 +58,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (SceneFileError,))
 
 
-def test_damaged_splats_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_splats_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_splats(referee):
+def test_many_damaged_splats(harness):
     """`pytest -m slow tests/fuzz/test_splats.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r3jax.simulators.habitat_stage import read_stage
-from tests.fuzz.referee import CASES_SLOW
+from r3jax.simulators.habitat.habitat_stage import read_stage
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files
 from tests.fuzz.worker import Reader
 
@@ -40,11 +40,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (ValueError,))
 
 
-def test_damaged_stage_configs_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_stage_configs_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_stage_configs(referee):
+def test_many_damaged_stage_configs(harness):
     """`pytest -m slow tests/fuzz/test_stage_configs.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.cameras import Camera
-from r3jax.splatting.checkpoints import (
+from r3jax.splatting.errors import CheckpointError
+from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.training.checkpoints import (
     begin_checkpoints,
     read_checkpoint,
     save_checkpoint,
     settings_record,
 )
-from r3jax.splatting.errors import CheckpointError
-from r3jax.splatting.scene import GaussianScene
-from r3jax.splatting.train_step import TrainState, start_state
-from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.training.config import TrainConfig
+from r3jax.splatting.training.train_step import TrainState, start_state
 from r3jax.splatting.views import Views
-from tests.fuzz.referee import CASES_SLOW
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files, pick_up, unsealed
 from tests.fuzz.worker import Reader
 
@@ -71,11 +71,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (CheckpointError,))
 
 
-def test_damaged_checkpoints_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_checkpoints_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_checkpoints(referee):
+def test_many_damaged_checkpoints(harness):
     """`pytest -m slow tests/fuzz/test_training_checkpoints.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

@@ -15,8 +15,8 @@ import pytest
 from r3jax.evaluation import test_views
 from r3jax.evaluation.test_views import ViewSet, read_view_set
 from r3jax.geometry.cameras import rigid_error
+from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.mutate import mutate
-from tests.fuzz.referee import CASES_SLOW
 from tests.fuzz.tree import Files, pick_up
 from tests.fuzz.worker import Reader
 
@@ -65,11 +65,11 @@ def read(folder: Path) -> None:
 READER = Reader(seeds, read, (ValueError, FileNotFoundError), make=make)
 
 
-def test_damaged_view_sets_are_refused_or_read(referee):
-    referee.check(__name__, CASES)
+def test_damaged_view_sets_are_refused_or_read(harness):
+    harness.check(__name__, CASES)
 
 
 @pytest.mark.slow
-def test_many_damaged_view_sets(referee):
+def test_many_damaged_view_sets(harness):
     """`pytest -m slow tests/fuzz/test_view_sets.py`."""
-    referee.check(__name__, CASES_SLOW)
+    harness.check(__name__, CASES_SLOW)

@@ -50,7 +50,7 @@ def centers_of(state: MapState) -> np.ndarray:
     return np.float64(voxel_center(jnp.stack(unpack(state.key[0], state.key[1])), state.voxel_size))
 
 
-def judged_by_hand(state: MapState, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def seen_by_hand(state: MapState, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Which rows are seen, voxel by voxel, and which lie too near a limit to be sure of."""
     centers, T = centers_of(state), np.linalg.inv(np.float64(frame.T_world_camera))
     depth = np.asarray(frame.depth)
@@ -88,7 +88,7 @@ def law_seen(modules: Modules) -> None:
     for seed in range(3):
         before, frame = cloud_map(seed), frame_of(seed)
         after = update(before, frame, REACH)
-        seen, unsure = judged_by_hand(before, frame)
+        seen, unsure = seen_by_hand(before, frame)
         bins = bins_by_hand(before, frame)
         fresh = ~has_bin(before, bins)
         sure = np.asarray(before.occupied) & ~unsure & fresh

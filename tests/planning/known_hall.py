@@ -2,18 +2,17 @@
 
 import functools
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 import r3jax
 from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.explorable import mask_unexplorable
-from r3jax.planning.travel import safe_cells
+from r3jax.planning.robot.explorable import mask_unexplorable
+from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.utility import visible_unexplored
@@ -58,5 +57,4 @@ def after_view(world: Known, T: Array) -> Known:
     state, grid = world
     shown = visible_unexplored(state, grid, CAMERA, T, SCORING)
     state, _ = simulate_view(state, CAMERA, T, SCORING)
-    log_odds = jnp.where(shown, LOG_ODDS_LIMIT, grid.log_odds)
-    return state, eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+    return state, grid.ignoring(shown)

@@ -8,6 +8,7 @@ import numpy as np
 import r3jax
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import Candidates, candidates_along
 
 CELL = 0.2
 ORIGIN = np.array([-1.0, 2.0, 0.5])
@@ -35,6 +36,11 @@ def pose_at(position: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, 3] = position
     return T
+
+
+def candidates_of(poses: np.ndarray) -> Candidates:
+    """The candidates with these poses, [C, 4, 4]."""
+    return candidates_along(poses[:, :3, 3], poses[:, :3, 2])
 
 
 def two_rooms() -> tuple[np.ndarray, np.ndarray]:

@@ -16,13 +16,13 @@ from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.policies.active_gamer import ActiveGamer, empty_share, score_of
-from r3jax.planning.policy import Outcome, Policy
+from r3jax.planning.policies.active_gamer.policy import ActiveGamer, empty_share, score_of
+from r3jax.planning.policy import DecisionOutcome, Policy
 from r3jax.scoring.pixels import score_pixels
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 
-CHAIN = ("r3jax.planning.policies.active_gamer",)
+CHAIN = ("r3jax.planning.policies.active_gamer.policy",)
 CAMERA = Camera.from_fov(32, 32)
 KEY = jax.random.key(3)
 NUM = 12
@@ -40,7 +40,7 @@ class Scorer:
         assert poses.shape == (NUM, 4, 4)
         assert poses.dtype == np.float32
         self.asked.append((poses, float(config.max_range)))
-        return jnp.asarray(self.gain(poses[:, :3, 3].astype(np.float64)), jnp.float32)
+        return jnp.asarray(self.gain(np.asarray(poses, np.float64)[:, :3, 3]), jnp.float32)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def decide(policy, world, state=None, cell=(6, 6, 4), key=KEY):
 
 def law_score(modules: Modules) -> None:
     """Distances 0, ln 2, ln 5 have softmax 1/8, 2/8, 5/8; gains 1, 3, 4 are 1/8, 3/8, 4/8."""
-    score_of = modules["active_gamer"].score_of
+    score_of = modules["policy"].score_of
     distance, gain = np.log([1.0, 2.0, 5.0]), np.array([1.0, 3.0, 4.0])
     np.testing.assert_allclose(
         score_of(gain, distance), [7 / 8 / 8, 6 / 8 * 3 / 8, 3 / 8 * 4 / 8], rtol=1e-12
@@ -71,13 +71,13 @@ def law_nearer_of_equal_gains(modules: Modules, seed: int = 0) -> None:
     distance, gain = rng.uniform(0, 9, 8), rng.uniform(0.01, 1, 8)
     gain[3] = gain[5]
     distance[3] = distance[5] + rng.uniform(0.1, 3)
-    score = modules["active_gamer"].score_of(gain, distance)
+    score = modules["policy"].score_of(gain, distance)
     assert 0 <= score[3] < score[5] <= gain[5] / gain.sum()
 
 
 def law_gain_is_the_share_of_empty_pixels(modules: Modules) -> None:
     hit = jnp.asarray(np.arange(12).reshape(3, 4) < 5)
-    share = modules["active_gamer"].empty_share(SimpleNamespace(hit=hit))
+    share = modules["policy"].empty_share(SimpleNamespace(hit=hit))
     np.testing.assert_allclose(share, 7 / 12, rtol=1e-6)
 
 
@@ -85,7 +85,7 @@ def law_decision(modules: Modules) -> None:
     """The greatest score is taken, leaves the pool, and so do the worthless."""
     # The robot stands by the wall; two of the twelve lie behind it, a detour away.
     scorer = Scorer(lambda p: np.where(p[:, 0] > 0.9, 0.004, 0.1 * (p[:, 1] - 2.0)))
-    policy = modules["active_gamer"].ActiveGamer(CONFIG, scorer)
+    policy = modules["policy"].ActiveGamer(CONFIG, scorer)
     world = empty_map(64), grid_of(*two_rooms())
     decision, state, _ = decide(policy, world, cell=(10, 2, 4))
     u, positions = decision.utilities, decision.candidates[:, :3, 3]
@@ -122,7 +122,7 @@ def test_law(law):
 
 @given(seed=st.integers(0, 10_000))
 def test_the_nearer_of_two_equal_gains_scores_higher(seed):
-    law_nearer_of_equal_gains({"active_gamer": SimpleNamespace(score_of=score_of)}, seed)
+    law_nearer_of_equal_gains({"policy": SimpleNamespace(score_of=score_of)}, seed)
 
 
 def test_decisions_are_safe_complete_and_repeatable(world):
@@ -131,7 +131,7 @@ def test_decisions_are_safe_complete_and_repeatable(world):
     decision, state, info = decide(policy, world)
     again, _, _ = decide(policy, world)
     np.testing.assert_array_equal(decision.T_world_camera, again.T_world_camera)
-    assert info.outcome is Outcome.MOVED
+    assert info.outcome is DecisionOutcome.MOVED
     assert info.num_candidates == info.num_reachable == NUM
     assert {"travel", "candidates", "scoring"} == set(info.stage_seconds)
     assert rigid_error(decision.T_world_camera) is None
@@ -156,7 +156,7 @@ def test_every_view_of_a_run_is_another_one_until_views_are_random(world):
     else:
         raise AssertionError("the pools were never exhausted")
     assert int(state.memory.num_ended) == 2
-    assert info.outcome is Outcome.MOVED
+    assert info.outcome is DecisionOutcome.MOVED
     assert np.linalg.norm(decision.T_world_camera[:3, 3] - center(6, 6, 4)) <= 0.5
 
 
@@ -165,7 +165,7 @@ def test_nowhere_to_go_is_an_outcome():
     nothing = (empty_map(64), grid_of(np.zeros((25, 14, 10), bool)))
     decision, state, info = decide(policy, nothing)
     assert decision is None
-    assert info.outcome is Outcome.NO_CANDIDATE
+    assert info.outcome is DecisionOutcome.NO_CANDIDATE
     assert int(state.memory.num_ended) == 0
 
 
@@ -204,20 +204,20 @@ def test_the_gain_of_a_wall_that_fills_half_the_picture():
 
 
 MUTANTS = [
-    Mutant("active_gamer", "(1.0 - far / far.sum())", "(far / far.sum())", law_score),
-    Mutant("active_gamer", "1.0 - far / far.sum()", "1.0 - far / far.max()", law_score),
-    Mutant("active_gamer", "gain / (gain.sum() or 1.0)", "gain", law_score),
-    Mutant("active_gamer", "np.exp(distance - distance.max())", "distance", law_score),
+    Mutant("policy", "(1.0 - far / far.sum())", "(far / far.sum())", law_score),
+    Mutant("policy", "1.0 - far / far.sum()", "1.0 - far / far.max()", law_score),
+    Mutant("policy", "gain / (gain.sum() or 1.0)", "gain", law_score),
+    Mutant("policy", "np.exp(distance - distance.max())", "distance", law_score),
     Mutant(
-        "active_gamer",
+        "policy",
         "np.exp(distance - distance.max())",
         "np.exp(distance.max() - distance)",
         law_nearer_of_equal_gains,
     ),
-    Mutant("active_gamer", "jnp.mean(~view.hit", "jnp.mean(view.hit", LAWS[2]),
-    Mutant("active_gamer", 'utilities["distance"])', 'utilities["path"])', law_decision),
-    Mutant("active_gamer", 'utilities["utility"], best)', 'utilities["utility"], 0)', law_decision),
-    Mutant("active_gamer", "max_range=extent", "", law_decision),
+    Mutant("policy", "jnp.mean(~view.hit", "jnp.mean(view.hit", LAWS[2]),
+    Mutant("policy", 'utilities["distance"])', 'utilities["path"])', law_decision),
+    Mutant("policy", "found, gain, best)", "found, gain, 0)", law_decision),
+    Mutant("policy", "max_range=extent", "", law_decision),
 ]
 
 

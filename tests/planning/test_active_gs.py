@@ -12,13 +12,12 @@ import r3jax
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.join import grow
-from r3jax.planning.candidates import poses_along
+from r3jax.planning.candidates import candidates_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policies.active_gs import ActiveGS, ActiveGSNoDepth, policy, regions
 from r3jax.planning.policies.active_gs.confidence import no_sightings
-from r3jax.planning.policy import Outcome
-from r3jax.planning.situation import Situation
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.policy import DecisionOutcome, Situation
+from r3jax.planning.robot.travel import plan_travel
 from r3jax.scoring.pixels import PixelView
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, pose_at, two_rooms
@@ -126,9 +125,8 @@ def score(policy_class, state, confidence, grid=None, direction=(1.0, 0.0, 0.0))
     travel = plan_travel(grid, START)
     seen = sightings_of(state, np.full(state.capacity, confidence))
     situation = Situation(state, grid, grid, travel, CAMERA, seen)
-    pose = np.asarray(pose_along(START, np.array(direction)), np.float64)
-    poses = np.tile(pose, (2, 1, 1))
-    return policy_class(CONFIG).score(situation, poses, key=KEY)[1]
+    candidates = candidates_along(np.tile(START, (2, 1)), np.tile(direction, (2, 1)))
+    return policy_class(CONFIG).score(situation, candidates, key=KEY)[1]
 
 
 def law_scores(modules: Modules) -> None:
@@ -337,7 +335,7 @@ def decide(state, grid, policy_class=ActiveGS, memory=None, position=START, key=
 def test_a_decision_has_all_candidates_and_follows_the_score(policy_class):
     state = map_of(center(0, 6, 4)[None])
     decision, after, info = decide(state, flat(), policy_class)
-    assert info.outcome is Outcome.MOVED
+    assert info.outcome is DecisionOutcome.MOVED
     assert decision.candidates.shape == (NUM, 4, 4)
     u = decision.utilities
     share = u["utility"] / u["utility"].sum() - 0.5 * u["path"] / u["path"].sum()
@@ -385,10 +383,10 @@ def test_nothing_of_use_is_a_random_choice():
 def test_lots_differ_between_decisions():
     state = wall_at(3.0)
     grid = grid_of(np.ones((40, 14, 10), bool))
-    poses = poses_along(np.tile(START, (8, 1)), np.tile([1.0, 0.0, 0.0], (8, 1)))
+    views = candidates_along(np.tile(START, (8, 1)), np.tile([1.0, 0.0, 0.0], (8, 1)))
     travel = plan_travel(grid, START)
     situation = Situation(state, grid, grid, travel, CAMERA, sightings_of(state))
-    lots = [ActiveGS(CONFIG).score(situation, poses, key=jax.random.key(i))[1]["lot"]
+    lots = [ActiveGS(CONFIG).score(situation, views, key=jax.random.key(i))[1]["lot"]
             for i in range(2)]  # fmt: skip
     assert len(np.unique(np.concatenate(lots))) == 16
 
@@ -397,12 +395,12 @@ def test_shut_in_all_candidates_are_the_robots_own_place():
     free = np.zeros((25, 14, 10), bool)
     free[6, 6, 4] = True
     decision, _, info = decide(map_of(START[None]), grid_of(free, ~free))
-    assert info.outcome is Outcome.MOVED
+    assert info.outcome is DecisionOutcome.MOVED
     assert decision.candidates.shape == (NUM, 4, 4)
     np.testing.assert_allclose(decision.candidates[:, :3, 3], np.tile(START, (NUM, 1)))
     nowhere, _, info = decide(map_of(START[None]), grid_of(np.zeros((25, 14, 10), bool)))
     assert nowhere is None
-    assert info.outcome is Outcome.NO_CANDIDATE
+    assert info.outcome is DecisionOutcome.NO_CANDIDATE
 
 
 @pytest.mark.full

@@ -7,15 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.planning.candidates import (
+    candidates_along,
     in_plain_view,
     lattice,
     local_random,
+    path_lengths,
     poses_along,
     random_directions,
     region_of_interest,
     spread,
 )
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.robot.travel import plan_travel
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, two_rooms
 
 KEY = jax.random.key(7)
@@ -128,6 +130,29 @@ def test_poses_look_along_their_direction_without_roll():
     np.testing.assert_allclose(poses[:, :3, 2], unit, atol=1e-6)
     np.testing.assert_allclose(poses[:, 2, 0], 0.0, atol=1e-6)  # the image's x axis is level
     np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0, atol=1e-5)
+
+
+def test_padding_repeats_views_and_has_no_path(travel):
+    positions = np.stack([center(6, 5, 4), center(8, 5, 4)])
+    drawn = candidates_along(positions, np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    padded = drawn.padded(5)
+    assert padded.valid.tolist() == [True, True, False, False, False]
+    assert padded.num_valid == 2
+    np.testing.assert_array_equal(padded.position, positions[[0, 1, 0, 1, 0]])
+    np.testing.assert_allclose(padded.axis, [[1, 0, 0], [0, 0, 1]] * 2 + [[1, 0, 0]])
+    np.testing.assert_array_equal(padded.padded(3).valid, padded.valid[:3])
+    lengths = path_lengths(travel, padded)
+    np.testing.assert_allclose(lengths[:2], travel.lengths(positions))
+    assert np.isinf(lengths[2:]).all()
+
+
+def test_matrices_are_those_of_the_lines_of_sight():
+    rng = np.random.default_rng(1)
+    drawn = candidates_along(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)))
+    poses = drawn.T_world_camera
+    np.testing.assert_array_equal(poses[:, :3, 3], drawn.position)
+    np.testing.assert_allclose(poses[:, :3, 2], drawn.axis, atol=1e-6)
+    np.testing.assert_array_equal(drawn.poses_on_device(), poses.astype(np.float32))
 
 
 def test_the_same_key_draws_the_same_candidates(travel):

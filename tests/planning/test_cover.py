@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import empty_map
-from r3jax.planning.candidates import poses_along
+from r3jax.planning.candidates import candidates_along
 from r3jax.planning.decision import net_utility
 from r3jax.planning.policies import cover
 from r3jax.planning.policies.cover import Cover
@@ -118,10 +118,10 @@ def scored():
         "the unknown": (walls.SEEN_FROM, (-0.4, 1.0, 0.0)),
     }
     places, axes = (np.array(part) for part in zip(*looks.values(), strict=True))
-    poses = poses_along(places, axes)
-    policy = Cover(walls.config(len(poses)))
-    _, utilities = policy.score(where, poses, key=jax.random.key(0))
-    return where, poses, policy, utilities, list(looks)
+    candidates = candidates_along(places, axes)
+    policy = Cover(walls.config(len(places)))
+    _, utilities = policy.score(where, candidates, key=jax.random.key(0))
+    return where, candidates.T_world_camera, policy, utilities, list(looks)
 
 
 def test_new_directions_are_worth_more_than_old_ones(scored):
@@ -149,8 +149,8 @@ def test_unexplored_cells_count_as_in_active_gs(scored):
 def test_a_map_that_holds_nothing_is_explored():
     """No pixel is covered: the unexplored cells alone decide."""
     where = walls.situation(empty_map(1 << 10, walls.VOXEL), walls.box(1.0))
-    poses = poses_along(np.tile(walls.SEEN_FROM, (5, 1)), np.eye(3)[[0, 1, 0, 0, 1]])
-    _, utilities = Cover(walls.config(5)).score(where, poses, key=jax.random.key(0))
+    candidates = candidates_along(np.tile(walls.SEEN_FROM, (5, 1)), np.eye(3)[[0, 1, 0, 0, 1]])
+    _, utilities = Cover(walls.config(5)).score(where, candidates, key=jax.random.key(0))
     assert not utilities["rendering"].any()
     np.testing.assert_array_equal(utilities["utility"], utilities["exploration"])
     assert utilities["utility"].argmax() in (1, 4)

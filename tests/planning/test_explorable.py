@@ -6,8 +6,8 @@ corners; only the first layer kept; free space that the robot cannot enter taken
 
 import numpy as np
 
-from r3jax.planning.explorable import explorable_cells, mask_unexplorable
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.robot.explorable import explorable_cells, mask_unexplorable
+from r3jax.planning.robot.travel import plan_travel
 from tests.planning.rooms import center, grid_of
 
 
@@ -88,8 +88,19 @@ def test_the_masked_grid_differs_only_in_hopeless_cells():
     occupied[6] = True
     grid = grid_of(free, occupied)
     masked = mask_unexplorable(grid, plan_travel(grid, center(3, 4, 4)).reachable)
-    np.testing.assert_array_equal(masked.free, grid.free)
+    np.testing.assert_array_equal(masked.log_odds, grid.log_odds)
     assert not bool(masked.unexplored[7:].any())
-    assert bool(masked.occupied[7:].all())
-    np.testing.assert_array_equal(masked.log_odds[:7], grid.log_odds[:7])
-    assert masked.log_odds.dtype == grid.log_odds.dtype
+    np.testing.assert_array_equal(masked.unexplored[:7], grid.unexplored[:7])
+
+
+def test_masks_add_up_and_what_is_known_stays():
+    free = np.zeros((4, 3, 3), bool)
+    free[0] = True
+    grid = grid_of(free)
+    first, second = np.zeros_like(free), np.zeros_like(free)
+    first[:2], second[2] = True, True
+    masked = grid.ignoring(first).ignoring(second)
+    np.testing.assert_array_equal(masked.unexplored, (np.arange(4) == 3)[:, None, None] & ~free)
+    np.testing.assert_array_equal(masked.free, grid.free)
+    assert not masked.occupied.any()
+    assert grid.worth_a_look is None

@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.planning import limits as limits_module
 from r3jax.planning.candidates import poses_along
-from r3jax.planning.motion import MOTIONS, Motion
+from r3jax.planning.robot import limits as limits_module
+from r3jax.planning.robot.motion import MOTIONS, Motion
 from tests.mutants import Modules, Mutant, assert_caught, each
+from tests.planning.rooms import candidates_of
 
-CHAIN = ("r3jax.planning.limits",)
+CHAIN = ("r3jax.planning.robot.limits",)
 NUM = 24
 LATTICE = fibonacci_lattice(526)
 TURNING = Motion(elevations=(-60.0, 20.0), turn_per_meter=90.0)
@@ -36,6 +37,11 @@ def limited(module, motion: Motion, seed: int):
     now = views(seed + 1000)[5]
     now[2, 3] = 0.1
     return module.Limits(motion, module.begin_at(motion, now), motion.heights_from(0.1))
+
+
+def feasible(limits, poses: np.ndarray) -> np.ndarray:
+    """The poses of the nearest views that are allowed."""
+    return limits.project_to_feasible(candidates_of(poses)).T_world_camera
 
 
 def elevation(poses: np.ndarray) -> np.ndarray:
@@ -68,7 +74,7 @@ def law_obeyed(modules: Modules, seed: int = 0) -> None:
         for spread in (0.05, 1.0, 5.0):
             poses = views(seed, spread)
             before = poses.copy()
-            obeyed = limits.project_to_feasible(poses)
+            obeyed = feasible(limits, poses)
             np.testing.assert_array_equal(poses, before)
             # float32 poses know angles near none and near straight up to some hundredths only.
             assert is_allowed(limits, obeyed, 0.1).all()
@@ -79,8 +85,8 @@ def law_obeyed(modules: Modules, seed: int = 0) -> None:
             )
             assert np.all(obeyed[:, 2, 1] <= 1e-6)  # nobody's head is down
             was_fine = is_allowed(limits, poses, -0.1)
-            np.testing.assert_array_equal(obeyed[was_fine], poses[was_fine])
-            np.testing.assert_allclose(limits.project_to_feasible(obeyed), obeyed, atol=1e-6)
+            np.testing.assert_allclose(obeyed[was_fine], poses[was_fine], atol=1e-6)
+            np.testing.assert_allclose(feasible(limits, obeyed), obeyed, atol=1e-6)
             np.testing.assert_array_equal(obeyed[:, :2, 3], poses[:, :2, 3])
 
 
@@ -91,20 +97,16 @@ def law_nearest(modules: Modules) -> None:
     tilted = module.Limits(MOTIONS["gimbal"], now)
     up = poses_along(here[None], np.array([[0.0, -1.0, 1.0]]))
     half = math.sqrt(0.75)
-    np.testing.assert_allclose(
-        tilted.project_to_feasible(up)[0, :3, 2], [0.0, -half, 0.5], atol=1e-6
-    )
+    np.testing.assert_allclose(feasible(tilted, up)[0, :3, 2], [0.0, -half, 0.5], atol=1e-6)
     walking = module.Limits(Motion(turn_per_meter=90.0), now)
     place = np.array([[0.3, 0.4, 0.0]])
     back = poses_along(place, np.array([[-1.0, 1e-3, 0.0]]))
     root = math.sqrt(0.5)
-    np.testing.assert_allclose(
-        walking.project_to_feasible(back)[0, :3, 2], [root, root, 0.0], atol=1e-6
-    )
+    np.testing.assert_allclose(feasible(walking, back)[0, :3, 2], [root, root, 0.0], atol=1e-6)
     # Across the azimuth where the angles begin again: 20 degrees are 20, not 340.
     wrapped = module.Limits(Motion(turn_per_meter=90.0), _level(170.0, here))
     there = _level(-170.0, place[0])[None]
-    np.testing.assert_array_equal(wrapped.project_to_feasible(there), there)
+    np.testing.assert_allclose(feasible(wrapped, there), there, atol=1e-6)
 
 
 def _level(degrees: float, place: np.ndarray) -> np.ndarray:
@@ -157,7 +159,7 @@ def law_turns(modules: Modules, seed: int = 0) -> None:
     gimbal = modules["limits"].Limits(Motion(elevations=TURNING.elevations))
     for position, row in zip(positions, may, strict=True):
         poses = poses_along(np.tile(position, (len(directions), 1)), directions)
-        settled = gimbal.project_to_feasible(poses)
+        settled = feasible(gimbal, poses)
         straight = np.linalg.norm(position - limits.T_world_camera[:3, 3])
         gap = 90.0 * straight - turn(limits.T_world_camera, settled)
         clear = np.abs(gap) > 0.1
@@ -175,11 +177,12 @@ def law_costs(modules: Modules) -> None:
     poses = np.stack([_level(0.0, here), _level(90.0, here), _level(180.0, here)])
     limits = modules["limits"].Limits(Motion(speed=2.0, turn_rate=45.0), poses[0])
     lengths = np.array([1.0, 1.0, np.inf])
-    np.testing.assert_allclose(limits.path_costs(lengths, poses), [1.0, 5.0, np.inf], rtol=1e-6)
-    assert limits.seconds(3.0, poses[1]) == pytest.approx(1.5 + 2.0, rel=1e-6)
+    axes = poses[:, :3, 2]
+    np.testing.assert_allclose(limits.path_costs(lengths, axes), [1.0, 5.0, np.inf], rtol=1e-6)
+    assert limits.seconds(3.0, axes[1]) == pytest.approx(1.5 + 2.0, rel=1e-6)
     free = modules["limits"].Limits()
-    np.testing.assert_array_equal(free.path_costs(lengths, poses), lengths)
-    assert free.seconds(3.0, poses[1]) is None
+    np.testing.assert_array_equal(free.path_costs(lengths, axes), lengths)
+    assert free.seconds(3.0, axes[1]) is None
 
 
 def law_begin(modules: Modules) -> None:
@@ -222,23 +225,29 @@ def test_any_place_has_its_allowed_axes(seed):
 MUTANTS = [
     Mutant("limits", "*np.radians(self.motion.elevations))", "-9.0, 9.0)", law_obeyed),
     Mutant("limits", "2], *self.heights)", "2], -9.0, 9.0)", law_obeyed),
-    Mutant("limits", "obeyed = np.array(poses)", "obeyed = poses", law_obeyed),
-    Mutant("limits", "(wanted, allowed) > _SAME", "(wanted, allowed) > -1.0", law_obeyed),
+    Mutant(
+        "limits",
+        "(wanted, allowed) > _SAME\n        directions",
+        "(wanted, allowed) > 9.0\n        directions",
+        law_obeyed,
+    ),
     Mutant("limits", "np.minimum(allowed / whole, 1.0)", "0.0", law_nearest),
-    Mutant("limits", " * np.cos(0.5 * by[1])", "", law_obeyed),
-    Mutant("limits", "_wrapped(azimuth - azimuth_now)", "azimuth - azimuth_now", law_nearest),
+    Mutant("limits", " * np.cos(0.5 * elevation)", "", law_obeyed),
+    Mutant(
+        "limits", "by = _wrapped(azimuth - azimuth_now)", "by = azimuth - azimuth_now", law_nearest
+    ),
     Mutant("limits", "np.minimum(cap, nearness", "np.maximum(cap, 0.0 * nearness", law_axes),
     Mutant("limits", "cap = 1.0 - 2.0 / num_bins", "cap = 1.0 - 1e-9", law_axes),
     Mutant("limits", "motion.looks_anywhere", "motion.turn_per_meter is None", law_axes),
     Mutant("limits", "motion.looks_anywhere", "motion.elevations == (-90.0, 90.0)", law_axes),
     Mutant(
         "limits",
-        "self._clipped(*_angles_along(directions))",
+        "self.clipped(*_angles_along(directions))",
         "_angles_along(directions)",
         law_turns,
     ),
-    Mutant("limits", "lengths + self.motion.speed *", "lengths +", law_costs),
-    Mutant("limits", "replace(motion, turn_per_meter=None)", "motion", law_begin),
+    Mutant("limits", "lengths + self.motion.speed * seconds", "lengths + seconds", law_costs),
+    Mutant("limits", "Limits(motion, pose).clipped(*wanted)", "wanted", law_begin),
     Mutant("limits", "    check_height(height, (low, high))\n", "", law_begin),
 ]
 

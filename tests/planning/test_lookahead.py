@@ -10,17 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from r3jax.planning import lookahead as real
-from r3jax.planning.candidates import poses_along
-from r3jax.planning.limits import Limits
-from r3jax.planning.motion import Motion
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.candidates import best_views, candidates_at, poses_along
+from r3jax.planning.policies.ahead import lookahead as real
+from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.motion import Motion
+from r3jax.planning.robot.travel import plan_travel
 from r3jax.scoring.batch import cache_positions_near, score_positions
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama import panorama
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.known_hall import CAMERA, CONFIG, SCORING, after_view, for_scoring
-from tests.planning.rooms import center, grid_of, two_rooms
+from tests.planning.rooms import candidates_of, center, grid_of, two_rooms
 
 PLACES = np.array([[1.0, 0.9, 1.2], [1.9, 0.9, 1.2], [1.0, 1.8, 1.2], [1.9, 1.7, 1.2]])
 """Each 0.7 m or more from the others."""
@@ -33,14 +33,12 @@ def outlook_of(config: real.AheadConfig, view_seconds: float = 1.0) -> real.Beam
     """The places, seen from the first one; ways are straight."""
     state, grid = for_scoring()
     panoramas = score_positions(state, grid, CAMERA, PLACES, SCORING)
-    poses = np.array(panoramas.T_world_camera, np.float64)
-    poses[:, :3, 3] = PLACES
+    views, utility = best_views(candidates_at(PLACES), panoramas)
     gap = np.linalg.norm(PLACES[:, None] - PLACES, axis=2)
     config = dataclasses.replace(config, view_seconds=view_seconds)
-    utility = np.asarray(panoramas.best_score, np.float64)
     start, places = at_hand(), jnp.asarray(PLACES, jnp.float32)
     _, kept = cache_positions_near(*start, CAMERA, places, SCORING)
-    return real.BeamProblem(poses, utility, gap[0], gap, kept, start, CAMERA, config)
+    return real.BeamProblem(views, utility, gap[0], gap, kept, start, CAMERA, config)
 
 
 def at_hand():
@@ -118,13 +116,14 @@ def law_motion(modules: Modules) -> None:
     limits = Limits(motion, start)
     flying = outlook_of(dataclasses.replace(WIDE, horizon=2), view_seconds=0.3)
     problem = dataclasses.replace(
-        flying, poses=limits.project_to_feasible(flying.poses), limits=limits
+        flying, views=limits.project_to_feasible(flying.views), limits=limits
     )
     found = modules["lookahead"].search(problem)
     assert len(found) > 10
     for path in found:
         seconds, here, place = 0.0, start, None
-        for number, pose in zip(path.places, path.poses, strict=True):
+        poses = poses_along(PLACES[list(path.places)], np.stack(path.directions))
+        for number, pose in zip(path.places, poses, strict=True):
             way = flying.lengths[number] if place is None else flying.between[place, number]
             turn = Rotation.from_matrix(here[:3, :3].T @ pose[:3, :3]).magnitude()
             seconds += 0.3 + way / 0.2 + np.degrees(turn) / 45.0
@@ -144,10 +143,12 @@ def law_apart(modules: Modules) -> None:
     poses[2, 0, 3] = 0.75
     poses[3, :3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # turned by 90 degrees
     apart = modules["lookahead"]._apart
-    assert apart([1, 0, 2, 3], poses, (), 4) == [1, 3]
-    assert apart([0, 1, 2, 3], poses, (), 4) == [0, 2, 3]
-    assert apart([0, 1, 2, 3], poses, (), 2) == [0, 2]
-    assert apart([0, 1, 2, 3], poses, (poses[2],), 4) == [0, 3]
+    views = candidates_of(poses)
+    assert apart([1, 0, 2, 3], views, (), 4) == [1, 3]
+    assert apart([0, 1, 2, 3], views, (), 4) == [0, 2, 3]
+    assert apart([0, 1, 2, 3], views, (), 2) == [0, 2]
+    third = views.position[2], views.direction[2]
+    assert apart([0, 1, 2, 3], views, (third,), 4) == [0, 3]
 
 
 def test_choices_lie_apart():
@@ -189,18 +190,18 @@ def test_ways_between_rooms_lead_through_the_door():
     assert between[0, 1] > 1.6
 
 
-CHAIN = ("r3jax.scoring.simulated", "r3jax.planning.lookahead")
-_TAKEN = "T = jnp.asarray(path.poses[-1]"
+CHAIN = ("r3jax.scoring.simulated", "r3jax.planning.policies.ahead.lookahead")
+_TAKEN = "path.directions[-1][None]"
 _SECONDS = "seconds=path.seconds + float(cost[i])"
 _FIRST = "cost = config.view_seconds + ways"
 MUTANTS = [
-    Mutant("lookahead", _TAKEN, "T = jnp.asarray(path.poses[0]", law_paths),
+    Mutant("lookahead", _TAKEN, "path.directions[0][None]", law_paths),
     Mutant("lookahead", "problem.between[last]", "problem.lengths", law_paths),
     Mutant("lookahead", _SECONDS, "seconds=float(cost[i])", law_paths),
     Mutant("lookahead", "return sum(self.gains) /", "return self.gains[-1] /", law_paths),
     Mutant("lookahead", _FIRST, "cost = ways", law_one_view),
     Mutant("lookahead", " + turning[k]", "", law_motion),
-    Mutant("lookahead", "poses = limits.project_to_feasible(poses)", "pass", law_motion),
+    Mutant("lookahead", "turned = limits.project_to_feasible(turned)", "pass", law_motion),
     Mutant("lookahead", "ways / problem.speed", "ways", law_motion),
     Mutant("lookahead", "< _TURNED", "> _TURNED", law_apart),
     Mutant("lookahead", "others = list(taken)", "others = []", law_apart),

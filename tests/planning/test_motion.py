@@ -8,7 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.motion import (
+from r3jax.planning.registry import make_policy
+from r3jax.planning.robot.motion import (
     MOTIONS,
     UNLIMITED,
     Motion,
@@ -16,7 +17,6 @@ from r3jax.planning.motion import (
     motion_of,
     motion_of_record,
 )
-from r3jax.planning.registry import make_policy
 from r3jax.trace.header import settings_of
 
 

@@ -8,13 +8,14 @@ import pytest
 
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import empty_map
-from r3jax.planning import decision, greedy, pool
-from r3jax.planning.candidates import poses_along
+from r3jax.planning import decision, greedy
+from r3jax.planning.candidates import Candidates, candidates_along, poses_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.limits import Limits
-from r3jax.planning.motion import MOTIONS, Motion
 from r3jax.planning.policies import frontier, random, renderability
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.policies.active_gamer import pool
+from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.motion import MOTIONS, Motion
+from r3jax.planning.robot.travel import plan_travel
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, center, grid_of, pose_at, two_rooms
 from tests.planning.test_motions_of_policies import CAMERA, CONSTRAINED, assert_obeys, turns
@@ -22,7 +23,7 @@ from tests.planning.test_motions_of_policies import CAMERA, CONSTRAINED, assert_
 CHAIN = (
     "r3jax.planning.decision",
     "r3jax.planning.greedy",
-    "r3jax.planning.pool",
+    "r3jax.planning.policies.active_gamer.pool",
     "r3jax.planning.policies.renderability",
     "r3jax.planning.policies.random",
     "r3jax.planning.policies.frontier",
@@ -79,8 +80,7 @@ def law_a_policy_that_turns_is_held(modules: Modules) -> None:
         def score(map_state, grid, camera, positions, config, allowed, kept=allowed_axes):
             kept.append(allowed)
             axes = LATTICE[allowed.argmax(axis=1)]  # the highest that is allowed
-            poses = poses_along(positions.astype(np.float64), axes).astype(np.float32)
-            return SimpleNamespace(T_world_camera=poses, best_score=np.ones(NUM))
+            return SimpleNamespace(best_direction=axes, best_score=np.ones(NUM))
 
         answer = decide(modules["renderability"].OursPano(config_of(name), score))
         assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
@@ -148,19 +148,23 @@ def law_pool_waits_for_turns(modules: Modules) -> None:
     # Stage 1 needs stage 0 to be over.
     _, every = modules["pool"].draw_candidates(pools, travel, 500)
     _, some = modules["pool"].draw_candidates(pools, travel, 500, limits)
-    assert 0 < len(some.poses) < len(every.poses)
-    assert not _is_cut_short(limits, some.poses).any()
-    drawn = lambda draw: {tuple(pose) for pose in np.round(draw.poses.reshape(-1, 16), 5)}
-    left_out = np.array(sorted(drawn(every) - drawn(some))).reshape(-1, 4, 4)
-    assert len(left_out) == len(every.poses) - len(some.poses)
-    assert _is_cut_short(limits, left_out).all()
+    assert 0 < some.candidates.num_valid < every.candidates.num_valid
+    assert not _is_cut_short(limits, some.candidates).any()
+    left_out = np.array(sorted(_views(every.candidates) - _views(some.candidates)))
+    assert len(left_out) == every.candidates.num_valid - some.candidates.num_valid
+    assert _is_cut_short(limits, candidates_along(left_out[:, :3], left_out[:, 3:])).all()
 
 
-def _is_cut_short(limits: Limits, poses: np.ndarray) -> np.ndarray:
-    """Which poses the carrier cannot turn to, once their elevations are allowed."""
-    tilted = Limits(Motion(elevations=limits.motion.elevations)).project_to_feasible(poses)
-    gap = np.abs(limits.project_to_feasible(poses)[:, :3, :3] - tilted[:, :3, :3])
-    return gap.max(axis=(1, 2)) > 1e-4
+def _views(candidates: Candidates) -> set[tuple[float, ...]]:
+    rows = np.concatenate([candidates.position, candidates.direction], axis=1)
+    return {tuple(row) for row in np.round(rows, 5)}
+
+
+def _is_cut_short(limits: Limits, candidates: Candidates) -> np.ndarray:
+    """Which views the carrier cannot turn to, once their elevations are allowed."""
+    tilted = Limits(Motion(elevations=limits.motion.elevations)).project_to_feasible(candidates)
+    gap = np.abs(limits.project_to_feasible(candidates).direction - tilted.direction)
+    return gap.max(axis=1) > 1e-4
 
 
 def law_low_robots_have_candidates(modules: Modules) -> None:
@@ -172,7 +176,7 @@ def law_low_robots_have_candidates(modules: Modules) -> None:
         modules["pool"].empty_pools((25, 14, 10), CELL), travel, 500
     )
     assert found is not None
-    assert np.all(found.poses[:, 2, 3] == start[2, 3])
+    assert np.all(found.candidates.position[:, 2] == start[2, 3])
 
 
 LAWS = [
@@ -192,14 +196,21 @@ def test_law(law):
 
 
 MUTANTS = [
-    Mutant("greedy", "limits.project_to_feasible(drawn.poses)", "drawn.poses", LAWS[0]),
-    Mutant("greedy", "            poses = limits.project_to_feasible(poses)\n", "", LAWS[1]),
+    Mutant("greedy", "limits.project_to_feasible(drawn.candidates)", "drawn.candidates", LAWS[0]),
+    Mutant(
+        "greedy", "            candidates = limits.project_to_feasible(candidates)\n", "", LAWS[1]
+    ),
     Mutant("greedy", "pose, travel.heights)", "pose)", LAWS[0]),
-    Mutant("greedy", "limits.path_costs(lengths, poses)", "lengths", law_turns_cost),
+    Mutant("greedy", "limits.path_costs(lengths, candidates.direction)", "lengths", law_turns_cost),
     Mutant("greedy", "memory, self.config.motion)", "memory)", LAWS[3]),
-    Mutant("decision", "seconds=limits.seconds(length, poses[best])", "seconds=None", LAWS[2]),
+    Mutant(
+        "decision",
+        "seconds=limits.seconds(length, candidates.direction[best])",
+        "seconds=None",
+        LAWS[2],
+    ),
     Mutant("decision", "is None or not np.isnan(start)", "is None", LAWS[3]),
-    Mutant("decision", "trail, heights, motion.body)", "trail)", LAWS[3]),
+    Mutant("decision", "state.trail, heights, motion.body)", "state.trail)", LAWS[3]),
     Mutant("frontier", "_may_look(limits, place, aim) and ", "", law_frontier_shows_its_target),
     Mutant("frontier", "travel.stops(stops)", "travel.centers(stops)", LAWS[4]),
     Mutant("pool", "has_place[:, None] & can_turn", "has_place[:, None]", law_pool_waits_for_turns),

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import poses_along
-from r3jax.planning.motion import MOTIONS, Motion
-from r3jax.planning.policy import Outcome
+from r3jax.planning.policy import DecisionOutcome
 from r3jax.planning.registry import make_policy, policy_names
+from r3jax.planning.robot.motion import MOTIONS, Motion
 from r3jax.scoring import batch
 from r3jax.scoring.config import ScoringConfig
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, known_flat, pose_at
@@ -54,7 +54,7 @@ def walk(policy, world, seed: int, num_decisions: int = 3):
         pose = np.asarray(pose, np.float32).astype(np.float64)  # as the trace has it
         key = jax.random.key(1000 * seed + step)
         decision, state, info = policy.decide(state, *world, pose, key=key)
-        assert info.outcome is Outcome.MOVED
+        assert info.outcome is DecisionOutcome.MOVED
         pairs.append((pose, decision))
         pose = decision.T_world_camera
     return pairs
@@ -153,4 +153,4 @@ def test_a_robot_that_fits_nowhere_says_so(world):
     nowhere = (world[0], grid_of(np.zeros((25, 14, 10), bool)))
     decision, _, info = policy.decide(state, *nowhere, start, key=jax.random.key(1))
     assert decision is None
-    assert info.outcome is Outcome.NO_CANDIDATE
+    assert info.outcome is DecisionOutcome.NO_CANDIDATE

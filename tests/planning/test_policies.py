@@ -19,9 +19,9 @@ from r3jax.planning.decision import ENOUGH_LOOKS, initial_state, net_utility, pr
 from r3jax.planning.policies.frontier import Frontier
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policies.renderability import Ours, OursPano
-from r3jax.planning.policy import Outcome, Policy
+from r3jax.planning.policy import DecisionOutcome, Policy
 from r3jax.planning.registry import describe, make_policy, policy_names, source_of
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.robot.travel import plan_travel
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 from tests.planning.test_travel import assert_inside
 
@@ -42,7 +42,7 @@ def prefer_high_x(map_state, grid, camera, poses, config):
     """A stand-in for `score_views`: what lies at greater x is worth more."""
     assert poses.shape == (NUM, 4, 4)
     assert poses.dtype == np.float32
-    x = poses[:, 0, 3].astype(np.float64)
+    x = np.asarray(poses, np.float64)[:, 0, 3]
     return SimpleNamespace(exploration=x * 0 + 1, rendering=(x + 2) ** 2, total=(x + 2) ** 2 + 1)
 
 
@@ -52,8 +52,8 @@ def look_down(map_state, grid, camera, positions, config, allowed):
     assert allowed.shape == (NUM, 526)
     down = np.tile([0.0, 0.0, -1.0], (NUM, 1))
     return SimpleNamespace(
-        T_world_camera=poses_along(positions, down).astype(np.float32),
-        best_score=positions[:, 2] ** 2,
+        best_direction=down,
+        best_score=np.asarray(positions)[:, 2] ** 2,
     )
 
 
@@ -84,7 +84,7 @@ def test_every_decision_is_safe_complete_and_repeatable(policy, world):
     decision, state, info = decide(policy, world, start)
     again, _, _ = decide(policy, world, start)
     np.testing.assert_array_equal(decision.T_world_camera, again.T_world_camera)
-    assert info.outcome is Outcome.MOVED
+    assert info.outcome is DecisionOutcome.MOVED
     assert rigid_error(decision.T_world_camera) is None
     assert decision.T_world_camera.dtype == np.float64
     np.testing.assert_array_equal(decision.waypoints[0], start)
@@ -109,14 +109,14 @@ def test_nowhere_to_go_is_an_outcome(policy):
     nothing = (empty_map(64), grid_of(np.zeros((25, 14, 10), bool)))
     decision, state, info = decide(policy, nothing, center(6, 6, 4))
     assert decision is None
-    assert info.outcome is Outcome.NO_CANDIDATE
+    assert info.outcome is DecisionOutcome.NO_CANDIDATE
     assert info.num_candidates == 0
     free = np.zeros((25, 14, 10), bool)
     free[6:12, 2:12, 1:9] = True
     walled = (empty_map(64), grid_of(free, ~free))
     decision, _, info = decide(policy, walled, center(5, 6, 4), state)
     assert decision is None
-    assert info.outcome is Outcome.NO_REACHABLE_CANDIDATE
+    assert info.outcome is DecisionOutcome.NO_REACHABLE_CANDIDATE
     assert info.num_candidates > 0
     assert info.num_reachable == 0
     decision, _, info = decide(policy, nothing, np.array([50.0, 0.0, 0.0]))
@@ -215,7 +215,7 @@ def test_frontier_goes_to_the_unknown_and_then_looks_elsewhere(world):
 def test_frontier_walks_at_random_when_all_is_known():
     world = (empty_map(64), grid_of(*two_rooms()))
     decision, _, info = decide(Frontier(CONFIG), world, center(6, 6, 4))
-    assert info.outcome is Outcome.MOVED
+    assert info.outcome is DecisionOutcome.MOVED
     assert np.linalg.norm(decision.T_world_camera[:3, 3] - center(6, 6, 4)) <= 0.5
 
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.planning import pool
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.policies.active_gamer import pool
+from r3jax.planning.robot.travel import plan_travel
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import CELL, center, grid_of, two_rooms
 
-CHAIN = ("r3jax.planning.pool",)
+CHAIN = ("r3jax.planning.policies.active_gamer.pool",)
 NUM = 30
 SHAPE = (25, 14, 10)
 
@@ -78,7 +78,7 @@ def law_floor(modules: Modules) -> None:
 
 def law_levels_share_no_cell(modules: Modules) -> None:
     """Stops are 0.3, 0.5, ... m high: without a border both levels would take the first."""
-    stage = modules["pool"].Stage(0.5, (0.3, 0.35), 3)
+    stage = modules["pool"].LatticeStage(0.5, (0.3, 0.35), 3)
     cells, there = stage.places(rooms_travel())
     assert there.sum() > 50
     assert len(np.unique(cells[there], axis=0)) == there.sum()
@@ -94,7 +94,11 @@ def history(modules: Modules, seed: int, num_rounds: int):
         pools, draw = pool.draw_candidates(pools, travel, NUM)
         if draw is None:
             continue
-        gain = np.where(rng.random(len(draw.poses)) < 0.7, 0.001, rng.random(len(draw.poses)))
+        gain = np.where(
+            rng.random(draw.candidates.num_valid) < 0.7,
+            0.001,
+            rng.random(draw.candidates.num_valid),
+        )
         best = int(rng.integers(len(gain)))
         yield draw, gain, best, travel, pools
         of_stage = list(pools.of_stage)
@@ -111,13 +115,14 @@ def law_history(modules: Modules, seed: int = 5, num_rounds: int = 25) -> None:
         ]
         assert 0 < len(names) == len(set(names)) <= NUM
         assert not gone & set(names)
-        rows = np.round(draw.poses[:, :3, 2:].reshape(len(names), -1), 5)
+        views = draw.candidates
+        rows = np.round(np.concatenate([views.position, views.direction], axis=1), 5)
         assert len(np.unique(rows, axis=0)) == len(names)
-        for pose, distance in zip(draw.poses, draw.distance, strict=True):
-            cell = travel.cell_of(pose[:3, 3])
+        for position, distance in zip(views.position, draw.distance, strict=True):
+            cell = travel.cell_of(position)
             assert travel.safe[cell]
             assert travel.reachable[cell]
-            np.testing.assert_allclose(np.linalg.norm(pose[:3, 3] - travel.start), distance)
+            np.testing.assert_allclose(np.linalg.norm(position - travel.start), distance)
         gone |= {n for n, g in zip(names, gain, strict=True) if g < 0.005} | {names[best]}
         assert stage <= int(pools.num_ended) <= draw.stage
         stage = int(pools.num_ended)
@@ -160,7 +165,7 @@ def law_stages(modules: Modules) -> None:
     first_room = free & (np.arange(25) < 13)[:, None, None]
     pools, draw = pool.draw_candidates(pool.empty_pools(SHAPE, CELL), travel_in(first_room), NUM)
     assert draw.stage == 0
-    num_before = len(draw.poses)
+    num_before = draw.candidates.num_valid
     assert num_before == 20  # 4 columns, 5 directions
     # Shut in: the pool keeps them, the next stage has its turn where it can be reached.
     shut = first_room & (np.arange(14) < 4)[:, None] & (np.arange(25) > 3)[:, None, None]
@@ -171,7 +176,7 @@ def law_stages(modules: Modules) -> None:
     pools, draw = pool.draw_candidates(pools, travel_in(low), NUM)
     assert (draw.stage, int(pools.num_ended)) == (1, 0)
     pools, draw = pool.draw_candidates(pools, travel_in(first_room), NUM)
-    assert (draw.stage, len(draw.poses)) == (0, num_before)
+    assert (draw.stage, draw.candidates.num_valid) == (0, num_before)
     spent = pool.dismiss(pools.of_stage[0], draw, np.zeros(num_before), 0)
     pools = pool.Pools((spent, pools.of_stage[1]), pools.num_ended)
     # New free space keeps the stage open; without it, it has ended, and stays so.
@@ -183,7 +188,7 @@ def law_stages(modules: Modules) -> None:
     for _ in range(200):
         if draw is None:
             break
-        worthless = pool.dismiss(pools.of_stage[1], draw, np.zeros(len(draw.poses)), 0)
+        worthless = pool.dismiss(pools.of_stage[1], draw, np.zeros(draw.candidates.num_valid), 0)
         pools = pool.Pools((pools.of_stage[0], worthless), pools.num_ended)
         pools, draw = pool.draw_candidates(pools, travel_in(free), NUM)
     assert draw is None

@@ -16,7 +16,7 @@ from r3jax.trace.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore, main_without_report
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "write-a-policy.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "howto/policy.md"
 CELL = ["--budget", "views:3", "--clock", "model", "--resolution", "32", "--fov", "90"]
 CELL += ["--train-resolution", "32", "--iterations", "20", "--gaussians", "200"]
 CELL += ["--capacity", "400", "--test-views", "6", "--lpips", "none", "--voxel-size", "0.1"]
@@ -117,8 +117,8 @@ def test_a_registered_policy_has_settings_of_its_own(empty):
         source = "a test"
         Config = Settings
 
-        def score(self, situation, poses, *, key):
-            return poses, {"utility": np.full(len(poses), self.config.eagerness)}
+        def score(self, situation, candidates, *, key):
+            return candidates, {"utility": np.full(len(candidates.valid), self.config.eagerness)}
 
     assert r3jax.make_policy("eager", eagerness=0.9, lambda2=0.1).config.eagerness == 0.9
     assert registry.describe("eager") == "Is eager."

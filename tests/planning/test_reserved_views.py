@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.planning.reserved_views import PromisedView
 from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.utility import view_utility
@@ -46,14 +46,14 @@ def law_yielded(modules: Modules, here=(9, 6, 4), others=((15, 6, 4),)) -> None:
     own = modules["reserved_views"].without_yielded(
         grid, jnp.asarray(center(*here), jnp.float32), jnp.asarray(places, jnp.float32)
     )
-    before, after = np.asarray(grid.log_odds), np.asarray(own.log_odds)
+    np.testing.assert_array_equal(own.log_odds, grid.log_odds)
+    before, after = np.asarray(grid.unexplored), np.asarray(own.unexplored)
     for cell in np.ndindex(free.shape):
         mine = np.linalg.norm(center(*cell) - center(*here))
         theirs = np.linalg.norm(center(*cell) - places, axis=1).min()
         if abs(mine - theirs) < 1e-4:
             continue  # a tie but for rounding
-        is_theirs = bool(grid.unexplored[cell]) and theirs < mine
-        assert after[cell] == (LOG_ODDS_LIMIT if is_theirs else before[cell]), cell
+        assert after[cell] == (before[cell] and mine < theirs), cell
 
 
 cells = st.tuples(st.integers(6, 11), st.integers(1, 12), st.integers(1, 8))
@@ -77,7 +77,7 @@ def law_left(modules: Modules) -> None:
     grid = grid_of(free & ~hidden, occupied & ~hidden)
     here, other = (jnp.asarray(center(*cell), jnp.float32) for cell in ((5, 6, 4), (17, 6, 4)))
     after = modules["reserved_views"].without_yielded(grid, here, other[None])
-    np.testing.assert_array_equal(after.log_odds, grid.log_odds)
+    np.testing.assert_array_equal(after.unexplored, grid.unexplored)
 
 
 def law_promise(modules: Modules) -> None:
@@ -92,9 +92,9 @@ def law_promise(modules: Modules) -> None:
     foreseen, _ = simulate_view(state, CAMERA, pose, CONFIG)
     for name in ("visited", "resolution", "count", "mean", "m2", "key"):
         np.testing.assert_array_equal(getattr(after, name), getattr(foreseen, name))
-    changed = np.asarray(dark.log_odds) != np.asarray(WORLD.log_odds)
+    np.testing.assert_array_equal(dark.log_odds, WORLD.log_odds)
+    changed = np.asarray(dark.unexplored) != np.asarray(WORLD.unexplored)
     assert changed.sum() == float(first.exploration)
-    assert set(np.asarray(dark.log_odds)[changed]) == {np.float32(LOG_ODDS_LIMIT)}
 
 
 @dataclass
@@ -128,7 +128,7 @@ def law_decision(modules: Modules) -> None:
     others = jnp.stack([view[:3, 3] for view in poses])
     left = promised.without_yielded(dark, jnp.asarray(pose[:3, 3], jnp.float32), others)
     np.testing.assert_array_equal(map_state.visited, after.visited)
-    np.testing.assert_array_equal(grid.log_odds, left.log_odds)
+    np.testing.assert_array_equal(grid.unexplored, left.unexplored)
 
 
 def test_whoever_has_nothing_left_leaves_nothing():
@@ -144,13 +144,12 @@ def test_a_policy_decides_on_what_others_leave():
 
 
 MUTANTS = [
-    Mutant("reserved_views", "(nearest < squared", "(nearest > squared", law_yielded),
-    Mutant("reserved_views", "grid.unexplored & (nearest", "(nearest", law_yielded),
-    Mutant("reserved_views", "jnp.where(is_left, log_odds, grid.log_odds)", "log_odds", law_left),
-    Mutant("reserved_views", "frontier_unexplored(own)", "frontier_unexplored(grid)", law_left),
+    Mutant("reserved_views", "nearest < squared", "nearest > squared", law_yielded),
+    Mutant("reserved_views", "is_yielded & is_left", "is_yielded", law_left),
+    Mutant("reserved_views", "(grid.ignoring(is_yielded)))", "(grid))", law_left),
     Mutant("reserved_views", "after, _ = simulate_view(",
            "after = map_state; simulate_view(", law_promise),
-    Mutant("reserved_views", "jnp.where(shown, LOG", "jnp.where(shown, -LOG", law_promise),
+    Mutant("reserved_views", "after, grid.ignoring(shown)", "after, grid", law_promise),
     Mutant("reserved_views", "(T_world_camera[:3, 3]", "(T_world_camera[:3, 2]", law_decision),
     Mutant("reserved_views", "in self.promised:", "in self.promised[:1]:", law_decision),
 ]  # fmt: skip

@@ -7,15 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.planning import robot_cells as carrier_cells
-from r3jax.planning import travel
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.robot import travel
+from r3jax.planning.robot.travel import plan_travel
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, two_rooms
 from tests.planning.test_travel import assert_inside
 
-CHAIN = ("r3jax.planning.robot_cells", "r3jax.planning.travel")
-REAL: Modules = {"robot_cells": carrier_cells, "travel": travel}
+CHAIN = ("r3jax.planning.robot.travel",)
+REAL: Modules = {"travel": travel}
 SHAPE = (8, 7, 9)
 LOW = float(ORIGIN[2])
 
@@ -41,11 +40,11 @@ def law_closed(modules: Modules, seed: int = 0) -> None:
     for body, margin in ((0.45, 0.3), (0.93, 0.5), (5.0, 0.05)):
         for heights in ((LOW, LOW + 1.79), (LOW + 1.13, LOW + 1.13), (LOW + 0.71, LOW + 1.33)):
             arguments = occupied, body, margin, heights, LOW, CELL
-            closed = modules["robot_cells"].cells_over_matter(*arguments)
+            closed = modules["travel"].cells_over_matter(*arguments)
             expected = closed_one_by_one(occupied, body, margin, heights)
             np.testing.assert_array_equal(closed, expected)
             assert expected.any()
-    nobody = modules["robot_cells"].cells_over_matter(occupied, 0.0, 0.3, (0.0, 3.0), LOW, CELL)
+    nobody = modules["travel"].cells_over_matter(occupied, 0.0, 0.3, (0.0, 3.0), LOW, CELL)
     assert not nobody.any()
 
 
@@ -54,7 +53,7 @@ def law_unlimited(modules: Modules) -> None:
     occupied = np.zeros(SHAPE, bool)
     occupied[4, 3, 2] = True
     everywhere = (-np.inf, np.inf)
-    closed = modules["robot_cells"].cells_over_matter(occupied, 0.5, 0.05, everywhere, LOW, CELL)
+    closed = modules["travel"].cells_over_matter(occupied, 0.5, 0.05, everywhere, LOW, CELL)
     np.testing.assert_array_equal(np.argwhere(closed), [[4, 3, 3], [4, 3, 4], [4, 3, 5]])
 
 
@@ -105,7 +104,7 @@ def test_law(law):
 def test_cells_are_closed_as_defined(seed):
     occupied = np.random.default_rng(seed).random(SHAPE) < 0.02
     heights = (LOW + 0.71, LOW + 1.33)
-    closed = carrier_cells.cells_over_matter(occupied, 0.45, 0.3, heights, LOW, CELL)
+    closed = travel.cells_over_matter(occupied, 0.45, 0.3, heights, LOW, CELL)
     np.testing.assert_array_equal(closed, closed_one_by_one(occupied, 0.45, 0.3, heights))
 
 
@@ -138,13 +137,13 @@ def test_a_camera_beyond_its_heights_is_told():
 
 
 MUTANTS = [
-    Mutant("robot_cells", "gap < radius - _BORDER", "gap < radius - 0.6", law_closed),
-    Mutant("robot_cells", "* cell_size, heights[0])", "* cell_size, -9.0)", law_closed),
-    Mutant("robot_cells", "lowest - body - origin", "lowest - origin", law_closed),
-    Mutant("robot_cells", "wide[:, :, below:layer]", "wide[:, :, :layer]", law_closed),
-    Mutant("robot_cells", "occupied.shape[2] - 1) + 1", "occupied.shape[2] - 1)", law_closed),
-    Mutant("robot_cells", "max(abs(x) - 0.5, 0.0)", "abs(x)", law_closed),
-    Mutant("robot_cells", "max(foot, -1.0) + _BORDER", "max(foot, -1.0) + 1.0", law_closed),
+    Mutant("travel", "gap < radius - _TOUCH", "gap < radius - 0.6", law_closed),
+    Mutant("travel", "* cell_size, heights[0])", "* cell_size, -9.0)", law_closed),
+    Mutant("travel", "lowest - body - origin", "lowest - origin", law_closed),
+    Mutant("travel", "wide[:, :, below:layer]", "wide[:, :, :layer]", law_closed),
+    Mutant("travel", "occupied.shape[2] - 1) + 1", "occupied.shape[2] - 1)", law_closed),
+    Mutant("travel", "max(abs(x) - 0.5, 0.0)", "abs(x)", law_closed),
+    Mutant("travel", "max(foot, -1.0) + _TOUCH", "max(foot, -1.0) + 1.0", law_closed),
     Mutant("travel", "safe[:, :, last + 1 :] = False", "pass", law_round_the_table),
     Mutant("travel", "safe[:, :, : max(first, 0)] = False", "pass", law_round_the_table),
     Mutant("travel", "safe &= ~cells_over", "safe &= True | cells_over", law_round_the_table),

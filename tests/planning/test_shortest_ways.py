@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from r3jax.planning.shortest_paths import shortest_paths
+from r3jax.planning.robot.shortest_paths import shortest_paths
 from tests.mutants import Mutant, assert_caught, each, load
 
 
@@ -54,7 +54,7 @@ def law_costs_are_scipys(modules):
 @pytest.mark.full
 def test_costs_are_scipys():
     assert_costs_are_scipys(shortest_paths)
-    law_costs_are_scipys(load(("r3jax.planning.shortest_paths",)))
+    law_costs_are_scipys(load(("r3jax.planning.robot.shortest_paths",)))
 
 
 MUTANTS = [
@@ -68,7 +68,7 @@ MUTANTS = [
 
 @each([Mutant("shortest_paths", *change, law_costs_are_scipys) for change in MUTANTS])
 def test_faults_are_noticed(mutant):
-    assert_caught(("r3jax.planning.shortest_paths",), mutant)
+    assert_caught(("r3jax.planning.robot.shortest_paths",), mutant)
 
 
 @given(st.integers(0, 1000), st.floats(0.3, 1.0))

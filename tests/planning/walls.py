@@ -8,9 +8,9 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.explorable import mask_unexplorable
-from r3jax.planning.situation import Situation
-from r3jax.planning.travel import plan_travel
+from r3jax.planning.policy import Situation
+from r3jax.planning.robot.explorable import mask_unexplorable
+from r3jax.planning.robot.travel import plan_travel
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import view_utility
 

@@ -10,8 +10,8 @@ import r3jax
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice, octahedral_direction
 from r3jax.mapping.state import MapState
-from r3jax.simulators.raycast import RaycastSimulator
-from r3jax.simulators.rays import TriangleScene
+from r3jax.simulators.raycast.raycast import RaycastSimulator
+from r3jax.simulators.raycast.rays import TriangleScene
 from r3jax.simulators.scenes import procedural
 
 CAPACITY = 1 << 18

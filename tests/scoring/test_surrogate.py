@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import r3jax
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.planning.climb import rotation_of
+from r3jax.planning.refinement.climb import rotation_of
 from r3jax.scoring import surrogate as real
 from r3jax.scoring.cells import cells_of
 from r3jax.scoring.config import ScoringConfig

@@ -12,9 +12,9 @@ from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
 from r3jax.simulators import free_space
+from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.free_space import GroundTruth
-from r3jax.simulators.noise import NoisySimulator
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import open_world
 from tests import mutants
 from tests.simulators.rooms import SMALL, box_quads, facing_x, world_of

@@ -8,8 +8,8 @@ import pytest
 
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.meshes import load_world
-from r3jax.simulators.raycast import RaycastSimulator
-from tests.simulators.habitat_golden import load_house, load_simple_room
+from r3jax.simulators.raycast.raycast import RaycastSimulator
+from tests.simulators.habitat.habitat_golden import load_house, load_simple_room
 
 
 def compare(simulator, poses, golden):

@@ -9,7 +9,7 @@ import pytest
 
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.meshes import load_world
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from tests.simulators.rooms import facing_x
 
 CAMERA = Camera.from_fov(64, 64, 60.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.start import APART, places_beside
 from tests.simulators.rooms import SMALL, box_quads, box_room, facing_x, world_of
 

@@ -8,7 +8,7 @@ from r3jax.geometry.cameras import Camera, look_at
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.render import render
 from r3jax.splatting.scene import GaussianScene
-from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.views import Views
 
 WIDTH, HEIGHT, NUM_VIEWS = 48, 32, 8

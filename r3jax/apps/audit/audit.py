@@ -1,6 +1,6 @@
 """One capture, audited: the map, the diagnosis of every surface, the frames, the views to take.
 
-Shape symbols: n frames of the path that is judged.
+Shape symbols: n frames of the path that is evaluated.
 """
 
 from collections import Counter
@@ -10,22 +10,26 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.apps.audit.bad_regions import Region, bad_regions, unseen_edges, unseen_regions
 from r3jax.apps.audit.camera_paths import CameraPath
-from r3jax.apps.audit.diagnosis import Diagnosis, demand_of
-from r3jax.apps.audit.regions import Region, bad_regions, unseen_edges, unseen_regions
-from r3jax.apps.audit.sampling import thinned
-from r3jax.apps.audit.seen import Seen, see
-from r3jax.apps.audit.sight import ViewScore, view_score
-from r3jax.apps.audit.source import Source
-from r3jax.apps.audit.standpoints import places_in_free_space, places_in_hull
-from r3jax.apps.audit.suggest import Plan, Task, suggest, without_cells
-from r3jax.apps.audit.survey import RANGE, Survey, Wishes, survey_of
+from r3jax.apps.audit.capture_maps import Seen, see
+from r3jax.apps.audit.diagnosis import (
+    Diagnosis,
+    ViewScore,
+    demand_of,
+    places_in_free_space,
+    places_in_hull,
+    view_score,
+)
+from r3jax.apps.audit.source import Source, thinned
+from r3jax.apps.audit.suggest import SuggestedViews, Task, suggest
+from r3jax.apps.audit.survey import RANGE, AuditSettings, Survey, survey_of
 from r3jax.formats.lenses import Lens
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import spread
-from r3jax.planning.explorable import mask_unexplorable
+from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
 
@@ -38,11 +42,11 @@ _IN_VAIN = 3
 
 
 @dataclass(frozen=True)
-class JudgedFrame:
-    """One frame of the path that is judged."""
+class EvaluatedFrame:
+    """One frame of the path that is evaluated."""
 
     index: int
-    """Of the picture in the capture, or of the pose in the path."""
+    """Number of the picture in the capture, or of the pose in the path."""
 
     label: str
     """How the reader calls it."""
@@ -62,22 +66,22 @@ class Audit:
     survey: Survey
     seen: Seen
     config: ScoringConfig
-    """Of all scores."""
+    """Settings of all scores."""
 
     lens: Lens
-    """Of the suggested views: that of most pictures."""
+    """Lens of the suggested views: that of most pictures."""
 
     places: np.ndarray
     """Where views were looked for, [p, 3] [audit units]."""
 
     standpoints: np.ndarray
-    """From where surfaces were judged, the first of the places, [q, 3] [audit units]."""
+    """From where surfaces were evaluated, the first of the places, [q, 3] [audit units]."""
 
-    frames: tuple[JudgedFrame, ...]
+    frames: tuple[EvaluatedFrame, ...]
     """The path."""
 
     is_own_path: bool
-    """True if the path is the capture's own: every frame was judged without its fold."""
+    """True if the path is the capture's own: every frame was evaluated without its fold."""
 
     regions: tuple[Region, ...]
     """Surfaces that render badly, the worst first."""
@@ -86,24 +90,24 @@ class Audit:
     """Where the capture ends although one could look on; none without depth images."""
 
     unseen_area: float
-    """Of all such places [square audit units]."""
+    """Area of all such places [square audit units]."""
 
-    plan: Plan
+    plan: SuggestedViews
     """Views to take, and what they promise."""
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """Of every voxel, of the capture as it is."""
+        """Diagnosis of every voxel, of the capture as it is."""
         return self.plan.before
 
     @property
     def camera(self) -> Camera:
-        """Of the suggested views, thinned out as the map's pictures were."""
+        """Camera of the suggested views, thinned out as the map's pictures were."""
         return thinned(self.lens.camera, self.source.stride)
 
     @property
     def renderability(self) -> np.ndarray:
-        """Of every frame of the path, [n]."""
+        """Renderability of every frame of the path, [n]."""
         return np.array([frame.score.renderability for frame in self.frames])
 
 
@@ -114,7 +118,7 @@ name after each step."""
 
 def audit(
     source: Source,
-    wishes: Wishes | None = None,
+    settings: AuditSettings | None = None,
     path: CameraPath | None = None,
     on_progress: Progress = lambda stage, steps: None,
 ) -> Audit:
@@ -122,34 +126,34 @@ def audit(
 
     Args:
         source: the capture.
-        wishes: what the user decides.
-        path: poses to be judged, in the capture's coordinates; None: the capture's own.
+        settings: what the user decides.
+        path: poses to be evaluated, in the capture's coordinates; None: the capture's own.
         on_progress: for a progress bar.
 
     Raises:
         ValueError: a wish that makes no sense; depth images that contradict the poses.
         FormatError, RunError: a file is missing or broken, or says nothing of depth.
     """
-    wishes = Wishes() if wishes is None else wishes
+    settings = AuditSettings() if settings is None else settings
     step = lambda: on_progress("", 1)
     on_progress("looking at the capture", 0)
-    survey = survey_of(source, wishes)
+    survey = survey_of(source, settings)
     on_progress("mapping", 2 * len(survey.chosen))
-    seen = see(source, survey, wishes.folds, step)
+    seen = see(source, survey, settings.folds, step)
     unit = _WORTH_OF_UNSEEN * (survey.cell_size / survey.voxel_size) ** 2
     config = ScoringConfig(lambda1=unit, max_range=RANGE)
     lens = Counter(source.lenses).most_common(1)[0][0]
     camera = thinned(lens.camera, source.stride)
     cameras = survey.alignment.points(source.poses[survey.chosen, :3, 3])
-    places = _places(source, survey, seen, cameras, wishes.num_places)
-    standpoints = places[: wishes.num_standpoints]
-    on_progress("judging frames", 0)
-    frames = tuple(_judged(source, survey, seen, config, path, step, on_progress))
+    places = _places(source, survey, seen, cameras, settings.num_places)
+    standpoints = places[: settings.num_standpoints]
+    on_progress("evaluating frames", 0)
+    frames = tuple(_evaluated_frames(source, survey, seen, config, path, step, on_progress))
     open_grid = _open_grid(source, survey, seen, cameras, config)
-    on_progress("choosing views", wishes.num_views)
+    on_progress("choosing views", settings.num_views)
     task = Task(camera, demand_of(seen.state, standpoints, config), config)
     plan = suggest(
-        seen.state, open_grid, task, places, wishes.num_views, seed=wishes.seed, on_view=step
+        seen.state, open_grid, task, places, settings.num_views, seed=settings.seed, on_view=step
     )
     edges = np.asarray(open_grid.unexplored)
     return Audit(
@@ -187,7 +191,7 @@ def _centers(state: MapState) -> np.ndarray:
     return np.asarray(state.center, np.float64).T[np.asarray(state.occupied)]
 
 
-def _judged(
+def _evaluated_frames(
     source: Source,
     survey: Survey,
     seen: Seen,
@@ -195,26 +199,26 @@ def _judged(
     path: CameraPath | None,
     step: Callable[[], None],
     on_progress: Progress,
-) -> Iterator[JudgedFrame]:
-    """The frames of the path; the capture's own are judged without the fold that they are in."""
+) -> Iterator[EvaluatedFrame]:
+    """The frames of the path; the capture's own are evaluated without the fold that they are in."""
     if path is not None:
-        on_progress("judging frames", len(path.poses))
+        on_progress("evaluating frames", len(path.poses))
         poses = survey.alignment.poses(path.poses)
         for index, (pose, lens) in enumerate(zip(poses, path.lenses, strict=True)):
             camera = thinned(lens.camera, source.stride)
             score = view_score(seen.state, camera, pose, config)
-            yield JudgedFrame(index, f"frame {index + 1}", pose, score)
+            yield EvaluatedFrame(index, f"frame {index + 1}", pose, score)
             step()
         return
-    on_progress("judging frames", len(survey.chosen))
+    on_progress("evaluating frames", len(survey.chosen))
     poses = survey.alignment.poses(source.poses[survey.chosen])
-    found: dict[int, JudgedFrame] = {}
+    found: dict[int, EvaluatedFrame] = {}
     for fold in range(len(seen.folds)):
         others = seen.without(fold)
         for place in np.flatnonzero(seen.fold_of == fold).tolist():
             index = int(survey.chosen[place])
             score = view_score(others, source.camera(index), poses[place], config)
-            found[place] = JudgedFrame(index, source.labels[index], poses[place], score)
+            found[place] = EvaluatedFrame(index, source.labels[index], poses[place], score)
             step()
     yield from (found[place] for place in sorted(found))
 
@@ -225,7 +229,7 @@ def _open_grid(
     """The grid in which only edges are unexplored: where free space ends in what could be seen."""
     grid = seen.grid
     if not source.is_dense:
-        return without_cells(grid, grid.unexplored)
+        return grid.ignoring(grid.unexplored)
     cells = np.floor((cameras - np.asarray(grid.origin)) / float(grid.cell_size)).astype(np.int64)
     cells = cells.clip(0, np.array(grid.log_odds.shape) - 1)
     reached = np.zeros(grid.log_odds.shape, dtype=bool)
@@ -237,4 +241,4 @@ def _open_grid(
         looks += np.asarray(visible_unexplored(seen.state, grid, source.camera(index), T, config))
     explorable = np.asarray(mask_unexplorable(grid, reached, looks >= _IN_VAIN).unexplored)
     edges = unseen_edges(grid, explorable)
-    return without_cells(grid, grid.unexplored & ~jnp.asarray(edges))
+    return grid.ignoring(~edges)

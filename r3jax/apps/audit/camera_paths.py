@@ -17,15 +17,18 @@ from typing import Any
 import numpy as np
 
 from r3jax.files import write_atomic
-from r3jax.formats.errors import naming
+from r3jax.formats.captures import open_capture
+from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens
+from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
+from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.transforms import OPENGL_FROM_OPENCV
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.fields import check_fields, check_type
 from r3jax.formats.validation.files import read_bytes
 from r3jax.formats.validation.json_text import parse_json
 from r3jax.geometry.cameras import Camera
+from r3jax.trace.reader import Run
 
 _MAX_BYTES = 256 << 20
 """A pose takes some hundred bytes."""
@@ -38,7 +41,7 @@ _FIELDS = {"camera_to_world": list[float], "fov": float}
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Poses to be judged."""
+    """Poses to be evaluated."""
 
     poses: np.ndarray
     """`T_world_camera`, [n, 4, 4] float64: OpenCV axes, the capture's own coordinates."""
@@ -71,7 +74,7 @@ def read_camera_path(path: Path) -> CameraPath:
         check_fields("camera path", content, {"camera_path": list[dict[str, Any]], **kinds})
         kind = content.get("camera_type", "perspective")
         if kind != "perspective":
-            raise ForeignFileError(f"only perspective paths are judged, this is {kind!r:.40}")
+            raise ForeignFileError(f"only perspective paths are read, this is {kind!r:.40}")
         entries: list[dict[str, Any]] = content["camera_path"]
         if not entries:
             raise ForeignFileError("it holds no cameras")
@@ -173,3 +176,24 @@ def write_path_transforms(path: Path, poses: np.ndarray, camera: Camera) -> None
         ],
     }
     write_atomic(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def path_of(path: Path) -> CameraPath:
+    """Reads the poses of a camera path, or of any capture.
+
+    Raises:
+        FormatError: it is neither, or damaged.
+        RunError: it is a damaged run.
+    """
+    if is_camera_path(path):
+        return read_camera_path(path)
+    source = open_capture(path, "z").source
+    if isinstance(source, PosedImages):
+        return CameraPath(source.poses, source.lenses)
+    if isinstance(source, Run):
+        if not source.rows:
+            raise FormatError(path, "the run has no views yet: there is no path to judge")
+        poses = np.stack([row.pose for row in source.rows]).astype(np.float64)
+    else:
+        poses = source.poses
+    return CameraPath(poses, (pinhole_lens(source.camera),) * len(poses))

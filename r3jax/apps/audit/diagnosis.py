@@ -1,9 +1,13 @@
 """How well every surface would render for somebody who stands somewhere else, and why not better.
 
 Renderability belongs to a voxel *and* a place from which it is asked. The places here are spread
-over all where somebody could stand; of each voxel the answers of those that see it are averaged.
+over all where somebody could stand, to take a picture or to look at the result; of each voxel the
+answers of those that see it are averaged. With depth images they lie in known free space, a margin
+from everything that is not known to be free, connected to where the camera was, at heights at
+which it was held. Without, they lie within the hull of the camera's positions and a margin round
+it, and a margin from every voxel.
 
-Shape symbols: N rows of the map; p standpoints.
+Shape symbols: N rows of the map; p standpoints; n cameras; m voxels; c places.
 """
 
 import functools
@@ -14,15 +18,141 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import Delaunay, KDTree
 
-from r3jax.apps.audit.sight import LEAST
+from r3jax.apps.audit.survey import MARGIN
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
+from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.batch import map_over_devices
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.renderability import score_voxels, term_images
 from r3jax.visibility.depth_buffer import seen_in
 from r3jax.visibility.selection import for_selected, select
 from r3jax.visibility.views import panorama_view
+
+_HEIGHTS = (5.0, 95.0)
+"""Percentiles of the cameras' heights between which people hold them."""
+
+_MOST_LATTICE = 40_000
+"""Places between which the hull's are chosen."""
+
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+
+
+def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray:
+    """Centers of the free cells where a camera could be held, [c, 3] [audit units].
+
+    Args:
+        grid: free and occupied space.
+        cameras: where the camera was, [n, 3] [audit units].
+    """
+    cell = float(grid.cell_size)
+    safe = safe_cells(np.asarray(grid.free), cell, MARGIN)
+    labels = np.zeros(safe.shape, dtype=np.int32)
+    ndimage.label(safe, output=labels)
+    cells = np.argwhere(safe)
+    if not len(cells):
+        return np.zeros((0, 3))
+    centers = centers_on_host(grid, cells)
+    # A camera near a wall stands in a cell that is not safe: the nearest safe one is meant.
+    distance, nearest = KDTree(centers).query(cameras)
+    close = cells[np.asarray(nearest)[np.asarray(distance) <= 2.0 * MARGIN + cell]]
+    if not len(close):
+        return np.zeros((0, 3))
+    is_reached = np.isin(labels[tuple(cells.T)], np.unique(labels[tuple(close.T)]))
+    low, high = np.percentile(cameras[:, 2], _HEIGHTS)
+    is_held = (centers[:, 2] >= low - MARGIN) & (centers[:, 2] <= high + MARGIN)
+    return centers[is_reached & is_held]
+
+
+def places_in_hull(cameras: np.ndarray, voxels: np.ndarray) -> np.ndarray:
+    """Places between the cameras, away from all voxels, [c, 3] [audit units].
+
+    Args:
+        cameras: where the camera was, [n, 3].
+        voxels: centers of all voxels, [m, 3], m >= 1.
+    """
+    # The hull of boxes round the cameras is the hull and its margin, and never flat.
+    boxes = (cameras[:, None, :] + MARGIN * _CORNERS).reshape(-1, 3)
+    low, high = boxes.min(axis=0), boxes.max(axis=0)
+    spacing = max(0.5 * MARGIN, float(np.cbrt(np.prod(high - low) / _MOST_LATTICE)))
+    axes = [np.arange(a + 0.5 * spacing, b, spacing) for a, b in zip(low, high, strict=True)]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = lattice[Delaunay(boxes).find_simplex(lattice) >= 0]
+    if not len(inside):
+        return inside
+    distance, _ = KDTree(voxels).query(inside)
+    return inside[np.asarray(distance) >= MARGIN]
+
+
+TERMS = ("bias", "noise", "resolution")
+"""Factors of renderability, in the paper's order."""
+
+LEAST = 1e-3
+"""Terms are not counted lower, so that their logarithm stays finite."""
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """How well one view would render, and why not better."""
+
+    renderability: float
+    """Mean over all pixels; a pixel without a voxel counts 0."""
+
+    coverage: float
+    """Share of the pixels that show a voxel."""
+
+    bias: float
+    """Mean over the pixels that show a voxel."""
+
+    noise: float
+    """Mean over the pixels that show a voxel."""
+
+    resolution: float
+    """Mean over the pixels that show a voxel."""
+
+    cause: str
+    """What costs most: `unseen` (pixels without a voxel), `angle`, `noise` or `distance`."""
+
+
+CAUSE_OF_TERM = {"bias": "angle", "noise": "noise", "resolution": "distance"}
+"""What a low factor means."""
+
+
+def view_score(
+    state: MapState, camera: Camera, pose: np.ndarray, config: ScoringConfig
+) -> ViewScore:
+    """Evaluates one view.
+
+    Args:
+        state: the map.
+        camera: of the view; its focal length in the unit that the map was made with.
+        pose: `T_world_camera`, [4, 4] [audit units].
+        config: range and size of the depth buffer.
+    """
+    seen = term_images(state, camera, jnp.asarray(pose, dtype=jnp.float32), config)
+    value, is_hit = np.asarray(seen.value), np.asarray(seen.row) < state.capacity
+    coverage = float(is_hit.mean())
+    images = {name: np.asarray(getattr(seen, name))[is_hit] for name in TERMS}
+    mean = {name: float(x.mean()) if x.size else 0.0 for name, x in images.items()}
+    # log R = sum of the logarithms: what each term costs adds up over the pixels that show any.
+    cost = {
+        CAUSE_OF_TERM[name]: -float(np.log(np.maximum(x, LEAST)).sum()) / is_hit.size
+        for name, x in images.items()
+    }
+    cost["unseen"] = (1.0 - coverage) * -np.log(LEAST)
+    return ViewScore(
+        renderability=float(value.mean()),
+        coverage=coverage,
+        bias=mean["bias"],
+        noise=mean["noise"],
+        resolution=mean["resolution"],
+        cause=max(cost, key=lambda name: cost[name]),
+    )
+
 
 CAUSES = ("fine", "angle", "rare", "distance", "noise")
 """What a voxel suffers from most; the numbers in `Diagnosis.cause` count along these."""
@@ -49,7 +179,7 @@ class Demand(eqx.Module):
         return jnp.sum(self.visible, axis=0, dtype=jnp.float32)
 
 
-class Answers(eqx.Module):
+class StandpointScores(eqx.Module):
     """What the standpoints say of the voxels."""
 
     value: Float[Array, "p N"]
@@ -88,26 +218,26 @@ class Diagnosis:
     """Index into `CAUSES`, [N] int."""
 
     @property
-    def is_judged(self) -> np.ndarray:
+    def is_seen(self) -> np.ndarray:
         """True for voxels that some standpoint sees, [N]."""
         return self.num_seen > 0.0
 
     @property
     def mean(self) -> float:
         """Mean renderability of the surfaces that can be seen; 0 where there are none."""
-        return float(self.value[self.is_judged].mean()) if self.is_judged.any() else 0.0
+        return float(self.value[self.is_seen].mean()) if self.is_seen.any() else 0.0
 
     @property
     def fine_share(self) -> float:
         """Share of the surfaces that can be seen, of those that are fine."""
-        judged = self.is_judged
-        return float((self.value[judged] >= FINE).mean()) if judged.any() else 0.0
+        evaluated = self.is_seen
+        return float((self.value[evaluated] >= FINE).mean()) if evaluated.any() else 0.0
 
     def share(self, cause: str) -> float:
         """Share of the surfaces that can be seen, of those with this cause."""
-        judged = self.is_judged
-        wanted = self.cause[judged] == CAUSES.index(cause)
-        return float(wanted.mean()) if judged.any() else 0.0
+        evaluated = self.is_seen
+        wanted = self.cause[evaluated] == CAUSES.index(cause)
+        return float(wanted.mean()) if evaluated.any() else 0.0
 
 
 def demand_of(state: MapState, standpoints: np.ndarray, config: ScoringConfig) -> Demand:
@@ -133,7 +263,9 @@ def _visible(
     return jax.lax.map(seen_from, positions)
 
 
-def ask(state: MapState, demand: Demand, focal: Float[Array, ""], config: ScoringConfig) -> Answers:
+def score_from_standpoints(
+    state: MapState, demand: Demand, focal: Float[Array, ""], config: ScoringConfig
+) -> StandpointScores:
     """Every standpoint's answers.
 
     Args:
@@ -146,7 +278,7 @@ def ask(state: MapState, demand: Demand, focal: Float[Array, ""], config: Scorin
     ids = jnp.arange(demand.position.shape[0], dtype=jnp.float32)
     part = functools.partial(_answers, state, demand, focal, config)
     value, terms, costs = map_over_devices(part, ids)
-    return Answers(value, jnp.sum(terms, axis=0), jnp.sum(costs, axis=0))
+    return StandpointScores(value, jnp.sum(terms, axis=0), jnp.sum(costs, axis=0))
 
 
 @jax.jit
@@ -185,8 +317,8 @@ def _answers(
     return jax.lax.map(answer, ids)
 
 
-def diagnose(state: MapState, demand: Demand, answers: Answers) -> Diagnosis:
-    """Judges every voxel by the mean of the answers.
+def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diagnosis:
+    """Evaluates every voxel by the mean of the answers.
 
     Args:
         state: the map.

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from r3jax.apps.audit.audit import Audit
+from r3jax.apps.audit.bad_regions import Region
 from r3jax.apps.audit.camera_paths import write_camera_path, write_path_transforms
-from r3jax.apps.audit.colors import cause_colors, score_colors
 from r3jax.apps.audit.diagnosis import CAUSES, FEW, FINE, Diagnosis
-from r3jax.apps.audit.regions import Region
+from r3jax.apps.audit.pages.audit_colors import cause_colors, score_colors
 from r3jax.files import write_atomic
-from r3jax.formats.pointcloud import write_points
-from r3jax.formats.transforms import OPENGL_FROM_OPENCV
+from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
+from r3jax.formats.points import write_points
 
 FORMAT = 1
 """Version of audit.json."""
@@ -69,10 +69,13 @@ def _write_clouds(audit: Audit, values: Path, causes: Path) -> None:
     present = np.asarray(state.occupied)
     centers = np.asarray(state.center, np.float64).T[present]
     points = audit.survey.alignment.points_back(centers).astype(np.float32)
-    judged = found.is_judged[present]
+    evaluated = found.is_seen[present]
     shown = score_colors(found.value)[present]
     write_points(
-        values, points[judged], shown[judged], {"renderability": found.value[present][judged]}
+        values,
+        points[evaluated],
+        shown[evaluated],
+        {"renderability": found.value[present][evaluated]},
     )
     properties = {
         "renderability": found.value,
@@ -148,13 +151,13 @@ def record_of(audit: Audit) -> dict[str, Any]:
 
 def _surfaces(found: Diagnosis, face: float) -> dict[str, Any]:
     """Shares and areas by cause; `face` is the area of a voxel's face in the capture's units."""
-    judged = int(found.is_judged.sum())
+    evaluated = int(found.is_seen.sum())
     return {
-        "voxels_judged": judged,
-        "area_judged": judged * face,
+        "voxels_judged": evaluated,
+        "area_judged": evaluated * face,
         "mean": found.mean,
         "share": {name: found.share(name) for name in CAUSES},
-        "area": {name: found.share(name) * judged * face for name in CAUSES},
+        "area": {name: found.share(name) * evaluated * face for name in CAUSES},
     }
 
 

@@ -1,27 +1,177 @@
 """What is audited: posed pictures with some depth, whoever recorded them.
 
-Shape symbols: n pictures; h, w size of a thinned picture.
+An audit needs no more pixels than fall into a voxel each, and no more exactness than a voxel: so
+images are thinned out, not averaged, and lenses are straightened by taking the nearest pixel. Where
+the ideal image looks past the lens's own, there is no pixel.
+
+Captures without depth get sparse depth images from points. Where a structure from motion says which
+image sees which point, that is taken; of a mere cloud (nerfstudio's `ply_file_path`) an image sees
+the points that no nearer one hides.
+
+Shape symbols: n pictures; m points; H, W image size; h, w size of a thinned picture.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from r3jax.apps.audit.alignment import Alignment
-from r3jax.apps.audit.sampling import sampling_table, thinned
-from r3jax.apps.audit.sparse import sparse_depth
-from r3jax.formats.captures import PosedImages
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens
-from r3jax.formats.ply_points import read_points
+from r3jax.formats.points import read_points
+from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.recordings import Recording
+from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.reader import Run
+
+_RADIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE",
+            "FISHEYE")  # fmt: skip
+
+
+class SamplingTable(NamedTuple):
+    """Which pixel of an image each pixel of the thinned one takes."""
+
+    row: np.ndarray
+    """[h, w] int64."""
+
+    column: np.ndarray
+    """[h, w] int64."""
+
+    is_there: np.ndarray
+    """False where the image has no such pixel, [h, w]."""
+
+    def take(self, image: np.ndarray) -> np.ndarray:
+        """The thinned image [h, w, ...] of an image [H, W, ...]; 0 where there is no pixel."""
+        taken = image[self.row, self.column]
+        taken[~self.is_there] = 0
+        return taken
+
+
+def thinned(camera: Camera, stride: int) -> Camera:
+    """The pinhole of every `stride`-th pixel, from the middle of the first block on."""
+    sides = (camera.width, camera.height)
+    width, height = (len(_taken(side, stride)) for side in sides)
+    cx, cy = (
+        (float(center) - _taken(side, stride)[0] - 0.5) / stride + 0.5
+        for center, side in zip((camera.cx, camera.cy), sides, strict=True)
+    )
+    return Camera(width, height, float(camera.fx) / stride, float(camera.fy) / stride, cx, cy)
+
+
+def _taken(side: int, stride: int) -> np.ndarray:
+    """Which of `side` pixels in a row are taken; at least one."""
+    return np.arange(min(stride // 2, side - 1), side, stride)
+
+
+@functools.lru_cache(maxsize=8)
+def sampling_table(lens: Lens, stride: int) -> SamplingTable:
+    """Where the pixels of `thinned(lens.camera, stride)` lie in the lens's own image.
+
+    Raises:
+        ForeignFileError: a lens whose distortion is not known here.
+    """
+    column, row = np.meshgrid(_taken(lens.width, stride), _taken(lens.height, stride))
+    if not lens.is_pinhole:
+        fx, fy, cx, cy = lens.intrinsics
+        x, y = distorted(lens, (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy)
+        column, row = np.floor(fx * x + cx), np.floor(fy * y + cy)
+    is_there = (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
+    column, row = np.where(is_there, column, 0), np.where(is_there, row, 0)
+    return SamplingTable(row.astype(np.int64), column.astype(np.int64), is_there)
+
+
+def distorted(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the lens shows the ray (x, y, 1): its own normalized coordinates.
+
+    The models are COLMAP's: a polynomial in the squared radius and a tangential part (Brown), or
+    in the angle to the axis (fisheye).
+
+    Args:
+        lens: the lens.
+        x: slopes of the rays to the right.
+        y: slopes of the rays downwards.
+
+    Raises:
+        ForeignFileError: another model.
+    """
+    k = {"k1": lens.named.get("k", 0.0), **lens.named}
+    value = lambda name: k.get(name, 0.0)
+    squared = x * x + y * y
+    if lens.model in _FISHEYE:
+        radius = np.sqrt(squared)
+        angle = np.arctan(radius)
+        t = angle * angle
+        bent = 1.0 + t * (value("k1") + t * (value("k2") + t * (value("k3") + t * value("k4"))))
+        factor = np.where(radius > 1e-9, angle * bent / np.maximum(radius, 1e-9), 1.0)
+        return x * factor, y * factor
+    if lens.model not in _RADIAL:
+        raise ForeignFileError(
+            f"images of a {lens.model} lens are not straightened here: undistort the capture "
+            "first, for example by COLMAP's image_undistorter"
+        )
+    upper = 1.0 + squared * (value("k1") + squared * (value("k2") + squared * value("k3")))
+    lower = 1.0 + squared * (value("k4") + squared * (value("k5") + squared * value("k6")))
+    factor = upper / np.where(np.abs(lower) > 1e-9, lower, 1.0)
+    p1, p2 = value("p1"), value("p2")
+    return (
+        x * factor + 2.0 * p1 * x * y + p2 * (squared + 2.0 * x * x),
+        y * factor + 2.0 * p2 * x * y + p1 * (squared + 2.0 * y * y),
+    )
+
+
+_BLOCKS_ACROSS = 80
+"""Blocks per row of an image, in which the nearest point of a cloud hides the others."""
+
+_SLACK = 1.05
+"""Points at most this many times as far as the nearest one of their block are seen."""
+
+
+def sparse_depth(
+    camera: Camera, pose: np.ndarray, xyz: np.ndarray, rgb: np.ndarray, *, hides: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """z-depth [H, W] float32 of the points that an image shows, and their colors [H, W, 3] uint8.
+
+    Args:
+        camera: of the image.
+        pose: `T_world_camera`, [4, 4], in the points' coordinates.
+        xyz: points, [m, 3].
+        rgb: their colors, [m, 3] uint8.
+        hides: True if a point hides those behind it.
+
+    Returns:
+        0 and black in pixels without a point; the nearest one where there are several.
+    """
+    shape = (camera.height, camera.width)
+    depth, colors = np.full(shape, np.inf, np.float32), np.zeros((*shape, 3), np.uint8)
+    local = (xyz - pose[:3, 3]) @ pose[:3, :3]
+    z = local[:, 2]
+    z_safe = np.where(z > 0.0, z, 1.0)
+    column = np.floor(float(camera.fx) * local[:, 0] / z_safe + float(camera.cx))
+    row = np.floor(float(camera.fy) * local[:, 1] / z_safe + float(camera.cy))
+    is_in = (z > 0.0) & (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    kept = np.flatnonzero(is_in)
+    row, column, z = row[kept].astype(np.int64), column[kept].astype(np.int64), z[kept]
+    if hides and len(kept):
+        side = max(1, round(shape[1] / _BLOCKS_ACROSS))
+        wide = -(-shape[1] // side)
+        block = (row // side) * wide + column // side
+        nearest = np.full(wide * -(-shape[0] // side), np.inf)
+        np.minimum.at(nearest, block, z)
+        is_front = z <= _SLACK * nearest[block]
+        kept, row, column, z = kept[is_front], row[is_front], column[is_front], z[is_front]
+    order = np.argsort(-z, kind="stable")  # the nearest is written last
+    depth[row[order], column[order]] = z[order]
+    colors[row[order], column[order]] = rgb[kept[order]]
+    return np.where(np.isfinite(depth), depth, np.float32(0.0)), colors
+
 
 MAX_SIDE = 640
 """Pictures are thinned out until their longer side has no more pixels."""

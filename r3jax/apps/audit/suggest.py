@@ -1,37 +1,148 @@
 """Which further views would help most: one after the other, each imagined before the next.
 
-Candidates: every place where somebody could stand gets its panorama (arXiv 2601.07484), the worth
+Candidates: every place where somebody could stand gets its panorama (arXiv 2601.07484), the utility
 of all directions at once, and looks along its best directions; views that show too little of what
-is known are left out. Of all candidates the one with the largest gain (`gains`) is taken, the map
-goes on as if it had been (`foresight`), the unexplored cells that it shows count no longer, and the
-others are asked again. A gain hardly ever grows by other views, so an old one is as good as an
-upper bound: only candidates whose old gain is above the best new one are asked again (Minoux 1978).
+is known are left out. What a view would add to the renderability of all surfaces is computed
+exactly, after `simulate_view`:
+
+    gain(view) = sum over voxels of mean over the standpoints that see it of (R after - R before)
+                 + the utility of the unexplored cells that the view shows
+
+in voxels: 1 is a voxel that could not be rendered at all, and then perfectly. Only voxels that the
+view shows can change, and only those that lack something can gain.
+
+Of all candidates the one with the largest gain is taken, the map goes on as if it had been, the
+unexplored cells that it shows count no longer, and the others are asked again: lazy greedy (Minoux
+1978). A gain hardly ever grows by other views, so an old one is as good as an upper bound, and only
+candidates whose old gain is above the best new one are asked again.
 
 Beside it, as many views at random from the same places say how much of the gain is owed to the
 choice.
 
-Shape symbols: p places; B bins of the panorama; C candidates; N rows of the map.
+Shape symbols: p places or standpoints; B bins of the panorama; C candidates; N rows of the map.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.apps.audit.diagnosis import CAUSES, FINE, Answers, Demand, Diagnosis, ask, diagnose
-from r3jax.apps.audit.gains import view_coverage, view_gains
+from r3jax.apps.audit.diagnosis import (
+    CAUSES,
+    FINE,
+    Demand,
+    Diagnosis,
+    StandpointScores,
+    diagnose,
+    score_from_standpoints,
+)
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
-from r3jax.scoring.batch import score_positions
+from r3jax.scoring.batch import map_over_devices, score_positions
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.utility import visible_unexplored
+from r3jax.visibility.depth_buffer import candidates_of, depth_buffer
+from r3jax.visibility.selection import for_selected, select
+from r3jax.visibility.views import pinhole_view
+
+_ENOUGH = 0.95
+"""A voxel with this mean renderability has hardly anything to gain."""
+
+
+def view_gains(
+    state: MapState,
+    grid: OccupancyGrid,
+    demand: Demand,
+    answers: StandpointScores,
+    camera: Camera,
+    poses: np.ndarray,
+    config: ScoringConfig,
+) -> np.ndarray:
+    """The gain of every view, [C] [voxels].
+
+    Args:
+        state: the map.
+        grid: whose unexplored cells count, `config.lambda1` each.
+        demand: who asks.
+        answers: what they say of the map as it is.
+        camera: of the views.
+        poses: [C, 4, 4] [audit units].
+        config: of all scores.
+    """
+    T = jnp.asarray(poses, dtype=jnp.float32)
+    part = functools.partial(_gains, state, grid, demand, answers, camera, config)
+    return np.asarray(map_over_devices(part, T), np.float64)
+
+
+def view_coverage(
+    state: MapState, camera: Camera, poses: np.ndarray, config: ScoringConfig
+) -> np.ndarray:
+    """Share of the pixels of every view that show a voxel, [C]; arguments as in `view_gains`."""
+    T = jnp.asarray(poses, dtype=jnp.float32)
+    return np.asarray(
+        map_over_devices(functools.partial(_coverage, state, camera, config), T), np.float64
+    )
+
+
+@jax.jit
+def _coverage(
+    state: MapState, camera: Camera, config: ScoringConfig, poses: Float[Array, "C 4 4"]
+) -> Float[Array, " C"]:
+    def share(pose: Float[Array, "4 4"]) -> Float[Array, ""]:
+        view = pinhole_view(camera, pose, config)
+        buffer = depth_buffer(state, candidates_of(state, view), view, config)
+        return jnp.mean(buffer.item < state.capacity, dtype=jnp.float32)
+
+    return jax.lax.map(share, poses)
+
+
+@jax.jit
+def _gains(
+    state: MapState,
+    grid: OccupancyGrid,
+    demand: Demand,
+    answers: StandpointScores,
+    camera: Camera,
+    config: ScoringConfig,
+    poses: Float[Array, "C 4 4"],
+) -> Float[Array, " C"]:
+    weight = 1.0 / jnp.maximum(demand.num_seen, 1.0)
+    mean = weight * jnp.sum(answers.value, axis=0)
+    lacks = (demand.num_seen > 0.0) & (mean < _ENOUGH)
+
+    def gain(pose: Float[Array, "4 4"]) -> Float[Array, ""]:
+        after, shown = simulate_view(state, camera, pose, config)
+
+        def add(
+            rows: Int[Array, " K"], valid: Bool[Array, " K"], total: Float[Array, ""]
+        ) -> Float[Array, ""]:
+            part = after.take(rows, valid)
+
+            def of_standpoint(index: Int[Array, ""]) -> Float[Array, ""]:
+                position = demand.position[index]
+                value = score_voxels(part, position, camera.focal, config.forms).value
+                seen = valid & demand.visible[index, rows]
+                change = jnp.where(seen, value - answers.value[index, rows], 0.0)
+                return jnp.sum(change * weight[rows])
+
+            ids = jnp.arange(demand.position.shape[0], dtype=jnp.int32)
+            return total + jnp.sum(jax.lax.map(of_standpoint, ids))
+
+        surfaces = for_selected(select(shown & lacks), add, jnp.zeros(()))
+        cells = visible_unexplored(state, grid, camera, pose, config)
+        return surfaces + config.lambda1 * jnp.sum(cells, dtype=jnp.float32)
+
+    return jax.lax.map(gain, poses)
+
 
 DIRECTIONS = 6
 """Directions in which a candidate looks from every place."""
@@ -70,7 +181,7 @@ class Suggestion:
     """Voxels that were not fine for those who stand about, and are fine after it."""
 
     causes: dict[str, int]
-    """Of the voxels that it shows and that were not fine, how many by cause."""
+    """Number of voxels that it shows and that were not fine, by cause."""
 
     mean_after: float
     """Mean renderability of all surfaces once it is taken."""
@@ -80,16 +191,16 @@ class Suggestion:
 
 
 @dataclass(frozen=True)
-class Plan:
+class SuggestedViews:
     """The suggested views, in order, and what they promise."""
 
     views: tuple[Suggestion, ...]
 
     before: Diagnosis
-    """Of the capture as it is."""
+    """Diagnosis of the capture as it is."""
 
     after: Diagnosis
-    """Once all views are taken, as far as it can be foreseen."""
+    """Diagnosis once all views are taken, as far as it can be foreseen."""
 
     random_mean: tuple[float, ...]
     """Mean renderability of all surfaces after each of as many random views."""
@@ -100,17 +211,17 @@ class Task:
     """What does not change from view to view."""
 
     camera: Camera
-    """Of the views; its focal length in the map's unit."""
+    """Camera of the views; its focal length in the map's unit."""
 
     demand: Demand
     """From where the result will be looked at."""
 
     config: ScoringConfig
-    """Of all scores."""
+    """Settings of all scores."""
 
-    def ask(self, state: MapState) -> tuple[Answers, Diagnosis]:
+    def evaluate(self, state: MapState) -> tuple[StandpointScores, Diagnosis]:
         """What the standpoints say of a map, and what it comes to."""
-        answers = ask(state, self.demand, self.camera.focal, self.config)
+        answers = score_from_standpoints(state, self.demand, self.camera.focal, self.config)
         return answers, diagnose(state, self.demand, answers)
 
 
@@ -123,7 +234,7 @@ def suggest(
     *,
     seed: int = 0,
     on_view: Callable[[], None] = lambda: None,
-) -> Plan:
+) -> SuggestedViews:
     """Chooses up to `num` views.
 
     Args:
@@ -135,7 +246,7 @@ def suggest(
         seed: of the random views.
         on_view: called after each view.
     """
-    answers, now = task.ask(state)
+    answers, now = task.evaluate(state)
     before = now
     views: list[Suggestion] = []
     imagined, open_grid = state, grid
@@ -147,11 +258,11 @@ def suggest(
             break
         pose, gain = poses[best], float(gains[best])
         imagined, open_grid, shown, cells = _take(imagined, open_grid, task, pose)
-        answers, after = task.ask(imagined)
+        answers, after = task.evaluate(imagined)
         views.append(_suggestion(pose, gain, cells, shown, now, after))
         now = after
         on_view()
-    return Plan(tuple(views), before, now, _random(state, task, places, len(views), seed))
+    return SuggestedViews(tuple(views), before, now, _random(state, task, places, len(views), seed))
 
 
 def candidate_poses(
@@ -186,7 +297,7 @@ def _best(
     state: MapState,
     grid: OccupancyGrid,
     task: Task,
-    answers: Answers,
+    answers: StandpointScores,
     poses: np.ndarray,
 ) -> int | None:
     """The candidate that gains most now; brings `gains` up to date as far as needed.
@@ -219,13 +330,7 @@ def _take(
     cells = visible_unexplored(state, grid, task.camera, T, task.config)
     after, shown = simulate_view(state, task.camera, T, task.config)
     rows, edges = (np.flatnonzero(np.asarray(mask)) for mask in (shown, cells))
-    return after, without_cells(grid, cells), rows, edges
-
-
-def without_cells(grid: OccupancyGrid, cells: Bool[Array, "X Y Z"]) -> OccupancyGrid:
-    """A grid for scoring in which these cells are no longer unexplored."""
-    known = jnp.where(cells, jnp.float32(LOG_ODDS_LIMIT), grid.log_odds)
-    return eqx.tree_at(lambda g: g.log_odds, grid, known)
+    return after, grid.ignoring(cells), rows, edges
 
 
 def _suggestion(
@@ -236,7 +341,7 @@ def _suggestion(
     now: Diagnosis,
     after: Diagnosis,
 ) -> Suggestion:
-    bad = shown[now.is_judged[shown] & (now.value[shown] < FINE)]
+    bad = shown[now.is_seen[shown] & (now.value[shown] < FINE)]
     counts = np.bincount(now.cause[bad], minlength=len(CAUSES))
     return Suggestion(
         pose=pose,
@@ -263,5 +368,5 @@ def _random(
     for pose in poses:
         T = jnp.asarray(pose, dtype=jnp.float32)
         state, _ = simulate_view(state, task.camera, T, task.config)
-        means.append(task.ask(state)[1].mean)
+        means.append(task.evaluate(state)[1].mean)
     return tuple(means)

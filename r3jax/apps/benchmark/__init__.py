@@ -1,1 +1,1 @@
-"""The referee: scenes x policies x seeds on equal terms, each cell done once and recorded."""
+"""The benchmark: scenes x policies x seeds on equal terms, each cell done once and recorded."""

@@ -35,13 +35,13 @@ class Cell:
     """Who chooses the views."""
 
     seed: int
-    """Of exploration, sensor noise and training."""
+    """Seed of exploration, sensor noise and training."""
 
     conditions: Conditions
     """What all cells have in common."""
 
     test_views_hash: str
-    """Of the scene's test set."""
+    """Hash of the scene's test set."""
 
     num_test_views: int
     """Views in it."""
@@ -129,7 +129,7 @@ class CellPaths:
         return self.folder / f"snapshot-{snapshot_slug(snapshot)}.json"
 
     def checkpoints(self, snapshot: str) -> Path:
-        """Of a training that is under way."""
+        """Folder of a training that is under way."""
         return self.folder / "training" / snapshot_slug(snapshot)
 
     def model(self, snapshot: str) -> Path:

@@ -8,12 +8,12 @@ from typing import Any, Literal
 from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.config import ClockName, ExplorationConfig
 from r3jax.geometry.cameras import Camera
-from r3jax.planning.motion import Motion, make_motion, motion_of_record
 from r3jax.planning.policy import Policy
 from r3jax.planning.registry import make_policy
+from r3jax.planning.robot.motion import Motion, make_motion, motion_of_record
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.config import Backend, RasterConfig
-from r3jax.splatting.training_config import TrainConfig
+from r3jax.splatting.training.config import TrainConfig
 
 _SCORING = "scoring."
 """Prefix of the settings that go to `ScoringConfig`."""
@@ -30,17 +30,17 @@ OWN_OF_TRAINER = ("iterations", "num_gaussians", "capacity", "raster", "seed")
 
 @dataclass(frozen=True)
 class Conditions:
-    """Budget, sensor, maps, clock, training and judging: the same for every policy.
+    """Budget, sensor, maps, clock, training and evaluating: the same for every policy.
 
     Raises:
         ValueError: a setting that cannot work, a snapshot beyond the budget.
     """
 
     budget: str = "views:60"
-    """Of every exploration: `views:N`, `seconds:S` or `metres:M`."""
+    """Budget of every exploration: `views:N`, `seconds:S` or `metres:M`."""
 
     snapshots: tuple[str, ...] = ()
-    """Where a model is trained and judged, in any of these units; by default at the budget."""
+    """Where a model is trained and evaluated, in any of these units; by default at the budget."""
 
     clock: ClockName = "wall"
     """`wall`: measured planning and mapping. `model`: fixed costs, the same run every time."""
@@ -67,7 +67,7 @@ class Conditions:
     """Rows of the map at the start, a power of two."""
 
     train_resolution: int = 128
-    """Width and height of the images that are trained on and judged [px]."""
+    """Width and height of the images that are trained on and evaluated [px]."""
 
     iterations: int = 2000
     """Steps of every training."""
@@ -116,7 +116,7 @@ class Conditions:
 
     @property
     def camera(self) -> Camera:
-        """Of every exploration, and of the test views before they are made smaller."""
+        """Camera of every exploration, and of the test views before they are made smaller."""
         return Camera.from_fov(self.resolution, self.resolution, self.fov)
 
     def exploration_config(self) -> ExplorationConfig:

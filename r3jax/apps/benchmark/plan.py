@@ -10,7 +10,12 @@ import numpy as np
 
 from r3jax.apps.benchmark.cells import Cell, snapshots_left
 from r3jax.apps.benchmark.conditions import Conditions
-from r3jax.apps.benchmark.judging import FOLDER, JudgingViews, judging_path, save_judging_views
+from r3jax.apps.benchmark.reference_images import (
+    FOLDER,
+    ReferenceImages,
+    reference_path,
+    save_reference_images,
+)
 from r3jax.evaluation.test_views import ViewSet, load_view_set, render_view_set
 from r3jax.exploration.step import check_world
 from r3jax.simulators.free_space import GroundTruth
@@ -118,11 +123,11 @@ def _prepare_scene(
     truth = GroundTruth(simulator)
     on_stage(f"finding the test views of {scene}")
     view_set = load_view_set(folder, truth, max_views=request.max_test_views)
-    path = judging_path(root, view_set.scene_hash, view_set.hash, conditions)
+    path = reference_path(root, view_set.scene_hash, view_set.hash, conditions)
     if not path.exists():
         on_stage(f"rendering {len(view_set)} test views of {scene}")
         frames = render_view_set(truth, view_set, conditions.resolution, conditions.fov)
         views = load_views(frames, conditions.train_resolution)
         poses = view_set.poses.astype(np.float32)
-        save_judging_views(path, JudgingViews(view_set.hash, poses, views))
+        save_reference_images(path, ReferenceImages(view_set.hash, poses, views))
     return view_set

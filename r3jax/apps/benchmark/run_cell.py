@@ -1,4 +1,4 @@
-"""One cell: explore once, then for each snapshot train from scratch, judge, and record.
+"""One cell: explore once, then for each snapshot train from scratch, evaluate, and record.
 
 Whatever is finished stays finished: a process that is killed at any moment and started again
 goes on behind the last complete stage (a training behind its last checkpoint).
@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.apps.benchmark.cells import Cell, CellPaths, identity, paths_of, snapshots_left
-from r3jax.apps.benchmark.judging import JudgingViews, load_judging_views
 from r3jax.apps.benchmark.record import make_record, write_record
+from r3jax.apps.benchmark.reference_images import ReferenceImages, load_reference_images
 from r3jax.evaluation.evaluate import evaluate
-from r3jax.evaluation.lpips import load_lpips
+from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.evaluation.maps import map_of
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.loop import explore
@@ -29,11 +29,11 @@ from r3jax.exploration.state import StopReason
 from r3jax.files import lock_folder, write_atomic
 from r3jax.scoring.renderability import renderability
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
-from r3jax.splatting import train
-from r3jax.splatting.checkpoints import remove_checkpoints
 from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.training import train
+from r3jax.splatting.training.checkpoints import remove_checkpoints
 from r3jax.splatting.views import load_views
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import RunHeader, camera_fields, package_versions, policy_fields
@@ -90,12 +90,12 @@ def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> 
         return
     write_atomic(paths.identity, json.dumps(identity(cell), indent=1).encode())
     run = _finished_run(paths.run) or _explore(cell, paths, on_stage)
-    judging = load_judging_views(root, cell)
+    reference = load_reference_images(root, cell)
     failures: list[str] = []
     for snapshot in left:
         stage: OnStage = lambda what, snapshot=snapshot: on_stage(f"{snapshot}: {what}")
         try:
-            _do_snapshot(cell, root, run, judging, snapshot, stage)
+            _do_snapshot(cell, root, run, reference, snapshot, stage)
         except Exception as error:  # the other snapshots may work
             traceback.print_exc()
             failures.append(f"{snapshot}: {type(error).__name__}: {error}")
@@ -218,9 +218,9 @@ def steps_within(run: Run, snapshot: str) -> tuple[StepRow, ...]:
 
 
 def _do_snapshot(
-    cell: Cell, root: Path, run: Run, judging: JudgingViews, snapshot: str, on_stage: OnStage
+    cell: Cell, root: Path, run: Run, reference: ReferenceImages, snapshot: str, on_stage: OnStage
 ) -> None:
-    """Trains, judges and records one snapshot."""
+    """Trains, evaluates and records one snapshot."""
     conditions, paths = cell.conditions, paths_of(root, cell)
     steps = steps_within(run, snapshot)
     scene = _train(cell, paths, run, len(steps), snapshot, on_stage)
@@ -235,19 +235,19 @@ def _do_snapshot(
         drop_edges=loop.drop_edges,
     )
     camera = conditions.camera
-    expected = [float(renderability(state, camera, jnp.asarray(T))) for T in judging.poses]
-    on_stage("judging")
+    expected = [float(renderability(state, camera, jnp.asarray(T))) for T in reference.poses]
+    on_stage("evaluating")
     config = conditions.train_config(cell.seed)
-    judgment = evaluate(
+    evaluation = evaluate(
         scene,
-        judging.views,
+        reference.views,
         config.raster,
         lpips=None if conditions.lpips == "none" else load_lpips(conditions.lpips),
         renderability=expected,
     )
     assert run.end is not None
     outcome = run.end.outcome if len(steps) == len(run.rows) else StopReason.BUDGET.value
-    record = make_record(root, cell, snapshot, steps, outcome, judgment.rows)
+    record = make_record(root, cell, snapshot, steps, outcome, evaluation.rows)
     write_record(paths.record(snapshot), record)
     # The model is kept, the optimizer's state is not.
     remove_checkpoints(paths.checkpoints(snapshot))

@@ -1,31 +1,94 @@
-"""A forecast of the image quality all over a place, from the map alone.
+"""A forecast of the image quality all over a place, from the map alone; a goal for it ends a run.
 
-Shape symbols: V views.
+While a place is being explored, nobody knows its free space: what is known to be free is too
+little, and a forecast over it alone would be content with the first room. So the views whose
+quality is forecast stand wherever the space is free or unexplored, connects to what is known to be
+free, and keeps its distance from everything known to be occupied. That is too much while much is
+unexplored (the forecast is then too low), and settles as the place becomes known.
+
+The views are those of the benchmark's test sets: in one of six directions, along the axes.
+
+Shape symbols: V views; X Y Z cells.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy import ndimage
+from scipy.stats import qmc
 
-from r3jax.apps.forecast.calibration import default_calibration
-from r3jax.apps.forecast.free_views import free_space_views
-from r3jax.apps.forecast.psnr import Calibration, statistic
+from r3jax.apps.forecast.goal import parse_goal
+from r3jax.apps.forecast.psnr import Calibration, default_calibration, statistic
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.state import LoopState
+from r3jax.geometry.axis_views import LOOKS, poses_at
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.batch import score_views
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
+
+MARGIN = 0.3
+"""Least distance of the views to what is occupied [m], as in the benchmark's test sets."""
+
+_NUM_DRAWN = 1 << 14
+"""Positions drawn over the scene's box; most of them lie in walls or outside."""
+
+_FACES = ndimage.generate_binary_structure(3, 1)
+
+
+def possible_cells(grid: OccupancyGrid, margin: float = MARGIN) -> np.ndarray:
+    """Cells that a camera may stand in, for all that is known, [X, Y, Z] bool.
+
+    None of them comes nearer than `margin` [m] to an occupied cell or to the end of the grid, and
+    each connects over others of them to one that is known to be free.
+    """
+    open_cells = safe_cells(~np.asarray(grid.occupied), float(grid.cell_size), margin)
+    labels = np.zeros(open_cells.shape, dtype=np.int32)
+    ndimage.label(open_cells, _FACES, output=labels)
+    reached = np.unique(labels[np.asarray(grid.free) & open_cells])
+    return np.isin(labels, reached[reached > 0])
+
+
+def free_space_views(grid: OccupancyGrid, num: int) -> np.ndarray:
+    """The first `num` views of a fixed sequence over the grid that stand in possible cells.
+
+    Args:
+        grid: what is known.
+        num: views at most; there are fewer where hardly anything is open.
+
+    Returns:
+        `T_world_camera`, [V, 4, 4] float32, without roll.
+    """
+    origin, size = np.asarray(grid.origin, np.float64), float(grid.cell_size)
+    shape = np.asarray(grid.log_odds.shape)
+    unit = _sequence()
+    cells = np.minimum(unit[:, :3] * shape, shape - 1).astype(int)
+    chosen = np.flatnonzero(possible_cells(grid)[tuple(cells.T)])[:num]
+    positions = origin + unit[chosen, :3] * shape * size
+    looks = np.asarray(LOOKS)[(len(LOOKS) * unit[chosen, 3]).astype(int)]
+    return poses_at(positions, looks).astype(np.float32)
+
+
+@functools.cache
+def _sequence() -> np.ndarray:
+    """Positions and directions in the unit cube, evenly spread, [n, 4]; the same for every run."""
+    return qmc.Sobol(d=4, scramble=False).random(_NUM_DRAWN)
+
 
 NUM_VIEWS = 96
 """Views that a forecast looks at; a percentile of so many is known to a few hundredths of them."""
 
 _LEAST_SHOWN = 0.5
 """A view that shows less than this share of surface and nothing unexplored looks into the void
-(out of a window, up where a scan has no ceiling): the referee leaves such views out."""
+(out of a window, up where a scan has no ceiling): the benchmark leaves such views out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +126,7 @@ def forecast_map(
         camera: that took the views.
         max_range: of its depth sensor [m].
         calibration: what to believe; by default the one that comes with the package, of the
-            referee's small size (`python -m experiments.forecast`).
+            benchmark's small size (`python -m experiments.forecast`).
     """
     poses = free_space_views(grid, NUM_VIEWS)
     known = calibration or default_calibration()
@@ -97,3 +160,36 @@ def _features(
         return jnp.mean(shown), jnp.mean(images.value)
 
     return jax.lax.map(look, poses)
+
+
+def stopping_rule(
+    config: ExplorationConfig, camera: Camera
+) -> Callable[[LoopState], str | None] | None:
+    """Makes the `is_enough` of `explore` from `config.until`.
+
+    Args:
+        config: of the loop.
+        camera: of the views whose PSNR is forecast.
+
+    Returns:
+        Says why no further view is needed, or None; None for a config without a goal.
+
+    Raises:
+        ValueError: a goal that is not understood.
+    """
+    if config.until is None:
+        return None
+    goal = parse_goal(config.until)
+
+    def is_enough(state: LoopState) -> str | None:
+        forecast = forecast_map(state.map_state, state.grid, camera, max_range=config.max_range)
+        if not goal.reached(forecast):
+            return None
+        low, high = forecast.interval(goal.statistic)
+        return (
+            f"{state.views} views: the forecast of the PSNR of free-space views "
+            f"({goal.statistic}) is {forecast.value(goal.statistic):.1f} dB, "
+            f"{low:.1f} to {high:.1f} in four of five places; {goal} was asked for"
+        )
+
+    return is_enough

@@ -10,7 +10,7 @@ _EXAMPLE = "use psnr:25 for the mean of all views, psnr:20@p10 for all but the w
 
 
 @runtime_checkable
-class Judged(Protocol):
+class PsnrForecast(Protocol):
     """What a goal asks of a forecast, which takes JAX to make."""
 
     def value(self, name: str) -> float:
@@ -28,7 +28,7 @@ class Goal:
     statistic: str = MEAN
     """`mean`, or a percentile: `p10`."""
 
-    def reached(self, forecast: Judged) -> bool:
+    def reached(self, forecast: PsnrForecast) -> bool:
         """True if the forecast is at least as good."""
         return forecast.value(self.statistic) >= self.psnr
 

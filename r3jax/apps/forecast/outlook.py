@@ -13,7 +13,7 @@ from r3jax.mapping.state import MapState
 from r3jax.trace.reader import Run
 
 _LEAST_GAIN = 0.1
-"""Of a doubling of the views [dB]; less is no gain that one could count on."""
+"""Least gain of a doubling of the views [dB]; less is no gain that one could count on."""
 
 
 @dataclass

@@ -55,7 +55,7 @@ def contact_sheet(views: Sequence[SheetView], title: str) -> Figure:
 
     Args:
         views: in the order of the lines, usually the worst first (`scores.worst_rows`).
-        title: what was judged, in a line or two.
+        title: what was evaluated, in a line or two.
 
     Raises:
         ValueError: there are no views.

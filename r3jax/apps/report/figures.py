@@ -1,15 +1,22 @@
 """The figures of a run. Each function makes one `matplotlib` figure from what was recorded."""
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch
 
+from r3jax.apps.forecast.outlook import Outlook
 from r3jax.apps.report import style
-from r3jax.apps.report.pictures import PanoramaPicture, floor_picture
+from r3jax.apps.report.pictures import BEYOND, PanoramaPicture, floor_picture
 from r3jax.apps.report.summary import map_row_bytes, stage_times
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.reader import Run
+
+_NEVER_SEEN = "#9ca3af"
+"""Color of directions that meet unexplored space."""
 
 
 def progress_figure(run: Run) -> Figure:
@@ -42,7 +49,9 @@ def progress_figure(run: Run) -> Figure:
         below.set_ylim(0.0, 1.0)
     axes[0, 0].set_title("Against views", fontsize=11, loc="left", fontweight="bold")
     axes[0, 1].set_title("Against time", fontsize=11, loc="left", fontweight="bold")
-    axes[1, 0].legend(fontsize=8, frameon=False, loc="upper left")
+    # Below the axes: anywhere inside, it covers the curves of some run.
+    figure.legend(*axes[1, 0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=2,
+                  loc="outside lower center")  # fmt: skip
     return figure
 
 
@@ -126,11 +135,14 @@ def panorama_figure(picture: PanoramaPicture) -> Figure:
         axes.set_xticks(range(-180, 181, 60))
         axes.set_yticks(range(-90, 91, 45))
     upper.imshow(picture.rgb, extent=extent)
-    lower.set_facecolor("#e5e7eb")
-    image = lower.imshow(picture.value, extent=extent, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
+    image = show_renderability(lower, picture, extent)
     bar = figure.colorbar(image, ax=[upper, lower], shrink=0.4, pad=0.01, anchor=(0.0, 0.0))
     bar.outline.set_visible(False)
-    bar.set_label("R (gray: nothing mapped within range)", fontsize=9, color=style.MUTED)
+    bar.set_label("renderability R", fontsize=9, color=style.MUTED)
+    lower.legend(
+        handles=empty_directions(), fontsize=8, frameon=False, ncols=2,
+        loc="upper right", bbox_to_anchor=(1.0, -0.1),
+    )  # fmt: skip
     bar.ax.tick_params(labelsize=8, colors=style.MUTED)
     for axes in (upper, lower):
         axes.plot(
@@ -142,6 +154,23 @@ def panorama_figure(picture: PanoramaPicture) -> Figure:
             color="white" if axes is upper else style.INK,
         )
     return figure
+
+
+def show_renderability(
+    axes: Axes, picture: PanoramaPicture, extent: tuple[float, float, float, float] | None = None
+) -> AxesImage:
+    """Draws R in all directions, and the two kinds of directions without a voxel apart."""
+    axes.set_facecolor(_NEVER_SEEN)
+    blue = np.concatenate([np.broadcast_to(BEYOND, (*picture.beyond.shape, 3)),
+                           picture.beyond[..., None]], axis=-1)  # fmt: skip
+    axes.imshow(blue, extent=extent)
+    return axes.imshow(picture.value, extent=extent, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
+
+
+def empty_directions() -> list[Patch]:
+    """Entries of a legend for directions without a voxel."""
+    kinds = (("beyond the sensor's range", BEYOND), ("never seen", _NEVER_SEEN))
+    return [Patch(facecolor=color, edgecolor=style.MUTED, label=name) for name, color in kinds]
 
 
 def cost_figure(run: Run) -> Figure:
@@ -169,7 +198,7 @@ def cost_figure(run: Run) -> Figure:
     right.plot(views, used, color=style.ACCENT, linewidth=2.0, label="rows in use")
     right.step(views, allocated, color=style.SECOND, where="post", label="allocated")
     right.set_ylim(0.0, 1.15 * allocated.max())
-    right.legend(fontsize=8, frameon=False, loc="center right")
+    right.legend(fontsize=8, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
@@ -192,3 +221,43 @@ def strip_figure(run: Run, count: int = 12) -> Figure:
         axes.imshow(np.asarray(image))
         axes.set_title(f"view {step + 1}", fontsize=8, color=style.MUTED, loc="left", pad=2)
     return figure
+
+
+LEVEL = 0.8
+"""Level of the intervals."""
+
+_SHOWN = (("mean", "mean of all views"), ("p10", "all but the worst tenth"))
+
+
+def outlook_figure(outlook: Outlook) -> Figure:
+    """Mean and p10 of the PSNR of free-space views against the views taken, with intervals."""
+    figure = style.new_figure(10.0, 3.6)
+    axes = figure.subplots()
+    style.dress(
+        axes, "Forecast of a model trained on the views so far", "views", "PSNR of free views [dB]"
+    )
+    for (name, label), color in zip(_SHOWN, (style.ACCENT, style.SECOND), strict=True):
+        values = np.array([forecast.value(name) for forecast in outlook.forecasts])
+        bounds = np.array([forecast.interval(name, LEVEL) for forecast in outlook.forecasts])
+        axes.fill_between(outlook.views, *bounds.T, color=color, alpha=0.15, linewidth=0)
+        axes.plot(outlook.views, values, color=color, marker="o", markersize=4, label=label)
+    axes.legend(fontsize=9, frameon=False, loc="lower right")
+    return figure
+
+
+def outlook_lines(outlook: Outlook) -> list[str]:
+    """The forecast after the last view, and what one more decibel would take, a line each."""
+    last = outlook.forecasts[-1]
+    if not last.mixture.size:
+        return ["No view of free space can be named yet, so nothing is forecast."]
+    lines: list[str] = []
+    for name, label in _SHOWN:
+        low, high = last.interval(name, LEVEL)
+        line = f"{label} ({name}): {last.value(name):.1f} dB ({low:.1f} to {high:.1f})"
+        more = outlook.more_views(name)
+        if more is not None:
+            line += f"; about {more} more views for +1 dB, as things went"
+        elif len(outlook.forecasts) > 1:
+            line += "; the last views added next to nothing to it"
+        lines.append(line)
+    return lines

@@ -25,6 +25,9 @@ _TITLES = {
     "ssim": ("SSIM", 3),
     "lpips": ("LPIPS", 3),
 }
+_TAIL = {"lpips": " (95th)"}
+"""Which percentile is the bad tail, where it is not the fifth."""
+
 _MAX_BYTES = 64 << 20
 
 _KINDS = {
@@ -45,7 +48,7 @@ _PARTS = {
 """What is used of one metric."""
 
 _COLUMNS = ("step", "loss", "psnr", "gaussians")
-"""Of history.csv."""
+"""Columns of history.csv."""
 
 _LARGEST = 1e12
 """No axis of a figure goes further."""
@@ -55,7 +58,7 @@ _SMOOTHING = 50
 
 
 @dataclass(frozen=True)
-class JudgedModel:
+class EvaluatedModel:
     """The newest evaluation of a model of a run, as it lies on disk."""
 
     evaluation: dict[str, Any]
@@ -68,7 +71,7 @@ class JudgedModel:
     """The contact sheet of the worst views, PNG."""
 
 
-def read_judged_model(run: Run) -> JudgedModel | None:
+def read_evaluated_model(run: Run) -> EvaluatedModel | None:
     """The newest evaluation of the run; None if there is none.
 
     Raises:
@@ -92,7 +95,7 @@ def read_judged_model(run: Run) -> JudgedModel | None:
         raise RunError(
             path, f"the evaluation cannot be read ({error!s:.300}): evaluate again"
         ) from None
-    return JudgedModel(evaluation, history, image)
+    return EvaluatedModel(evaluation, history, image)
 
 
 def _check(evaluation: Any) -> None:
@@ -173,7 +176,7 @@ def quality_table(evaluation: dict[str, Any]) -> str:
             f"{metric['mean']:.{digits}f}",
             f"{low:.{digits}f} – {high:.{digits}f}",
             f"{metric['median']:.{digits}f}",
-            f"{metric['percentile_5']:.{digits}f}",
+            f"{metric['percentile_5']:.{digits}f}{_TAIL.get(name, '')}",
             f"{metric['worst']:.{digits}f} (view {metric['worst_view']})",
             "" if poor is None else f"{100 * poor:.0f} %",
         ]
@@ -196,6 +199,6 @@ def quality_note(evaluation: dict[str, Any]) -> str:
     else:
         which = f"{count} views, {trained_on} of which the model was trained on"
     return (
-        f"{evaluation['gaussians']} Gaussians, judged by {which}, at "
+        f"{evaluation['gaussians']} Gaussians, evaluated by {which}, at "
         f"{evaluation['width']}x{evaluation['height']} px. Black is what no training view saw."
     )

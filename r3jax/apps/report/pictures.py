@@ -16,6 +16,9 @@ from r3jax.scoring.renderability import voxel_renderability
 _UNKNOWN = (0.86, 0.87, 0.89)
 _FREE = (0.985, 0.985, 0.985)
 _OCCUPIED = (0.68, 0.71, 0.76)
+BEYOND = (0.78, 0.85, 0.94)
+"""Color of directions that are free up to the sensor's range."""
+
 _HEIGHT, _WIDTH = 256, 512
 """Size of a panorama picture [px]."""
 
@@ -73,25 +76,34 @@ class PanoramaPicture:
     """An equirectangular picture round a position; the middle column looks along +x."""
 
     rgb: np.ndarray
-    """Mean color of the voxel seen, [h, w, 3]; light gray where there is none."""
+    """Mean color of the voxel seen, [h, w, 3]; blue or gray where there is none."""
 
     value: np.ndarray
     """Renderability of the voxel seen, [h, w]; NaN where there is none."""
 
+    beyond: np.ndarray
+    """True where free space is known up to the sensor's range, [h, w]; where there is neither a
+    voxel nor this, the direction meets unexplored space."""
+
     azimuth: float
-    """Of the camera's axis in this position [rad]."""
+    """Azimuth of the camera's axis in this position [rad]."""
 
     elevation: float
-    """Of the camera's axis in this position [rad]."""
+    """Elevation of the camera's axis in this position [rad]."""
 
 
 def panorama_picture(
-    map_state: MapState, camera: Camera, T_world_camera: np.ndarray, max_range: float
+    map_state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: np.ndarray,
+    max_range: float,
 ) -> PanoramaPicture:
     """Renderability in all directions from a camera's position.
 
     Args:
         map_state: the voxels.
+        grid: free and unexplored space.
         camera: its focal length sets the resolution that is asked for.
         T_world_camera: the pose, [4, 4].
         max_range: range of the sensor [m].
@@ -101,14 +113,39 @@ def panorama_picture(
     row = _nearest_rows(map_state, np.asarray(position), max_range)
     is_seen = row < map_state.capacity
     row = np.where(is_seen, row, 0)
-    rgb = np.where(is_seen[..., None], np.asarray(map_state.mean).T[row], np.asarray(_UNKNOWN))
+    beyond = ~is_seen & _is_free_to(grid, np.asarray(position), max_range)
+    empty = np.where(beyond[..., None], np.asarray(BEYOND), np.asarray(_UNKNOWN))
+    rgb = np.where(is_seen[..., None], np.asarray(map_state.mean).T[row], empty)
     forward = T_world_camera[:3, 2]
     return PanoramaPicture(
         rgb=rgb,
         value=np.where(is_seen, value[row], np.nan),
+        beyond=beyond,
         azimuth=float(np.arctan2(forward[1], forward[0])),
         elevation=float(np.arcsin(np.clip(forward[2], -1.0, 1.0))),
     )
+
+
+def _is_free_to(grid: OccupancyGrid, position: np.ndarray, max_range: float) -> np.ndarray:
+    """True where a straight line up to `max_range` [m] crosses known free cells alone, [h, w].
+
+    Marches in half cells; what leaves the grid counts as unexplored, but for the last cell.
+    """
+    free, cell = np.asarray(grid.free), float(grid.cell_size)
+    origin = np.asarray(grid.origin, np.float64)
+    elevation = (0.5 - (np.arange(_HEIGHT) + 0.5) / _HEIGHT)[:, None] * np.pi
+    azimuth = (0.5 - (np.arange(_WIDTH) + 0.5) / _WIDTH)[None, :] * 2.0 * np.pi
+    flat = np.cos(elevation)
+    direction = np.stack(
+        np.broadcast_arrays(flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), -1
+    )
+    is_free = np.ones(direction.shape[:2], bool)
+    for distance in np.arange(0.5 * cell, max_range - cell, 0.5 * cell):
+        index = np.floor((position + distance * direction - origin) / cell).astype(int)
+        inside = np.all((index >= 0) & (index < free.shape), axis=-1)
+        x, y, z = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
+        is_free &= inside & free[x, y, z]
+    return is_free
 
 
 def _nearest_rows(map_state: MapState, position: np.ndarray, max_range: float) -> np.ndarray:

@@ -14,7 +14,7 @@ from r3jax.scoring.explain import CAUSES
 from r3jax.trace.reader import Run
 
 COLORS = (style.NEVER_SEEN, style.TOO_OBLIQUE, style.INCONSISTENT, style.TOO_FAR)
-"""Of the causes, in the order of `CAUSES`."""
+"""Colors of the causes, in the order of `CAUSES`."""
 
 _MANY = 60
 """From so many views on their bars touch: gaps would be narrower than a pixel."""

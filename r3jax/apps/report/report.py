@@ -1,23 +1,22 @@
 """The report of a run: PNG figures and one HTML page that opens from disk."""
 
 import html
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from matplotlib.figure import Figure
 
 from r3jax.apps.forecast.outlook import Outlook
 from r3jax.apps.report import figures, style
+from r3jax.apps.report.figures import outlook_figure, outlook_lines
 from r3jax.apps.report.model_report import (
-    JudgedModel,
+    EvaluatedModel,
     quality_note,
     quality_table,
-    read_judged_model,
+    read_evaluated_model,
     training_figure,
 )
-from r3jax.apps.report.outlook_figure import outlook_figure, outlook_lines
 from r3jax.apps.report.page import image, page, section
 from r3jax.apps.report.pictures import panorama_picture
 from r3jax.apps.report.reasons import reasons_figure, utility_by_cause
@@ -62,7 +61,10 @@ _NOTES = {
     ),
     "panorama": (
         "Panorama at the last position",
-        "All directions from the last view's position. The cross is the direction it looked in.",
+        "All directions from the last view's position; the cross is the direction it looked in. "
+        "Two kinds of direction show no voxel: blue ones reach the end of the sensor's range "
+        "through known free space, gray ones meet space that was never seen. Neither is part of "
+        "a mean of R over voxels; in the renderability of a whole view both count as R = 0.",
     ),
     "views": ("Some of the views", "Evenly spread over the run."),
     "cost": (
@@ -102,7 +104,7 @@ def write_report(
         raise RunError(run.path, "the run has no view, so there is nothing to report")
     last = run.rows[-1]
     max_range = float(run.header.config.get("max_range", 5.0))
-    panorama = panorama_picture(map_state, run.camera, last.pose, max_range)
+    panorama = panorama_picture(map_state, grid, run.camera, last.pose, max_range)
     outlook = Outlook(run)
     drawn: dict[str, Figure | str] = {
         "plan": figures.plan_figure(run, map_state, grid),
@@ -126,7 +128,7 @@ def write_report(
         write_atomic(folder / f"{name}.png", png)
         table = _beside(name, run, outlook)
         sections.append(_figure_section(name, png, table))
-    model = read_judged_model(run)
+    model = read_evaluated_model(run)
     if model is not None:
         # What came out of it all stands first.
         sections[:0] = _model_sections(folder, model)
@@ -169,7 +171,7 @@ def _beside(name: str, run: Run, outlook: Outlook) -> str:
     return ""
 
 
-def _model_sections(folder: Path, model: JudgedModel) -> list[str]:
+def _model_sections(folder: Path, model: EvaluatedModel) -> list[str]:
     """The trained model: numbers and curves, then the contact sheet of the worst views."""
     note = html.escape(quality_note(model.evaluation))
     curves = b""
@@ -184,19 +186,19 @@ def _model_sections(folder: Path, model: JudgedModel) -> list[str]:
     return sections
 
 
-def _cards(run: Run, model: JudgedModel | None) -> dict[str, str]:
+def _cards(run: Run, model: EvaluatedModel | None) -> dict[str, str]:
+    """At most six large numbers, so that they fit one row: what came out of the run first."""
     last = run.rows[-1]
-    cards = {
-        "views": str(len(run.rows)),
-        "mission clock": f"{last.seconds:.1f} s",
-        "path": f"{last.metres:.1f} m",
-        "explored": f"{100 * last.coverage.known_share:.0f} %",
-        "mean renderability": f"{last.coverage.mean_renderability:.2f}",
-        "map in use": summary(run)["map"].split(", ")[1].removesuffix(" in use"),
-    }
+    cards: dict[str, str] = {}
     if model is not None:
         cards["PSNR of test views"] = f"{model.evaluation['metrics']['psnr']['mean']:.1f} dB"
-    return cards
+    return cards | {
+        "mean renderability": f"{last.coverage.mean_renderability:.2f}",
+        "explored": f"{100 * last.coverage.known_share:.0f} %",
+        "views": str(len(run.rows)),
+        "path": f"{last.metres:.1f} m",
+        "mission clock": f"{last.seconds:.1f} s",
+    }
 
 
 def _figure_section(name: str, png: bytes, extra: str) -> str:
@@ -229,11 +231,11 @@ def _settings_section(run: Run) -> str:
     groups = {
         **summary(run),
         "scene hash": str(header.scene.get("hash", "")),
-        "scene settings": _compact({k: v for k, v in header.scene.items() if k != "hash"}),
-        "policy settings": _compact(header.policy.get("settings", {})),
-        "loop settings": _compact(header.config),
-        "camera": _compact(header.camera),
-        "software": _compact(header.packages),
+        "scene settings": _in_words({k: v for k, v in header.scene.items() if k != "hash"}),
+        "policy settings": _in_words(header.policy.get("settings", {})),
+        "loop settings": _in_words(header.config),
+        "camera": _in_words(header.camera),
+        "software": _in_words(header.packages),
     }
     rows = "".join(
         f"<tr><th>{html.escape(name)}</th><td><code>{html.escape(text)}</code></td></tr>"
@@ -242,7 +244,17 @@ def _settings_section(run: Run) -> str:
     return section("Outcome and settings", "", f"<table>{rows}</table>")
 
 
-def _compact(settings: object) -> str:
-    if not isinstance(settings, dict):
-        return json.dumps(settings)
-    return ", ".join(f"{k} {v}" for k, v in settings.items())
+def _in_words(settings: dict[str, Any]) -> str:
+    """Settings as text: `name value`, groups in brackets behind their name."""
+    texts: list[str] = []
+    for name, value in settings.items():
+        words = name.replace("_", " ")
+        if isinstance(value, dict):
+            texts.append(f"{words} ({_in_words(value)})")
+        elif isinstance(value, bool):
+            texts.append(f"{words} {'yes' if value else 'no'}")
+        elif value is None:
+            texts.append(f"{words} none")
+        else:
+            texts.append(f"{words} {value:.6g}" if isinstance(value, float) else f"{words} {value}")
+    return ", ".join(texts)

@@ -22,7 +22,7 @@ class FrameReport:
     index: int
 
     renderability: float
-    """Of the frame's view, from the map before the frame joined it."""
+    """Mean over the frame's view, from the map before the frame joined it."""
 
     new_voxels: int
     """Voxels that the frame added."""

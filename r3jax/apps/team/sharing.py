@@ -52,7 +52,7 @@ class Common:
     """What all have told each other, and what they have not yet."""
 
     map_state: MapState
-    """Of the frames that were told."""
+    """Map of the frames that were told."""
 
     grid: OccupancyGrid
 

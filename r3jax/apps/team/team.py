@@ -3,7 +3,7 @@
 They fly at the same time. Every member has its own lens, policy, map and mission clock; the one
 whose clock is behind steps next, so a mission lasts as long as its longest clock. At a meeting
 all learn the frames that were taken until then; in between each has its own frames on top. When
-it decides, it takes the views that the others were on their way to at the last meeting as taken,
+it decides, it takes the views that the others were heading for at the last meeting as taken,
 and leaves to them what lies nearer to them (`planning.promised`).
 
 Nobody knows anything before it happened: a frame is told once it is taken, and a member hears of
@@ -78,7 +78,7 @@ class TeamResult:
     """All views in the order of the clock, and what was known after each by whoever knew all."""
 
     map_state: MapState
-    """Of all frames, in that order."""
+    """Map of all frames, in that order."""
 
     grid: OccupancyGrid
 
@@ -286,7 +286,7 @@ def _with_common(state: LoopState, common: Common) -> LoopState:
 
 
 def _promised_to(me: _Flying, common: Common) -> tuple[PromisedView, ...]:
-    """The views that the others were on their way to at the last meeting."""
+    """The views that the others were heading for at the last meeting."""
     first: dict[int, Sight] = {}
     for sight in in_order(common.waiting):
         if sight.member != me.number:

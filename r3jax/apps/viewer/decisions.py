@@ -13,8 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.apps.viewer.colors import WORTH, paint, spread
-from r3jax.apps.viewer.shapes import frustum_segments
+from r3jax.apps.viewer.color_maps import UTILITY_MAP, paint, spread
+from r3jax.apps.viewer.overlays import frustum_segments
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import ExplorationConfig
@@ -65,7 +65,7 @@ def offer_segments(camera: Camera, offer: Offer) -> tuple[np.ndarray, np.ndarray
     ]
     if not parts:
         return np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
-    colors = np.repeat(paint(scores, WORTH), len(parts[0]), axis=0)
+    colors = np.repeat(paint(scores, UTILITY_MAP), len(parts[0]), axis=0)
     return np.concatenate(parts), np.repeat(colors[:, None], 2, axis=1)
 
 
@@ -123,7 +123,7 @@ class WatchedPolicy:
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> Any:
-        """Takes note of a way that another policy chose."""
+        """Takes note of a path that another policy chose."""
         return self._policy.follow(state, map_state, grid, T_world_camera, waypoints)
 
 

@@ -1,4 +1,4 @@
-"""A run as pictures and as a film, without a browser.
+"""A run as pictures and as a film that browsers play, without a browser.
 
 Shape symbols: n blocks; H W picture size.
 """
@@ -6,21 +6,93 @@ Shape symbols: n blocks; H W picture size.
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from PIL import Image
 
-from r3jax.apps.viewer.blocks import QUANTITIES, block_colors
-from r3jax.apps.viewer.known import Known, cut_height, known_at, scoring_of
-from r3jax.apps.viewer.poster import Sheet, compose
-from r3jax.apps.viewer.raster import Squares, draw, lines, overview
-from r3jax.apps.viewer.shapes import frustum_segments, path_segments
-from r3jax.apps.viewer.timeline import Timeline
-from r3jax.apps.viewer.video import write_video
+from r3jax.apps.viewer.blocks import (
+    QUANTITIES,
+    Known,
+    block_colors,
+    cut_height,
+    known_at,
+    scoring_of,
+)
+from r3jax.apps.viewer.overlays import frustum_segments, path_segments
+from r3jax.apps.viewer.stills import Sheet, Squares, compose, draw, lines, overview
+from r3jax.apps.viewer.story import Timeline
 from r3jax.formats.errors import FormatError
 from r3jax.trace.reader import Run
+
+ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "mpeg4")
+"""Tried in this order: H.264 by three programs, and what every FFmpeg has."""
+
+
+def write_video(path: Path, pictures: Iterable[np.ndarray], rate: int) -> str:
+    """Writes an MP4.
+
+    Args:
+        path: the file.
+        pictures: [H, W, 3] uint8 each, of one size; H and W even.
+        rate: pictures a second.
+
+    Returns:
+        The encoder that was used.
+
+    Raises:
+        ImportError: PyAV is not installed; the message names the extra.
+        ValueError: no picture, or odd sizes.
+        OSError: the disk is full, not writable, ...
+    """
+    av = load_av()
+    name = next(encoder for encoder in ENCODERS if _is_known(encoder))
+    stream = None
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        for picture in pictures:
+            height, width = picture.shape[:2]
+            if stream is None:
+                if width % 2 or height % 2:
+                    raise ValueError(f"a film needs even sizes, got {width} x {height}")
+                stream = container.add_stream(name, rate=rate)
+                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                if name == "libx264":
+                    stream.options = {"crf": "18"}
+                else:
+                    stream.bit_rate = 4_000_000
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            container.mux(stream.encode(frame))
+        if stream is None:
+            raise ValueError("a film needs at least one picture")
+        container.mux(stream.encode(None))
+    return name
+
+
+def load_av() -> ModuleType:
+    """PyAV.
+
+    Raises:
+        ImportError: it is not installed; the message names the extra.
+    """
+    try:
+        import av
+    except ImportError:
+        raise ImportError(
+            "films are written by PyAV, which is not installed: pip install 'r3jax[viewer]'"
+        ) from None
+    return av
+
+
+def _is_known(encoder: str) -> bool:
+    av = load_av()
+    try:
+        av.Codec(encoder, "w")
+    except ValueError:  # how PyAV says that FFmpeg was built without it
+        return False
+    return True
+
 
 WIDTH, HEIGHT = 1280, 720
 """Size of every picture [px]; even numbers, which H.264 wants."""
@@ -91,7 +163,7 @@ class Film:
         return np.asarray(image.resize((width // fine, HEIGHT), Image.Resampling.BOX))
 
     def _lines(self, step: int, least: float) -> list[Squares]:
-        """The way so far, the views along it, and the newest one larger."""
+        """The path so far, the views along it, and the newest one larger."""
         rows = self.run.rows[: step + 1]
         segments, colors = path_segments(rows, len(self.run.rows))
         frusta = [frustum_segments(self.run.camera, row.pose, 0.14) for row in rows]

@@ -2,28 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
 
-@dataclass(frozen=True)
-class Audit:
-    """Audit a capture: what it lacks for splats, how frames would render, which views to add."""
+@dataclass(frozen=True, kw_only=True)
+class AuditTermOptions:
+    """How the capture is judged."""
 
-    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
-    """nerfstudio's transforms.json or its folder, a COLMAP model, a scene of Replica-SLAM, TUM or
-    7-Scenes, a recording (images/, depth/, poses.txt, K.txt), or a run."""
-
-    path: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Camera path to judge, in the capture's coordinates: nerfstudio's camera_path.json, or any
-    capture. By default the capture's own frames, each judged without itself."""
-
-    views: int = 10
-    """Further views to suggest."""
-
-    out: Path | None = None
-    """Folder of the audit; by default runs/audit/NAME. An earlier audit in it is replaced."""
+    TITLE: ClassVar[str] = "terms"
 
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
     """Edge of a voxel in the capture's units; by default 5 cm, or from the depths."""
@@ -46,4 +34,28 @@ class Audit:
     """Take the depth images as they are, even if they contradict the poses or each other."""
 
     seed: int = 0
-    """Of the random views that the suggested ones are compared with."""
+    """Seed of the random views that the suggested ones are compared with."""
+
+
+@dataclass(frozen=True)
+class AuditOptions(AuditTermOptions):
+    """Audit a capture: what it lacks for splats, how frames would render, which views to add."""
+
+    EXAMPLES: ClassVar[tuple[str, ...]] = (
+        "r3jax audit scans/kitchen",
+        "r3jax audit scans/kitchen/transforms.json --path camera_path.json --views 20",
+    )
+
+    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
+    """nerfstudio's transforms.json or its folder, a COLMAP model, a scene of Replica-SLAM, TUM or
+    7-Scenes, a recording (images/, depth/, poses.txt, K.txt), or a run."""
+
+    path: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Camera path to judge, in the capture's coordinates: nerfstudio's camera_path.json, or any
+    capture. By default the capture's own frames, each judged without itself."""
+
+    views: int = 10
+    """Further views to suggest."""
+
+    out: Path | None = None
+    """Folder of the audit; by default runs/audit/NAME. An earlier audit in it is replaced."""

@@ -2,40 +2,44 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
 
-@dataclass(frozen=True)
-class Benchmark:
-    """Compare policies on equal terms: explore, train and judge scenes x policies x seeds."""
+@dataclass(frozen=True, kw_only=True)
+class ExplorationOptions:
+    """On what terms every policy explores."""
 
-    scenes: Annotated[str, tyro.conf.arg(metavar="A,B")] = "flat,office"
-    """Embedded scenes by name, or `mesh:<file>`, with commas between."""
-
-    policies: Annotated[str, tyro.conf.arg(metavar="A,B")] = "ours,ours-pano,frontier,random"
-    """Who chooses the views, with commas between."""
-
-    seeds: Annotated[str, tyro.conf.arg(metavar="0,1")] = "0"
-    """Each makes an exploration and a training of its own."""
-
-    budget: Annotated[str, tyro.conf.arg(metavar="BUDGET")] = "views:60"
-    """Of every exploration: `views:N`, `seconds:S` of the mission clock, or `metres:M`."""
-
-    snapshots: Annotated[str | None, tyro.conf.arg(metavar="A,B")] = None
-    """Where a model is trained and judged, for example `views:30,views:60`; by default at the
-    budget."""
-
-    out: Path = Path("runs/benchmark")
-    """Folder of the results. What is done in it is not done again; an interrupted benchmark
-    goes on when it is started again with the same words."""
+    TITLE: ClassVar[str] = "exploration"
 
     clock: Literal["wall", "model"] = "wall"
     """`wall`: measured planning and mapping + flight. `model`: fixed costs, repeatable."""
 
     resolution: int = 256
     """Width and height of the explored images [px]."""
+
+    fov: float = 60.0
+    """Field of view [degrees]."""
+
+    noise: float = 0.01
+    """Standard deviation of the explored depth as a share of the depth; test views have none."""
+
+    max_range: float = 5.0
+    """Range of the depth sensor [m]."""
+
+    voxel_size: float = 0.05
+    """Edge of a voxel of the map [m]."""
+
+    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Settings of all policies: `num_candidates=50`, `lambda2=0.3`, `scoring.lambda1=8`, ..."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """On what terms every model is trained and judged."""
+
+    TITLE: ClassVar[str] = "training and judging"
 
     train_resolution: int = 128
     """Width and height of the images that are trained on and judged [px]."""
@@ -55,20 +59,15 @@ class Benchmark:
     lpips: Literal["alex", "vgg", "none"] = "alex"
     """Network of LPIPS; `none` leaves it out."""
 
-    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Settings of all policies: `num_candidates=50`, `lambda2=0.3`, `scoring.lambda1=8`, ..."""
+    backend: Literal["auto", "numba", "xla", "splax"] = "auto"
+    """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
 
-    voxel_size: float = 0.05
-    """Edge of a voxel of the map [m]."""
 
-    max_range: float = 5.0
-    """Range of the depth sensor [m]."""
+@dataclass(frozen=True, kw_only=True)
+class MeshOptions:
+    """How mesh files are opened."""
 
-    noise: float = 0.01
-    """Standard deviation of the explored depth as a share of the depth; test views have none."""
-
-    fov: float = 60.0
-    """Field of view [degrees]."""
+    TITLE: ClassVar[str] = "mesh files"
 
     up: Literal["y", "z"] | None = None
     """Vertical axis of mesh files; by default y for GLB and glTF, z for the others."""
@@ -79,8 +78,12 @@ class Benchmark:
     cull_backfaces: bool = False
     """Look through faces seen from behind, as Habitat-Sim always does."""
 
-    backend: Literal["auto", "numba", "xla", "splax"] = "auto"
-    """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
+
+@dataclass(frozen=True, kw_only=True)
+class MachineOptions:
+    """Where the cells run."""
+
+    TITLE: ClassVar[str] = "machines"
 
     engine: Literal["local", "slurm"] = "local"
     """`local`: processes on this machine, one GPU each where there are several. `slurm`: an array
@@ -92,3 +95,33 @@ class Benchmark:
     slurm: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Parameters of the array job, as submitit calls them: `timeout_min=240`,
     `slurm_partition=gpu`, `gpus_per_node=1`, ..."""
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions(ExplorationOptions, TrainingOptions, MeshOptions, MachineOptions):
+    """Compare policies on equal terms: explore, train and judge scenes x policies x seeds."""
+
+    EXAMPLES: ClassVar[tuple[str, ...]] = (
+        "r3jax benchmark --scenes flat,office --policies ours,random --seeds 0,1",
+        "r3jax benchmark --budget views:60 --snapshots views:30,views:60 --jobs 2",
+    )
+
+    scenes: Annotated[str, tyro.conf.arg(metavar="A,B")] = "flat,office"
+    """Embedded scenes by name, or `mesh:<file>`, with commas between."""
+
+    policies: Annotated[str, tyro.conf.arg(metavar="A,B")] = "ours,ours-pano,frontier,random"
+    """Who chooses the views, with commas between."""
+
+    seeds: Annotated[str, tyro.conf.arg(metavar="0,1")] = "0"
+    """Each makes an exploration and a training of its own."""
+
+    budget: Annotated[str, tyro.conf.arg(metavar="BUDGET")] = "views:60"
+    """When every exploration stops: `views:N`, `seconds:S` of the mission clock, or `metres:M`."""
+
+    snapshots: Annotated[str | None, tyro.conf.arg(metavar="A,B")] = None
+    """Where a model is trained and judged, for example `views:30,views:60`; by default at the
+    budget."""
+
+    out: Path = Path("runs/benchmark")
+    """Folder of the results. What is done in it is not done again; an interrupted benchmark
+    goes on when it is started again with the same words."""

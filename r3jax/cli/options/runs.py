@@ -2,16 +2,21 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
 
 @dataclass(frozen=True)
-class Info:
+class InfoOptions:
     """List scenes, policies and versions; or show a run or a recording, given its folder."""
 
-    path: Annotated[Path | None, tyro.conf.Positional] = None
+    EXAMPLES: ClassVar[tuple[str, ...]] = (
+        "r3jax info",
+        "r3jax info runs/demo",
+    )
+
+    path: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")] = None
     """A run folder, or a recording (images/, depth/, poses.txt, K.txt)."""
 
     plot: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None
@@ -25,16 +30,20 @@ class Info:
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReplayOptions:
     """Rebuild the map of a run from its recorded frames, and compare it with the stored one."""
+
+    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax replay runs/demo",)
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """A run folder."""
 
 
 @dataclass(frozen=True)
-class Merge:
+class MergeOptions:
     """Merge two runs of one scene: their frames in one data set, and the map that saw both."""
+
+    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax merge runs/first runs/second --out runs/both",)
 
     first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """A run folder."""
@@ -50,8 +59,10 @@ class Merge:
 
 
 @dataclass(frozen=True)
-class Forecast:
+class ForecastOptions:
     """Forecast the PSNR that a model of a run's views would have all over the place."""
+
+    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax forecast runs/demo --plot forecast.png",)
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """A run folder."""
@@ -64,8 +75,13 @@ class Forecast:
 
 
 @dataclass(frozen=True)
-class Export:
+class ExportOptions:
     """Export a run for other programs: nerfstudio's transforms.json, or a COLMAP model."""
+
+    EXAMPLES: ClassVar[tuple[str, ...]] = (
+        "r3jax export runs/demo --out kitchen",
+        "r3jax export runs/demo --format colmap --out kitchen-colmap",
+    )
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """A run folder."""
@@ -79,11 +95,16 @@ class Export:
 
 
 @dataclass(frozen=True)
-class View:
+class ViewOptions:
     """Look at a run in the browser: the map over time, and what a camera that you drag would see.
 
     Or, with --export, write the pictures without a browser.
     """
+
+    EXAMPLES: ClassVar[tuple[str, ...]] = (
+        "r3jax view runs/demo",
+        "r3jax view runs/demo --export pictures --video",
+    )
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """A run folder."""
@@ -113,5 +134,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Policies:
+class PoliciesOptions:
     """List who can choose views: every policy in a sentence, and where its rule comes from."""
+
+    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax policies",)

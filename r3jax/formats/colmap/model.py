@@ -77,7 +77,7 @@ class ColmapModel:
     """Cameras, images and points that belong together."""
 
     cameras: Mapping[int, Lens]
-    """By their ids."""
+    """Cameras by their ids."""
 
     images: tuple[ColmapImage, ...]
     points: ColmapPoints

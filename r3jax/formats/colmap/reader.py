@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.formats.captures import PosedImages, SparsePoints
 from r3jax.formats.colmap.binary import read_binary
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints, pose_of
 from r3jax.formats.colmap.text import read_text
 from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import Lens
+from r3jax.formats.posed_images import PosedImages, SparsePoints
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.names import below
 

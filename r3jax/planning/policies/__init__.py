@@ -34,7 +34,7 @@ HOMES = {
 """Module and class of every policy of this package."""
 
 RETIRED = {"ours-demand": "it lost 0.74 dB against ours-pano; commit e43d800 has it"}
-"""Of every policy that has left the package the reason, and where its code is."""
+"""Policies that have left the package: the reason, and where their code is."""
 
 REGISTERED: dict[str, type] = {}
 """Classes that `planning.registry.register_policy` was told of in this process."""
@@ -45,11 +45,13 @@ _CLASS = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 @functools.cache
 def plugins() -> dict[str, str]:
     """Finds the module and class of every policy that an installed package offers."""
+    # Not loaded: listing names must not import the packages of others.
     return {point.name: point.value for point in entry_points(group=GROUP)}
 
 
 def known_names() -> tuple[str, ...]:
     """Lists all names: this package's, other packages', this process's."""
+    # A dictionary drops repeats and keeps the order, which a set would lose.
     return tuple(dict.fromkeys([*HOMES, *plugins(), *REGISTERED]))
 
 
@@ -59,8 +61,10 @@ def home_of(name: str) -> str:
     Raises:
         ValueError: no policy has that name; names the known ones, and the one that was meant.
     """
+    # Before all else: who asks for a policy that has left wants the reason, not a similar name.
     if name in RETIRED:
         raise ValueError(f"policy {name!r} has left the package: {RETIRED[name]}")
+    # Before plug-ins: in recorded runs these names mean policies of this package.
     if name in HOMES:
         return HOMES[name]
     if name in plugins():
@@ -84,6 +88,7 @@ def check_policy(name: str) -> None:
         return
     module = home_of(name).partition(":")[0]
     try:
+        # This imports the parents of a module, and raises where one of them is missing.
         found = importlib.util.find_spec(module)
     except ImportError:
         found = None

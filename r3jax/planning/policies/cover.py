@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
+from r3jax.planning.candidates import Candidates
 from r3jax.planning.greedy import GreedyPolicy, score_by_pixels
-from r3jax.planning.situation import Situation
+from r3jax.planning.policy import Situation
 from r3jax.scoring.directions import nearest_seen
 from r3jax.scoring.pixels import PixelView
 
@@ -54,6 +55,7 @@ def coverage_of_pixels(
     direction = offset / jnp.maximum(length, 1e-6)[None]
     nearest = nearest_seen(seen.visited, direction, seen.num_bins)
     total, num = jnp.sum(hit * 0.5 * (1.0 + nearest)), jnp.sum(hit)
+    # Clipped: rounding may carry the mean past 1, and the novelty below 0.
     return jnp.where(num > 0.0, jnp.clip(total / jnp.maximum(num, 1.0), 0.0, 1.0), 1.0)
 
 
@@ -71,17 +73,17 @@ class Cover(GreedyPolicy):
     source = "COVER of NBV-Gym, CVPR 2026, plus unexplored cells"
 
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """New directions (`rendering`) and unexplored cells (`exploration`) of every pose."""
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+        """New directions (`rendering`) and unexplored cells (`exploration`) of every view."""
         del key
         state = situation.map_state
         seen = SeenBins(state.visited, state.num_bins)
         rendering, cells = score_by_pixels(
-            situation, _novelty_and_cells, poses, self.config.scoring, seen
+            situation, _novelty_and_cells, candidates, self.config.scoring, seen
         )
         exploration = UNSEEN_WEIGHT * cells / situation.grid.log_odds.size
-        return poses, {
+        return candidates, {
             "exploration": exploration,
             "rendering": rendering,
             "utility": exploration + rendering,

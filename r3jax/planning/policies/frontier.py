@@ -8,18 +8,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from scipy.spatial import KDTree
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier
-from r3jax.planning.candidates import VIEW_DISTANCE, host_generator, in_plain_view, poses_along
+from r3jax.planning.candidates import (
+    VIEW_DISTANCE,
+    Candidates,
+    candidates_along,
+    host_generator,
+    in_plain_view,
+)
 from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_lots, free_views
-from r3jax.planning.limits import UNBOUND, Limits
-from r3jax.planning.situation import Situation
-from r3jax.planning.travel import Travel
+from r3jax.planning.policy import Situation
+from r3jax.planning.robot.limits import UNBOUND, Limits
+from r3jax.planning.robot.travel import Travel
 
 _MAX_TARGETS = 300
 """Frontier cells that are considered per decision, drawn at random."""
@@ -40,10 +45,10 @@ class Frontier(GreedyPolicy):
     name = "frontier"
     source = "Yamauchi, CIRA 1997: the nearest frontier"
 
-    def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Array:
+    def first_memory(self, camera: Camera, grid: OccupancyGrid) -> np.ndarray:
         """Frontier cells that were looked at on purpose, [X, Y, Z] bool: none."""
         del camera
-        return jnp.zeros(grid.log_odds.shape, dtype=bool)
+        return np.zeros(grid.log_odds.shape, dtype=bool)
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """Views of the nearest frontier cells not looked at yet; if there is none, any nearby.
@@ -53,30 +58,34 @@ class Frontier(GreedyPolicy):
         target_key, random_key = jax.random.split(key)
         num = self.config.num_candidates
         targets, attempted = np.asarray(frontier(situation.scoring_grid)), situation.memory
-        if not np.any(targets & ~np.asarray(attempted)):
-            attempted = jnp.zeros_like(attempted)
-        fresh = targets & ~np.asarray(attempted)
+        # All were looked at: begin again, since the map has grown meanwhile.
+        if not np.any(targets & ~attempted):
+            attempted = np.zeros_like(attempted)
+        fresh = targets & ~attempted
         stops, aims = nearest_views(situation.travel, fresh, num, situation.limits, key=target_key)
         if len(stops) == 0:
+            # The memory stays as it was: random views are no attempt at the frontier.
             anywhere = free_views(situation, num, self.config.radius, key=random_key)
             return Drawn(anywhere, situation.memory, notes=False)
-        # Always as many as can be asked for, so that nothing compiles again.
-        padding = np.arange(num) % len(stops)
-        poses = poses_along(stops[padding], (aims - stops)[padding])[: len(stops)]
-        return Drawn(poses, attempted, notes=True)
+        return Drawn(candidates_along(stops, aims - stops).padded(num), attempted, notes=True)
 
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """Nothing: the path alone decides; lots where no frontier is in reach."""
-        return poses, {} if situation.notes else draw_lots(len(poses), key=key)
+        lots = {} if situation.notes else draw_lots(len(candidates.valid), key=key)
+        return candidates, lots
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """Minus the path length, or the lots."""
         return utilities.get("lot", -utilities["path"])
 
     def conclude(
-        self, situation: Situation, poses: np.ndarray, utilities: dict[str, np.ndarray], best: int
+        self,
+        situation: Situation,
+        candidates: Candidates,
+        utilities: dict[str, np.ndarray],
+        best: int,
     ) -> Any:
         """The cells that the chosen view of the frontier shows count as looked at."""
         del utilities
@@ -84,7 +93,10 @@ class Frontier(GreedyPolicy):
             return situation.memory
         cells = np.moveaxis(np.indices(situation.memory.shape), 0, -1)
         centers = situation.travel.centers(cells)
-        return situation.memory | jnp.asarray(_is_looked_at(centers, poses[best]))
+        # The pose, not the line of sight: lines to lattice cells lie on the border of the cone, and
+        # float32 has always decided on which side.
+        pose = candidates.T_world_camera[best]
+        return situation.memory | _is_looked_at(centers, pose)
 
 
 def _is_looked_at(centers: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
@@ -97,6 +109,7 @@ def _is_looked_at(centers: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray
 
 def _may_look(limits: Limits, place: np.ndarray, aim: np.ndarray) -> bool:
     """Whether the allowed view from a place that comes nearest to a target counts as one of it."""
+    # Never 0 / 0: places nearer than `VIEW_DISTANCE` were dropped before.
     direction = (aim - place) / np.linalg.norm(aim - place)
     return bool(limits.nearness(place[None], direction[None])[0] >= _ATTEMPT_COSINE)
 
@@ -124,20 +137,25 @@ def nearest_views(
     cells, stops = np.argwhere(targets), np.argwhere(travel.goals)
     if len(cells) == 0 or len(stops) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
+    # Hundreds of targets tell the nearest well enough; thousands take seconds.
     if len(cells) > _MAX_TARGETS:
         cells = host_generator(key).choice(cells, size=_MAX_TARGETS, replace=False)
     closest, farthest = VIEW_DISTANCE
     places, aims = travel.stops(stops), travel.centers(cells)
+    # Far more than are tried: the nearest in a straight line may be far away by path.
     count = min(64, len(stops))
     distance, index = KDTree(places).query(aims, k=count, distance_upper_bound=farthest)
+    # SciPy drops the axis of neighbors if one alone is asked for.
     distance, index = distance.reshape(-1, count), index.reshape(-1, count)
     is_allowed = (distance >= closest) & (distance <= farthest)
     cost = np.append(travel.cost[tuple(stops.T)], np.inf)[index]  # index of nothing: len(stops)
+    # Too near or too far to see the target counts as out of reach.
     cost = np.where(is_allowed, cost, np.inf)
     best = np.argsort(cost, axis=1)[:, :_STOPS_PER_TARGET]
     aim_index = np.repeat(np.arange(len(cells)), best.shape[1])
     index, cost = (np.take_along_axis(a, best, axis=1).ravel() for a in (index, cost))
     found: list[tuple[np.ndarray, np.ndarray]] = []
+    # Nearest first, so that the costly test of sight ends early.
     for pair in np.argsort(cost, kind="stable"):
         if not np.isfinite(cost[pair]) or len(found) == num:
             break

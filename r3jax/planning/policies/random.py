@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array
 
+from r3jax.planning.candidates import Candidates
 from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_lots, free_views
-from r3jax.planning.situation import Situation
+from r3jax.planning.policy import Situation
 
 
 @dataclass(frozen=True)
@@ -22,11 +23,11 @@ class Random(GreedyPolicy):
         return Drawn(free_views(situation, num, radius, key=key), situation.memory)
 
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """The lot that each candidate draws."""
         del situation
-        return poses, draw_lots(len(poses), key=key)
+        return candidates, draw_lots(len(candidates.valid), key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """The lot alone: paths cost nothing."""

@@ -10,14 +10,14 @@ Shape symbols: C candidates, always `config.num_candidates`, so that scoring com
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.planning.candidates import best_views
-from r3jax.planning.greedy import GreedyPolicy, ScoreViews
-from r3jax.planning.situation import Situation
+from r3jax.planning.candidates import Candidates, best_views
+from r3jax.planning.greedy import Drawn, GreedyPolicy, ScoreViews, random_places
+from r3jax.planning.policy import Situation
 from r3jax.scoring.batch import score_positions, score_views
-from r3jax.scoring.config import ScoringConfig
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,19 @@ class Ours(GreedyPolicy):
     climbs = True
 
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """U = lambda1 U_G + U_R of every pose."""
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+        """U = lambda1 U_G + U_R of every view."""
         del key
+        # On the masked grid: cells that no robot can look at would attract it forever.
         views = self.score_all(
             situation.map_state,
             situation.scoring_grid,
             situation.camera,
-            poses.astype(np.float32),
+            candidates.poses_on_device(),
             self.config.scoring,
         )
-        return poses, {
+        return candidates, {
             "exploration": np.asarray(views.exploration, dtype=np.float64),
             "rendering": np.asarray(views.rendering, dtype=np.float64),
             "utility": np.asarray(views.total, dtype=np.float64),
@@ -61,35 +62,24 @@ class OursPano(GreedyPolicy):
     source = "Ours-Pano, arXiv 2601.07484"
     climbs = True
 
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """Positions of Ours; where they look is not chosen yet."""
+        return Drawn(random_places(situation, self.config, key=key), situation.memory)
+
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """Every position's best direction that is allowed, and what the panorama promises there."""
         del key
-        return turned_views(self.score_all, situation, poses[:, :3, 3], self.config.scoring)
-
-
-def turned_views(
-    score_all: ScoreViews,
-    situation: Situation,
-    positions: np.ndarray,
-    scoring: ScoringConfig,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """What `GreedyPolicy.score` answers for positions that look where it is worth most.
-
-    Args:
-        score_all: `score_positions`, or a stand-in for it.
-        situation: what is known.
-        positions: [C, 3] [m].
-        scoring: settings of the utilities.
-    """
-    panorama = score_all(
-        situation.map_state,
-        situation.scoring_grid,
-        situation.camera,
-        positions.astype(np.float32),
-        scoring,
-        situation.limits.allowed_axes(positions, scoring.panorama_bins),
-    )
-    turned, utility = best_views(positions, panorama)
-    return turned, {"utility": utility}
+        scoring = self.config.scoring
+        panorama = self.score_all(
+            situation.map_state,
+            situation.scoring_grid,
+            situation.camera,
+            jnp.asarray(candidates.position, dtype=jnp.float32),
+            scoring,
+            situation.limits.allowed_axes(candidates.position, scoring.panorama_bins),
+        )
+        # Positions stay, lines of sight are the panorama's choice.
+        turned, utility = best_views(candidates, panorama)
+        return turned, {"utility": utility}

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array, Float
 
+from r3jax.planning.candidates import Candidates
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.greedy import GreedyPolicy, draw_lots, score_by_pixels
-from r3jax.planning.situation import Situation
+from r3jax.planning.policy import Situation
 from r3jax.scoring.pixels import PixelView
 
 
@@ -23,22 +24,27 @@ def _cells_and_distance(view: PixelView) -> tuple[Float[Array, ""], Float[Array,
 
 
 def unseen_utilities(
-    situation: Situation, poses: np.ndarray, config: PlannerConfig, *, weighted: bool, key: Array
+    situation: Situation,
+    candidates: Candidates,
+    config: PlannerConfig,
+    *,
+    weighted: bool,
+    key: Array,
 ) -> dict[str, np.ndarray]:
-    """`cells`, `depth` and `utility` of poses [C, 4, 4], [C] each.
+    """`cells`, `depth` and `utility` of candidates, [C] each.
 
     Args:
         situation: what is known.
-        poses: the candidates.
+        candidates: views on offer.
         config: settings of the policy.
         weighted: True to take the distances for the utility, False to count.
         key: draws lots as utilities where no candidate shows an unexplored cell. Without them
             the path alone would decide, and the robot would stay where it is.
     """
-    cells, depth = score_by_pixels(situation, _cells_and_distance, poses, config.scoring)
+    cells, depth = score_by_pixels(situation, _cells_and_distance, candidates, config.scoring)
     utility = depth if weighted else cells
     if not utility.any():
-        utility = draw_lots(len(poses), key=key)["lot"]
+        utility = draw_lots(len(candidates.valid), key=key)["lot"]
     return {"cells": cells, "depth": depth, "utility": utility}
 
 
@@ -50,10 +56,11 @@ class Unseen(GreedyPolicy):
     source = "unmapped volume in view, as in Bircher et al., ICRA 2016"
 
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """U_G of every pose."""
-        return poses, unseen_utilities(situation, poses, self.config, weighted=False, key=key)
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+        """U_G of every view."""
+        config = self.config
+        return candidates, unseen_utilities(situation, candidates, config, weighted=False, key=key)
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,8 @@ class UnseenDepth(GreedyPolicy):
     source = "unseen, times the depth factor of Active-GS"
 
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """The sum over the visible unexplored cells of distance / range."""
-        return poses, unseen_utilities(situation, poses, self.config, weighted=True, key=key)
+        config = self.config
+        return candidates, unseen_utilities(situation, candidates, config, weighted=True, key=key)

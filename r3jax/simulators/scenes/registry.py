@@ -6,11 +6,11 @@ import numpy as np
 
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.base import Simulator
-from r3jax.simulators.habitat import HabitatSimulator
-from r3jax.simulators.habitat_stage import read_stage
+from r3jax.simulators.depth_noise import NoisySimulator
+from r3jax.simulators.habitat.habitat import HabitatSimulator
+from r3jax.simulators.habitat.habitat_stage import read_stage
 from r3jax.simulators.meshes import load_world
-from r3jax.simulators.noise import NoisySimulator
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes import procedural, replica
 from r3jax.simulators.scenes.names import (
     OUTSIDE,

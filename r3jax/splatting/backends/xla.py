@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Num
 
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.backend import Composite
+from r3jax.splatting.backends.tiles import TileLists, grid_shape, list_tiles
 from r3jax.splatting.backends.xla_chunk import (
     PIXELS,
     chunk_gradient,
@@ -28,7 +29,6 @@ from r3jax.splatting.backends.xla_chunk import (
 from r3jax.splatting.config import TILE, TRANSMITTANCE_MIN, RasterConfig
 from r3jax.splatting.projection import project_gaussians
 from r3jax.splatting.scene import GaussianScene
-from r3jax.splatting.tiles import TileLists, grid_shape, list_tiles
 
 
 class Layout(eqx.Module):

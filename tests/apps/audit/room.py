@@ -9,8 +9,8 @@ from PIL import Image
 from r3jax.formats.colmap.binary import write_binary
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints, colmap_pose
 from r3jax.formats.lenses import Lens
-from r3jax.formats.pointcloud import write_points
-from r3jax.formats.transforms import OPENGL_FROM_OPENCV
+from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
+from r3jax.formats.points import write_points
 from r3jax.geometry.cameras import look_at
 
 SIZE = np.array([4.0, 3.0, 2.4])

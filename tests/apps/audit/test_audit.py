@@ -5,19 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r3jax.apps.audit import seen
+from r3jax.apps.audit import capture_maps
+from r3jax.apps.audit.alignment import Alignment
 from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.bad_regions import bad_regions, unseen_edges, unseen_regions
 from r3jax.apps.audit.camera_paths import CameraPath
 from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
-from r3jax.apps.audit.regions import bad_regions, unseen_edges, unseen_regions
-from r3jax.apps.audit.sentences import method, verdict
+from r3jax.apps.audit.pages.sentences import directions, method, verdict
 from r3jax.apps.audit.source import Source, source_of
-from r3jax.apps.audit.survey import MARGIN, Wishes, survey_of
+from r3jax.apps.audit.survey import MARGIN, AuditSettings, survey_of
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import read_transforms
-from r3jax.formats.ply_points import read_points
+from r3jax.formats.points import read_points
 from r3jax.formats.recordings import read_recording
 from tests.apps.audit.room import (
     LENS,
@@ -32,9 +33,9 @@ from tests.apps.audit.room import (
 pytestmark = pytest.mark.full
 
 VOXEL = 0.15
-WISHES = Wishes(voxel_size=VOXEL, num_views=3, folds=4, num_places=16, num_standpoints=8)
-FEW_VIEWS = dataclasses.replace(WISHES, voxel_size=None, num_views=2)
-NO_VIEWS = dataclasses.replace(WISHES, num_views=0)
+SETTINGS = AuditSettings(voxel_size=VOXEL, num_views=3, folds=4, num_places=16, num_standpoints=8)
+FEW_VIEWS = dataclasses.replace(SETTINGS, voxel_size=None, num_views=2)
+NO_VIEWS = dataclasses.replace(SETTINGS, num_views=0)
 
 
 def corner_poses() -> np.ndarray:
@@ -47,7 +48,7 @@ def corner_poses() -> np.ndarray:
 def _small_maps():
     """A room needs no more rows: everything else is three times as quick."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(seen, "_CAPACITY", 1 << 13)
+        patch.setattr(capture_maps, "_CAPACITY", 1 << 13)
         yield
 
 
@@ -59,7 +60,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def corner(folder) -> Audit:
     recording = read_recording(write_recording(folder / "corner", corner_poses()), "z")
-    return audit(source_of(recording, "corner"), WISHES)
+    return audit(source_of(recording, "corner"), SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +75,8 @@ def centers(found: Audit) -> np.ndarray:
 
 def test_what_was_seen_from_one_side_only_is_seen_from_wrong_angles_or_from_afar(corner):
     found = corner.diagnosis
-    judged = found.is_judged
-    far = judged & (centers(corner)[:, 0] > 3.0)
+    evaluated = found.is_seen
+    far = evaluated & (centers(corner)[:, 0] > 3.0)
     assert far.sum() > 100
     bad = far & (found.value < FINE)
     names = {CAUSES[i] for i in np.unique(found.cause[bad])}
@@ -110,10 +111,10 @@ def test_suggested_views_are_in_the_open_and_promise_more_than_random_ones(corne
 
 def test_a_gain_is_what_all_surfaces_gain_together(corner):
     """Two ways to the same number: view by view, and standpoint by standpoint."""
-    judged = corner.diagnosis.is_judged.sum()
+    evaluated = corner.diagnosis.is_seen.sum()
     before = corner.diagnosis.mean
     for view in corner.plan.views:
-        surfaces = (view.mean_after - before) * judged
+        surfaces = (view.mean_after - before) * evaluated
         cells = float(corner.config.lambda1) * len(view.cells)
         # Voxels that are nearly perfect are left out of gains.
         assert view.gain == pytest.approx(surfaces + cells, rel=0.03, abs=0.5)
@@ -167,8 +168,8 @@ def test_colors_that_contradict_are_noise(corner):
 
     changed = dataclasses.replace(corner.source, read=flickering)
     found = audit(changed, NO_VIEWS)
-    assert found.diagnosis.noise[found.diagnosis.is_judged].mean() < 0.9
-    calm = corner.diagnosis.noise[corner.diagnosis.is_judged].mean()
+    assert found.diagnosis.noise[found.diagnosis.is_seen].mean() < 0.9
+    calm = corner.diagnosis.noise[corner.diagnosis.is_seen].mean()
     assert calm > 0.97
     assert found.diagnosis.share("noise") > 0.05
 
@@ -268,6 +269,33 @@ def test_one_view_is_spoken_of_as_one(cloud):
     assert verdict(cloud)[-1].startswith(f"{len(cloud.plan.views)} further views would")
 
 
+@pytest.mark.parametrize("tilt", [0.0, 30.0, -90.0])  # of the picture [degrees]
+def test_directions_lead_from_a_picture_to_the_view(corner, tilt):
+    """The view is put where the words say; a picture that looks straight down is no exception."""
+    heading = np.radians(25.0)
+    forward = np.array([np.cos(heading), np.sin(heading), 0.0])
+    axis = np.cos(np.radians(tilt)) * forward + [0.0, 0.0, np.sin(np.radians(tilt))]
+    eye = np.array([1.0, 1.0, 1.5])
+    here = np.eye(4) if tilt == -90.0 else pose_at(eye, eye + axis)
+    if tilt == -90.0:  # its upper edge shows where it faces
+        here[:3, :3] = np.stack([[forward[1], -forward[0], 0.0], -forward, [0, 0, -1]], axis=1)
+        here[:3, 3] = eye
+    turned = heading + np.radians(40.0)
+    looks = np.array([np.cos(turned), np.sin(turned), -np.tan(np.radians(10.0))])
+    left = np.array([-forward[1], forward[0], 0.0])
+    place = eye + 1.2 * forward - 0.4 * left + [0.0, 0.0, 0.3]
+    view = dataclasses.replace(corner.plan.views[0], pose=pose_at(place, place + looks))
+    back = np.stack([here] * len(corner.source.poses))
+    source = dataclasses.replace(corner.source, poses=back)
+    as_it_is = Alignment(np.eye(3), 1.0, np.zeros(3))
+    survey = dataclasses.replace(corner.survey, alignment=as_it_is)
+    audit = dataclasses.replace(corner, source=source, survey=survey)
+    assert directions(audit, view, 2) == (
+        f"Stand where {source.labels[2]} was taken, go 1.2 m forward and 0.4 m to the right, hold "
+        "the camera 0.3 m higher, turn 40° left and look 10° down."
+    )
+
+
 def test_what_points_leave_out_is_said(cloud, corner):
     told = [any("plain walls" in text for text in verdict(found)) for found in (cloud, corner)]
     assert told == [True, False]
@@ -284,14 +312,14 @@ def one_picture(depth: np.ndarray) -> Source:
 
 def test_a_capture_without_any_depth_is_refused():
     with pytest.raises(FormatError, match="no picture shows anything"):
-        survey_of(one_picture(np.zeros((36, 48), np.float32)), Wishes())
+        survey_of(one_picture(np.zeros((36, 48), np.float32)), AuditSettings())
 
 
 @pytest.mark.parametrize(
     ("depth", "range_in_metres"), [(3.0, 5.0), (20.0, 20.0), (0.5, 1.25), (4.9, 5.0)]
 )
 def test_a_capture_of_a_rooms_size_stays_as_it_is_and_others_are_scaled(depth, range_in_metres):
-    survey = survey_of(one_picture(np.full((36, 48), depth, np.float32)), Wishes(up="-y"))
+    survey = survey_of(one_picture(np.full((36, 48), depth, np.float32)), AuditSettings(up="-y"))
     assert survey.length(5.0) == pytest.approx(range_in_metres)
     assert survey.alignment.scale == pytest.approx(5.0 / range_in_metres)
     assert survey.length(survey.voxel_size) >= 0.01 * range_in_metres
@@ -300,12 +328,12 @@ def test_a_capture_of_a_rooms_size_stays_as_it_is_and_others_are_scaled(depth, r
 def test_a_median_depth_that_no_room_has_is_refused_unless_it_is_meant():
     millimeters = one_picture(np.full((36, 48), 2000.0, np.float32))
     with pytest.raises(ValueError, match=r"median depth is 2000 m: is its unit right"):
-        survey_of(millimeters, Wishes())
-    assert survey_of(millimeters, Wishes(up="-y", trust_depth=True)).median_depth == 2000.0
+        survey_of(millimeters, AuditSettings())
+    assert survey_of(millimeters, AuditSettings(up="-y", trust_depth=True)).median_depth == 2000.0
 
 
 @pytest.mark.parametrize(
-    ("wishes", "message"),
+    ("settings", "message"),
     [
         ({"voxel_size": 0.0}, "--voxel-size must be positive"),
         ({"max_range": float("nan")}, "--max-range must be positive"),
@@ -319,6 +347,6 @@ def test_a_median_depth_that_no_room_has_is_refused_unless_it_is_meant():
         ({"up": "w"}, "up must be one of"),
     ],
 )
-def test_wishes_without_sense_are_named(wishes, message):
+def test_wishes_without_sense_are_named(settings, message):
     with pytest.raises(ValueError, match=message):
-        survey_of(one_picture(np.ones((36, 48), np.float32)), Wishes(**wishes))
+        survey_of(one_picture(np.ones((36, 48), np.float32)), AuditSettings(**settings))

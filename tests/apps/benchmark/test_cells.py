@@ -6,8 +6,8 @@ import pytest
 
 from r3jax.apps.benchmark.cells import Cell, identity, paths_of, snapshots_left
 from r3jax.apps.benchmark.conditions import Conditions
-from r3jax.planning.motion import MOTIONS, Motion
 from r3jax.planning.registry import policy_names
+from r3jax.planning.robot.motion import MOTIONS, Motion
 from tests.apps.benchmark.tiny import CONDITIONS, SETTINGS
 
 CELL = Cell("flat", "a" * 64, "ours", 0, CONDITIONS, "b" * 64, 100, SETTINGS)

@@ -100,7 +100,7 @@ def children_of(pid):
 
 @pytest.mark.slow
 def test_on_a_cluster_a_job_that_is_preempted_goes_on_with_its_cell(finished, room, tmp_path):
-    """submitit's own stand-in for a cluster: each job a process, preempted by a signal."""
+    """submitit's own local substitute for a cluster: each job a process, preempted by a signal."""
     pytest.importorskip("submitit")
     cells = make_cells(room, tmp_path)
     bad, good = broken(cells[0]), cells[0]

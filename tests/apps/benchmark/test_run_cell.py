@@ -160,7 +160,7 @@ def test_a_cell_that_is_killed_again_and_again_ends_in_the_same_record(finished,
     assert read_run(paths.run).end is None
     stages = run_until("views:2: training, step 20", room, tmp_path)
     assert "exploring, 3 views" in stages  # cut off in the middle: from the start again
-    stages = run_until("views:3: judging", room, tmp_path)
+    stages = run_until("views:3: evaluating", room, tmp_path)
     assert not any(stage.startswith("exploring") for stage in stages)
     steps = [int(s.split()[-1].split("/")[0]) for s in stages if "views:2: training" in s]
     assert steps[0] > 18  # behind the checkpoint, not at the start

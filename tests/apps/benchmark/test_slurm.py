@@ -1,4 +1,7 @@
-"""The cluster engine on a real Slurm: a node on this machine, jobs requeued and killed on it."""
+"""The cluster engine on a real Slurm: a node on this machine, jobs requeued and killed on it.
+
+What is made of the answers of Slurm's queue; the real one is asked in `test_slurm.py`.
+"""
 
 import os
 import shutil
@@ -11,12 +14,60 @@ from pathlib import Path
 import pytest
 
 from r3jax.apps.benchmark.cells import paths_of, snapshots_left
-from r3jax.apps.benchmark.engines.slurm import run_on_cluster
+from r3jax.apps.benchmark.engines.slurm import ended_jobs, read_queue, run_on_cluster
 from r3jax.apps.benchmark.plan import cells_left
 from r3jax.trace.reader import read_run
 from tests.apps.benchmark.test_engines import assert_same_records, ends
 from tests.apps.benchmark.tiny import make_cells
 from tests.slurm import cluster
+
+LISTING = """\
+7_0|COMPLETED|None
+7_1|RUNNING|None
+7_2|FAILED|NonZeroExitCode
+7_10|COMPLETING|None
+7_11|PENDING|BeginTime
+7_12|CANCELLED|None
+7_13|REQUEUE_HOLD|job requeued in held state
+8|OUT_OF_MEMORY|OutOfMemory
+"""
+
+
+def test_a_job_has_ended_when_the_queue_says_so_or_forgot_it():
+    assert read_queue(["7_0", "7_1", "7_10", "7_11", "7_13", "8", "9"], LISTING) == {
+        "7_0": "COMPLETED",
+        "8": "OUT_OF_MEMORY (OutOfMemory)",
+        "9": "no longer in the queue",
+    }
+    assert read_queue(["7_12", "7_2"], LISTING) == {
+        "7_12": "CANCELLED",
+        "7_2": "FAILED (NonZeroExitCode)",
+    }
+
+
+@pytest.fixture
+def answer(tmp_path, monkeypatch):
+    """`answer(script)` makes a shell script the queue."""
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+
+    def install(script):
+        (tmp_path / "squeue").write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / "squeue").chmod(0o755)
+
+    return install
+
+
+def test_all_tasks_of_an_array_are_asked_for_at_once(answer):
+    answer('for last; do :; done; echo "7_0|FAILED|$last"')
+    assert ended_jobs(["7_0", "8"])["7_0"] == "FAILED (--jobs=7,8)"
+
+
+def test_a_controller_that_does_not_answer_ends_no_job(answer):
+    answer("echo slurm_load_jobs error: Unable to contact slurm controller >&2; exit 1")
+    assert ended_jobs(["7_0"]) == {}
+    answer("echo slurm_load_jobs error: Invalid job id specified >&2; exit 1")
+    assert ended_jobs(["7_0"]) == {"7_0": "no longer in the queue"}
+
 
 ABSENT = ", ".join(cluster.missing())
 pytestmark = [

@@ -9,7 +9,11 @@ import numpy as np
 
 from r3jax.apps.benchmark.cells import Cell
 from r3jax.apps.benchmark.conditions import Conditions
-from r3jax.apps.benchmark.judging import JudgingViews, judging_path, save_judging_views
+from r3jax.apps.benchmark.reference_images import (
+    ReferenceImages,
+    reference_path,
+    save_reference_images,
+)
 from r3jax.apps.benchmark.run_cell import run_cell
 from r3jax.geometry.cameras import look_at
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
@@ -45,8 +49,8 @@ def make_cells(
     poses = np.stack([np.asarray(look_at(corner, center)) for corner in corners])
     frames = [simulator.render(pose.astype(np.float64)) for pose in poses]
     views = load_views(frames, conditions.train_resolution)
-    path = judging_path(root, digest, "four", conditions)
-    save_judging_views(path, JudgingViews("four", poses, views))
+    path = reference_path(root, digest, "four", conditions)
+    save_reference_images(path, ReferenceImages("four", poses, views))
     return tuple(
         Cell(room, digest, policy, seed, conditions, "four", len(poses), dict(settings))
         for policy in policies

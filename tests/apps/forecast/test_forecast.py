@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from r3jax.apps.forecast import forecast as real
-from r3jax.apps.forecast.calibration import default_calibration, read_calibration, write_calibration
-from r3jax.apps.forecast.forecast import forecast_map, view_features
-from r3jax.apps.forecast.free_views import free_space_views
+from r3jax.apps.forecast.forecast import forecast_map, free_space_views, view_features
+from r3jax.apps.forecast.psnr import default_calibration, read_calibration, write_calibration
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import pose_along
 from r3jax.mapping.state import empty_map

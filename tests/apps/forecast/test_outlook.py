@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.apps.forecast import outlook as real
-from r3jax.apps.forecast.forecast import forecast_map
+from r3jax.apps.forecast.forecast import forecast_map, stopping_rule
 from r3jax.apps.forecast.outlook import Outlook
-from r3jax.apps.forecast.stopping import stopping_rule
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.replay import states_of
@@ -158,7 +157,7 @@ def test_an_outlook_watches_a_replay(whole, reached):
     assert outlook.views == [3, 6, 9]
 
 
-def test_a_goal_that_nobody_judges_is_refused():
+def test_a_goal_that_nobody_checks_is_refused():
     config = dataclasses.replace(CONFIG, until="psnr:20")
     with pytest.raises(ValueError, match=r"config\.until is 'psnr:20', is_enough is not given"):
         explore(BoxRoom(), small_policy("random"), budget="views:1", config=config)

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.apps.forecast import psnr as real
-from r3jax.apps.forecast.calibration import default_calibration
-from r3jax.apps.forecast.psnr import PERCENTILES, Calibration, PsnrModel
+from r3jax.apps.forecast.psnr import PERCENTILES, Calibration, PsnrModel, default_calibration
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 CHAIN = ("r3jax.apps.forecast.psnr",)

@@ -82,7 +82,7 @@ def test_the_page_tells_the_runs_own_numbers(reported):
     assert f"<b>{last.coverage.mean_renderability:.2f}</b>" in text
     assert "budget: 4 views" in text
     assert "0123abcd" in text
-    assert "num_candidates 7" in text
+    assert "num candidates 7" in text
     assert "&lt;box&gt; &amp; room" in text  # a name from outside is text, never markup
     assert "<box>" not in text
 
@@ -225,13 +225,21 @@ def test_the_panorama_picture_shows_directions():
     colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], np.float32)
     state = paint(points, colors.repeat(len(grid), axis=0))
     pose = np.asarray(pose_along(jnp.zeros(3), jnp.array([0.0, 1.0, 0.0])))
-    picture = panorama_picture(state, Camera.from_fov(64, 64), pose, 5.0)
+    # Known to be free but for a slab overhead: 1 m up begins what was never seen.
+    space = empty_grid(np.array([[-6.0] * 3, [6.0] * 3]), 0.2)
+    heights = np.asarray(space.origin)[2] + 0.2 * np.arange(space.log_odds.shape[2])
+    odds = np.broadcast_to(np.where(heights < 1.0, -4.5, 0.0), space.log_odds.shape)
+    space = eqx.tree_at(lambda g: g.log_odds, space, jnp.asarray(odds, jnp.float32))
+    picture = panorama_picture(state, space, Camera.from_fov(64, 64), pose, 5.0)
     height, width = picture.value.shape
     column = {angle: int((180.0 - angle) / 360.0 * width) for angle in (0, 90, -90)}
     for angle, color in ((0, colors[0]), (90, colors[1]), (-90, colors[3])):
         np.testing.assert_allclose(picture.rgb[height // 2, column[angle]], color, atol=1e-6)
     np.testing.assert_allclose(picture.rgb[height // 2, 2], colors[2], atol=1e-6)
     assert np.isnan(picture.value[5, 5])  # nothing overhead
+    assert not picture.beyond[5, 5]  # nor is that known to be free
+    assert picture.beyond[height // 2, column[0] + 30]  # free space up to the range
+    assert not picture.beyond[height // 2, column[0]]  # a voxel
     assert 0.0 <= picture.value[height // 2, column[0]] <= 1.0
     assert picture.azimuth == pytest.approx(np.pi / 2)
     assert picture.elevation == pytest.approx(0.0)

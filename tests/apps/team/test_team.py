@@ -23,7 +23,7 @@ from r3jax.exploration.state import StopReason
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.state import empty_map
 from r3jax.planning.planner import add_frame, first_grid
-from r3jax.planning.policy import Decision, Outcome, PlanInfo
+from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 from r3jax.planning.reserved_views import after_promise, without_yielded
 from r3jax.scoring.batch import score_views
 from r3jax.scoring.config import ScoringConfig
@@ -252,7 +252,7 @@ class Turning:
         decision = Decision(
             poses[best], np.stack([here, here]), 0.0, float(total[best]), poses, {"total": total}
         )
-        return decision, state, PlanInfo(Outcome.MOVED, 8, 8)
+        return decision, state, PlanInfo(DecisionOutcome.MOVED, 8, 8)
 
     def follow(self, state, map_state, grid, T_world_camera, waypoints):
         return state

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r3jax.apps.runs.settings import settings_of_run
 from r3jax.apps.viewer.decisions import decide_again, offer_segments
-from r3jax.cli.setup import plan_of_run
 from r3jax.planning.registry import make_policy
 from r3jax.trace.errors import RunError
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.full
 
 @pytest.fixture(scope="module")
 def plan(run):
-    return plan_of_run(run)
+    return settings_of_run(run)
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,10 @@ from PIL import Image
 
 from r3jax.apps.viewer import film
 from r3jax.apps.viewer.blocks import QUANTITIES
-from r3jax.apps.viewer.colors import UNSEEN
-from r3jax.apps.viewer.film import HEIGHT, WIDTH, Film, export_film
-from r3jax.apps.viewer.poster import Sheet
-from r3jax.apps.viewer.timeline import Timeline
-from r3jax.apps.viewer.video import ENCODERS, write_video
+from r3jax.apps.viewer.color_maps import UNSEEN
+from r3jax.apps.viewer.film import ENCODERS, HEIGHT, WIDTH, Film, export_film, write_video
+from r3jax.apps.viewer.stills import Sheet
+from r3jax.apps.viewer.story import Timeline
 from r3jax.formats.errors import FormatError
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import read_run
@@ -101,7 +100,7 @@ def test_a_broken_frame_leaves_nothing_behind(run, tmp_path):
 
 
 def test_cameras_under_the_ceiling_do_not_lift_the_cut_above_it(run):
-    from r3jax.apps.viewer.known import cut_height
+    from r3jax.apps.viewer.blocks import cut_height
 
     ceiling = np.array([[0.0, 0.0, z] for z in np.linspace(0.0, 1.0, 50)])
     assert cut_height(run.rows, ceiling) < 1.0

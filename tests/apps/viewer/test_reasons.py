@@ -8,8 +8,8 @@ import pytest
 
 from r3jax.apps.report.reasons import COLORS
 from r3jax.apps.viewer.blocks import Blocks, block_causes, cause_colors
-from r3jax.apps.viewer.colors import UNSEEN
-from r3jax.apps.viewer.panel import reason_html
+from r3jax.apps.viewer.color_maps import UNSEEN
+from r3jax.apps.viewer.page.panel import reason_html
 from r3jax.apps.viewer.story import RecordedStory
 from r3jax.exploration.explain_run import Reason, explain_run
 from r3jax.scoring.explain import CAUSES

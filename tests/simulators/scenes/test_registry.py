@@ -6,8 +6,8 @@ import trimesh
 
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.base import Simulator
+from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.free_space import GroundTruth
-from r3jax.simulators.noise import NoisySimulator
 from r3jax.simulators.scenes import registry
 
 CAMERA = Camera.from_fov(64, 64, 60.0)

@@ -8,13 +8,13 @@ import pytest
 import trimesh
 
 from r3jax.geometry.cameras import Camera
-from r3jax.simulators import habitat
+from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.free_space import GroundTruth
+from r3jax.simulators.habitat import habitat
 from r3jax.simulators.meshes import load_world
-from r3jax.simulators.noise import NoisySimulator
-from r3jax.simulators.raycast import RaycastSimulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes import registry, replica
-from tests.simulators.fake_habitat import FakeHabitat
+from tests.simulators.habitat.fake_habitat import FakeHabitat
 
 CAMERA = Camera.from_fov(32, 24, 60.0)
 

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.geometry.cameras import Camera
-from r3jax.splatting import reference
-from r3jax.splatting.backends import numba
+from r3jax.splatting.backends import numba, reference
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 from tests.splatting.clouds import random_cloud, safe_pixels, view

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.cameras import invert_pose
-from r3jax.splatting import reference
+from r3jax.splatting.backends import reference
 from r3jax.splatting.backends.numba import records
 from r3jax.splatting.config import ALPHA_MIN, TILE, RasterConfig
 from r3jax.splatting.projection import project_gaussians
@@ -26,7 +26,7 @@ PACKAGE = "r3jax.splatting.backends.numba"
 CHAIN = tuple(
     f"{PACKAGE}.{name}"
     for name in (
-        "harmonics", "spans", "project", "bins", "forward", "backward", "gradient", "passes",
+        "harmonics", "project", "bins", "compositing", "gradient", "passes",
     )
 )  # fmt: skip
 COUNT, SIZE, BUDGET = 70, (40, 24), 1024
@@ -227,9 +227,9 @@ def lists_are_tight(modules: Modules) -> None:
 MUTANTS = [
     Mutant("harmonics", "_T * x * y * z", "_T * x * y", images_agree),
     Mutant("harmonics", "- _8 * _U * yz * g[11]", "+ _8 * _U * yz * g[11]", gradients_agree),
-    Mutant("spans", "+ slope * slope / inverse", "", lists_are_tight),
-    Mutant("spans", "np.float32(TILE - 1)", "np.float32(TILE - 4)", images_agree),
-    Mutant("spans", "x = min(max(at_top, low), high)", "x = at_top", lists_are_tight),
+    Mutant("bins", "+ slope * slope / inverse", "", lists_are_tight),
+    Mutant("bins", "np.float32(TILE - 1)", "np.float32(TILE - 4)", images_agree),
+    Mutant("bins", "x = min(max(at_top, low), high)", "x = at_top", lists_are_tight),
     Mutant("project", "axes[2] * axes[2] + DILATION", "axes[2] * axes[2]", images_agree),
     Mutant("project", "min(max(ratio, low), high)", "ratio", images_agree),
     Mutant(
@@ -243,30 +243,32 @@ MUTANTS = [
         "bottom = TILE - 1",
         lists_are_tight,
     ),
-    Mutant("forward", "keep_ge(alpha, alpha, ALPHA_MIN)", "alpha", images_agree),
-    Mutant("forward", "smaller(alpha, splat(ALPHA_MAX))", "alpha", images_agree),
+    Mutant("compositing", "keep_ge(alpha, alpha, ALPHA_MIN)", "alpha", images_agree),
+    Mutant("compositing", "smaller(alpha, splat(ALPHA_MAX))", "alpha", images_agree),
     Mutant(
-        "forward",
-        "weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)",
-        "weight = before * alpha",
+        "compositing",
+        "weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)\n    store",
+        "weight = before * alpha\n    store",
         images_agree,
     ),
-    Mutant("forward", "            return place", "            return first", gradients_agree),
-    Mutant("forward", "most = larger(most, load(state, k))", "most = load(state, k)", images_agree),
+    Mutant("compositing", "            return place", "            return first", gradients_agree),
     Mutant(
-        "backward",
+        "compositing", "most = larger(most, load(state, k))", "most = load(state, k)", images_agree
+    ),
+    Mutant(
+        "compositing",
         "rest = load(state, PIXELS + k) - passed",
         "rest = load(state, PIXELS + k)",
         gradients_agree,
     ),
     Mutant(
-        "backward",
+        "compositing",
         "keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)",
         "keep_gt(v, weight, _ZERO)",
         gradients_agree,
     ),
     Mutant(
-        "backward",
+        "compositing",
         "store12(slots, list_slots[place] * at.GRADIENT_SIZE, splat(_ZERO))",
         "pass",
         gradients_agree,

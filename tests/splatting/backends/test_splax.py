@@ -1,6 +1,6 @@
-"""The adapter to splax: what it asks of the package, told by a stand-in where it is absent.
+"""The adapter to splax: what it asks of the package, told by a fake where it is absent.
 
-The stand-in follows the documented conventions of `splax.project` and `splax.rasterize_depth`
+The fake follows the documented conventions of `splax.project` and `splax.rasterize_depth`
 (world-to-camera matrix, linear scales, wxyz, opacities in [0, 1], intrinsics as plain numbers,
 depth divided by alpha). So the readable rasterizer must come out, with all its gradients. With
 the package and a GPU, `test_golden.py` runs the real one.
@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.cameras import invert_pose
-from r3jax.splatting import reference
 from r3jax.splatting.backend import find_backend
-from r3jax.splatting.backends import splax
+from r3jax.splatting.backends import reference, splax
 from r3jax.splatting.config import DILATION, NEAR, RasterConfig
 from r3jax.splatting.projection import ProjectedGaussians, rotation_rows
 from r3jax.splatting.scene import GaussianScene

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.geometry.cameras import Camera, look_at
-from r3jax.splatting import reference
-from r3jax.splatting.backends import xla
+from r3jax.splatting.backends import reference, xla
 from r3jax.splatting.config import RasterConfig, fitting_budget
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.splatting.clouds import random_cloud, safe_pixels, view

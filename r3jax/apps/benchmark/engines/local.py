@@ -2,6 +2,7 @@
 
 A process that crashes, or is killed for its memory, costs its cell and nothing else. Light on
 purpose: a worker imports this module before its environment is set, and nothing here may wake JAX.
+What any engine tells while cells run (`Event`) stands here too.
 """
 
 import multiprocessing
@@ -13,14 +14,35 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from r3jax.apps.benchmark.cells import Cell
 
 if TYPE_CHECKING:
     from r3jax.apps.benchmark.cells import Cell
-    from r3jax.apps.benchmark.engines.events import Report
+
+
+Kind = Literal["started", "stage", "done", "failed"]
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something happened to a cell. Each cell ends with one `done` or one `failed`."""
+
+    cell: Cell
+    kind: Kind
+
+    text: str = ""
+    """The stage, or why it failed."""
+
+
+Report = Callable[[Event], None]
+"""Called in the process that started the engine."""
+
 
 _STAGE_EVERY = 0.5
 """Stages are told at most this often [s]."""
@@ -28,7 +50,7 @@ _STAGE_EVERY = 0.5
 
 def run_here(cells: Sequence["Cell"], root: Path, report: "Report") -> None:
     """Runs cells one after the other in this process."""
-    from r3jax.apps.benchmark.engines.events import Event
+    from r3jax.apps.benchmark.engines.local import Event
     from r3jax.apps.benchmark.run_cell import run_cell
 
     for cell in cells:
@@ -56,7 +78,7 @@ def run_in_processes(
         ValueError: jobs below 1.
         KeyboardInterrupt: Ctrl-C; the processes are ended, what is complete stays.
     """
-    from r3jax.apps.benchmark.engines.events import Event
+    from r3jax.apps.benchmark.engines.local import Event
 
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs}")
@@ -104,7 +126,7 @@ class _Worker:
 
     def receive(self) -> Any:
         """The next event of its cell; a process that died makes it a failure."""
-        from r3jax.apps.benchmark.engines.events import Event
+        from r3jax.apps.benchmark.engines.local import Event
 
         assert self.pipe is not None
         assert self.cell is not None

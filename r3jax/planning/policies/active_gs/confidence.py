@@ -54,6 +54,7 @@ class Sightings(eqx.Module):
     @property
     def confidence(self) -> Float[Array, " N"]:
         """C of every row, in [0, 1]; 0 where nothing was seen."""
+        # Opposite directions cancel: seen from all around, a voxel counts up to e times as much.
         spread = safe_norm(self.direction_sum, axis=0) / jnp.maximum(self.views, 1.0)
         return jnp.clip(jnp.exp(1.0 - spread) * self.cosine_sum, 0.0, 1.0)
 
@@ -74,6 +75,7 @@ def aligned(seen: Sightings, state: MapState) -> Sightings:
 
     A map never moves its rows but to grow. Voxels that the map does not have are forgotten.
     """
+    # Sizes first: keys of tables of different sizes cannot be compared row by row.
     if seen.views.shape[0] == state.capacity and bool(_is_aligned(seen.key, state.key)):
         return seen
     return _realigned(seen, state)
@@ -81,6 +83,7 @@ def aligned(seen: Sightings, state: MapState) -> Sightings:
 
 @jax.jit
 def _is_aligned(key: Array, map_key: Array) -> Bool[Array, ""]:
+    # The map may have gained rows since: only those that were written here must agree.
     is_used = key[1] != jnp.uint32(EMPTY_WORD)
     return jnp.all(~is_used | jnp.all(key == map_key, axis=0))
 
@@ -117,15 +120,18 @@ def _see(seen: Sightings, state: MapState, frame: Frame, max_range: Float[Array,
     seen = eqx.tree_at(lambda s: s.key, seen, state.key)
     depth = frame.depth
     valid = (depth > 0.0) & (depth <= max_range)
+    # Any finite depth where there is none: the mask drops these points, NaN would spread.
     points = points_of_pixels(frame, jnp.where(valid, depth, 1.0))
     normals = pixel_normals(frame.camera, depth, valid, state.voxel_size)
+    # Normals stand in for colors: groups add up any three numbers per point.
     groups = group_by_voxel(points, normals.T, valid.reshape(-1), state.voxel_size)
     num = groups.is_leader.shape[0]
     size = min(num, CHUNK)
+    # Room for whole chunks: XLA would shift a slice past the end back over the one before.
     leaders = positions_of_set(groups.is_leader, -(-num // size) * size)
     num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
 
-    # Chunks are counted one by one, as in `scoring.chunks`: XLA miscounts other steps.
+    # Chunks are counted one by one, as in `visibility.selection`: XLA miscounts other steps.
     def see_chunk(chunk: Int[Array, ""], seen: Sightings) -> Sightings:
         index = jax.lax.dynamic_slice_in_dim(leaders, chunk * size, size)
         return _sight(seen, state, groups, index, frame, max_range)
@@ -143,6 +149,7 @@ def _sight(
 ) -> Sightings:
     """One frame's sighting of the voxels that some points stand for."""
     num = groups.is_leader.shape[0]
+    # Padding lies past the end: clipped to be read here, and then found in no row.
     index = jnp.minimum(leader, num - 1)
     key = groups.key[:, index]
     row = find(state.key, key, leader < num)
@@ -153,12 +160,16 @@ def _sight(
 
     center = voxel_center(jnp.stack(unpack(key[0], key[1])), state.voxel_size)
     offset = frame.position[:, None] - center
+    # A camera at the very center of a voxel must not divide by zero.
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     direction = offset / distance[None, :]
     R = frame.T_world_camera[:3, :3]
+    # All bits of float32: accelerators multiply matrices with fewer unless they are told.
     turned = jnp.matmul(R, groups.rgb_sum[index, :3].T, precision="highest")
     normal_sum = at(seen.normal_sum) + _unit(turned)
+    # With this frame counted in: n is the normal as known after frame t.
     cosine = jnp.maximum(0.0, jnp.sum(_unit(normal_sum) * direction, axis=0))
+    # Rays within range by depth may be longer than it off the axis: no negative weights.
     weight = jnp.maximum(0.0, 1.0 - distance / max_range)
     return Sightings(
         key=seen.key,

@@ -37,6 +37,7 @@ def glance(
         frame: the frame.
         max_range: d_max, the sensor's range [m].
     """
+    # Whole numbers are exact in float32: an equal count means that no pixel fell in.
     is_new = rows_in_view(state, frame, max_range) & (touched.views == before.views)
     center = voxel_center(jnp.stack(unpack(state.key[0], state.key[1])), state.voxel_size)
     offset = frame.position[:, None] - center

@@ -37,11 +37,14 @@ def pixel_normals(
         step: a step of depth up to this is no edge [m].
     """
     height, width = depth.shape
+    # Holes get a finite depth: NaN or infinity would survive the products below.
     depth = jnp.where(valid, depth, 1.0)
     inverse = jnp.where(valid, 1.0 / depth, 0.0)
+    # In inverse depth a step of fixed size shrinks with the square of the distance.
     limit = _NOISE * inverse + step * inverse * inverse
     along_u = camera.fx * _slope(inverse, limit, width, axis=1)
     along_v = camera.fy * _slope(inverse, limit, width, axis=0)
+    # Rays run through the middles of pixels, which lie at halves.
     u = (jnp.arange(width, dtype=jnp.float32) + 0.5 - camera.cx) / camera.fx
     v = (jnp.arange(height, dtype=jnp.float32) + 0.5 - camera.cy) / camera.fy
     along_axis = inverse - along_u * u[None, :] - along_v * v[:, None]
@@ -58,8 +61,10 @@ def _slope(
         before, after = _shifted(inverse, -reach, axis), _shifted(inverse, reach, axis)
         is_straight = jnp.abs(before + after - 2.0 * inverse) <= limit
         is_pair = (before > 0.0) & (after > 0.0) & is_straight
+        # Least squares: the same noise over a wider pair says more about the slope.
         weight = jnp.where(is_pair, float(reach), 0.0)
         rise, run = rise + weight * (after - before), run + 2.0 * reach * weight
+        # Powers of two: a few pairs tell nearly as much as all of them.
         reach *= 2
     return rise / jnp.where(run > 0.0, run, 1.0)
 

@@ -20,7 +20,12 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.candidates import local_random, poses_along, random_directions
+from r3jax.planning.candidates import (
+    Candidates,
+    candidates_along,
+    local_random,
+    random_directions,
+)
 from r3jax.planning.decision import PlannerState
 from r3jax.planning.greedy import (
     Drawn,
@@ -35,7 +40,7 @@ from r3jax.planning.policies.active_gs.regions import aimed_views, low_confidenc
 from r3jax.scoring.pixels import PixelView, Value
 
 EXPLORATION_WEIGHT = 1000.0
-"""Of the share of all cells that are unexplored and in view."""
+"""Weight of the share of all cells that are unexplored and in view."""
 
 _REACH = 3.0
 """Voxels are drawn up to so many times the sensor's range: a known wall that is too far away for
@@ -55,6 +60,7 @@ def rendering_without_depth(view: PixelView) -> tuple[Float[Array, ""], Float[Ar
 
 def _doubt(view: PixelView) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """1 - C and the depth [m] of every pixel; `view.rows` is the confidence C."""
+    # Known, but too far to be measured: a look from here would not add to its confidence.
     is_far = view.hit & (view.depth > view.max_range)
     doubt = jnp.where(view.hit, jnp.where(is_far, 0.0, 1.0 - view.rows), 1.0)
     return doubt, jnp.where(view.hit, view.depth, 0.5 * view.max_range)
@@ -78,6 +84,7 @@ class ActiveGS(GreedyPolicy):
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
         """Directions, distances and normals of the frame's voxels."""
         reach = self.config.scoring.max_range
+        # The table may have grown with this frame, which moves its rows.
         before = aligned(state.memory, map_state)
         touched = see(before, map_state, frame, reach)
         return replace(state, memory=glance(before, touched, map_state, frame, reach))
@@ -96,33 +103,31 @@ class ActiveGS(GreedyPolicy):
             travel, config.num_candidates - len(places), config.radius, key=local_key
         )
         positions = np.concatenate([places, local])
-        if len(positions) == 0:
-            return Drawn(np.zeros((0, 4, 4)), seen)
         directions = random_directions(len(local), key=direction_key)
-        directions = np.concatenate([aims - places, directions])
-        # Nothing local: repeats keep the shape.
-        repeats = np.arange(config.num_candidates) % len(positions)
-        return Drawn(poses_along(positions[repeats], directions[repeats]), seen)
+        drawn = candidates_along(positions, np.concatenate([aims - places, directions]))
+        return Drawn(drawn.padded(config.num_candidates) if len(positions) else drawn, seen)
 
     def score(
-        self, situation: Situation, poses: np.ndarray, *, key: Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """U of every pose, its two parts, and lots in case that every U is zero."""
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+        """U of every view, its two parts, and lots in case that every U is zero."""
         scoring, confidence = self.config.scoring, situation.memory.confidence
         reach = _REACH * float(scoring.max_range)
         cells, rendering = score_by_pixels(
-            situation, self.rendering, poses, scoring, confidence, reach
+            situation, self.rendering, candidates, scoring, confidence, reach
         )
+        # Of all cells of the box, not of those left: the weight means the same throughout a run.
         exploration = cells / situation.grid.log_odds.size
-        return poses, {
+        return candidates, {
             "exploration": exploration,
             "rendering": rendering,
             "utility": EXPLORATION_WEIGHT * exploration + rendering,
-        } | draw_lots(len(poses), key=key)
+        } | draw_lots(len(candidates.valid), key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """The share of the utility less that of the path; the lots where nothing is of use."""
         is_reachable = np.isfinite(utilities["path"])
+        # All zero: the path alone would keep the robot where it is for ever.
         if not np.any(utilities["utility"][is_reachable]):
             return np.where(is_reachable, utilities["lot"], -np.inf)
         return super().weigh(utilities)

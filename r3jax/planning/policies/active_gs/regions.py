@@ -14,7 +14,7 @@ from r3jax.mapping.occupancy import OccupancyGrid, world_to_cell
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import VIEW_DISTANCE, host_generator
 from r3jax.planning.policies.active_gs.confidence import Sightings
-from r3jax.planning.travel import Travel
+from r3jax.planning.robot.travel import Travel
 
 LOW_CONFIDENCE = 0.3
 """Voxels with less than this are worth another look."""
@@ -64,8 +64,10 @@ def low_confidence(
     is_low = state.occupied & (seen.confidence < LOW_CONFIDENCE)
     flat = jnp.zeros(state.capacity, dtype=jnp.int32)
     for axis, n in enumerate(shape):
+        # The map has no bounds, the grid has: voxels outside lie in no cell.
         is_low &= (cell[:, axis] >= 0) & (cell[:, axis] < n)
         flat = flat * n + cell[:, axis]
+    # One past the end is dropped by the scatter; -1 would wrap round.
     flat = jnp.where(is_low, flat, grid.log_odds.size)
     count = jnp.zeros(grid.log_odds.size, dtype=jnp.int32).at[flat].add(1, mode="drop")
     total = jnp.zeros((3, grid.log_odds.size)).at[:, flat].add(seen.normal, mode="drop")
@@ -86,6 +88,7 @@ def regions_of(
         count: voxels of low confidence per cell, [X, Y, Z].
         normal_sum: sum of their normals, [3, X, Y, Z].
     """
+    # Beyond the box nothing is known to be free: a border of zeros says so.
     padded = np.pad(free, 1)
     to_free = np.zeros((*free.shape, 3))
     has_free = np.zeros(free.shape, dtype=bool)
@@ -97,6 +100,7 @@ def regions_of(
     at = tuple(cells.T)
     is_frontier = unexplored[at][:, None]
     normals = np.where(is_frontier, to_free[at], normal_sum[(slice(None), *at)].T)
+    # Directions to free cells on opposite sides cancel: then no side is better.
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return Regions(cells, np.where(length > 1e-6, normals / np.maximum(length, 1e-6), 0.0))
 
@@ -120,6 +124,7 @@ def aimed_views(
         regions' distance from the robot.
     """
     rng = host_generator(key)
+    # Nearest regions first: they are filled before the number of candidates is used up.
     distance = np.linalg.norm(travel.centers(regions.cells) - travel.start, axis=1)
     order = np.argsort(distance, kind="stable")[:_MOST]
     found: list[tuple[np.ndarray, np.ndarray]] = []
@@ -127,6 +132,7 @@ def aimed_views(
         batch = order[begin : begin + _BATCH]
         cells = regions.cells[batch]
         places, is_good = _draw(travel, cells, regions.normals[batch], rng)
+        # The cheap tests come first; lines are walked only for what passed them.
         is_good[is_good] = _is_clear(travel, places[is_good], cells[np.nonzero(is_good)[0]])
         for cell, row, good in zip(cells, places, is_good, strict=True):
             wanted = min(PER_REGION, num - len(found))
@@ -145,6 +151,7 @@ def _draw(
     closest, farthest = VIEW_DISTANCE
     aims = travel.centers(cells)[:, None, :]
     directions = _draw_directions(normals, rng)
+    # Cube roots of uniform numbers are uniform in volume, not crowded at the center.
     cubed = rng.uniform(closest**3, farthest**3, size=(len(cells), _DRAWS, 1))
     index = (aims + np.cbrt(cubed) * directions - travel.origin) / travel.cell_size
     stop = np.floor(index).astype(np.int64)
@@ -152,8 +159,10 @@ def _draw(
     places = travel.origin + np.clip(index, middle - _INSET, middle + _INSET) * travel.cell_size
     size = np.array(travel.goals.shape)
     is_inside = np.all((stop >= 0) & (stop < size), axis=2)
+    # Clipped for the lookup alone: `is_inside` has already refused what lies outside.
     stop = np.clip(stop, 0, size - 1)
     is_good = is_inside & travel.goals[tuple(np.moveaxis(stop, 2, 0))]
+    # Measured again: keeping off the faces of cells has moved the places.
     offset = places - aims
     distance = np.linalg.norm(offset, axis=2)
     is_good &= (distance >= closest) & (distance <= farthest)
@@ -169,6 +178,7 @@ def _draw_directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarra
         return x / np.maximum(np.linalg.norm(x, axis=2, keepdims=True), 1e-12)
 
     anywhere = rng.normal(size=(len(normals), _DRAWS, 3))
+    # Uniform in the cosine is uniform over the cap; in the angle it would crowd at the normal.
     cosine = rng.uniform(MIN_COSINE, 1.0, size=(len(normals), _DRAWS, 1))
     axis = normals[:, None, :]
     across = unit(anywhere - np.sum(anywhere * axis, axis=2, keepdims=True) * axis)
@@ -182,6 +192,7 @@ def _is_clear(travel: Travel, places: np.ndarray, cells: np.ndarray) -> np.ndarr
     Every quarter of a cell is looked at: what a line only grazes does not hide its end.
     """
     start = (places - travel.origin) / travel.cell_size
+    # As many steps for every line as for the longest: one array, no loop over lines.
     steps = int(np.ceil(4.0 * VIEW_DISTANCE[1] / travel.cell_size))
     t = np.linspace(0.0, 1.0, steps + 1)[:, None]
     line = start[:, None, :] + t * (cells[:, None, :] + 0.5 - start[:, None, :])

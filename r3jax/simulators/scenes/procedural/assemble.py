@@ -11,8 +11,8 @@ import math
 import numpy as np
 from scipy import ndimage
 
+from r3jax.simulators.scenes.procedural.materials.random_fields import Real
 from r3jax.simulators.scenes.procedural.model import Finish, Model
-from r3jax.simulators.scenes.procedural.noise import Real
 from r3jax.simulators.world import Lamp, Material, World
 
 _VOXEL = 0.1  # [m]

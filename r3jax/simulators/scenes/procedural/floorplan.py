@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.simulators.scenes.procedural import finishes as f
+from r3jax.simulators.scenes.procedural.materials import finishes as f
+from r3jax.simulators.scenes.procedural.materials.random_fields import Real
 from r3jax.simulators.scenes.procedural.model import Finish, Model
-from r3jax.simulators.scenes.procedural.noise import Real
 from r3jax.simulators.scenes.procedural.shapes import Shape, box, combine, grid, quad
 
 OUTER_WALL = 0.25
@@ -62,7 +62,7 @@ class Opening:
 
 
 @dataclass
-class Plan:
+class FloorPlan:
     """A floor plan under construction."""
 
     rooms: dict[str, Room] = field(default_factory=dict[str, Room])

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from r3jax.simulators.scenes.procedural.noise import Real
+from r3jax.simulators.scenes.procedural.materials.random_fields import Real
+from r3jax.simulators.scenes.procedural.materials.textures import Color
 from r3jax.simulators.scenes.procedural.shapes import Shape, rotation
-from r3jax.simulators.scenes.procedural.textures import Color
 from r3jax.simulators.world import Lamp, Material
 
 HEADINGS = {"n": 0.0, "w": 90.0, "s": 180.0, "e": 270.0}

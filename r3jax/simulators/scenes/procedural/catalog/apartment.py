@@ -1,19 +1,19 @@
 """The apartment: two bedrooms, a living room, a kitchen and a bathroom along a hall."""
 
-from r3jax.simulators.scenes.procedural import decor, kitchen, objects, seating, storage
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.catalog.palettes import BERBER, NORDIC, PERSIAN
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import decor, kitchen, objects, seating, storage
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.world import World
 
 SUMMARY = "two-bedroom apartment with living room, kitchen, bathroom and hall, 90 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn, white = Plan(), f.enamel(f.WHITE, 3, 0.2)
+    drawn, white = FloorPlan(), f.enamel(f.WHITE, 3, 0.2)
     parquet, boards = f.parquet_floor(f.OAK, 14), f.plank_floor(f.WALNUT, 15, 0.25)
     ceiling = f.plaster((0.93, 0.92, 0.9), 50, 0.7)
     lilac = ((0.72, 0.68, 0.74), (0.56, 0.5, 0.62))

@@ -1,19 +1,19 @@
 """The classroom: rows of desks before a blackboard, a cloakroom and a science store."""
 
-from r3jax.simulators.scenes.procedural import decor, kitchen, objects, storage, workplace
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import decor, kitchen, objects, storage, workplace
+from r3jax.simulators.scenes.procedural.furniture.seating import bench
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
-from r3jax.simulators.scenes.procedural.seating import bench
 from r3jax.simulators.world import World
 
 SUMMARY = "classroom with a blackboard, a cloakroom and a store, 80 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn, ceiling = Plan(), f.acoustic_ceiling(5)
+    drawn, ceiling = FloorPlan(), f.acoustic_ceiling(5)
     gray = f.enamel((0.5, 0.52, 0.5), 3, 0.2)
     speckled = f.terrazzo(
         (0.6, 0.64, 0.62), ((0.4, 0.45, 0.45), (0.75, 0.78, 0.74), (0.3, 0.36, 0.4)), 101

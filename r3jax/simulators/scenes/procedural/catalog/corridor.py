@@ -1,19 +1,19 @@
 """The corridor: a long passage with three offices, an archive and a lounge along it."""
 
-from r3jax.simulators.scenes.procedural import decor, objects, seating, storage, workplace
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.catalog.palettes import BERBER, NORDIC, PERSIAN
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.world import World
 
 SUMMARY = "corridor with three offices, an archive and a lounge, 118 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn, ceiling = Plan(), f.acoustic_ceiling(4)
+    drawn, ceiling = FloorPlan(), f.acoustic_ceiling(4)
     white, gray = f.enamel(f.WHITE, 3, 0.2), f.carpet((0.45, 0.4, 0.37), (0.62, 0.56, 0.5), 10)
     green = f.enamel((0.42, 0.5, 0.42), 6, 0.25)
     drawn.room(

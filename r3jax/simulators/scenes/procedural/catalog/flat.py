@@ -1,19 +1,19 @@
 """The flat: one room with bed, sofa and kitchenette, a hall and a bathroom. The demo's scene."""
 
-from r3jax.simulators.scenes.procedural import decor, kitchen, objects, seating, storage
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.catalog.palettes import LEAFY, PERSIAN
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import decor, kitchen, objects, seating, storage
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.world import World
 
 SUMMARY = "one-room flat with kitchenette, hall and bathroom, 34 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn, white, oak = Plan(), f.enamel(f.WHITE, 3, 0.2), f.plank_floor(f.OAK, 4)
+    drawn, white, oak = FloorPlan(), f.enamel(f.WHITE, 3, 0.2), f.plank_floor(f.OAK, 4)
     ceiling = f.plaster((0.93, 0.92, 0.9), 50, 0.7)
     drawn.room(
         "living",

@@ -1,19 +1,19 @@
 """The gallery: three halls with pictures, sculptures, benches and a large mirror."""
 
-from r3jax.simulators.scenes.procedural import decor, objects, seating, storage, workplace
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.catalog.palettes import CHIPS, PERSIAN
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.world import World
 
 SUMMARY = "gallery of three halls with pictures, sculptures and a wall mirror, 88 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn = Plan()
+    drawn = FloorPlan()
     gilt, damask = f.enamel((0.62, 0.5, 0.28), 3, 0.5), ((0.5, 0.19, 0.18), (0.56, 0.25, 0.2))
     drawn.room(
         "red",

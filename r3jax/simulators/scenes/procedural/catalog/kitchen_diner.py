@@ -1,19 +1,19 @@
 """The kitchen-diner: a family kitchen with an island, a dining corner and a pantry."""
 
-from r3jax.simulators.scenes.procedural import decor, kitchen, objects, seating, storage
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.catalog.palettes import CHIPS, NORDIC
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import decor, kitchen, objects, seating, storage
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.world import World
 
 SUMMARY = "kitchen-diner with an island, marble worktops and a pantry, 32 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn, ceiling = Plan(), f.plaster((0.93, 0.92, 0.9), 50, 0.7)
+    drawn, ceiling = FloorPlan(), f.plaster((0.93, 0.92, 0.9), 50, 0.7)
     lines = ((0.8, 0.78, 0.72), (0.5, 0.6, 0.5))
     drawn.room(
         "kitchen",

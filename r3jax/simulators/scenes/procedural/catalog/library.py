@@ -1,19 +1,19 @@
 """The library: a reading hall with shelves, a study and a foyer."""
 
-from r3jax.simulators.scenes.procedural import decor, objects, seating, storage, workplace
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.catalog.palettes import NORDIC, PERSIAN
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.world import World
 
 SUMMARY = "library with a reading hall, a study and a foyer, 98 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn, dark = Plan(), f.enamel((0.3, 0.21, 0.15), 3, 0.3)
+    drawn, dark = FloorPlan(), f.enamel((0.3, 0.21, 0.15), 3, 0.3)
     ceiling = f.plaster((0.92, 0.9, 0.85), 111)
     drawn.room(
         "hall",

@@ -2,11 +2,18 @@
 
 import numpy as np
 
-from r3jax.simulators.scenes.procedural import decor, kitchen, objects, seating, storage, workplace
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.catalog.palettes import BERBER, PERSIAN
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import (
+    decor,
+    kitchen,
+    objects,
+    seating,
+    storage,
+    workplace,
+)
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.scenes.procedural.shapes import box, cylinder, tube
 from r3jax.simulators.world import World
@@ -14,9 +21,9 @@ from r3jax.simulators.world import World
 SUMMARY = "brick loft with columns and beams, bathroom and dressing room, 72 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn, brick = Plan(), f.brick(7)
+    drawn, brick = FloorPlan(), f.brick(7)
     floor = f.concrete((0.62, 0.6, 0.57), 31)
     drawn.room(
         "loft",

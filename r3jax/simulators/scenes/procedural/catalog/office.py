@@ -1,19 +1,26 @@
 """The office: desk islands, a meeting room behind glass, a break room and a copy room."""
 
-from r3jax.simulators.scenes.procedural import decor, kitchen, objects, seating, storage, workplace
-from r3jax.simulators.scenes.procedural import finishes as f
 from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.catalog.palettes import NORDIC
-from r3jax.simulators.scenes.procedural.floorplan import Plan
+from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
+from r3jax.simulators.scenes.procedural.furniture import (
+    decor,
+    kitchen,
+    objects,
+    seating,
+    storage,
+    workplace,
+)
+from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.world import World
 
 SUMMARY = "open-plan office with glass partitions, meeting room, break room and copy room, 88 m2"
 
 
-def plan() -> Plan:
+def plan() -> FloorPlan:
     """Rooms, doorways and windows."""
-    drawn, ceiling = Plan(), f.acoustic_ceiling(3)
+    drawn, ceiling = FloorPlan(), f.acoustic_ceiling(3)
     gray = f.carpet((0.4, 0.43, 0.47), (0.58, 0.6, 0.6), 5)
     skirting = f.enamel(f.CHARCOAL, 2, 0.2)
     drawn.room(

@@ -1,0 +1,1 @@
+"""What the pages of experiments are made of: records of origin, tables, figures."""

@@ -1,0 +1,115 @@
+"""One look per policy in every figure: color, marker and line. Ours are warm and thick.
+
+The colors are those of Okabe and Ito ("Color universal design", 2008), which people with any kind
+of color vision tell apart; the floor (frontier, uniform, random) is ink, brown and light gray.
+Markers and dashes say the same again, for print.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from r3jax.apps.report import style
+
+OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Colors of groups that are no policies."""
+
+
+@dataclass(frozen=True)
+class PolicyStyle:
+    """How one method is drawn."""
+
+    color: str
+    marker: str
+    dashes: Any
+    """Style of the line, as matplotlib takes it."""
+
+    width: float
+    """Line width [pt]."""
+
+    order: float
+    """Height in the stack of artists: ours are drawn on top."""
+
+    def line(self) -> dict[str, Any]:
+        """Arguments of `Axes.plot`."""
+        return {
+            "color": self.color, "marker": self.marker, "linestyle": self.dashes,
+            "linewidth": self.width, "markersize": 4.5, "zorder": self.order,
+        }  # fmt: skip
+
+
+_POLICIES = {
+    "ours-pano": ("#D55E00", "o", "-"),
+    "ours": ("#E69F00", "s", "-"),
+    "ours-ahead": ("#8f2d00", ">", "-"),
+    "active-gs": ("#0072B2", "^", "-"),
+    "active-gs-no-depth": ("#0072B2", "<", "--"),
+    "active-gamer": ("#56B4E9", "v", "-"),
+    "cover": ("#CC79A7", "D", "-"),
+    "unseen": ("#009E73", "P", "--"),
+    "unseen-depth": ("#009E73", "p", "-"),
+    "frontier": (style.INK, "X", "-"),
+    "uniform": ("#7a4a1e", "d", "-"),
+    "random": ("#c3c9d1", "h", "-"),
+}
+"""Color, marker and dashes; the variants of one idea share a color."""
+
+_UNKNOWN = ("#8b5cf6", "*", "-")
+_DASHES = (":", "-.", (0, (5, 1, 1, 1, 1, 1)))
+
+
+def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
+    """The look of each method, as `equal_terms.method_name` writes it.
+
+    The first settings of a policy look the same in every figure; others have other dashes.
+    """
+    seen: dict[str, int] = {}
+    styles: dict[str, PolicyStyle] = {}
+    for method in methods:
+        policy = method.partition(" (")[0]
+        color, marker, dashes = _POLICIES.get(policy, _UNKNOWN)
+        variant = seen[policy] = seen.get(policy, -1) + 1
+        if variant:
+            dashes = _DASHES[(variant - 1) % len(_DASHES)]
+        width, order = (2.6, 4.0) if policy.startswith("ours") else (1.5, 3.0)
+        styles[method] = PolicyStyle(color, marker, dashes, width, order)
+    return styles
+
+
+def legend_below(figure: Figure, labels: Sequence[str]) -> None:
+    """One legend for all panels, below them; the figure grows by its height.
+
+    Args:
+        figure: whose axes have artists with these labels.
+        labels: in the order of the legend; those that no panel has are left out.
+    """
+    found: dict[str, Any] = {}
+    for axes in figure.axes:
+        found = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True)) | found
+    named = [label for label in labels if label in found]
+    if not named:
+        return
+    columns = _columns_that_fit(named, figure.get_figwidth() - 0.3)
+    figure.set_figheight(figure.get_figheight() + _LEGEND_LINE * -(-len(named) // columns))
+    figure.legend(
+        [found[label] for label in named], named, loc="outside lower center", ncols=columns,
+        fontsize=8, frameon=False, labelcolor=style.INK, columnspacing=1.4,
+    )  # fmt: skip
+
+
+_LEGEND_LINE, _LETTER, _HANDLE = 0.19, 0.068, 0.55
+"""Height of a line, width of a letter, width of a handle with its spaces [inch], at 8 pt."""
+
+
+def _columns_that_fit(labels: Sequence[str], width: float) -> int:
+    """The fewest columns with the fewest lines that are no wider than that [inch]."""
+    for lines in range(1, len(labels)):
+        columns = -(-len(labels) // lines)
+        # As matplotlib fills them: one below the other, the first columns one longer.
+        filled = np.array_split([len(label) for label in labels], columns)
+        if sum(_LETTER * column.max() + _HANDLE for column in filled) <= width:
+            return columns
+    return 1

@@ -1,0 +1,130 @@
+"""The places where a capture lacks most: blocks of voxels that render badly, the worst first.
+
+Shape symbols: N rows of the map; m bad voxels; X Y Z cells of the coarse grid.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from r3jax.apps.audit.diagnosis import CAUSES, FINE, Diagnosis
+from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
+from r3jax.mapping.state import MapState
+
+BLOCK = 1.0
+"""Regions are as large, and their middles as far apart [audit units]."""
+
+MOST = 10
+"""Bad regions that are listed."""
+
+MOST_UNSEEN = 6
+"""Unseen regions that are listed."""
+
+_SMALLEST = 0.02
+"""Smaller regions are not worth a line [square audit units]."""
+
+_FACES = ndimage.generate_binary_structure(3, 1)
+
+
+@dataclass(frozen=True)
+class Region:
+    """One bad place."""
+
+    center: np.ndarray
+    """Middle of its bad voxels or cells, [3] [audit units]."""
+
+    area: float
+    """Area of its bad voxels or cells, a face each [square audit units]."""
+
+    cause: str
+    """What most of its bad voxels suffer from; `unseen` where there are none yet."""
+
+    renderability: float
+    """Mean over its bad voxels; 0 where nothing is known."""
+
+    bad_share: float
+    """Bad voxels among those of the block that can be seen; 1 where nothing is known."""
+
+    rows: np.ndarray
+    """Rows of its bad voxels in the map; where nothing is known flat indices of its cells."""
+
+
+def bad_regions(state: MapState, diagnosis: Diagnosis, most: int = MOST) -> list[Region]:
+    """Where surfaces that are known would render badly; the largest loss first.
+
+    The loss of a block is the sum of 1 - R over its bad voxels. A region is what lies within half
+    a block of the bad voxel in the middle of the worst block that is left.
+
+    Args:
+        state: the map.
+        diagnosis: of its voxels.
+        most: regions at most.
+    """
+    centers = np.asarray(state.center, np.float64).T
+    face = float(state.voxel_size) ** 2
+    left = diagnosis.is_seen & (diagnosis.value < FINE)
+    found: list[Region] = []
+    while len(found) < most and left.any():
+        rows = np.flatnonzero(left)
+        middle = _worst_block(centers[rows], 1.0 - diagnosis.value[rows])
+        is_near = np.abs(centers - middle).max(axis=1) <= 0.5 * BLOCK
+        bad = is_near & left
+        area = float(bad.sum()) * face
+        if area >= _SMALLEST:
+            causes = np.bincount(diagnosis.cause[bad], minlength=len(CAUSES))
+            region = Region(
+                center=centers[bad].mean(axis=0),
+                area=area,
+                cause=CAUSES[int(np.argmax(causes))],
+                renderability=float(diagnosis.value[bad].mean()),
+                bad_share=float(bad.sum() / (is_near & diagnosis.is_seen).sum()),
+                rows=np.flatnonzero(bad),
+            )
+            found.append(region)
+        left &= ~is_near
+    # A region is not quite the block that it was found by.
+    return sorted(found, key=lambda region: -float((1.0 - diagnosis.value[region.rows]).sum()))
+
+
+def _worst_block(points: np.ndarray, loss: np.ndarray) -> np.ndarray:
+    """The point in the middle of those in the block of a regular division that loses most, [3]."""
+    index = np.floor(points / BLOCK).astype(np.int64)
+    _, block = np.unique(index, axis=0, return_inverse=True)
+    block = block.reshape(-1)
+    worst = int(np.argmax(np.bincount(block, weights=loss)))
+    inside = points[block == worst]
+    # One of the points, so that there is something near it.
+    return inside[np.argmin(np.linalg.norm(inside - inside.mean(axis=0), axis=1))]
+
+
+def unseen_edges(grid: OccupancyGrid, open_cells: np.ndarray) -> np.ndarray:
+    """Cells where known free space ends in what nobody has looked at, [X, Y, Z] bool.
+
+    Args:
+        grid: free and occupied space.
+        open_cells: unexplored cells that count, [X, Y, Z] bool: not the inside of walls.
+    """
+    return open_cells & ndimage.binary_dilation(np.asarray(grid.free), _FACES)
+
+
+def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST_UNSEEN) -> list[Region]:
+    """Where a capture ends: blocks of unseen cells beside free space, the largest first.
+
+    Args:
+        grid: free and occupied space.
+        edges: such cells, [X, Y, Z] bool.
+        most: regions at most.
+    """
+    cell = float(grid.cell_size)
+    points = centers_on_host(grid, np.argwhere(edges))
+    flat = np.flatnonzero(edges)
+    left = np.ones(len(points), dtype=bool)
+    found: list[Region] = []
+    while len(found) < most and left.any():
+        middle = _worst_block(points[left], np.ones(int(left.sum())))
+        is_near = left & (np.abs(points - middle).max(axis=1) <= max(0.5 * BLOCK, cell))
+        area = float(is_near.sum()) * cell * cell
+        found.append(Region(points[is_near].mean(axis=0), area, "unseen", 0.0, 1.0, flat[is_near]))
+        left &= ~is_near
+    return found

@@ -1,0 +1,177 @@
+"""What a capture has seen, as a map of all pictures and of all but some.
+
+A picture must not be in the map that it is scored by. Maps cannot forget; so the pictures
+are dealt into folds, and every fold gets a map of its own over *the same rows*:
+
+    1. all pictures join one map: now the surfaces are known;
+    2. each picture joins the map of its fold, an empty one with the rows of the first.
+       What it looks at (`mark_seen`) is told by the surfaces of all pictures.
+
+Maps with the same rows unite row by row, so the map without a fold is the union of the others. No
+result depends on the order of the pictures.
+
+Shape symbols: N rows; F folds.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from r3jax.apps.audit.source import Source
+from r3jax.apps.audit.survey import MARGIN, RANGE, Survey
+from r3jax.frame import Frame
+from r3jax.mapping.join import combine_moments
+from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
+from r3jax.mapping.seen import mark_seen
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.update import integrate_pixels, update_growing
+
+_CAPACITY = 1 << 15
+_MOST_ROWS = 1 << 22
+"""Beyond this the folds would not fit into memory."""
+
+_SPARSE_REACH = 1.1
+"""A picture without depth images looks this many times as far as its farthest point."""
+
+OnFrame = Callable[[], None]
+"""Called after each picture, twice for each."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Everything that the pictures have seen."""
+
+    state: MapState
+    """Map of all pictures."""
+
+    grid: OccupancyGrid
+    """Free and occupied space; all unexplored where no depth images say what is free."""
+
+    folds: tuple[MapState, ...]
+    """Maps of the pictures of each fold, on the rows of `state`."""
+
+    fold_of: np.ndarray
+    """Fold of each picture used, in the order of `Survey.chosen`."""
+
+    def without(self, fold: int) -> MapState:
+        """The map of all pictures but those of a fold."""
+        return united([part for i, part in enumerate(self.folds) if i != fold])
+
+
+def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: None) -> Seen:
+    """Reads every picture twice and maps it.
+
+    Args:
+        source: the pictures.
+        survey: which of them, and how fine.
+        folds: as many, or one for each picture where there are fewer.
+        on_frame: for a progress bar.
+
+    Raises:
+        FormatError, RunError: a file is missing or broken.
+        ValueError: so many voxels that they are surely too small.
+    """
+    whole, grid = _surfaces(source, survey, on_frame)
+    count = min(folds, len(survey.chosen))
+    parts = [_blank(whole)] * count
+    fold_of = np.arange(len(survey.chosen)) % count
+    is_dense = jnp.asarray(source.is_dense)
+    for fold, index in zip(fold_of.tolist(), survey.chosen.tolist(), strict=True):
+        frame = source.frame(index, survey.alignment)
+        parts[fold] = _join_fold(parts[fold], whole, frame, _reach(source, frame), is_dense)
+        on_frame()
+    return Seen(united(parts), grid, tuple(parts), fold_of)
+
+
+def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> tuple[MapState, OccupancyGrid]:
+    state = empty_map(_CAPACITY, survey.voxel_size)
+    grid = empty_grid(survey.bounds, survey.cell_size)
+    update_grid = jax.jit(integrate_depth)
+    for index in survey.chosen.tolist():
+        frame = source.frame(index, survey.alignment)
+        state = _grown(state, frame, source.is_dense)
+        if source.is_dense:
+            grid = update_grid(grid, frame, jnp.float32(RANGE))
+        on_frame()
+    if source.is_dense:
+        # The camera itself was there, whatever the sensor says of places so near.
+        for position in survey.alignment.points(source.poses[survey.chosen, :3, 3]):
+            grid = _free_ball(grid, jnp.asarray(position, dtype=jnp.float32))
+    return state, grid
+
+
+@jax.jit
+def _free_ball(grid: OccupancyGrid, center: Float[Array, " 3"]) -> OccupancyGrid:
+    return mark_free_ball(grid, center, MARGIN)
+
+
+_integrate_pixels = jax.jit(integrate_pixels)
+
+
+def _grown(state: MapState, frame: Frame, drop_edges: bool) -> MapState:
+    """The frame's pixels join; the table grows."""
+    arguments = frame, jnp.float32(RANGE), jnp.asarray(drop_edges)
+    try:
+        return update_growing(lambda now: _integrate_pixels(now, *arguments), state, _MOST_ROWS)
+    except ValueError as error:
+        raise ValueError(
+            f"the capture fills more than {_MOST_ROWS} voxels: choose a larger --voxel-size"
+        ) from error
+
+
+def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
+    """How far a picture looks [audit units]."""
+    if source.is_dense:
+        return jnp.float32(RANGE)
+    farthest = float(jnp.max(frame.depth))
+    return jnp.float32(min(RANGE, _SPARSE_REACH * farthest))
+
+
+def _blank(state: MapState) -> MapState:
+    """The same rows, of which nothing has been seen."""
+    empty = jax.tree.map(jnp.zeros_like, state)
+    kept = lambda m: (m.key, m.voxel_size)
+    return eqx.tree_at(kept, empty, kept(state))
+
+
+@jax.jit
+def _join_fold(
+    part: MapState,
+    whole: MapState,
+    frame: Frame,
+    max_range: Float[Array, ""],
+    drop_edges: Bool[Array, ""],
+) -> MapState:
+    part = integrate_pixels(part, frame, jnp.float32(RANGE), drop_edges)
+    marks = lambda m: (m.visited, m.resolution)
+    marked = mark_seen(eqx.tree_at(marks, whole, marks(part)), frame, max_range)
+    return eqx.tree_at(marks, part, marks(marked))
+
+
+def united(parts: Sequence[MapState]) -> MapState:
+    """The union of maps with the same rows: what `merge` gives, row by row."""
+    total = parts[0]
+    for part in parts[1:]:
+        total = _unite(total, part)
+    return total
+
+
+@jax.jit
+def _unite(a: MapState, b: MapState) -> MapState:
+    count, mean, m2 = combine_moments((a.count, a.mean, a.m2), (b.count, b.mean, b.m2))
+    return MapState(
+        key=a.key,
+        visited=a.visited | b.visited,
+        count=count,
+        mean=mean,
+        m2=m2,
+        resolution=jnp.maximum(a.resolution, b.resolution),
+        voxel_size=a.voxel_size,
+        dropped=a.dropped + b.dropped,
+        num_bins=a.num_bins,
+    )

@@ -1,0 +1,1 @@
+"""The report of an audit: its page, figures, map from above, words and colors."""

@@ -1,0 +1,233 @@
+"""What an audit says in words: on the page and on the console."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from r3jax.apps.audit.alignment import AXES
+from r3jax.apps.audit.audit import Audit
+from r3jax.apps.audit.diagnosis import FEW, FINE
+from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
+
+MEANING = {
+    "fine": f"R of at least {FINE:g} for those who stand about",
+    "angle": "seen, but only from directions far from those in which one would look at it",
+    "rare": f"seen in fewer than {FEW} pictures",
+    "distance": "only seen from farther away than one would look at it",
+    "noise": "its color differs from picture to picture: reflections, exposure, poses that are off",
+    "unseen": "free space ends there in something that no picture shows",
+}
+"""Remedy of every cause, for the table."""
+
+REMEDY = {
+    "fine": "",
+    "angle": "go round it: pictures from the missing sides",
+    "rare": "take more pictures of it, from several places",
+    "distance": "go nearer",
+    "noise": "lock exposure and white balance; avoid reflections; check the poses",
+    "unseen": "look into it, if it belongs to the place",
+}
+"""What one can do."""
+
+_SHORT = {
+    "angle": "only from other angles",
+    "rare": "too rarely",
+    "distance": "only from too far away",
+    "noise": "in contradictory colors",
+}
+
+_ORDINARY = ("angle", "rare", "distance", "noise")
+
+
+def length(audit: Audit, in_audit: float) -> str:
+    """A length of the audit, in the capture's units."""
+    return f"{audit.survey.length(in_audit):.3g} {audit.survey.unit}"
+
+
+def area(audit: Audit, in_audit: float) -> str:
+    """An area of the audit to two digits, in the capture's units: voxels count no finer."""
+    value = float(f"{in_audit * audit.survey.length(1.0) ** 2:.2g}")
+    return f"{value:g} {audit.survey.unit}²"
+
+
+def point(position: np.ndarray) -> str:
+    """Coordinates, to be read."""
+    return ", ".join(f"{value:.2f}" for value in position)
+
+
+def verdict(audit: Audit) -> list[str]:
+    """What the audit comes to, a sentence each."""
+    found, plan = audit.diagnosis, audit.plan
+    shares = {cause: found.share(cause) for cause in _ORDINARY}
+    ordered = sorted(shares, key=lambda cause: -shares[cause])
+    parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
+    sentences = [
+        f"{100 * found.fine_share:.0f} % of the surface that one sees from where people could "
+        f"stand would render well (R ≥ {FINE:g})" + (f"; {_list(parts)}." if parts else ".")
+    ]
+    if not audit.source.is_dense:
+        sentences.append(
+            "Without depth images only surfaces with points are scored; plain walls may have none."
+        )
+    if audit.source.remark is not None:
+        sentences.insert(0, audit.source.remark)
+    if audit.unseen:
+        sentences.append(
+            f"Free space ends in about {area(audit, audit.unseen_area)} that no picture shows."
+        )
+    mean = float(audit.renderability.mean())
+    worst = min(audit.frames, key=lambda frame: frame.score.renderability)
+    what = "A frame of this capture" if audit.is_own_path else "A frame of the path"
+    sentences.append(
+        f"{what} has a renderability of {mean:.2f} on average, the worst ({worst.label}) "
+        f"{worst.score.renderability:.2f}."
+    )
+    if plan.views:
+        count = len(plan.views)
+        views, drawn = (
+            ("One further view", "one at a random place")
+            if count == 1
+            else (f"{count} further views", "as many at random places")
+        )
+        sentences.append(
+            f"{views} would raise the mean over all surfaces from {found.mean:.2f} to "
+            f"{plan.after.mean:.2f}, as far as it can be foreseen; {drawn} "
+            f"{plan.random_mean[-1]:.2f}."
+        )
+    return sentences
+
+
+def _list(parts: list[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
+    """Why a view is suggested."""
+    face = audit.survey.voxel_size**2
+    parts: list[str] = []
+    total = sum(view.causes.values())
+    if view.num_mended:
+        parts.append(f"makes about {area(audit, view.num_mended * face)} render well")
+    if total:
+        named = sorted(view.causes, key=lambda cause: -view.causes[cause])
+        shares = [f"{100 * view.causes[c] / total:.0f} % {c}" for c in named]
+        parts.append(
+            f"of {area(audit, total * face)} in sight that do not yet: {', '.join(shares)}"
+        )
+    if len(view.cells):
+        cells = area(audit, len(view.cells) * audit.survey.cell_size**2)
+        parts.append(f"looks into about {cells} of what no picture shows")
+    names = list(letters)
+    if names:
+        parts.append(f"regions {', '.join(names)}" if len(names) > 1 else f"region {names[0]}")
+    return "; ".join(parts) or "adds a direction to what it shows"
+
+
+def directions(audit: Audit, view: Suggestion, like: int) -> str:
+    """The way from a picture of the capture to a suggested view, as a person would follow it.
+
+    Forward and left are those of the picture, in the plane; a picture that looks straight up or
+    down is faced as its upper edge.
+    """
+    here = audit.survey.alignment.poses(audit.source.poses[[like]])[0]
+    axis = here[:3, 2] if np.hypot(*here[:2, 2]) > 0.05 else -here[:3, 1]
+    forward = axis[:2] / np.hypot(*axis[:2])
+    offset = view.pose[:3, 3] - here[:3, 3]
+    ahead = float(offset[:2] @ forward)
+    left = float(forward[0] * offset[1] - forward[1] * offset[0])
+    steps = [
+        f"{length(audit, abs(amount))} {forth if amount > 0 else back}"
+        for amount, forth, back in (
+            (ahead, "forward", "back"), (left, "to the left", "to the right"),
+        )
+        if abs(amount) >= 0.05
+    ]  # fmt: skip
+    parts = [f"Stand where {audit.source.labels[like]} was taken"]
+    if steps:
+        parts.append(f"go {' and '.join(steps)}")
+    if abs(offset[2]) >= 0.05:
+        higher = "higher" if offset[2] > 0 else "lower"
+        parts.append(f"hold the camera {length(audit, abs(float(offset[2])))} {higher}")
+    looks = view.pose[:3, 2]
+    elevation = np.degrees(np.arcsin(np.clip(looks[2], -1.0, 1.0)))
+    if abs(elevation) < 80.0:
+        turn = np.degrees(np.arctan2(forward[0] * looks[1] - forward[1] * looks[0],
+                                     forward @ looks[:2]))  # fmt: skip
+        side = "left" if turn > 0 else "right"
+        parts.append(f"turn {abs(turn):.0f}° {side}" if abs(turn) >= 5.0 else "do not turn")
+    way = "up" if elevation > 0 else "down"
+    parts.append("look level" if abs(elevation) < 5.0 else f"look {abs(elevation):.0f}° {way}")
+    return f"{', '.join(parts[:-1])} and {parts[-1]}."
+
+
+def method(audit: Audit) -> list[str]:
+    """How the numbers came about, a sentence or two each."""
+    survey, source = audit.survey, audit.source
+    depth = {
+        "depth": "depth images",
+        "tracks": "the points whose tracks name the picture",
+        "cloud": "the cloud's points that no nearer one hides",
+    }[source.kind]
+    up = survey.alignment.directions_back(np.array([[0.0, 0.0, 1.0]]))[0]
+    sentences = [
+        f"{len(survey.chosen)} of {len(source)} pictures, every {_ordinal(source.stride)} pixel "
+        f"along rows and columns; depth from {depth}.",
+        f"Voxels of {length(audit, survey.voxel_size)}, cells of free space of "
+        f"{length(audit, survey.cell_size)}, visible up to {length(audit, 5.0)}; the depths have "
+        f"the median {survey.median_depth:.3g} {survey.unit} and the 95th percentile "
+        f"{survey.far_depth:.3g} {survey.unit}, and the sizes follow from them where they are not "
+        "given.",
+        f"Up is {_up_name(up)} of the capture.",
+        "Renderability R (arXiv 2601.07484) of a surface for a place to look from is bias × noise "
+        "× resolution: the angle to the nearest direction it was seen from, the consistency of "
+        "its color, and the best distance it was seen from.",
+        f"Surfaces: every voxel is asked from those of {len(audit.standpoints)} "
+        "standpoints that see it, with the camera of most pictures; its numbers are the means. "
+        "Areas count a face of a voxel each; where depth is noisy, walls are several voxels thick, "
+        "and areas too large by that.",
+    ]
+    if audit.is_own_path:
+        count = len(audit.seen.folds)
+        sentences.append(
+            f"Frames: the capture's own, each scored by a map without every {_ordinal(count)} "
+            "picture, itself among them: what a model trained without these would have to invent. "
+            "R of a frame is the mean over its pixels; one that shows no voxel counts 0."
+        )
+    else:
+        sentences.append(
+            "Frames: the path's, scored by the map of all pictures. R of a frame is the mean over "
+            "its pixels; one that shows no voxel counts 0."
+        )
+    where = (
+        f"in space known to be free, {length(audit, 0.3)} from everything else, connected to where "
+        "the camera was and at its heights"
+        if source.is_dense
+        else f"within the hull of the camera's positions and {length(audit, 0.3)} round it, "
+        f"{length(audit, 0.3)} from every voxel"
+    )
+    sentences.append(
+        f"Views: of {len(audit.places)} places {where}, {DIRECTIONS} directions each, those of "
+        f"which {100 * OVERLAP:.0f} % or more show what is known (or a picture could not be "
+        "registered); "
+        "of all these the one that raises the renderability of all surfaces most is imagined as "
+        "taken before the next one is chosen. What cannot be foreseen: surfaces that nobody has "
+        "seen, and colors."
+    )
+    if not source.is_metric:
+        sentences.append("Nobody knows what a unit of this capture is: u stands for one.")
+    if not source.has_images:
+        sentences.append("The images are missing: nothing can be said about noise.")
+    return sentences
+
+
+def _ordinal(count: int) -> str:
+    if 10 <= count % 100 <= 20:
+        return f"{count}th"
+    return f"{count}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(count % 10, 'th') }"
+
+
+def _up_name(up: np.ndarray) -> str:
+    best = int(np.argmax(np.abs(up)))
+    if abs(up[best]) > 0.9999:
+        return ("-" if up[best] < 0.0 else "") + list(AXES)[best]
+    return f"({point(up)})"

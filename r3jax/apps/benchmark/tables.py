@@ -1,0 +1,222 @@
+"""The table that a benchmark ends with: methods x metrics by scenes.
+
+Fields have ranks, lines their seeds; notes tell the terms.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from r3jax.evaluation.comparison import (
+    Cell,
+    check_equal_terms,
+    methods_of,
+    scenes_of,
+    scores_by_method,
+    seeds_by_method,
+    shared_settings,
+    snapshots_of,
+    with_short_names,
+)
+from r3jax.evaluation.scores import METRICS, Metric
+from r3jax.evaluation.statistics import (
+    Estimate,
+    Scores,
+)
+
+FEWEST_SEEDS = 3
+"""That the protocol asks for in each cell of a table."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One field of a table."""
+
+    value: float | None
+    """With every digit; None where there is none, which is never shown as a number."""
+
+    text: str = ""
+    """As people read it."""
+
+    rank: int = 0
+    """1 for the best of its column, 2 for the second best, 0 for others."""
+
+    extra: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
+    """What else the text tells (interval, name of a scene), by name, for machines."""
+
+
+MISSING = Entry(None)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table."""
+
+    labels: tuple[str, ...]
+    """Method and, where the table has several, metric."""
+
+    seeds: str
+    """Seeds per cell: `3`, or `2-3` if they differ; `0` counts as missing."""
+
+    entries: tuple[Entry, ...]
+    """One per column."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table without a format; `table_formats` writes it as text."""
+
+    title: str
+    heads: tuple[str, ...]
+    """Names of the labels."""
+
+    columns: tuple[str, ...]
+    """Names of the entries."""
+
+    rows: tuple[Row, ...]
+    """Lines of one method follow each other."""
+
+    notes: tuple[str, ...]
+    """Sentences below the table: terms, seeds, what is missing."""
+
+
+def metric_named(name: str) -> Metric:
+    """The metric of `scores.METRICS`.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    for metric in METRICS:
+        if metric.name == name:
+            return metric
+    known = ", ".join(metric.name for metric in METRICS)
+    raise ValueError(f"no metric {name!r}; there are {known}")
+
+
+def full_title(metric: Metric) -> str:
+    """The metric's title where it does not stand below that of PSNR."""
+    return "PSNR [dB], holes left out" if metric.name == "psnr_measured" else metric.title
+
+
+def ranked(values: Sequence[float | None], metric: Metric) -> list[Entry]:
+    """Entries of one column: all that *read* the same as the best are best, second likewise.
+
+    With one value there is nothing to compare, so nothing is marked.
+    """
+    texts = [MISSING.text if v is None else f"{v:.{metric.decimals}f}" for v in values]
+    sign = 1.0 if metric.lower_is_better else -1.0
+    read = sorted({sign * float(text) for text in texts if text})
+    ranks = dict(zip(read, (1, 2), strict=False)) if sum(map(bool, texts)) > 1 else {}
+    return [
+        MISSING if v is None else Entry(v, text, ranks.get(sign * float(text), 0))
+        for v, text in zip(values, texts, strict=True)
+    ]
+
+
+def with_bounds(entry: Entry, found: Estimate, metric: Metric, sign: str = "") -> Entry:
+    """The entry with its 95 % interval; `sign` as in format strings."""
+    low, high = (f"{end:{sign}.{metric.decimals}f}" for end in (found.low, found.high))
+    extra = {"low": found.low, "high": found.high}
+    return Entry(entry.value, f"{entry.text} [{low}, {high}]", entry.rank, extra)
+
+
+def with_name(entry: Entry, name: str) -> Entry:
+    """The entry with what it belongs to."""
+    return Entry(entry.value, f"{entry.text} ({name})", entry.rank, {"name": name})
+
+
+def seed_text(seeds: Sequence[Sequence[int]]) -> str:
+    """Fewest and most seeds of some cells: `3`, `2-3`."""
+    counts = sorted({len(found) for found in seeds})
+    return f"{counts[0]}" if len(counts) == 1 else f"{counts[0]}-{counts[-1]}"
+
+
+def seed_texts(cells: Sequence[Cell]) -> dict[str, str]:
+    """The same for each method over all scenes of the table."""
+    found = seeds_by_method(cells)
+    return {method: seed_text(list(scenes.values())) for method, scenes in found.items()}
+
+
+def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
+    """The terms that all records share, how many seeds, who made them, and what is not there.
+
+    Args:
+        cells: of the whole table, with their full names.
+    """
+    cell, training = cells[0], cells[0]["training"]
+    sentences = [
+        f"{', '.join(snapshots_of(cells))} on the {cell['clock']} clock, "
+        f"images of {cell['resolution']} px; "
+        f"{training['iterations']} iterations of training at {training['resolution']} px; "
+        f"test views of {cell['test_views']['resolution']} px."
+    ]
+    if shared := shared_settings(cells):
+        given = ", ".join(f"{name}={value}" for name, value in shared.items())
+        sentences.append(f"Settings of all policies: {given}.")
+    seeds = seeds_by_method(with_short_names(cells))
+    counts = [len(found) for scenes in seeds.values() for found in scenes.values() if found]
+    fewest, most = min(counts), max(counts)
+    told = f"{most}" if fewest == most else f"{fewest} to {most}"
+    short = f", fewer than the {FEWEST_SEEDS} of the protocol" if fewest < FEWEST_SEEDS else ""
+    sentences.append(f"{told} seed{'s' * (most > 1)} per cell{short}.")
+    absent = [f"{m} in {s}" for m, by_scene in seeds.items() for s, n in by_scene.items() if not n]
+    if absent:
+        sentences.append(f"No record of {', '.join(absent)}.")
+    machines = ", ".join(sorted({cell["machine"] or "an unknown machine" for cell in cells}))
+    commits = ", ".join(sorted({_short_commit(cell["commit"]) for cell in cells}))
+    return (*sentences, f"Made on {machines} from commit {commits}.")
+
+
+def _short_commit(commit: str | None) -> str:
+    """Ten digits, and whether the source was changed after it."""
+    digits, hyphen, changed = (commit or "unknown").partition("-")
+    return f"{digits[:10]}{hyphen}{changed}"
+
+
+PAPER_METRICS = ("ssim", "psnr", "lpips")
+"""Lines of a method in the paper's tables."""
+
+
+def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
+    """The paper's table: methods x (SSIM, PSNR, LPIPS) by scenes and their mean.
+
+    A field is the mean over seeds of the mean over the scene's test views. The last column is the
+    mean of the scenes, and missing for a method that lacks one: means over other scenes are not
+    comparable.
+
+    Args:
+        cells: records of one snapshot; rows go in the order of `equal_terms.POLICIES`.
+        title: of the table; none given: the snapshot.
+
+    Raises:
+        ValueError: the records were not made on equal terms (`check_equal_terms`).
+    """
+    check_equal_terms(cells)
+    told, cells = notes(cells), with_short_names(cells)
+    scenes, methods, seeds = scenes_of(cells), methods_of(cells), seed_texts(cells)
+    rows: dict[tuple[str, str], Row] = {}
+    for name in PAPER_METRICS:
+        metric, scores = metric_named(name), scores_by_method(cells, name)
+        columns: list[list[Entry]] = []
+        for scene in [*scenes, None]:
+            means = [_mean(scores.get(method, {}), scene, scenes) for method in methods]
+            columns.append(ranked(means, metric))
+        for method, entries in zip(methods, zip(*columns, strict=True), strict=True):
+            rows[method, name] = Row((method, metric.title), seeds[method], entries)
+    return Table(
+        title=title or cells[0]["snapshot"],
+        heads=("method", "metric"),
+        columns=(*scenes, "mean"),
+        rows=tuple(rows[method, name] for method in methods for name in PAPER_METRICS),
+        notes=told,
+    )
+
+
+def _mean(scores: Scores, scene: str | None, scenes: Sequence[str]) -> float | None:
+    """Mean of one scene, or (None) of all if there are values for all."""
+    if scene is not None:
+        return float(np.nanmean(scores[scene])) if scene in scores else None
+    if set(scores) != set(scenes):
+        return None
+    return float(np.mean([np.nanmean(values) for values in scores.values()]))

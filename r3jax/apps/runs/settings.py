@@ -1,0 +1,180 @@
+"""What an exploration needs, for a new run or from the header of a recorded one."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.exploration.budget import Budget, parse_budget
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.replay import config_of, planner_config_of, policy_key
+from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.planning.policy import Policy
+from r3jax.planning.registry import make_policy
+from r3jax.simulators.base import Simulator
+from r3jax.simulators.scenes.registry import open_scene, scene_hash
+from r3jax.trace.errors import RunError
+from r3jax.trace.header import RunHeader, camera_fields, package_versions, policy_fields
+from r3jax.trace.reader import Run
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What is asked of an exploration, before its scene is opened."""
+
+    budget: Budget
+    config: ExplorationConfig
+    policy: Policy
+
+    def with_limits(self, budget: str | None, until: str | None) -> "RunSettings":
+        """The same with another budget or goal where one is given.
+
+        Raises:
+            ValueError: a budget or a goal that cannot work.
+        """
+        changed = self
+        if budget is not None:
+            changed = dataclasses.replace(changed, budget=parse_budget(budget))
+        if until is not None:
+            config = dataclasses.replace(changed.config, until=until)
+            changed = dataclasses.replace(changed, config=config)
+        return changed
+
+
+def settings_of_run(run: Run) -> RunSettings:
+    """Reads what a recorded run was asked for.
+
+    Raises:
+        RunError: a policy or a setting that this version does not know.
+    """
+    header = run.header
+    try:
+        policy = make_policy(policy_key(run), **vars(planner_config_of(run)))
+        return RunSettings(parse_budget(header.budget), config_of(run), policy)
+    except RunError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(run.path / "run.json", f"the run cannot be set up again: {error}") from None
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """How a scene is opened: a line of a run's header, but for the camera and the seed."""
+
+    name: str
+    """An embedded scene, or one of `outside_scenes`."""
+
+    camera: Camera
+    seed: int
+
+    noise: float = 0.01
+    """Standard deviation of the depth as a share of the depth."""
+
+    max_range: float | None = 5.0
+    """Reach of the depth sensor [m]; None: unlimited."""
+
+    up: Literal["y", "z"] | None = None
+    """Vertical axis of a mesh file."""
+
+    scale: float = 1.0
+    """Meters in a unit of a mesh file."""
+
+    cull_backfaces: bool = False
+    """Faces seen from behind are looked through."""
+
+    start: tuple[float, float, float] | None = None
+    """Start position [m], looking along x; None: the scene's own, or a search."""
+
+    def open(self) -> Simulator:
+        """Opens the scene.
+
+        Raises:
+            ValueError: the scene is unknown, or its file is refused.
+            ImportError: its simulator is not installed.
+        """
+        return open_scene(
+            self.name,
+            up=self.up,
+            scale=self.scale,
+            cull_back_faces=self.cull_backfaces,
+            camera=self.camera,
+            noise=self.noise,
+            seed=self.seed,
+            max_range=self.max_range,
+            start_pose=None if self.start is None else _pose_at(self.start),
+        )
+
+
+_RECORDED = ("up", "scale", "cull_backfaces", "noise", "max_range", "start")
+"""What a header keeps of `SceneSettings`, beside the name."""
+
+
+def scene_of_run(run: Run) -> SceneSettings:
+    """Reads how the scene of a recorded run was opened.
+
+    Raises:
+        RunError: the header does not say.
+    """
+    scene = run.header.scene
+    # Headers of earlier versions lack what there was not yet.
+    given: dict[str, Any] = {"up": None, "scale": 1.0, "cull_backfaces": False} | scene
+    try:
+        how: dict[str, Any] = {name: given[name] for name in _RECORDED}
+        if how["start"] is not None:  # JSON knows lists alone
+            how["start"] = tuple(how["start"])
+    except KeyError as error:
+        raise RunError(run.path / "run.json", f"the scene lacks {error}") from None
+    return SceneSettings(scene["name"], run.camera, run.header.seed, **how)
+
+
+def open_run_scene(run: Run) -> Simulator:
+    """Opens the scene of a recorded run, as it was.
+
+    Raises:
+        RunError: the scene is not the one that the run was recorded in.
+        ValueError: the scene is unknown, or its file is refused.
+    """
+    settings = scene_of_run(run)
+    simulator = settings.open()
+    if scene_hash(simulator) != run.header.scene.get("hash"):
+        raise RunError(
+            run.path / "run.json",
+            f"the scene {settings.name} is not the one that the run was recorded in: its content "
+            "has changed",
+        )
+    return simulator
+
+
+def new_header(settings: RunSettings, scene: SceneSettings, simulator: Simulator) -> RunHeader:
+    """Makes the header of a new run: all that fixes it.
+
+    Args:
+        settings: what is asked for.
+        scene: how the scene was opened.
+        simulator: the scene, opened.
+    """
+    how = {name: getattr(scene, name) for name in _RECORDED}
+    return RunHeader(
+        scene={"name": scene.name, "hash": scene_hash(simulator), **how},
+        policy=policy_fields(settings.policy),
+        budget=str(settings.budget),
+        seed=scene.seed,
+        config=dataclasses.asdict(settings.config),
+        camera=camera_fields(simulator.camera),
+        bounds=np.asarray(simulator.bounds).tolist(),
+        packages=package_versions(),
+    )
+
+
+def changed_versions(run: Run) -> list[str]:
+    """Lists the packages that are not those a run was begun with, as `jax 0.9 -> 0.10`."""
+    now, then = package_versions(), run.header.packages
+    return [f"{k} {then.get(k)} -> {v}" for k, v in now.items() if then.get(k) != v]
+
+
+def _pose_at(start: Any) -> np.ndarray:
+    """`T_world_camera` [4, 4] at a position [m], looking along x."""
+    pose = pose_along(jnp.asarray(start, jnp.float32), jnp.asarray([1.0, 0.0, 0.0]))
+    return np.asarray(pose, dtype=np.float64)

@@ -1,0 +1,210 @@
+"""Teams on disk: a folder with a run for every camera; begun, gone on with, and concluded."""
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from r3jax.apps.runs.settings import (
+    RunSettings,
+    SceneSettings,
+    new_header,
+    open_run_scene,
+    settings_of_run,
+)
+from r3jax.apps.team.team import Member, TeamResult
+from r3jax.exploration.step import check_world
+from r3jax.files import lock_folder, write_atomic
+from r3jax.formats.nerfstudio import write_team_transforms, write_transforms
+from r3jax.formats.points import voxel_points, write_points
+from r3jax.planning.robot.limits import begin_at
+from r3jax.planning.robot.motion import motion_of
+from r3jax.simulators.base import Simulator
+from r3jax.simulators.start import APART, places_beside
+from r3jax.trace.reader import Run, read_run
+from r3jax.trace.writer import RunWriter
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Everything that `explore_team` is called with."""
+
+    settings: RunSettings
+    """Settings of the first member: budget and configuration are those of all."""
+
+    members: list[Member]
+    recorders: list[RunWriter]
+    seed: int
+
+    meet_every: float
+    """Mission clock between two meetings [s]; 0: always in touch."""
+
+    recorded: list[Run] | None = None
+    """What was recorded before; None for a new team."""
+
+
+def begin_team(
+    settings: Sequence[RunSettings],
+    scenes: Sequence[SceneSettings],
+    folder: Path,
+    stack: contextlib.ExitStack,
+    *,
+    meet_every: float,
+    overwrite: bool = False,
+) -> Crew:
+    """Opens the scene for every camera and makes the folders, in this order.
+
+    Args:
+        settings: what is asked of each camera.
+        scenes: how each camera sees the scene; all but the first start beside the first.
+        folder: the team's folder.
+        stack: closes the recorders and frees the team's lock.
+        meet_every: mission clock between two meetings [s].
+        overwrite: replace the team that is there.
+
+    Raises:
+        ValueError: the scene is unknown, there is no room beside the start, or the folder holds
+            something.
+        ImportError: the scene's simulator is not installed.
+    """
+    _check_leftovers(folder, len(scenes))
+    placed, simulators = _with_starts(scenes, settings[0].config.cell_size)
+    members = [Member(s, each.policy) for s, each in zip(simulators, settings, strict=True)]
+    for member in members:  # refused before there is a folder
+        begin_at(motion_of(member.policy), member.simulator.start_pose)
+    names = [str(number) for number in range(len(scenes))]
+    headers = [
+        dataclasses.replace(
+            new_header(each, scene, simulator),
+            parent={"team": names, "member": number, "meet_every": meet_every},
+        )
+        for number, (each, scene, simulator) in enumerate(
+            zip(settings, placed, simulators, strict=True)
+        )
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    _only_writer(folder, stack)
+    _check_leftovers(folder, len(scenes))  # another process may have been faster
+    recorders = [
+        stack.enter_context(RunWriter(folder / name, header, overwrite=overwrite))
+        for name, header in zip(names, headers, strict=True)
+    ]
+    return Crew(settings[0], members, recorders, scenes[0].seed, meet_every)
+
+
+def resume_team(folder: Path, stack: contextlib.ExitStack, budget: str | None = None) -> Crew:
+    """Goes on with a team that was cut off: its members' runs say what it was.
+
+    Args:
+        folder: the team's folder.
+        stack: closes the recorders and frees the team's lock.
+        budget: another budget; None keeps the team's.
+
+    Raises:
+        ValueError: no team, a damaged one, or one that another process writes.
+    """
+    read_run(folder / "0")  # says what is wrong before anything is written
+    _only_writer(folder, stack)
+    first = read_run(folder / "0")
+    if not first.header.is_of_team:
+        raise ValueError(f"{first.path} did not fly in a team: `r3jax explore --resume` it")
+    parent: dict[str, Any] = first.header.parent or {}
+    members: list[Member] = []
+    recorders: list[RunWriter] = []
+    recorded: list[Run] = []
+    settings = settings_of_run(first).with_limits(budget, None)
+    for name in parent["team"]:
+        run = read_run(folder / name)
+        simulator = open_run_scene(run)
+        header = dataclasses.replace(run.header, budget=str(settings.budget))
+        recorder, run = RunWriter.resume(run.path, header)
+        recorders.append(stack.enter_context(recorder))
+        members.append(Member(simulator, settings_of_run(run).policy))
+        recorded.append(run)
+    meet_every = float(parent["meet_every"])
+    return Crew(settings, members, recorders, first.header.seed, meet_every, recorded)
+
+
+def _only_writer(folder: Path, stack: contextlib.ExitStack) -> None:
+    """Until the stack ends no other process writes this team."""
+    try:
+        stack.enter_context(lock_folder(folder))
+    except BlockingIOError:
+        raise ValueError(f"{folder}: another process is writing this team") from None
+
+
+def _with_starts(
+    scenes: Sequence[SceneSettings], cell_size: float
+) -> tuple[list[SceneSettings], list[Simulator]]:
+    """The scene as each camera sees it; all but the first start beside the first.
+
+    Raises:
+        ValueError: there is no room.
+    """
+    placed, simulators = [scenes[0]], [_opened(scenes[0], cell_size)]
+    places = places_beside(simulators[0].start_pose[:3, 3])
+    for scene in scenes[1:]:
+        for place in places:
+            x, y, z = place.tolist()
+            scene = dataclasses.replace(scene, start=(x, y, z))
+            try:
+                simulators.append(_opened(scene, cell_size))
+            except ValueError:
+                continue  # in a wall, or too close to one
+            placed.append(scene)
+            break
+        else:
+            raise ValueError(
+                f"there is no room for {len(scenes)} cameras {APART} m apart beside the start "
+                f"{simulators[0].start_pose[:3, 3].round(2).tolist()}: give a roomier --start"
+            )
+    return placed, simulators
+
+
+def _opened(scene: SceneSettings, cell_size: float) -> Simulator:
+    simulator = scene.open()
+    check_world(simulator.bounds, cell_size)
+    return simulator
+
+
+def _check_leftovers(folder: Path, cameras: int) -> None:
+    """A smaller team must not be written over a larger one: whose run would the last one be?"""
+    present = {path.name for path in folder.iterdir()} if folder.is_dir() else set[str]()
+    if present - {"lock"} and "0" not in present:
+        raise ValueError(f"{folder} holds something that is not a team: give another --name")
+    if (folder / str(cameras)).exists():
+        raise ValueError(f"{folder} holds a team of more than {cameras}: give another --name")
+
+
+def write_team_data(
+    folder: Path, result: TeamResult, on_run: Callable[[Run], None] = lambda run: None
+) -> list[Run]:
+    """Writes the data set that all have in common, and that of every run.
+
+    Args:
+        folder: the team's folder.
+        result: what the team saw.
+        on_run: called with every run whose data set is written.
+
+    Returns:
+        The runs.
+
+    Raises:
+        RunError: a run cannot be read back.
+        OSError: the disk is full, not writable, ...
+    """
+    lines = "".join(json.dumps(dataclasses.asdict(view)) + "\n" for view in result.views)
+    write_atomic(folder / "coverage.jsonl", lines.encode())
+    runs = [read_run(folder / str(number)) for number in range(len(result.members))]
+    points = voxel_points(result.map_state)
+    for place in (folder, *(run.path for run in runs)):
+        (place / "exports").mkdir(exist_ok=True)
+        write_points(place / "exports" / "points.ply", *points)
+    for run in runs:
+        write_transforms(run, "exports/points.ply")
+        on_run(run)
+    write_team_transforms(folder, runs, "exports/points.ply")
+    return runs

@@ -1,0 +1,201 @@
+"""The three dimensions of the page: what stands where. It knows viser, and nothing of maps.
+
+Shape symbols: n points; s segments; H W picture size.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from r3jax.apps.viewer.overlays import pose_of, quaternion
+from r3jax.geometry.cameras import Camera
+
+_VIEW_COLOR = (120, 124, 134)
+_NOW_COLOR = (37, 99, 235)
+_CAMERA_COLOR = (15, 118, 110)
+_SUGGESTED = (239, 68, 68)
+
+Color = tuple[int, int, int]
+
+
+class Canvas:
+    """Everything in space, by what it shows. Methods may be called from any thread."""
+
+    def __init__(self, server: viser.ViserServer, camera: Camera):
+        """Puts the camera that can be dragged on the canvas.
+
+        Args:
+            server: with nothing on its page.
+            camera: shape of all frusta.
+        """
+        self._server, scene = server, server.scene
+        self._fov = float(2.0 * np.arctan(0.5 * camera.height / float(camera.fy)))
+        self._aspect = camera.width / camera.height
+        self._views: dict[int, viser.CameraFrustumHandle] = {}
+        scene.configure_default_lights(cast_shadow=False)
+        self.gizmo = scene.add_transform_controls(
+            "/camera", scale=0.6, line_width=3.5, depth_test=False
+        )
+        """The handles by which the camera is dragged."""
+        self._body = scene.add_camera_frustum(
+            "/camera/body",
+            self._fov,
+            self._aspect,
+            scale=0.45,
+            thickness=0.02,
+            color=_CAMERA_COLOR,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def on_drag(self, handler: Callable[[], None]) -> None:
+        """Calls the handler, in the server's thread, whenever the camera is dragged."""
+
+        # A coroutine: threads of a pool would mix up the order of a drag.
+        async def drag(event: Any) -> None:
+            del event
+            handler()
+
+        self.gizmo.on_update(drag)
+
+    @property
+    def pose(self) -> np.ndarray:
+        """`T_world_camera` of the camera that is dragged, [4, 4] float64."""
+        return pose_of(np.asarray(self.gizmo.wxyz), np.asarray(self.gizmo.position))
+
+    def place_camera(self, T_world_camera: np.ndarray) -> None:
+        """Puts the camera that is dragged somewhere."""
+        with self._server.atomic():
+            self.gizmo.wxyz = quaternion(T_world_camera[:3, :3])
+            self.gizmo.position = T_world_camera[:3, 3]
+
+    def place_eye(self, position: np.ndarray, target: np.ndarray) -> None:
+        """From where the page is first seen, and where to [m]."""
+        self._server.initial_camera.position = position
+        self._server.initial_camera.look_at = target
+
+    def paint_camera(self, color: Color) -> None:
+        """The color of the dragged camera's frustum."""
+        self._body.color = color
+
+    def fill_camera(self, image: np.ndarray) -> None:
+        """The picture in the dragged camera's frustum, [H, W, 3] uint8."""
+        self._body.image = image
+
+    def clients(self) -> list[viser.ClientHandle]:
+        """Whoever looks at the page."""
+        return list(self._server.get_clients().values())
+
+    def add_view(
+        self,
+        step: int,
+        T_world_camera: np.ndarray,
+        thumbnail: np.ndarray,
+        on_click: Callable[[], None],
+    ) -> None:
+        """A view along the path, with its picture [H, W, 3] uint8; it can be clicked."""
+        handle = self._add_frustum(
+            f"/views/{step:06d}", T_world_camera, 0.12, 0.004, _VIEW_COLOR, thumbnail
+        )
+        self._views[step] = handle
+
+        async def click(event: Any) -> None:
+            del event
+            on_click()
+
+        handle.on_click(click)
+
+    def show_views(self, before: int) -> None:
+        """Those before one of them; 0 shows none."""
+        for step, handle in list(self._views.items()):
+            handle.visible = step < before
+
+    def show_view(self, T_world_camera: np.ndarray, image: np.ndarray) -> None:
+        """The view on the slider, larger than the others."""
+        self._add_frustum("/view", T_world_camera, 0.26, 0.012, _NOW_COLOR, image)
+
+    def _add_frustum(
+        self,
+        name: str,
+        T_world_camera: np.ndarray,
+        scale: float,
+        thickness: float,
+        color: Color,
+        image: np.ndarray,
+    ) -> viser.CameraFrustumHandle:
+        return self._server.scene.add_camera_frustum(
+            name,
+            self._fov,
+            self._aspect,
+            scale=scale,
+            thickness=thickness,
+            color=color,
+            image=image,
+            wxyz=quaternion(T_world_camera[:3, :3]),
+            position=T_world_camera[:3, 3],
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def view_position(self) -> np.ndarray:
+        """Where the view on the slider stands [m], [3]; where no view is shown, NaN."""
+        handle = self._server.scene.get_handle_by_name("/view")
+        return np.full(3, np.nan) if handle is None else np.array(handle.position)
+
+    def show_lines(
+        self, name: str, segments: np.ndarray, colors: np.ndarray, thickness: float
+    ) -> None:
+        """Lines of a thickness [m]: ends [s, 2, 3] [m], colors [s, 2, 3] uint8; none: nothing."""
+        if len(segments):
+            self._server.scene.add_line_segments(name, segments, colors, thickness=thickness)
+        else:
+            self._server.scene.remove_by_name(name)
+
+    def show_points(self, name: str, points: np.ndarray, colors: np.ndarray, edge: float) -> None:
+        """Squares of an edge [m] at points [n, 3] [m] in colors [n, 3] uint8; none: nothing."""
+        if not len(points):
+            self._server.scene.remove_by_name(name)
+            return
+        self._server.scene.add_point_cloud(
+            name,
+            points,
+            colors,
+            point_size=edge,
+            point_shape="square",
+            point_shading="gradient",
+            precision="float32",
+        )
+
+    def show_splats(
+        self, name: str, arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    ) -> None:
+        """Gaussians, as `shapes.splat_arrays` gives them."""
+        self._server.scene.add_gaussian_splats(name, *arrays)
+
+    def show_mesh(self, name: str, glb: bytes) -> None:
+        """The scene's own triangles."""
+        self._server.scene.add_glb(name, glb, cast_shadow=False, receive_shadow=False)
+
+    def show_only(self, name: str, names: Sequence[str]) -> None:
+        """Leaves only one of the nodes called `names` visible; those not there stay away."""
+        for other in names:
+            handle = self._server.scene.get_handle_by_name(other)
+            if handle is not None:
+                handle.visible = other == name
+
+    def show_suggestion(self, position: np.ndarray, direction: np.ndarray) -> None:
+        """An arrow from a position [m] along a direction."""
+        self._server.scene.add_arrows(
+            "/suggestion",
+            np.stack([position, position + 0.9 * direction])[None].astype(np.float32),
+            _SUGGESTED,
+            shaft_radius=0.018,
+            head_radius=0.05,
+            head_length=0.12,
+        )
+
+    def hide_suggestion(self) -> None:
+        """Takes the arrow away."""
+        self._server.scene.remove_by_name("/suggestion")

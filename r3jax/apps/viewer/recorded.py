@@ -1,0 +1,154 @@
+"""The page of a recorded run: its map over time, its model, and the scene that it was made in."""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from r3jax.apps.models.folder import find_model, newest_name
+from r3jax.apps.runs.settings import scene_of_run, settings_of_run
+from r3jax.apps.viewer.blocks import scoring_of, title_of
+from r3jax.apps.viewer.decisions import Offer, decide_again
+from r3jax.apps.viewer.glb import world_glb
+from r3jax.apps.viewer.overlays import recorded_points
+from r3jax.apps.viewer.page.app import App
+from r3jax.apps.viewer.page.place import Sources
+from r3jax.apps.viewer.page.queries import Extras, picture_camera
+from r3jax.apps.viewer.page.server import close_server, open_server, url_of
+from r3jax.apps.viewer.story import RecordedStory
+from r3jax.formats.captures import Capture
+from r3jax.simulators.base import Simulator
+from r3jax.simulators.raycast.raycast import RaycastSimulator
+from r3jax.simulators.scenes.registry import scene_hash
+from r3jax.splatting.ply import read_scene
+from r3jax.splatting.scene import GaussianScene
+from r3jax.trace.reader import Run
+
+
+@dataclass(frozen=True)
+class RunPage:
+    """A page that is being shown."""
+
+    url: str
+    app: App
+
+
+@contextlib.contextmanager
+def open_run_page(
+    run: Run,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    allow: tuple[str, ...] = (),
+    model: str | None = None,
+    with_scene: bool = True,
+) -> Generator[RunPage]:
+    """Shows a run for as long as the context lasts.
+
+    Args:
+        run: with at least one view.
+        host: address to listen at.
+        port: port to listen at; 0 takes any free one.
+        allow: further names under which the page may be asked for.
+        model: name of the model to show; None: `last`, or the newest, or none.
+        with_scene: open the scene that the run was recorded in when it is asked for.
+
+    Raises:
+        ValueError, OSError: the port is in use, the address is not this machine's, there is no
+            such model, or it is damaged.
+    """
+    server = open_server(host, port, allow)
+    try:
+        splats = _splats(run, model)
+        scene = RecordedScene(run) if with_scene else None
+        header = run.header
+        extras = Extras(
+            Sources(
+                None if splats is None else splats[0],
+                functools.partial(recorded_points, run),
+                None if scene is None else scene.mesh,
+            ),
+            (0.0, 0.0, 0.0) if splats is None else splats[1],
+            None if scene is None else scene.photograph,
+            functools.partial(_decisions, run),
+            lambda: "" if scene is None else scene.remark,
+        )
+        app = App(
+            server,
+            RecordedStory(run),
+            scoring_of(header),
+            np.asarray(header.bounds, np.float64),
+            title=title_of(header),
+            subtitle=f"{run.path}; {run.outcome}",
+            extras=extras,
+        )
+        try:
+            yield RunPage(url_of(server), app)
+        finally:
+            app.close()
+    finally:
+        close_server(server)
+
+
+def _decisions(run: Run) -> Iterator[tuple[int, Offer | None]]:
+    settings = settings_of_run(run)
+    return decide_again(run, settings.policy, settings.config)
+
+
+def _splats(run: Run, name: str | None) -> tuple[GaussianScene, tuple[float, float, float]] | None:
+    """The model of that name, and the background that it was trained with."""
+    name = name or newest_name(run.path / "models")
+    if name is None:
+        return None
+    model = find_model(Capture(run.path, run), name)
+    red, green, blue = model.background.tolist()
+    return read_scene(model.path), (red, green, blue)
+
+
+class RecordedScene:
+    """The scene that a run was recorded in, opened when first asked for: large ones take long."""
+
+    def __init__(self, run: Run):
+        """Opens nothing yet."""
+        self._run = run
+        self.remark = ""
+        """Why it cannot be opened, once that is known."""
+
+    def photograph(self, T_world_camera: np.ndarray) -> np.ndarray | None:
+        """The true picture at a pose, [H, W, 3]; None if the scene cannot be opened."""
+        if self._simulator is None:
+            return None
+        return np.asarray(self._simulator.render(T_world_camera).rgb)
+
+    def mesh(self, top: float) -> bytes:
+        """The triangles as GLB, without what lies above a height [m].
+
+        Raises:
+            ValueError: the scene cannot be opened, or is too large to be shown.
+        """
+        if not isinstance(self._simulator, RaycastSimulator):
+            raise ValueError(self.remark or "the simulator of this scene has no mesh to show")
+        return world_glb(self._simulator.world, top)
+
+    @functools.cached_property
+    def _simulator(self) -> Simulator | None:
+        """For small pictures without noise and without a limit of range."""
+        try:
+            settings = dataclasses.replace(
+                scene_of_run(self._run),
+                camera=picture_camera(self._run.camera),
+                noise=0.0,
+                max_range=None,
+                start=None,
+            )
+            simulator = settings.open()
+            if scene_hash(simulator) == self._run.header.scene.get("hash"):
+                return simulator
+            reason = "its content has changed since"
+        except (ValueError, OSError, ImportError) as error:
+            reason = " ".join(str(error).split())
+        self.remark = f"no true image: the scene cannot be opened ({reason})"
+        return None

@@ -1,0 +1,113 @@
+"""`r3jax audit`: what a capture lacks, how its frames would render, which views would help."""
+
+from pathlib import Path
+
+from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.camera_paths import path_of
+from r3jax.apps.audit.outputs import suggested_poses, write_outputs
+from r3jax.apps.audit.pages import sentences
+from r3jax.apps.audit.pages.audit_page import write_report
+from r3jax.apps.audit.pages.ground_plan import letter
+from r3jax.apps.audit.source import source_of
+from r3jax.apps.audit.survey import AuditSettings
+from r3jax.cli.console import Console, Table
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import AuditOptions
+from r3jax.cli.progress import Stages
+from r3jax.formats.captures import open_capture
+
+_SHOWN = 5
+"""Regions that the console lists."""
+
+
+def run_audit(options: AuditOptions) -> int:
+    """Audits a capture and writes the report and what belongs to it.
+
+    Raises:
+        UserError: not a capture, a broken one, one that says nothing of depth; a setting that
+            makes no sense; a folder that holds something else; a disk that is full.
+    """
+    progress = Console(stderr=True)
+    try:
+        capture = open_capture(options.capture, "z")
+        folder = options.out or Path("runs") / "audit" / capture.name
+        _check_folder(folder)
+        path = None if options.path is None else path_of(options.path)
+        source = source_of(capture.source, capture.name)
+        with Stages(progress) as stages:
+            found = audit(source, _settings_of(options), path, stages.on_progress)
+            folder.mkdir(parents=True, exist_ok=True)
+            stages.on_progress("writing the report", 0)
+            written = write_outputs(found, folder)
+            page = write_report(found, folder, written.values())
+    except (ValueError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    _show(Console(), found, {"report": page, **written})
+    if found.plan.views:
+        progress.say("then take the views above, add them to the capture, and")
+    progress.next("audit", options.capture)
+    return 0
+
+
+def _settings_of(options: AuditOptions) -> AuditSettings:
+    return AuditSettings(
+        voxel_size=options.voxel_size,
+        max_range=options.max_range,
+        up=options.up,
+        max_frames=options.max_frames,
+        folds=options.folds,
+        num_views=options.views,
+        seed=options.seed,
+        trust_depth=options.trust_depth,
+    )
+
+
+def _check_folder(folder: Path) -> None:
+    """Only an earlier audit is replaced."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "audit.json").exists():
+        raise UserError(f"{folder} holds something that is no audit: give another --out")
+
+
+def _show(console: Console, found: Audit, written: dict[str, Path]) -> None:
+    for sentence in sentences.verdict(found):
+        console.print(sentence)
+    if found.regions:
+        console.print(_regions(found))
+    if found.plan.views:
+        console.print(_views(found))
+    for what, path in written.items():
+        console.say(f"{what}  {path}")
+
+
+def _regions(found: Audit) -> Table:
+    table = Table(title="Where it is worst", title_justify="left", title_style="bold", box=None)
+    for name in ("", "mostly"):
+        table.add_column(name)
+    for name in ("bad", "R", "middle (x, y, z)"):
+        table.add_column(name, justify="right")
+    for number, region in enumerate(found.regions[:_SHOWN]):
+        center = found.survey.alignment.points_back(region.center[None])[0]
+        table.add_row(
+            letter(number),
+            region.cause,
+            sentences.area(found, region.area),
+            f"{region.renderability:.2f}",
+            sentences.point(center),
+        )
+    return table
+
+
+def _views(found: Audit) -> Table:
+    table = Table(title="Views to take", title_justify="left", title_style="bold", box=None)
+    for name in ("", "from (x, y, z)", "towards", "mean R then"):
+        table.add_column(name, justify="right")
+    table.add_row("0", "", "", f"{found.diagnosis.mean:.3f}")
+    poses = suggested_poses(found)
+    for number, (view, pose) in enumerate(zip(found.plan.views, poses, strict=True), start=1):
+        table.add_row(
+            str(number),
+            sentences.point(pose[:3, 3]),
+            sentences.point(pose[:3, 2]),
+            f"{view.mean_after:.3f}",
+        )
+    return table

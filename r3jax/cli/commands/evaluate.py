@@ -1,0 +1,116 @@
+"""`r3jax evaluate`: judges a model by test views and writes what came out."""
+
+from pathlib import Path
+
+import numpy as np
+
+from r3jax.apps.models.folder import find_model
+from r3jax.apps.models.judge import (
+    NETWORKS,
+    JudgeSettings,
+    Judgment,
+    judge,
+    warnings_of,
+    write_judgment,
+)
+from r3jax.apps.models.test_sets import choose_views
+from r3jax.apps.report.report import write_report
+from r3jax.cli.console import Console, Table, Text
+from r3jax.cli.errors import UserError, check_resolution, one_line
+from r3jax.cli.options import EvaluateOptions
+from r3jax.cli.progress import Stages
+from r3jax.evaluation.scores import Summary
+from r3jax.formats.captures import open_capture
+
+
+def run_evaluate(options: EvaluateOptions) -> int:
+    """Judges a model and writes rows, summary and contact sheet.
+
+    Raises:
+        UserError: no model, no test views, views that cannot be judged, a missing package.
+    """
+    progress = Console(stderr=True)
+    try:
+        check_resolution(options.resolution)
+        if options.worst < 0:
+            raise ValueError(f"--worst must not be negative, got {options.worst}")
+        capture = open_capture(options.path, options.up)
+        model = find_model(capture, options.name, options.model)
+        test = choose_views(options.views, capture, model, options.up)
+        with Stages(progress) as stages:
+            judgment = judge(capture, model, test, _settings(options), stages.on_progress)
+            stages.on_progress("writing the results", 0)
+            default = model.path.parent if capture.run is None else capture.path / "report"
+            folder = options.out or default
+            written = write_judgment(judgment, folder, options.views, options.rows, options.worst)
+            if capture.run is not None and folder == default:
+                _, state, grid = capture.run.checkpoint()
+                written["report"] = write_report(capture.run, state, grid, stages.on_progress)
+    except (ValueError, OSError, ImportError) as error:
+        raise UserError(one_line(error)) from error
+    _show(Console(), judgment, written)
+    if capture.run is not None:
+        which = () if options.name == EvaluateOptions.name else ("--name", options.name)
+        progress.next("view", options.path, *which)
+    else:
+        progress.next("audit", options.path)
+    return 0
+
+
+def _settings(options: EvaluateOptions) -> JudgeSettings:
+    return JudgeSettings(
+        lpips=options.lpips,
+        resolution=options.resolution,
+        with_map=not options.no_renderability,
+        seed=options.seed,
+        backend=options.backend,
+    )
+
+
+def _show(console: Console, judgment: Judgment, written: dict[str, Path]) -> None:
+    rows, network = judgment.evaluation.rows, judgment.settings.lpips
+    console.say(judgment.described)
+    console.say(f"model: {judgment.model.path}, {judgment.num_gaussians} Gaussians")
+    console.print(_table(judgment.summaries))
+    lpips = "no LPIPS" if network == "none" else f"LPIPS v0.1 with {NETWORKS[network]} on [-1, 1]"
+    console.print(
+        "Renders rounded to 8 bits; SSIM with an 11x11 Gaussian window, sigma 1.5, data range 1; "
+        f"{lpips}. Brackets: 95 % bootstrap interval of the mean over views. The 5th percentile "
+        "is the bad tail (of LPIPS the 95th).",
+        style="dim",
+    )
+    coverage = np.mean([row.coverage for row in rows])
+    holes = 1.0 - np.mean([row.measured for row in rows])
+    facts = f"filled by the model {100 * coverage:.1f} %, holes of the scan {100 * holes:.1f} %"
+    expected = [row.renderability for row in rows if row.renderability is not None]
+    if expected:
+        facts += f", mean renderability {np.mean(expected):.3f}"
+    console.say(facts)
+    for what, path in written.items():
+        console.say(f"{what}  {path}")
+    for warning in warnings_of(judgment):
+        console.say(f"warning: {warning}", style="yellow")
+
+
+def _table(summaries: tuple[Summary, ...]) -> Table:
+    table = Table("", "mean", "", "median", "5th %", "worst (view)", "<20 dB", box=None)
+    for column in table.columns:
+        column.no_wrap = True
+        column.justify = "left" if column is table.columns[0] else "right"
+    for summary in summaries:
+
+        def show(value: float, digits: int = summary.metric.decimals) -> str:
+            return f"{value:.{digits}f}"
+
+        low, high = summary.interval
+        poor = "" if summary.poor_share is None else f"{100 * summary.poor_share:.1f} %"
+        table.add_row(
+            summary.metric.title,
+            Text(show(summary.mean), style="bold"),
+            f"[{show(low)}, {show(high)}]",
+            show(summary.median),
+            show(summary.percentile_5),
+            f"{show(summary.worst)} ({summary.worst_view})",
+            poor,
+        )
+    return table

@@ -1,0 +1,176 @@
+"""`r3jax explore`: begin a run, go on with one, or fork one; write what comes out of it."""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from r3jax.apps.forecast.forecast import stopping_rule
+from r3jax.apps.report.report import write_report
+from r3jax.apps.runs.begin import Expedition, begin_run, fork_run, resume_run, write_data_set
+from r3jax.apps.runs.settings import changed_versions, settings_of_run
+from r3jax.cli.checks import default_name
+from r3jax.cli.console import Console
+from r3jax.cli.errors import UserError, check_viser, one_line, resumable, resume_command
+from r3jax.cli.from_options import policy_of_options, run_settings, scene_settings
+from r3jax.cli.options import ExploreOptions
+from r3jax.cli.progress import RunProgress, Stages
+from r3jax.exploration.loop import Result, explore
+from r3jax.exploration.state import StopReason
+from r3jax.planning.robot.motion import motion_of
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run, read_run
+from r3jax.trace.rows import StepRow
+
+EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
+"""Exit codes of a run that can be gone on with; 0 for all others."""
+
+
+def run_explore(options: ExploreOptions) -> int:
+    """Explores a scene and writes the data set and the report.
+
+    Raises:
+        UserError: an unknown scene or policy, a setting that cannot work, a run that exists, or
+            one that cannot be gone on with.
+    """
+    console = Console(stderr=True)
+    with contextlib.ExitStack() as stack:
+        # A port that is in use must be told before there is a folder.
+        page = _open_page(options, stack) if options.live else None
+        try:
+            expedition = _expedition(options, console)
+        except (ValueError, OSError, ImportError) as error:
+            raise UserError(one_line(error)) from error
+        settings, recorder = expedition.settings, stack.enter_context(expedition.recorder)
+        stack.enter_context(resumable("explore", recorder.path))
+        policy, on_view = settings.policy, lambda row: None
+        if page is not None:
+            feed = stack.enter_context(page(expedition))
+            policy, on_view = feed.watch(policy), feed.on_step
+            console.say(f"live      {feed.url}")
+        progress = stack.enter_context(RunProgress(console, settings.budget))
+
+        def on_step(row: StepRow) -> None:
+            progress.on_step(row)
+            on_view(row)
+
+        try:
+            result = explore(
+                expedition.simulator,
+                policy,
+                budget=settings.budget,
+                seed=expedition.seed,
+                config=settings.config,
+                recorder=recorder,
+                resume=expedition.recorded,
+                decided_from=expedition.decided_from,
+                is_enough=stopping_rule(settings.config, expedition.simulator.camera),
+                on_step=on_step,
+                on_stage=progress.on_stage,
+            )
+        except RunError as error:
+            raise UserError(one_line(error)) from error
+    with resumable("explore", recorder.path):
+        _conclude(console, recorder.path, result)
+    return EXIT_CODES.get(result.reason, 0)
+
+
+def _open_page(options: ExploreOptions, stack: contextlib.ExitStack) -> Callable[[Expedition], Any]:
+    """A server for a page that will show an expedition; the stack closes it.
+
+    Returns:
+        Makes the `viewer.live.LiveFeed` of the expedition, once there is one.
+
+    Raises:
+        UserError: viser is not installed, or the port is in use.
+    """
+    check_viser()
+    from r3jax.apps.viewer.page.live import open_live
+    from r3jax.apps.viewer.page.server import close_server, open_server
+
+    try:
+        server = open_server("127.0.0.1", options.port)
+    except (ValueError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    stack.callback(close_server, server)
+
+    def fill(expedition: Expedition) -> Any:
+        return open_live(
+            server,
+            expedition.simulator.camera,
+            expedition.simulator.bounds,
+            expedition.settings.config,
+            title=f"{expedition.settings.policy.name}, live",
+            subtitle=str(expedition.recorder.path),
+            earlier=expedition.recorded,
+        )
+
+    return fill
+
+
+def _expedition(options: ExploreOptions, console: Console) -> Expedition:
+    """The run that the options ask for: resumed, forked or new."""
+    if options.resume is not None:
+        with console.status(f"opening {options.resume} and its scene ..."):
+            expedition = resume_run(options.resume, options.budget, options.until)
+        assert expedition.recorded is not None
+        warn_of_versions(console, expedition.recorded)
+        console.say(f"goes on behind view {len(expedition.recorded.rows)} of {options.resume}")
+        return expedition
+    if options.fork is not None:
+        assert options.at is not None
+        run = read_run(options.fork)
+        settings = settings_of_run(run).with_limits(options.budget, options.until)
+        if options.changes_policy:
+            max_range = run.header.scene["max_range"]
+            policy = policy_of_options(options, max_range, motion_of(settings.policy))
+            settings = dataclasses.replace(settings, policy=policy)
+        name = options.name or f"{options.fork.name}-{settings.policy.name}-from{options.at}"
+        with console.status(f"opening {options.fork} and its scene ..."):
+            path = options.out / name
+            return fork_run(run, options.at, settings, path, overwrite=options.overwrite)
+    assert options.scene is not None
+    settings = run_settings(options)
+    name = options.name or default_name(options, options.scene, settings.policy.name)
+    with console.status(f"opening {options.scene} ..."):
+        path = options.out / name
+        return begin_run(settings, scene_settings(options), path, overwrite=options.overwrite)
+
+
+def warn_of_versions(console: Console, run: Run) -> None:
+    """Says which packages are not those that a run was begun with."""
+    changed = changed_versions(run)
+    if changed:
+        console.say(
+            f"the run was begun with other versions ({', '.join(changed)}): what follows may "
+            "differ in the last digits from what would have followed then",
+        )
+
+
+def _conclude(console: Console, path: Path, result: Result) -> None:
+    """Data set, report, and a few words; a full disk must not hide how the run ended."""
+    console.say(f"{result.reason.value}: {result.message}")
+    if result.reason in EXIT_CODES:
+        console.say(f"go on     {resume_command('explore', path)}")
+    if result.state.views == 0:
+        return
+    try:
+        with Stages(console) as stages:
+            stages.on_progress("writing the data set", 0)
+            run = read_run(path)
+            write_data_set(run, result)
+            state = result.state
+            page = write_report(run, state.map_state, state.grid, stages.on_progress)
+    except (RunError, OSError) as error:
+        console.say(f"the report could not be written: {one_line(error)}")
+        return
+    last = result.rows[-1]
+    console.say(
+        f"{len(result.rows)} views, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
+        f"{100 * last.coverage.known_share:.0f} % of the box explored, mean renderability "
+        f"{last.coverage.mean_renderability:.2f}",
+    )
+    console.say(f"data set  {path / 'transforms.json'}")
+    console.say(f"report    {page}")
+    console.next("train", path)

@@ -1,0 +1,40 @@
+"""`r3jax export`: a run as a data set of nerfstudio or COLMAP."""
+
+import shlex
+
+from r3jax.cli.console import Console
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import ExportOptions
+from r3jax.cli.progress import Stages
+from r3jax.formats.errors import FormatError
+from r3jax.formats.exports import export_run
+from r3jax.trace import DEPTH_STEPS_PER_METRE
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import read_run
+
+
+def run_export(options: ExportOptions) -> int:
+    """Writes the folder.
+
+    Raises:
+        UserError: not a run, no views, a folder that holds something, a disk that is full.
+    """
+    console = Console(stderr=True)
+    try:
+        run = read_run(options.path)
+        with Stages(console) as stages:
+            stages.on_progress("copying the images", len(run.rows))
+            points = export_run(run, options.out, options.format, lambda: stages.on_progress("", 1))
+    except (RunError, FormatError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    console.say(f"{len(run.rows)} images, {points} points")
+    console.say(f"exported  {options.out}")
+    if options.format == "nerfstudio":
+        unit = 1.0 / DEPTH_STEPS_PER_METRE
+        console.say(
+            f"next      ns-train splatfacto --data {shlex.quote(str(options.out))} nerfstudio-data "
+            f"--depth-unit-scale-factor {unit:g}"
+        )
+    else:
+        console.next("audit", options.out)
+    return 0

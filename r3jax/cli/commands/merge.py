@@ -1,0 +1,34 @@
+"""`r3jax merge`: two runs of one scene as one data set, with the map that saw both."""
+
+from r3jax.apps.runs.merge import merge_runs
+from r3jax.cli.console import Console
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import MergeOptions
+from r3jax.cli.progress import Stages
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import read_run
+
+
+def run_merge(options: MergeOptions) -> int:
+    """Writes the merged run: the views of both, the map, transforms.json and points.
+
+    Raises:
+        UserError: not runs, of different scenes or settings, or the folder cannot be written.
+    """
+    console = Console(stderr=True)
+    out = options.out or options.first.parent / f"{options.first.name}+{options.second.name}"
+    try:
+        runs = [read_run(path) for path in (options.first, options.second)]
+        total = sum(len(run.rows) for run in runs)
+        with Stages(console) as stages:
+            stages.on_progress("integrating the frames of both", total)
+            map_state = merge_runs(
+                runs, out, overwrite=options.overwrite, on_frame=lambda: stages.on_progress("", 1)
+            )
+    except (RunError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    views = " + ".join(str(len(run.rows)) for run in runs)
+    console.say(f"{views} views, {int(map_state.num_occupied)} voxels")
+    console.say(f"merged    {out}")
+    console.next("train", out)
+    return 0

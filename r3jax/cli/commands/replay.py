@@ -1,0 +1,39 @@
+"""`r3jax replay`: do the recorded frames rebuild the stored map?"""
+
+from r3jax.cli.console import Console
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import ReplayOptions
+from r3jax.cli.progress import Stages
+from r3jax.exploration.replay import differences
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import read_run
+
+_DIFFERS = 1
+"""Exit code where the maps are not equal."""
+
+
+def run_replay(options: ReplayOptions) -> int:
+    """Rebuilds map and grid from the frames and compares them, array by array, bit by bit.
+
+    Raises:
+        UserError: not a run, no stored map, a frame that is missing or not the recorded one.
+    """
+    console = Console(stderr=True)
+    try:
+        run = read_run(options.path)
+        with Stages(console) as stages:
+            stages.on_progress("integrating the recorded frames", len(run.rows))
+            views, found = differences(run, lambda: stages.on_progress("", 1))
+    except (RunError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    if not found:
+        console.say(f"{views} frames rebuild the stored map and grid, bit for bit")
+        console.next("train", options.path)
+        return 0
+    console.say(f"{views} frames do not rebuild what is stored:")
+    for difference in found:
+        what = f"{difference.num_different} elements, by at most {difference.largest:g}"
+        text = "another shape" if difference.num_different < 0 else what
+        console.say(f"  {difference.name}: {text}")
+    console.say("made by another version of this package, or on another kind of device?")
+    return _DIFFERS

@@ -1,0 +1,102 @@
+"""`r3jax view`: a run in the browser, or as pictures and a film without one."""
+
+import contextlib
+import os
+import sys
+import threading
+from pathlib import Path
+
+from r3jax.apps.viewer.film import export_film, load_av
+from r3jax.cli.console import Console
+from r3jax.cli.errors import UserError, check_viser, one_line
+from r3jax.cli.options import ViewOptions
+from r3jax.cli.progress import Stages
+from r3jax.exploration.replay import config_of
+from r3jax.trace.reader import Run, read_run
+
+_THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
+
+
+def run_view(options: ViewOptions) -> int:
+    """Shows a run until Ctrl-C, or writes its pictures.
+
+    Raises:
+        UserError: not a run, no views, a port that is in use, a folder that holds something, a
+            missing package.
+    """
+    console = Console(stderr=True)
+    try:
+        run = read_run(options.path)
+        if not run.rows:
+            raise UserError(f"{run.path}: the run has no views yet: there is nothing to see")
+        config_of(run)  # says what is wrong with it
+        if options.export is not None:
+            return _export(run, options.export, options.video, console)
+        _show(options, run, console)
+    except (ValueError, OSError, ImportError) as error:
+        raise UserError(one_line(error)) from error
+    return 0
+
+
+def _show(options: ViewOptions, run: Run, console: Console) -> None:
+    """Shows the page until Ctrl-C.
+
+    Raises:
+        UserError: viser is not installed.
+        ValueError, OSError: as `open_run_page`.
+    """
+    check_viser()
+    from r3jax.apps.viewer.recorded import open_run_page  # needs viser
+
+    if options.host not in _THIS_MACHINE:
+        text = f"everybody who can reach {options.host} sees the page, and can use it"
+        console.say(text, style="yellow")
+    with contextlib.ExitStack() as stack:
+        page = open_run_page(
+            run,
+            host=options.host,
+            port=options.port,
+            allow=options.allow,
+            model=options.name,
+            with_scene=not options.no_scene,
+        )
+        with console.status("opening the run ..."):
+            shown = stack.enter_context(page)
+        with contextlib.suppress(KeyboardInterrupt):
+            console.say(f"view      {shown.url}")
+            console.say("Ctrl-C ends it")  # from here on, and not only once this waits
+            until_interrupted()
+        end_at_once()
+
+
+def until_interrupted() -> None:
+    """Waits for Ctrl-C."""
+    threading.Event().wait()
+
+
+def end_at_once() -> None:
+    """Ends the process: the page writes nothing, and what it works on may take half a minute yet.
+
+    An answer that is being worked out or compiled cannot be stopped, and Python would wait for it,
+    as viser does for its browsers.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
+
+
+def _export(run: Run, out: Path, video: bool, console: Console) -> int:
+    """Writes the pictures.
+
+    Raises:
+        FormatError, RunError, ImportError, OSError: as `export_film`.
+    """
+    if video:
+        load_av()  # says what is missing before an hour has passed
+    with Stages(console) as stages:
+        written = export_film(
+            run, out, video=video, on_picture=lambda done, total: stages.at("drawing", done, total)
+        )
+    for path in written:
+        console.say(f"written   {path}")
+    return 0

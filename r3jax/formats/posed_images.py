@@ -1,0 +1,188 @@
+"""Posed images: what a transforms.json or a COLMAP model says of a capture.
+
+Poses and points stay in the capture's own coordinates: nothing is turned, centered or scaled. A
+COLMAP model without known positions is not in meters, and its world may be upside down.
+
+Shape symbols: n images; m points; t observations.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.lenses import Lens
+from r3jax.formats.validation.images import image_pixels, image_size
+from r3jax.frame import Frame
+
+IMAGE_FORMATS = ("PNG", "JPEG")
+"""What Pillow may try."""
+
+_DEPTH_MODES = ("I;16", "I;16B", "I")
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """Points that a structure from motion found, and which image sees which."""
+
+    xyz: np.ndarray
+    """Positions in the capture's coordinates, [m, 3] float64."""
+
+    rgb: np.ndarray
+    """Colors, [m, 3] uint8."""
+
+    seen_point: np.ndarray
+    """Index of the point of every observation, [t] int64, ascending."""
+
+    seen_image: np.ndarray
+    """Index of the image of every observation, [t] int64."""
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.xyz)
+
+    def seen_by(self, image: int) -> np.ndarray:
+        """Indices of the points that an image sees, ascending."""
+        return np.unique(self.seen_point[self.seen_image == image])
+
+
+@dataclass(frozen=True)
+class DepthUnit:
+    """What the whole numbers in a depth image mean; 0 is no measurement."""
+
+    metres_per_step: float = 0.001
+    """Units of the capture per step."""
+
+    beyond_range: int | None = None
+    """Stored where nothing lies within the sensor's range; None: there is no such number."""
+
+    invalid: int | None = None
+    """Stored, beside 0, where there is no measurement; None: there is no such number."""
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """Images with their cameras and poses. Whether the files exist shows when they are read."""
+
+    path: Path
+    """File or folder that says all this."""
+
+    image_paths: tuple[Path, ...]
+    """One per image; not all of them need to exist."""
+
+    lenses: tuple[Lens, ...]
+    """One per image."""
+
+    poses: np.ndarray
+    """`T_world_camera`, [n, 4, 4] float64: OpenCV axes, the capture's own coordinates."""
+
+    depth_paths: tuple[Path | None, ...]
+    """One per image; None where there is no depth image."""
+
+    depth_unit: DepthUnit = DepthUnit()
+    """Meaning of the numbers in all depth images."""
+
+    points: SparsePoints | None = None
+    """None where the capture comes without."""
+
+    points_path: Path | None = None
+    """A PLY with further points, of which nothing says who sees them: see `read_points`."""
+
+    T_capture_original: np.ndarray | None = None
+    """Where the program that wrote the capture moved it: takes points [4, 4] from the coordinates
+    it was given to those of the poses; None: it does not say."""
+
+    remark: str | None = None
+    """What else is there but not among the images, a sentence; None: nothing is left out."""
+
+    def __len__(self) -> int:
+        """Number of images."""
+        return len(self.image_paths)
+
+    def with_depth(self, folder: Path, unit: DepthUnit) -> "PosedImages":
+        """The same images with the depth images of a folder: 16-bit PNGs of the same names.
+
+        For formats that have no place for depth. Images without a PNG there have no depth.
+        """
+        candidates = [folder / f"{path.stem}.png" for path in self.image_paths]
+        found = tuple(path if path.is_file() else None for path in candidates)
+        return dataclasses.replace(self, depth_paths=found, depth_unit=unit)
+
+    def frame(self, index: int) -> Frame:
+        """One image with its depth. A depth image of another size is sampled at its nearest pixels.
+
+        Raises:
+            FormatError: the image has distortion (undistort it first), there is no depth image,
+                or a file is missing, broken, of another size, or of another unit of depth.
+        """
+        lens, path = self.lenses[index], self.image_paths[index]
+        if not lens.is_pinhole:
+            raise FormatError(
+                path,
+                f"the image is distorted ({lens.model}): undistort the capture first, for example "
+                "by COLMAP's image_undistorter",
+            )
+        depth_path = self.depth_paths[index]
+        if depth_path is None:
+            raise FormatError(path, "there is no depth image that belongs to it")
+        rgb, depth = self.rgb(index), self.depth(index)
+        try:
+            return Frame(
+                rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
+                depth=jnp.asarray(depth),
+                T_world_camera=jnp.asarray(self.poses[index], dtype=jnp.float32),
+                camera=lens.camera,
+            )
+        except ValueError as error:
+            raise FormatError(depth_path, str(error)) from None
+
+    def rgb(self, index: int) -> np.ndarray:
+        """The pixels of one image as they are, distortion included, [H, W, 3] uint8.
+
+        Raises:
+            FormatError: the file is missing, broken or of another size.
+        """
+        path, lens = self.image_paths[index], self.lenses[index]
+        with naming(path):
+            image_size(path, IMAGE_FORMATS)  # refuses what would not fit into memory
+            return image_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
+
+    def depth(self, index: int) -> np.ndarray | None:
+        """The depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
+
+        0 is no measurement, inf nothing within range.
+
+        Raises:
+            FormatError: the file is missing, broken, or no 16-bit image.
+        """
+        path, lens = self.depth_paths[index], self.lenses[index]
+        if path is None:
+            return None
+        return _read_depth(path, (lens.width, lens.height), self.depth_unit)
+
+    def frames(self) -> Iterator[Frame]:
+        """Every frame in order, read one by one."""
+        return (self.frame(index) for index in range(len(self)))
+
+
+def _read_depth(path: Path, size: tuple[int, int], unit: DepthUnit) -> np.ndarray:
+    """z-depth [H, W] float32; 0 no measurement, inf beyond the range."""
+    with naming(path):
+        stored = image_size(path, IMAGE_FORMATS)
+        wanted = "depth must be a 16-bit PNG"
+        steps = image_pixels(path, IMAGE_FORMATS, stored, _DEPTH_MODES, wanted)
+    rows, columns = (
+        ((np.arange(now) + 0.5) * there / now).astype(np.int64)
+        for now, there in zip(size[::-1], stored[::-1], strict=True)
+    )
+    steps = steps[rows[:, None], columns[None, :]]
+    depth = (steps.astype(np.float64) * unit.metres_per_step).astype(np.float32)
+    if unit.invalid is not None:
+        depth = np.where(steps == unit.invalid, np.float32(0.0), depth)
+    if unit.beyond_range is None:
+        return depth
+    return np.where(steps == unit.beyond_range, np.float32(np.inf), depth)

@@ -1,0 +1,1 @@
+"""Data sets and recordings that are folders of numbered images: one module for each."""

@@ -1,0 +1,99 @@
+"""Reads a scene of the Replica-SLAM renderings (NICE-SLAM, Zhu et al. 2022).
+
+    results/frame000000.jpg    8-bit RGB
+    results/depth000000.png    uint16, `scale` steps a meter (6553.5), 0 = no measurement
+    traj.txt                   a camera-to-world matrix per line, 16 numbers row by row, OpenCV axes
+    cam_params.json            {"camera": {w, h, fx, fy, cx, cy, scale}}; here or one folder above
+
+The world is Replica's own: meters, z up.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.lenses import Lens
+from r3jax.formats.posed_images import DepthUnit, PosedImages
+from r3jax.formats.poses import mend_pose, read_numbers
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_fields
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json
+
+_MAX_JSON = 1 << 20
+"""A camera takes some hundred bytes."""
+
+_FIELDS = {"w": int, "h": int, "fx": float, "fy": float, "cx": float, "cy": float, "scale": float}
+
+
+def is_replica_slam(path: Path) -> bool:
+    """True if the folder looks like a scene of Replica-SLAM."""
+    return (path / "traj.txt").exists() and (path / "results").is_dir()
+
+
+def read_replica_slam(path: Path | str) -> PosedImages:
+    """Opens a scene and checks everything but the pixels.
+
+    Args:
+        path: the folder of the scene.
+
+    Raises:
+        FormatError: files that are missing, numbers of images and poses that differ, a camera
+            that makes no sense, poses that are not finite or not rigid.
+    """
+    path = Path(path)
+    images = _numbered(path / "results", "frame")
+    depths = _numbered(path / "results", "depth")
+    source = path / "traj.txt"
+    poses = read_numbers(source, columns=16).reshape(-1, 4, 4)
+    if not len(images) == len(depths) == len(poses):
+        raise FormatError(
+            path,
+            f"the numbers must be equal, found {len(images)} images, {len(depths)} depth images, "
+            f"{len(poses)} poses",
+        )
+    for image, depth in zip(images, depths, strict=True):
+        if image.stem.removeprefix("frame") != depth.stem.removeprefix("depth"):
+            raise FormatError(depth, f"the depth image of {image.name} should be here")
+    lens, unit = _camera(path)
+    return PosedImages(
+        path=path,
+        image_paths=images,
+        lenses=(lens,) * len(images),
+        poses=np.stack(
+            [mend_pose(source, f"pose {i} (line {i + 1})", pose) for i, pose in enumerate(poses)]
+        ),
+        depth_paths=depths,
+        depth_unit=unit,
+    )
+
+
+def _numbered(folder: Path, start: str) -> tuple[Path, ...]:
+    """The pictures whose names start like this, by their names."""
+    if not folder.is_dir():
+        raise FormatError(folder, "the folder is missing")
+    kinds = (".png", ".jpg", ".jpeg")
+    found = [p for p in folder.glob(f"{start}*") if p.suffix.lower() in kinds]
+    if not found:
+        raise FormatError(folder, f"the folder holds no image {start}*.jpg or {start}*.png")
+    return tuple(sorted(found))
+
+
+def _camera(path: Path) -> tuple[Lens, DepthUnit]:
+    """The camera of all images, and the unit of their depth."""
+    places = (path / "cam_params.json", path.resolve().parent / "cam_params.json")
+    source = next((place for place in places if place.exists()), places[0])
+    with naming(source):
+        content: Any = parse_json(read_bytes(source, _MAX_JSON))
+        check_fields("cam_params", content, {"camera": dict[str, Any]})
+        camera: dict[str, Any] = content["camera"]
+        check_fields("camera", camera, _FIELDS)
+        if not 1e-3 < camera["scale"] < 1e9:
+            raise ForeignFileError(f"the scale {camera['scale']:g} makes no sense")
+        # Pixel centers lie at whole numbers there.
+        center = (camera["cx"] + 0.5, camera["cy"] + 0.5)
+        params = (float(camera["fx"]), float(camera["fy"]), *center)
+        lens = Lens("PINHOLE", camera["w"], camera["h"], params)
+        return lens, DepthUnit(1.0 / camera["scale"])

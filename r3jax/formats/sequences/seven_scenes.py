@@ -1,0 +1,64 @@
+"""Reads a sequence of the 7-Scenes data set (Shotton et al. 2013).
+
+    frame-000000.color.png    8-bit RGB, 640x480; or .color.jpg, as some hand it on
+    frame-000000.depth.png    uint16, millimeters; 0 and 65535 are no measurement
+    frame-000000.pose.txt     a 4x4 camera-to-world matrix, OpenCV axes
+
+The data set names one camera for both images: focal length 585 px, principal point (320, 240).
+Its depth images are not registered to the color images, which are off by some pixels.
+(https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/)
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from r3jax.formats.errors import FormatError
+from r3jax.formats.lenses import Lens
+from r3jax.formats.posed_images import DepthUnit, PosedImages
+from r3jax.formats.poses import mend_pose, read_numbers
+
+_LENS = Lens("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0))
+_UNIT = DepthUnit(0.001, invalid=65535)
+_COLORS = (".color.png", ".color.jpg", ".color.jpeg")
+
+
+def is_seven_scenes(path: Path) -> bool:
+    """True if the folder looks like a sequence of the data set."""
+    return path.is_dir() and any(any(path.glob(f"frame-*{color}")) for color in _COLORS)
+
+
+def read_seven_scenes(path: Path | str) -> PosedImages:
+    """Opens a sequence and checks everything but the pixels.
+
+    Args:
+        path: the folder of the sequence, such as `chess/seq-01`.
+
+    Raises:
+        FormatError: no frames, a pose that is missing, not 4x4, not finite or not rigid. Images
+            that are missing are noticed when they are read.
+    """
+    path = Path(path)
+    found = {
+        image.name.removesuffix(color): image
+        for color in reversed(_COLORS)  # where a frame has both, the PNG is the original
+        for image in path.glob(f"frame-*{color}")
+    }
+    if not found:
+        raise FormatError(path, f"the folder holds no frame-*{_COLORS[0]} or .jpg")
+    bases = sorted(found)
+    return PosedImages(
+        path=path,
+        image_paths=tuple(found[base] for base in bases),
+        lenses=(_LENS,) * len(bases),
+        poses=np.stack([_pose(path / f"{base}.pose.txt") for base in bases]),
+        depth_paths=tuple(path / f"{base}.depth.png" for base in bases),
+        depth_unit=_UNIT,
+    )
+
+
+def _pose(source: Path) -> np.ndarray:
+    matrix = read_numbers(source, columns=4)
+    if matrix.shape != (4, 4):
+        raise FormatError(source, f"expected a 4x4 matrix, got {len(matrix)} lines")
+    return mend_pose(source, "the pose", matrix)

@@ -1,0 +1,146 @@
+"""Reads a sequence of the TUM RGB-D benchmark (Sturm et al. 2012), or one recorded like it.
+
+    rgb.txt, depth.txt    lines "timestamp path", the path relative to the folder
+    groundtruth.txt       lines "timestamp tx ty tz qx qy qz qw", camera to world, OpenCV axes
+    K.txt                 3x3 intrinsics; without it the benchmark's own defaults
+
+Depth images are uint16 in steps of 0.2 mm, registered to the color images; 0 is no measurement.
+The three lists have clocks of their own: every color image takes the depth image and the pose
+that are nearest in time, and is left out where one of them is more than 0.02 s away. The
+benchmark recommends its default intrinsics, without undistortion.
+(https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats)
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from r3jax.formats.colmap.model import rotation_of
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.lenses import Lens
+from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
+from r3jax.formats.poses import MAX_DISTANCE, read_lines, read_numbers, to_floats
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.images import image_size
+from r3jax.formats.validation.names import below
+
+_MAX_GAP = 0.02
+"""Pictures and poses farther apart than this do not belong together [s]."""
+
+_UNIT = DepthUnit(1.0 / 5000.0)
+_SIZE = (640, 480)
+_DEFAULT = (525.0, 525.0, 319.5, 239.5)
+"""fx, fy, cx, cy of the benchmark's sensors [px]; pixel centers lie at whole numbers."""
+
+
+def is_tum(path: Path) -> bool:
+    """True if the folder looks like a sequence of the benchmark."""
+    return all((path / name).exists() for name in ("rgb.txt", "depth.txt", "groundtruth.txt"))
+
+
+def read_tum(path: Path | str) -> PosedImages:
+    """Opens a sequence and checks everything but the pixels.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        FormatError: files that are missing or damaged, paths that lead out of the folder, no image
+            with depth and pose, intrinsics that make no sense, poses that are not finite.
+    """
+    path = Path(path)
+    (image_times, images), (depth_times, depths) = (
+        _pictures(path, name) for name in ("rgb.txt", "depth.txt")
+    )
+    source = path / "groundtruth.txt"
+    table = read_numbers(source, columns=8)
+    if not np.all(np.isfinite(table)):
+        raise FormatError(source, "there are numbers that are not finite")
+    depth_at, pose_at = nearest(image_times, depth_times), nearest(image_times, table[:, 0])
+    chosen = np.flatnonzero((depth_at >= 0) & (pose_at >= 0))
+    if not len(chosen):
+        raise FormatError(
+            path, f"no image has a depth image and a pose within {_MAX_GAP:g} s of it"
+        )
+    poses = [_pose(source, table[pose_at[i]]) for i in chosen]
+    lens = _lens(path, images[chosen[0]])
+    return PosedImages(
+        path=path,
+        image_paths=tuple(images[i] for i in chosen),
+        lenses=(lens,) * len(chosen),
+        poses=np.stack(poses),
+        depth_paths=tuple(depths[depth_at[i]] for i in chosen),
+        depth_unit=_UNIT,
+    )
+
+
+def nearest(times: np.ndarray, others: np.ndarray, max_gap: float = _MAX_GAP) -> np.ndarray:
+    """For each time the index of the nearest other time; -1 where it is too far away.
+
+    Args:
+        times: [n] [s], in any order.
+        others: [m] [s], in any order, m >= 1.
+        max_gap: the largest difference [s].
+    """
+    order = np.argsort(others, kind="stable")
+    ordered = others[order]
+    right = np.searchsorted(ordered, times).clip(0, len(others) - 1)
+    left = (right - 1).clip(0)
+    is_left = np.abs(ordered[left] - times) <= np.abs(ordered[right] - times)
+    best = np.where(is_left, left, right)
+    return np.where(np.abs(ordered[best] - times) <= max_gap, order[best], -1)
+
+
+def _pictures(folder: Path, name: str) -> tuple[np.ndarray, list[Path]]:
+    """Times [n] and paths of a list of pictures."""
+    source = folder / name
+    times: list[float] = []
+    paths: list[Path] = []
+    for number, words in read_lines(source):
+        if len(words) != 2:
+            raise FormatError(source, f"line {number} is not a timestamp and a path")
+        times += to_floats(source, number, words[:1], 1)
+        try:
+            paths.append(below(folder, words[1]))
+        except ForeignFileError as error:
+            raise FormatError(source, f"line {number}: {error}") from None
+    if not paths:
+        raise FormatError(source, "the file lists no pictures")
+    if not np.all(np.isfinite(times)):
+        raise FormatError(source, "there are timestamps that are not finite")
+    return np.asarray(times), paths
+
+
+def _pose(source: Path, row: np.ndarray) -> np.ndarray:
+    """`T_world_camera` of a line: time, translation, quaternion x y z w."""
+    which = f"the pose at {row[0]:.4f} s"
+    if np.abs(row[1:4]).max() > MAX_DISTANCE:
+        raise FormatError(source, f"{which}: the position is {row[1:4].tolist()}")
+    pose = np.eye(4)
+    pose[:3, 3] = row[1:4]
+    try:
+        pose[:3, :3] = rotation_of(row[[7, 4, 5, 6]])
+    except ForeignFileError as error:
+        raise FormatError(source, f"{which}: {error}") from None
+    return pose
+
+
+def _lens(path: Path, first_image: Path) -> Lens:
+    with naming(first_image):
+        width, height = image_size(first_image, IMAGE_FORMATS)
+    source = path / "K.txt"
+    if source.exists():
+        K = read_numbers(source, columns=3)
+        if K.shape != (3, 3):
+            raise FormatError(source, "expected a 3x3 matrix")
+        fx, fy, cx, cy = (float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    elif (width, height) == _SIZE:
+        fx, fy, cx, cy = _DEFAULT
+    else:
+        raise FormatError(
+            source,
+            f"the file is missing, and the images are {width}x{height}, not the benchmark's "
+            f"{_SIZE[0]}x{_SIZE[1]}: give their 3x3 intrinsics in it",
+        )
+    with naming(source):
+        return Lens("PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5))

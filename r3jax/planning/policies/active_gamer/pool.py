@@ -1,0 +1,222 @@
+"""A pool of candidates on lattices, kept between decisions, for ActiveGAMER.
+
+A candidate is a column of a stage's lattice, a level above the floor and a direction. It stands
+in the cell of the column in which the robot may stop that is nearest to the level, within 0.5 m:
+ceilings may be low. It enters the pool when there is such a cell, and sits out the decisions for
+which there is none.
+
+The arrays have a place for every candidate that the grid's box allows: the pool cannot overflow,
+and cannot hold a candidate twice.
+
+Shape symbols: X Y Z cells; P places of a stage (columns x levels); D its directions; C
+candidates drawn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.planning.candidates import Candidates, candidates_along
+from r3jax.planning.robot.limits import UNBOUND, Limits
+from r3jax.planning.robot.travel import Travel
+
+LEAST_GAIN = 0.005
+"""Share of the pixels below which a view is not worth taking."""
+
+_SLACK = 0.5
+"""A candidate stands at most this far above or below its level [m]."""
+
+_BELOW_FLOOR = 0.02
+"""Share of the known free cells that may lie below what is called the floor: seen through
+windows, or put there by the sensor's noise."""
+
+
+@dataclass(frozen=True)
+class LatticeStage:
+    """Where the candidates of one stage lie."""
+
+    spacing: float
+    """Lattice spacing along x and y [m]."""
+
+    heights: tuple[float, ...]
+    """Levels above the floor, ascending [m]."""
+
+    num_directions: int
+    """Directions of the Fibonacci lattice at every place."""
+
+    def columns(self, grid_shape: Sequence[int], cell_size: float) -> np.ndarray:
+        """The cells (x, y) that hold a point of the lattice, [n, 2]; no cell twice.
+
+        The lattice lies half a spacing inside the box's lower corner.
+        """
+        axes: list[np.ndarray] = []
+        for length in grid_shape[:2]:
+            points = np.arange(0.5 * self.spacing, length * cell_size, self.spacing)
+            # The nudge puts points that lie on a border of cells on the same side of it.
+            cells = np.floor(points / cell_size + 1e-3).astype(np.int64)
+            # Cells wider than the spacing hold several points, and are one place all the same.
+            axes.append(np.unique(cells[cells < length]))
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    def places(self, travel: Travel) -> tuple[np.ndarray, np.ndarray]:
+        """The cell [P, 3] in which each place's candidates stand now, and where there is one [P].
+
+        Places are ordered by column, then by level. The levels share a column's cells out among
+        them, so that no two places ever mean the same cell.
+        """
+        columns = self.columns(travel.usable.shape, travel.cell_size)
+        # Safe ones only: the robot's own cell is a goal without the margin, but only for now.
+        stops = (travel.goals & travel.safe)[tuple(columns.T)]
+        layer_of_floor = floor_layer(travel.free)
+        height = (np.arange(stops.shape[1]) + 0.5 - layer_of_floor) * travel.cell_size
+        lowest, highest = (np.array(travel.heights) - travel.origin[2]) - (
+            layer_of_floor * travel.cell_size
+        )
+        # Cells half way between two levels belong to one of them only.
+        borders = [-np.inf, *(0.5 * (a + b) for a, b in pairwise(self.heights)), np.inf]
+        layers: list[np.ndarray] = []
+        is_there: list[np.ndarray] = []
+        for level, (low, high) in zip(self.heights, pairwise(borders), strict=True):
+            # A robot that never comes up or down to the level has it where it comes nearest.
+            gap = np.abs(height - np.clip(level, lowest, highest))
+            may_stand = stops & (height >= low) & (height < high) & (gap <= _SLACK + 1e-6)
+            gaps = np.where(may_stand, gap, np.inf)
+            # Where no cell will do, argmin says 0: the flag beside it tells that from layer 0.
+            layers.append(gaps.argmin(axis=1))
+            is_there.append(may_stand.any(axis=1))
+        cells = np.repeat(columns, len(self.heights), axis=0)
+        layer = np.stack(layers, axis=1).reshape(-1, 1)
+        return np.concatenate([cells, layer], axis=1), np.stack(is_there, axis=1).reshape(-1)
+
+
+STAGES = (LatticeStage(1.0, (1.75,), 5), LatticeStage(0.5, (1.0, 2.5), 15))
+"""Coarse, then fine."""
+
+
+def floor_layer(free: np.ndarray) -> int:
+    """The lowest layer of free cells [X, Y, Z], their lowest 2 % left out; 0 if there is none."""
+    layers = np.nonzero(free)[2]
+    return int(np.quantile(layers, _BELOW_FLOOR, method="higher")) if len(layers) else 0
+
+
+class Pool(eqx.Module):
+    """Every candidate that one stage can ever have, so that none is ever held twice or lost."""
+
+    entered: Bool[Array, "P D"] = eqx.field(converter=jnp.asarray)
+    """Candidates that could be stood at, once."""
+
+    left: Bool[Array, "P D"] = eqx.field(converter=jnp.asarray)
+    """Those that were worth nothing or were chosen; they never return."""
+
+    gain: Float[Array, "P D"] = eqx.field(converter=jnp.asarray)
+    """Share of empty pixels when last scored; 1 before."""
+
+    @property
+    def is_spent(self) -> bool:
+        """True if it once held candidates and none is left."""
+        return bool(jnp.any(self.entered)) and bool(jnp.all(self.left == self.entered))
+
+
+class Pools(eqx.Module):
+    """What the policy remembers."""
+
+    of_stage: tuple[Pool, ...]
+
+    num_ended: Int[Array, ""] = eqx.field(converter=jnp.asarray)
+    """Stages that are over for good."""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The candidates that are scored in one decision. All arrays [C] hold at least one."""
+
+    stage: int
+
+    place: np.ndarray
+    """Row of each in the stage's pool."""
+
+    direction: np.ndarray
+    """Column of each in the stage's pool."""
+
+    candidates: Candidates
+    """Views from those places along those directions."""
+
+    distance: np.ndarray
+    """Straight from the robot [m]."""
+
+
+def empty_pools(grid_shape: Sequence[int], cell_size: float) -> Pools:
+    """Pools for a grid in which nothing is known yet."""
+    pools: list[Pool] = []
+    for stage in STAGES:
+        num_places = len(stage.columns(grid_shape, cell_size)) * len(stage.heights)
+        shape = (num_places, stage.num_directions)
+        nothing = np.zeros(shape, dtype=bool)
+        pools.append(Pool(nothing, nothing, np.ones(shape, dtype=np.float32)))
+    return Pools(tuple(pools), np.zeros((), dtype=np.int32))
+
+
+def admit(pool: Pool, has_place: np.ndarray) -> Pool:
+    """All directions of the places [P] that can be stood at join the pool."""
+    return replace(pool, entered=np.asarray(pool.entered) | has_place[:, None])
+
+
+def dismiss(pool: Pool, draw: Draw, gain: np.ndarray, best: int) -> Pool:
+    """Notes the gains [C]; the chosen candidate and those that are worth nothing leave."""
+    is_done = gain < LEAST_GAIN
+    # What the chosen view did not show now, it will never show.
+    is_done[best] = True
+    remembered, left = np.array(pool.gain), np.array(pool.left)
+    remembered[draw.place, draw.direction] = gain
+    left[draw.place, draw.direction] |= is_done
+    return replace(pool, gain=remembered, left=left)
+
+
+def draw_candidates(
+    pools: Pools, travel: Travel, num: int, limits: Limits = UNBOUND
+) -> tuple[Pools, Draw | None]:
+    """The pools as they are now, and up to `num` candidates of the first stage that has any.
+
+    Those for which the camera cannot turn far enough on the way from here sit out, too.
+    """
+    of_stage, num_ended = list(pools.of_stage), int(pools.num_ended)
+    found = None
+    # Stages before the one that is due have ended for good. Later ones step in while it has no
+    # candidate that can be reached.
+    for k in range(num_ended, len(STAGES)):
+        cells, has_place = STAGES[k].places(travel)
+        of_stage[k] = pool = admit(of_stage[k], has_place)
+        # Only the stage that is due may end: a later one waits, even if it is spent for now.
+        if k == num_ended and pool.is_spent:
+            num_ended += 1
+            continue
+        lattice = fibonacci_lattice(STAGES[k].num_directions)
+        can_turn = limits.may_turn(travel.stops(cells)[:, None, :], lattice)
+        is_open = np.asarray(pool.entered & ~pool.left) & has_place[:, None] & can_turn
+        if is_open.any():
+            found = _best_remembered(pool, is_open, travel, cells, k, num)
+            break
+    return Pools(tuple(of_stage), np.int32(num_ended)), found
+
+
+def _best_remembered(
+    pool: Pool, is_open: np.ndarray, travel: Travel, cells: np.ndarray, stage: int, num: int
+) -> Draw:
+    """Up to `num` of the open candidates [P, D]: the greatest gains, then the nearest."""
+    place, direction = np.nonzero(is_open)
+    positions = travel.stops(cells[place])
+    distance = np.linalg.norm(positions - travel.start, axis=1)
+    # Gains hardly ever rise, so that an old one is a bound, and 1 means never scored.
+    remembered = np.asarray(pool.gain)[place, direction]
+    # The last key of a lexsort rules: gains first, distances among equals.
+    order = np.lexsort((distance, -remembered))[:num]
+    place, direction = place[order], direction[order]
+    lattice = fibonacci_lattice(STAGES[stage].num_directions)
+    views = candidates_along(positions[order], lattice[direction])
+    return Draw(stage, place, direction, views, distance[order])

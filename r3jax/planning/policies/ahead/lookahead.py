@@ -1,0 +1,273 @@
+"""Paths of several views, searched by a beam: each view as if those before it had been taken.
+
+A path is worth what its views add (`scoring.simulated`) over what it costs, in seconds:
+
+    rate = sum of the utility of each view after those before it
+           / sum over its views of (seconds of a view + of the way and the turn)
+
+The carrier's motion says how long ways and turns take and which views there are; a camera that
+flies goes 1 m/s and turns in no time.
+
+The beam holds the paths of the greatest rate. From each, some places are tried whose panorama was
+worth most when nothing else had been seen, which bounds what it can be worth now, and the last
+place once more, in another direction. What is tried lies apart, in place or direction: a hundred
+views of one corner are one choice. On the host; scores are jitted.
+
+Shape symbols: C places.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import shortest_path
+
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import Candidates, best_views, poses_along
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.travel import Travel, segment_is_inside
+from r3jax.scoring.batch import score_cached_near
+from r3jax.scoring.cells import Cells
+from r3jax.scoring.panorama_cache import PanoramaCache
+from r3jax.scoring.simulated import simulate_view_near
+
+_NEIGHBORS = 8
+"""Straight ways are looked for to so many of the nearest places."""
+
+_APART = 0.7
+"""Views from places this far apart are two choices [m]."""
+
+SPEED = 1.0
+"""Speed of a robot whose motion does not say [m/s]."""
+
+_TURNED = 0.5
+"""Cosine between the axes of two views from one place, below which they are two choices."""
+
+
+@dataclass(frozen=True)
+class AheadConfig(PlannerConfig):
+    """How far `ours-ahead` looks, beside what all policies share."""
+
+    horizon: int = 4
+    """Views of the paths that are compared."""
+
+    num_spread: int = 40
+    """How many of the candidates of it are spread over all reachable space."""
+
+    beam: int = 4
+    """Paths that it keeps for every further view."""
+
+    branching: int = 6
+    """Places that it tries for the next view of each path."""
+
+    view_seconds: float = 4.0
+    """What it counts for a view, beside the way to it [s]. With 1 it saves meters, looks
+    at what is near once more, and 60 views of an office come out 1 dB worse."""
+
+    def __post_init__(self) -> None:
+        """Refuses values that would fail later, and says which."""
+        super().__post_init__()
+        for name, least in (("horizon", 1), ("num_spread", 0), ("beam", 1), ("branching", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if not (math.isfinite(self.view_seconds) and self.view_seconds >= 0.0):
+            raise ValueError(f"view_seconds must be a finite number >= 0, got {self.view_seconds}")
+
+
+@dataclass(frozen=True)
+class Path:
+    """Views one after the other, and what is known once they are taken."""
+
+    places: tuple[int, ...]
+    """Numbers of the places, in order."""
+
+    directions: tuple[np.ndarray, ...]
+    """Lines of sight there, [3] each."""
+
+    gains: tuple[float, ...]
+    """Utility that each view adds."""
+
+    seconds: float
+    """Time that the whole path takes [s]."""
+
+    voxels: MapState
+    """Before the last view."""
+
+    cells: Cells
+    """Before the last view."""
+
+    @property
+    def rate(self) -> float:
+        """Gain per second."""
+        # With `view_seconds` 0, a turn on the spot may take no time at all.
+        return sum(self.gains) / max(self.seconds, 1e-9)
+
+
+@dataclass(frozen=True)
+class BeamProblem:
+    """What the search knows of the places."""
+
+    views: Candidates
+    """The best view from each, if it were the first."""
+
+    utility: np.ndarray
+    """What that is worth, [C]: a bound on what it is worth later."""
+
+    lengths: np.ndarray
+    """Path lengths to each from where the robot is, [C] [m]; inf: there is none."""
+
+    between: np.ndarray
+    """Path lengths between them, [C, C] [m]."""
+
+    kept: PanoramaCache
+    """The panorama of each."""
+
+    start: tuple[MapState, Cells]
+    """What is known: surfaces and unexplored space at hand (`scoring.gather.gather_in_range`)."""
+
+    camera: Camera
+    config: AheadConfig
+
+    limits: Limits = field(default_factory=Limits)
+    """Limits of the robot where it is."""
+
+    @property
+    def speed(self) -> float:
+        """Speed of the robot [m/s]."""
+        return self.limits.motion.speed or SPEED
+
+
+def search(problem: BeamProblem) -> list[Path]:
+    """The paths of the greatest rate, best first; none if no place can be reached."""
+    config = problem.config
+    views = problem.views
+    ways = problem.limits.path_costs(problem.lengths, views.direction)
+    cost = config.view_seconds + ways / problem.speed
+    reachable = np.flatnonzero(np.isfinite(cost))
+    # Gain per second, not gain: else the longest path would always win.
+    rate = problem.utility[reachable] / np.maximum(cost[reachable], 1e-9)
+    ranked = reachable[np.argsort(-rate, kind="stable")]
+    beam = [
+        Path(
+            places=(i,),
+            directions=(views.direction[i],),
+            gains=(float(problem.utility[i]),),
+            seconds=float(cost[i]),
+            voxels=problem.start[0],
+            cells=problem.start[1],
+        )
+        for i in _apart(ranked.tolist(), views, (), config.beam)
+    ]
+    for _ in range(config.horizon - 1):
+        # Parents leave the beam: only paths of as many views compare their rates.
+        children = [child for path in beam for child in _expanded(path, problem)]
+        beam = _best(children, config.beam)
+    return beam
+
+
+def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
+    """Lengths of ways between positions [C, 3] that the robot can come to, [C, C] [m].
+
+    Over straight lines between near ones, each safe throughout, or back past the robot: no
+    shorter than the shortest way. Unreachable positions are infinitely far from all others.
+    """
+    num = len(positions)
+    # All pairs at once: a hundred positions are few.
+    gap = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    scaled = travel.scaled(positions)
+    direct = np.zeros((num, num))
+    # Column 0 is the place itself, or a repeat of it.
+    nearest = np.argsort(gap, axis=1, kind="stable")[:, 1 : _NEIGHBORS + 1]
+    for i in range(num):
+        for j in nearest[i]:
+            if direct[i, j] == 0.0 and segment_is_inside(travel.usable, scaled[i], scaled[j]):
+                direct[i, j] = direct[j, i] = max(gap[i, j], 1e-6)  # 0 means "no edge" to SciPy
+    over = shortest_path(csr_matrix(direct), directed=False)
+    # Back past the robot is always a way, though rarely a short one.
+    own = travel.lengths(positions)
+    ways = np.minimum(over, own[:, None] + own[None, :])
+    np.fill_diagonal(ways, 0.0)
+    return ways
+
+
+def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
+    """The path with one more view, once for each place that is tried."""
+    config, last, views = problem.config, path.places[-1], problem.views
+    (pose,) = poses_along(views.position[[last]], path.directions[-1][None])
+    # Turns count from the last view of the path, not from where the robot is now.
+    limits = replace(problem.limits, T_world_camera=pose)
+    # Without the turn, whose direction is not known yet: with a cost too low it stays a bound.
+    cost = config.view_seconds + problem.between[last] / problem.speed
+    # The first panorama bounds what a place can still add: views only take away.
+    bound = (sum(path.gains) + problem.utility) / np.maximum(path.seconds + cost, 1e-9)
+    bound[~np.isfinite(problem.lengths) | ~np.isfinite(cost)] = -np.inf
+    ranked = [int(i) for i in np.argsort(-bound, kind="stable") if bound[i] > -np.inf]
+    taken = [(views.position[i], d) for i, d in zip(path.places, path.directions, strict=True)]
+    # The last place whatever its bound: another direction there takes no way.
+    tried = [last, *_apart(ranked, views, taken, config.branching - 1)]
+    offered = views.take(np.array(tried)).padded(config.branching)  # compiles once
+    T = jnp.asarray(pose, dtype=jnp.float32)
+    voxels, cells = simulate_view_near(path.voxels, path.cells, problem.camera, T, config.scoring)
+    places = jnp.asarray(offered.position, dtype=jnp.float32)
+    allowed = limits.allowed_axes(offered.position, config.scoring.panorama_bins)
+    rows = jnp.asarray([tried[i % len(tried)] for i in range(config.branching)])
+    kept, now = problem.kept.at(rows), (voxels, cells)
+    panorama = score_cached_near(
+        kept, problem.start, now, problem.camera, places, config.scoring, allowed
+    )
+    turned, gains = best_views(offered, panorama)
+    turned = limits.project_to_feasible(turned)
+    turning = [limits.motion.turning(float(angle)) for angle in limits.turns(turned.direction)]
+    return [
+        Path(
+            places=(*path.places, i),
+            directions=(*path.directions, turned.direction[k]),
+            gains=(*path.gains, float(gains[k])),
+            seconds=path.seconds + float(cost[i]) + turning[k],
+            voxels=voxels,
+            cells=cells,
+        )
+        for k, i in enumerate(tried)
+    ]
+
+
+def _best(paths: list[Path], num: int) -> list[Path]:
+    """The `num` paths of the greatest rate; of those through the same places, the first."""
+    kept: dict[frozenset[tuple[int, bytes]], Path] = {}
+    # The same views in another order know the same: only the fastest order is kept.
+    for path in sorted(paths, key=lambda path: -path.rate):
+        views = zip(path.places, path.directions, strict=True)
+        kept.setdefault(frozenset((i, direction.tobytes()) for i, direction in views), path)
+    return list(kept.values())[:num]
+
+
+_Sight = tuple[np.ndarray, np.ndarray]
+"""A position and a line of sight, [3] each."""
+
+
+def _apart(
+    ranked: Sequence[int], views: Candidates, taken: Sequence[_Sight], num: int
+) -> list[int]:
+    """Up to `num` of the views, in order, each apart from those before it and those taken."""
+    chosen: list[int] = []
+    others = list(taken)
+    for i in ranked:
+        if len(chosen) == num:
+            break
+        view = views.position[i], views.direction[i]
+        if all(_are_apart(view, other) for other in others):
+            chosen.append(i)
+            others.append(view)
+    return chosen
+
+
+def _are_apart(first: _Sight, second: _Sight) -> bool:
+    is_far = float(np.linalg.norm(first[0] - second[0])) >= _APART
+    # Directions have any length: a product on the other side saves dividing by it.
+    lengths = float(np.linalg.norm(first[1]) * np.linalg.norm(second[1]))
+    return is_far or float(first[1] @ second[1]) < _TURNED * lengths

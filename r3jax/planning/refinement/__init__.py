@@ -1,0 +1,1 @@
+"""The best candidates climb the slope of the utility."""

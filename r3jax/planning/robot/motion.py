@@ -1,0 +1,182 @@
+"""What carries the camera: where it may be, how it may look, how fast it goes and turns.
+
+Constraints are data: they change which candidates there are and what ways cost, and nothing else.
+`Limits` is a motion at a moment; every policy's candidates pass through it.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+from r3jax.formats.validation.choices import did_you_mean
+
+UNLIMITED = (-math.inf, math.inf)
+"""Heights of a carrier that may be at any [m]."""
+
+_LEVEL = 90.0
+"""Elevation of a camera that looks straight up [deg]."""
+
+
+def _check_range(name: str, values: tuple[float, float], unit: str) -> None:
+    if len(values) != 2 or not all(math.isfinite(value) for value in values):
+        raise ValueError(f"{name} must be two finite numbers {unit}, got {values}")
+    if values[0] > values[1]:
+        raise ValueError(f"{name} {_range(values)} are upside down: give the lower one first")
+
+
+def _range(values: tuple[float, float]) -> str:
+    return f"{values[0]:g} to {values[1]:g}"
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a robot or a person can do with the camera. The default is a free-flying camera.
+
+    Raises:
+        ValueError: a setting that nothing could move with.
+    """
+
+    heights: tuple[float, float] | None = None
+    """Lowest and highest place of the camera [m]; None: any."""
+
+    heights_above: Literal["start", "world"] = "start"
+    """What `heights` count from: where the camera starts, or the world's z = 0."""
+
+    elevations: tuple[float, float] = (-_LEVEL, _LEVEL)
+    """Lowest and highest angle of the line of sight above the horizon [deg]. A camera that can
+    only turn round the vertical has one angle, the tilt of its mounting."""
+
+    body: float = 0.0
+    """What stands on the ground reaches so far down from the camera [m]: no cell there, nor
+    round it within the safety margin, may be known to be occupied."""
+
+    speed: float | None = None
+    """Along the way [m/s]; None: that of the loop's own settings, and turning takes no time."""
+
+    turn_rate: float | None = None
+    """How fast the line of sight turns [deg/s], after the way; None: in no time."""
+
+    turn_per_meter: float | None = None
+    """Largest turn from one view to the next for each meter between them, in a straight line
+    [deg/m]: who turns on the spot blurs the images. None: any turn, anywhere."""
+
+    def __post_init__(self) -> None:
+        """Refuses what cannot work, and says what to do."""
+        if self.heights is not None:
+            _check_range("heights", self.heights, "[m]")
+            if self.heights_above not in ("start", "world"):
+                raise ValueError(
+                    f"heights_above must be `start` or `world`, got {self.heights_above!r}"
+                )
+            if self.heights_above == "start" and not self.heights[0] <= 0.0 <= self.heights[1]:
+                raise ValueError(
+                    f"heights {_range(self.heights)} m above the start leave out the start itself: "
+                    "let them hold 0, or count them from the world's z = 0 (heights_above)"
+                )
+        _check_range("elevations", self.elevations, "[degrees]")
+        if not -_LEVEL <= self.elevations[0] <= self.elevations[1] <= _LEVEL:
+            raise ValueError(
+                f"elevations must lie between -90 (straight down) and 90 degrees (straight up), "
+                f"got {_range(self.elevations)}"
+            )
+        if not (math.isfinite(self.body) and self.body >= 0.0):
+            raise ValueError(f"body must be a finite length >= 0 [m], got {self.body}")
+        for name in ("speed", "turn_rate", "turn_per_meter"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise ValueError(
+                    f"{name} must be positive and finite, got {value}; leave it out for no limit"
+                )
+        if self.turn_rate is not None and self.speed is None:
+            raise ValueError("turn_rate weighs turns against ways: give the speed [m/s] too")
+
+    @property
+    def looks_anywhere(self) -> bool:
+        """True if the line of sight may have any direction, whatever it was before."""
+        return self.elevations == (-_LEVEL, _LEVEL) and self.turn_per_meter is None
+
+    @property
+    def is_relative(self) -> bool:
+        """True if the allowed heights depend on where the camera started."""
+        return self.heights is not None and self.heights_above == "start"
+
+    def heights_from(self, start: float) -> tuple[float, float]:
+        """Allowed heights of the camera [m], world, of a carrier that started at height `start`."""
+        if self.heights is None:
+            return UNLIMITED
+        base = start if self.is_relative else 0.0
+        return base + self.heights[0], base + self.heights[1]
+
+    def seconds(self, length: float, angle: float) -> float | None:
+        """Time for a way of `length` [m] and a turn by `angle` [rad]; None: the motion has none."""
+        if self.speed is None:
+            return None
+        return length / self.speed + self.turning(angle)
+
+    def turning(self, angle: float) -> float:
+        """Time for a turn by `angle` [rad] alone [s]."""
+        return 0.0 if self.turn_rate is None else math.degrees(angle) / self.turn_rate
+
+
+MOTIONS = {
+    "free": Motion(),
+    "ground": Motion(
+        heights=(0.0, 0.0), elevations=(0.0, 0.0), body=1.0, speed=0.5, turn_rate=60.0
+    ),
+    "gimbal": Motion(elevations=(-90.0, 30.0), speed=1.0, turn_rate=90.0),
+    "handheld": Motion(
+        heights=(-0.6, 0.4), elevations=(-60.0, 60.0), speed=0.5, turn_rate=45.0,
+        turn_per_meter=90.0,
+    ),
+}  # fmt: skip
+"""Motions by name: a free-flying camera; a robot on wheels whose camera is level and stays at the
+height where it starts; a drone whose gimbal cannot look up far; a person who walks."""
+
+
+def make_motion(name: str = "free", **changes: Any) -> Motion:
+    """A motion by name, with other values for some of its fields.
+
+    Raises:
+        ValueError: no motion has that name, it has no such field, or a value cannot work.
+    """
+    if name not in MOTIONS:
+        hint = did_you_mean(name, MOTIONS)
+        raise ValueError(f"unknown motion {name!r}{hint}; known: {', '.join(MOTIONS)}")
+    known = [field.name for field in fields(Motion)]
+    unknown = [field for field in changes if field not in known]
+    if unknown:
+        raise ValueError(f"a motion has no setting {', '.join(unknown)}; known: {', '.join(known)}")
+    return replace(MOTIONS[name], **changes)
+
+
+def check_height(height: float, heights: tuple[float, float]) -> None:
+    """Refuses a camera at a height [m] that its carrier cannot be at.
+
+    Raises:
+        ValueError: says what to do.
+    """
+    low, high = heights
+    # A millimeter of grace: the pose may have been rounded to float32.
+    if not low - 1e-3 <= height <= high + 1e-3:
+        raise ValueError(
+            f"the camera is at a height of {height:.3f} m, but its motion's heights are {low:.3f} "
+            f"to {high:.3f} m above the world's z = 0: start within them, or change `heights`"
+        )
+
+
+def motion_of_record(record: Any) -> Motion:
+    """A motion from what JSON holds of it; None, where nothing was written: a free camera.
+
+    Raises:
+        ValueError: an unknown field, a value of another kind, or one that cannot work.
+    """
+    if not isinstance(record, dict | None):
+        raise ValueError(f"a motion must be an object with its settings, got {record!r}")
+    # JSON has no tuples, and a list never equals one: `looks_anywhere` would be wrong.
+    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in (record or {}).items()}
+    return make_motion("free", **plain)
+
+
+def motion_of(policy: object) -> Motion:
+    """The motion that a policy plans for: a free-flying camera if it does not say."""
+    return getattr(getattr(policy, "config", None), "motion", MOTIONS["free"])

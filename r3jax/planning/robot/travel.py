@@ -1,0 +1,384 @@
+"""Path lengths and waypoints over known free space. On the host: NumPy and Numba.
+
+A cell is *safe* if the ball of the safety margin round its center touches known free cells only;
+unknown space is an obstacle. With 0.2 m cells and 0.3 m margin these are the cells whose 26
+neighbors are free, so that every point of a path keeps at least one cell's width from
+anything that is not known to be free. The cell in which the robot stands is always usable.
+
+Paths run over the 26-connected graph of usable cells. A diagonal step needs every cell of the
+block it crosses, so that it cannot squeeze between two corners. `skimage.graph.MCP_Geometric`
+cannot express that rule (tests compare the two), and SciPy's Dijkstra, for which the graph would
+have to be spelled out, takes five to nine times as long.
+
+Shape symbols: X Y Z cells along the axes; n cells or points; K waypoints.
+"""
+
+import functools
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning.robot.motion import UNLIMITED, check_height
+from r3jax.planning.robot.shortest_paths import shortest_paths
+
+_BORDER = 1e-3
+"""A segment that passes a corner closer than this counts as touching it [cells]."""
+
+_INSET = 1e-2
+"""A camera at a fixed height that is a border of layers counts as so far inside its own [cells]:
+the next layer is none of its cells."""
+
+_TOUCH = 1e-3
+"""A height this close to a border of layers is on the upper one's side, and a body this close to
+matter touches it [cells]."""
+
+_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * _BORDER
+
+
+@dataclass(frozen=True)
+class Travel:
+    """What can be reached from one position, how far it is, and the way. Made by `plan_travel`."""
+
+    start: np.ndarray
+    """The robot's position, [3] float64 [m]."""
+
+    start_cell: tuple[int, int, int]
+    """The cell that holds it."""
+
+    origin: np.ndarray
+    """Lower corner of cell (0, 0, 0), [3] float64 [m]."""
+
+    cell_size: float
+    """Edge of a cell [m]."""
+
+    free: np.ndarray
+    """Cells known to be free, [X, Y, Z] bool."""
+
+    safe: np.ndarray
+    """Cells that keep the margin and are open to what carries the camera, [X, Y, Z] bool."""
+
+    usable: np.ndarray
+    """Cells that paths may cross: the safe ones, the robot's own, [X, Y, Z] bool."""
+
+    cost: np.ndarray
+    """Length of the shortest way between the centers of the robot's cell and of each cell [m],
+    [X, Y, Z] float64; inf where there is none."""
+
+    previous: np.ndarray
+    """Flat index of the cell before each on that way, [X, Y, Z] int64; -1 at its start."""
+
+    heights: tuple[float, float] = UNLIMITED
+    """Lowest and highest place of the camera [m]: all waypoints lie between them."""
+
+    @functools.cached_property
+    def reachable(self) -> np.ndarray:
+        """Cells to which a way leads, [X, Y, Z] bool."""
+        return np.isfinite(self.cost)
+
+    @functools.cached_property
+    def goals(self) -> np.ndarray:
+        """Cells where the robot may stop: safe and reachable, and its own if that is free."""
+        goals = self.reachable & self.safe
+        if self.contains(self.start_cell) and self.free[self.start_cell]:
+            goals[self.start_cell] = True
+        return goals
+
+    def contains(self, cell: tuple[int, int, int]) -> bool:
+        """True if the grid has that cell."""
+        return all(0 <= i < n for i, n in zip(cell, self.usable.shape, strict=True))
+
+    def cell_of(self, position: np.ndarray) -> tuple[int, int, int]:
+        """The cell that holds a position [m]; it may lie outside the grid."""
+        # float64 throughout: float32 would put points on a border into either cell.
+        x, y, z = np.floor((np.asarray(position, np.float64) - self.origin) / self.cell_size)
+        return int(x), int(y), int(z)
+
+    def centers(self, cells: np.ndarray) -> np.ndarray:
+        """Centers [m] of cells given by index, [n, 3]."""
+        return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
+
+    def stops(self, cells: np.ndarray) -> np.ndarray:
+        """Where the camera stands in cells given by index, [n, 3] [m]: at an allowed height."""
+        places = self.centers(cells)
+        places[..., 2] = np.clip(places[..., 2], *self.heights)
+        return places
+
+    def distance(self, cell: np.ndarray | tuple[int, int, int]) -> float:
+        """Length of the way from the robot to its stop in a cell [m]; inf if there is none."""
+        x, y, z = (int(i) for i in np.asarray(cell))
+        if not self.contains((x, y, z)):
+            return float("inf")
+        first = self.stops(np.array(self.start_cell))
+        return float(np.linalg.norm(first - self.start) + self.cost[x, y, z])
+
+    def lengths(self, positions: np.ndarray) -> np.ndarray:
+        """Path lengths [m] to positions [n, 3]; inf where there is no way.
+
+        The straight line where it is safe, else the way over the cells' centers: no shorter
+        than what `path` returns.
+        """
+        return np.array([self._length(position) for position in positions])
+
+    def _length(self, position: np.ndarray) -> float:
+        cell = self.cell_of(position)
+        if not (self.contains(cell) and self.reachable[cell]):
+            return float("inf")
+        # The straight line first: no way is shorter, and `path` takes it too.
+        if segment_is_inside(self.usable, *self._in_cells(self.start, position)):
+            return float(np.linalg.norm(position - self.start))
+        last = float(np.linalg.norm(position - self.stops(np.array(cell))))
+        return self.distance(cell) + last
+
+    def path(self, position: np.ndarray) -> np.ndarray:
+        """Waypoints [K, 3] [m] from the robot to a position; every segment is safe throughout.
+
+        Raises:
+            ValueError: there is no way; ask `lengths` first.
+        """
+        goal = np.asarray(position, dtype=np.float64)
+        cell = self.cell_of(goal)
+        if not (self.contains(cell) and self.reachable[cell]):
+            raise ValueError(f"no safe path leads from {self.start} to {goal} (cell {cell})")
+        # From the goal back to the robot: each cell knows only the one before it.
+        way = [int(np.ravel_multi_index(cell, self.usable.shape))]
+        previous = self.previous.reshape(-1)
+        while previous[way[-1]] >= 0:
+            way.append(int(previous[way[-1]]))
+        cells = np.stack(np.unravel_index(way[::-1], self.usable.shape), axis=1)
+        return self._shortcut(np.concatenate([self.start[None], self.stops(cells), goal[None]]))
+
+    def cells_along(self, waypoints: np.ndarray) -> np.ndarray:
+        """Cells of the grid that the path over waypoints [K, 3] [m] crosses, [X, Y, Z] bool."""
+        swept = np.zeros(self.usable.shape, dtype=bool)
+        for a, b in itertools.pairwise(waypoints):
+            cells = segment_cells(*self._in_cells(a, b))
+            # Cells that a line only touches may lie outside the grid.
+            cells = cells[np.all((cells >= 0) & (cells < swept.shape), axis=1)]
+            swept[tuple(cells.T)] = True
+        return swept
+
+    def _shortcut(self, points: np.ndarray) -> np.ndarray:
+        """Drops waypoints wherever the straight line past them is safe."""
+        last = len(points) - 1
+        kept = [0]
+        while kept[-1] < last:
+            here = kept[-1]
+            # The goal first: most paths in a room end with one straight leg.
+            if self._sees(points[here], points[last]):
+                kept.append(last)
+                break
+            # Greedy from the front: each leg goes as far along the cells as it safely can.
+            ahead = here + 1  # neighbors on the way always see each other
+            while ahead + 1 < last and self._sees(points[here], points[ahead + 1]):
+                ahead += 1
+            kept.append(ahead)
+        return points[kept]
+
+    def _sees(self, a: np.ndarray, b: np.ndarray) -> bool:
+        return segment_is_inside(self.usable, *self._in_cells(a, b))
+
+    def _in_cells(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.scaled(a), self.scaled(b)
+
+    def scaled(self, positions: np.ndarray) -> np.ndarray:
+        """Positions [..., 3] in cells, kept off the borders of the layers that are allowed."""
+        scaled = (positions - self.origin) / self.cell_size
+        if self.heights != UNLIMITED:
+            num = self.usable.shape[2]
+            first, last = layers_between(self.heights, self.origin[2], self.cell_size, num)
+            scaled[..., 2] = np.clip(scaled[..., 2], first + _INSET, last + 1.0 - _INSET)
+        return scaled
+
+
+def plan_travel(
+    grid: OccupancyGrid,
+    position: np.ndarray,
+    safety_margin: float = 0.3,
+    trail: np.ndarray | None = None,
+    heights: tuple[float, float] = UNLIMITED,
+    body: float = 0.0,
+) -> Travel:
+    """Shortest ways from a position to everywhere that is safe. Once per decision.
+
+    Args:
+        grid: what is known.
+        position: the robot's position in the world [m]. Outside the grid nothing is reachable.
+        safety_margin: radius of the ball that must be known free [m].
+        trail: cells that the robot has come through, [X, Y, Z] bool. If its present cell is
+            not safe (a closer look found something in the margin), it may go back through them
+            unless they turned out to be occupied; otherwise they change nothing.
+        heights: lowest and highest place of the camera [m], world.
+        body: what carries the camera reaches so far down from it [m]
+            (`cells_over_matter`).
+
+    Raises:
+        ValueError: a position that is not finite, or not at an allowed height.
+    """
+    # Copied to the host once per decision; all that follows is lookups of single cells.
+    free = np.asarray(grid.free)
+    cell_size = float(grid.cell_size)
+    origin = np.asarray(grid.origin, dtype=np.float64)
+    start = np.asarray(position, dtype=np.float64)
+    if start.shape != (3,) or not np.all(np.isfinite(start)):
+        raise ValueError(f"the position must be three finite numbers [m], got {start}")
+    check_height(float(start[2]), heights)
+    safe = safe_cells(free, cell_size, safety_margin)
+    if heights != UNLIMITED:
+        first, last = layers_between(heights, origin[2], cell_size, free.shape[2])
+        # Closed layers, not clipped paths: the search itself must not leave the heights.
+        safe[:, :, : max(first, 0)] = False
+        safe[:, :, last + 1 :] = False
+    if body > 0.0:
+        occupied = np.asarray(grid.occupied)
+        safe &= ~cells_over_matter(occupied, body, safety_margin, heights, origin[2], cell_size)
+    cell = tuple(int(i) for i in np.floor((start - origin) / cell_size))
+    is_inside = all(0 <= i < n for i, n in zip(cell, free.shape, strict=True))
+    usable = safe
+    if is_inside and not safe[cell]:
+        # Only a robot that is shut in gets more cells, and only those that it came through.
+        usable = safe.copy()
+        if trail is not None:
+            usable |= trail & ~np.asarray(grid.occupied)
+        usable[cell] = True
+    cost, previous = shortest_paths(usable, (cell[0], cell[1], cell[2]) if is_inside else None)
+    return Travel(
+        start=start,
+        start_cell=(cell[0], cell[1], cell[2]),
+        origin=origin,
+        cell_size=cell_size,
+        free=free,
+        safe=safe,
+        usable=usable,
+        # The search counts in cells; from here on lengths are in meters.
+        cost=cost * cell_size,
+        previous=previous,
+        heights=heights,
+    )
+
+
+def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
+    """Cells round whose center a ball of radius `margin` [m] touches free cells only.
+
+    Args:
+        free: cells known to be free, [X, Y, Z] bool; beyond the array nothing is.
+        cell_size: edge of a cell [m].
+        margin: radius of the ball [m].
+    """
+    # Cells farther away than this cannot touch the ball.
+    reach = max(0, int(np.ceil(margin / cell_size + 0.5)) - 1)
+    # Beyond the array nothing is known to be free: zeros close the border.
+    padded = np.pad(free, reach)
+    safe = free.copy()
+    for offset in itertools.product(range(-reach, reach + 1), repeat=3):
+        gap = np.maximum(np.abs(offset) - 0.5, 0.0) * cell_size
+        # Touching is not overlapping: with 0.2 m cells, 0.3 m ends where the next cell begins.
+        if np.linalg.norm(gap) < margin - 1e-6:
+            window = tuple(
+                slice(reach + o, reach + o + n) for o, n in zip(offset, free.shape, strict=True)
+            )
+            safe &= padded[window]
+    return safe
+
+
+def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
+    """True if a segment runs through cells of the mask only, corners it touches included.
+
+    Args:
+        mask: [X, Y, Z] bool; beyond the array nothing is in the mask.
+        a: one end, in cells (cell (0, 0, 0) spans 0 to 1), [3].
+        b: the other end.
+    """
+    cells = segment_cells(a, b)
+    # NumPy would wrap negative indices round to the other side.
+    if np.any(cells < 0) or np.any(cells >= mask.shape):
+        return False
+    return bool(mask[cells[:, 0], cells[:, 1], cells[:, 2]].all())
+
+
+def segment_cells(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cells that a segment between two points [cells] crosses or touches, [n, 3], repeated."""
+    points = [np.stack([a, b])]
+    for axis in range(3):
+        low, high = sorted((a[axis], b[axis]))
+        # Only where a segment passes a plane between two layers does it change cells.
+        planes = np.arange(np.floor(low) + 1.0, np.ceil(high))
+        # Along an axis on which both ends agree no plane is passed: nothing is divided by zero.
+        if planes.size:
+            t = (planes - a[axis]) / (b[axis] - a[axis])
+            crossing = a + t[:, None] * (b - a)
+            # On both sides of the plane, and of any other plane that is as good as touched.
+            points.append((crossing[:, None, :] + _CORNERS).reshape(-1, 3))
+    return np.floor(np.concatenate(points)).astype(np.int64)
+
+
+def layers_between(
+    heights: tuple[float, float], origin: float, cell_size: float, num: int
+) -> tuple[int, int]:
+    """The first and the last layer of cells that hold heights [m] out of a range.
+
+    Args:
+        heights: lowest and highest, either may be infinite.
+        origin: height of the lowest cell's lower face [m].
+        cell_size: edge of a cell [m].
+        num: layers that there are.
+    """
+    # Clipped before they become integers: heights may be infinite.
+    low, high = np.clip((np.array(heights) - origin) / cell_size, -1.0, float(num))
+    return int(np.floor(low)), int(np.floor(high))
+
+
+def cells_over_matter(
+    occupied: np.ndarray,
+    body: float,
+    margin: float,
+    heights: tuple[float, float],
+    origin: float,
+    cell_size: float,
+) -> np.ndarray:
+    """Cells in which a camera on a body would have something known inside the body.
+
+    The body is a cylinder below the camera, as wide as the safety margin; of a cell the lowest
+    allowed height counts. What is unknown is open: a camera that looks ahead never sees the floor
+    at the robot's own wheels.
+
+    Args:
+        occupied: cells known to be occupied, [X, Y, Z] bool.
+        body: how far it reaches down [m]; 0: there is none.
+        margin: its radius, round the middle of a cell [m].
+        heights: the camera's lowest and highest height [m].
+        origin: height of the lowest cell's lower face [m].
+        cell_size: edge of a cell [m].
+
+    Returns:
+        [X, Y, Z] bool.
+    """
+    closed = np.zeros(occupied.shape, dtype=bool)
+    if body == 0.0:
+        return closed
+    # Widened once for all layers: the body is as wide at every height.
+    wide = _widened(occupied, margin / cell_size)
+    first, last = layers_between(heights, origin, cell_size, occupied.shape[2])
+    for layer in range(max(first, 0), min(last, occupied.shape[2] - 1) + 1):
+        lowest = max(origin + layer * cell_size, heights[0])
+        # The lowest allowed height of the layer is the worst case for what stands below it.
+        foot = (lowest - body - origin) / cell_size
+        below = max(0, int(np.floor(max(foot, -1.0) + _TOUCH)))
+        # Up to the layer below: the margin looks after the camera's own.
+        closed[:, :, layer] = wide[:, :, below:layer].any(axis=2)
+    return closed
+
+
+def _widened(mask: np.ndarray, radius: float) -> np.ndarray:
+    """Cells within whose disk of `radius` [cells], level and round the middle, the mask holds."""
+    reach = int(np.ceil(radius + 0.5)) - 1
+    padded = np.pad(mask, ((reach, reach), (reach, reach), (0, 0)))
+    wide = mask.copy()
+    for x, y in itertools.product(range(-reach, reach + 1), repeat=2):
+        gap = np.hypot(max(abs(x) - 0.5, 0.0), max(abs(y) - 0.5, 0.0))
+        if gap < radius - _TOUCH:  # touching is not overlapping
+            wide |= padded[
+                reach + x : reach + x + mask.shape[0], reach + y : reach + y + mask.shape[1]
+            ]
+    return wide

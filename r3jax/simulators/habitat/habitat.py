@@ -1,0 +1,301 @@
+"""Habitat-Sim 0.3.x as a simulator, for who wants its pictures instead of the ray caster's.
+
+Habitat-Sim is not on the Python package index, so there is no extra for it; it comes from conda:
+
+    conda install habitat-sim headless -c conda-forge -c aihabitat
+
+or, where these packages do not fit (r3jax needs Python 3.11 and NumPy 2), from source:
+https://github.com/facebookresearch/habitat-sim. No display is needed, and no GPU.
+
+Surfaces are shown in their stored colors, without lights. Three of Habitat's ways matter here:
+faces are seen from their front only; lines are drawn, which no ray meets; and a mesh without a
+material (any PLY, so also Replica's) is shown dark and tinted by a default material, a mean of 84
+of 255 off, though its depth is right. Of a PLY the colors are therefore the ray caster's, as
+stored in the file; for Replica the ray caster alone (`replica:<name>`) shows the same faster.
+
+Range and noise are ours, as those of the ray caster: depth beyond `max_range` is inf, and
+`NoisySimulator` adds the noise. Where Habitat finds no surface its depth is 0, which is our
+"no measurement" (the ray caster says inf there: it knows that nothing is there).
+"""
+
+import contextlib
+import ctypes
+import hashlib
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.simulators.habitat.habitat_poses import agent_from_pose, horizontal_fov_deg, rotation_of
+from r3jax.simulators.habitat.habitat_stage import read_stage
+from r3jax.simulators.meshes import load_world, world_from_file
+from r3jax.simulators.raycast.raycast import RaycastSimulator
+
+_SAME_PLACE = 0.05
+"""Depths of the mesh and of Habitat that differ by less show the same surface [m]."""
+
+_MIN_AGREEMENT = 0.5
+"""Least share of pixels that show the same surface; in the right world it is over 0.99."""
+
+
+_NOISE = ("SSD Load Failure", r"\.scn exists but failed to load")
+"""Lines that Habitat writes at every start, about a file that is not there and not needed."""
+
+
+class HabitatSimulator:
+    """RGB-D frames from Habitat-Sim, in the world of the `mesh:` scene of the same file.
+
+    The box, the start and the free space round it come from the mesh file itself, so that a
+    mission in Habitat starts where one in the ray caster does.
+    """
+
+    def __init__(
+        self,
+        scene: str | Path,
+        camera: Camera | None = None,
+        *,
+        up: str | None = None,
+        max_range: float | int | None = 5.0,
+        start_pose: np.ndarray | None = None,
+        seed: int = 0,
+        gpu_device_id: int | None = None,
+        mesh_colors: bool | None = None,
+    ) -> None:
+        """Loads the scene, into Habitat and for the start.
+
+        Args:
+            scene: a `.glb`, a `.ply` or a `.stage_config.json`.
+            camera: intrinsics, square pixels and centered; None: 512x512 pixels, 60 degrees.
+            up: vertical axis of the mesh file, "y" or "z"; None: y for glTF, z for PLY.
+            max_range: z-depth beyond which the depth sensor sees nothing [m]; None: unlimited.
+            start_pose: `T_world_camera` at the start; None: a search.
+            seed: of the search for a start.
+            gpu_device_id: CUDA device whose renderer is used, -1 for any; None: see
+                `default_gpu_device`.
+            mesh_colors: take the colors from the mesh file by ray casting, the depth alone from
+                Habitat; None: for a PLY, whose vertex colors Habitat shows dark.
+
+        Raises:
+            ImportError: Habitat-Sim is not installed; says how to get it.
+            ValueError: a camera that Habitat does not have, a file that it cannot show, settings
+                out of range, or a start inside or too close to the mesh.
+        """
+        self._camera = Camera.from_fov(512, 512, 60.0) if camera is None else camera
+        fov = horizontal_fov_deg(self._camera)
+        stage = read_stage(scene)
+        library = _import_habitat()
+        self._habitat_from_world = stage.habitat_from_file @ world_from_file(stage.mesh, up).T
+        self._mesh = RaycastSimulator(
+            load_world(stage.mesh, up),
+            self._camera,
+            max_range=max_range,
+            start_pose=start_pose,
+            cull_back_faces=True,
+            supersample=0,
+            lighting=False,
+            seed=seed,
+        )
+        self._mesh_colors = stage.is_ply if mesh_colors is None else mesh_colors
+        lines = self._mesh.world.notes.get("lines")
+        if lines is not None:
+            warnings.warn(
+                f"{stage.mesh} has {lines} meshes of lines: Habitat draws them, no ray meets them "
+                "(mesh:<file> does not show them); take them out to compare the two",
+                stacklevel=2,
+            )
+        self._max_depth = np.float32(np.inf if max_range is None else max_range)
+        self._is_same_world = False
+        if gpu_device_id is None:
+            gpu_device_id = default_gpu_device()
+        self._habitat = _Habitat(library, stage.file, self._camera, fov, gpu_device_id)
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of every frame."""
+        return self._camera
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Axis-aligned box of the mesh, [2, 3] [m]."""
+        return self._mesh.bounds
+
+    @property
+    def start_pose(self) -> np.ndarray:
+        """`T_world_camera` at the start, [4, 4] float64; searched for when first asked for.
+
+        Raises:
+            ValueError: no place has half a meter free all round, or Habitat shows another place
+                there than the mesh file has, so that it cannot be said what is free.
+        """
+        pose = self._mesh.start_pose
+        if not self._is_same_world:
+            self._check_same_world(pose)
+            self._is_same_world = True
+        return pose
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of what is shown; another one than that of the ray caster's scene."""
+        who = "habitat, colors of the mesh" if self._mesh_colors else "habitat"
+        return hashlib.sha256(f"{who} {self._mesh.world.content_hash}".encode()).hexdigest()
+
+    def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
+        """The RGB-D frame at a pose [4, 4].
+
+        Depth is 0 where Habitat finds no surface, and inf beyond `max_range`.
+
+        Raises:
+            ValueError: the pose is not finite or not rigid.
+        """
+        T = np.asarray(T_world_camera, dtype=np.float64)
+        image, depth = self._observe(T)
+        depth = np.where(depth <= self._max_depth, depth, np.float32(np.inf))
+        rgb = jnp.asarray(image.astype(np.float32) / np.float32(255.0))
+        return Frame(
+            rgb=self._mesh.render(T).rgb if self._mesh_colors else rgb,
+            depth=jnp.asarray(depth),
+            T_world_camera=jnp.asarray(T.astype(np.float32)),
+            camera=self._camera,
+            far=True,
+        )
+
+    def _observe(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bytes [H, W, 3] and depth without limit [H, W] at a pose [4, 4]."""
+        try:
+            position, wxyz = agent_from_pose(T, self._habitat_from_world)
+        except ValueError as error:
+            raise ValueError(f"cannot render: {error}") from None
+        return self._habitat.observe(position, rotation_of(wxyz))
+
+    def _check_same_world(self, pose: np.ndarray) -> None:
+        """Refuses a Habitat that shows something else than the mesh does from `pose` [4, 4]."""
+        mesh = self._mesh.with_camera(self._camera, max_range=None)
+        known = np.asarray(mesh.render(pose).depth)
+        known = np.where(np.isfinite(known), known, np.float32(0.0))
+        found = self._observe(pose)[1]
+        is_seen = (known > 0.0) | (found > 0.0)
+        is_same = np.abs(found - known)[is_seen] < _SAME_PLACE
+        if is_same.size and is_same.mean() < _MIN_AGREEMENT:
+            raise ValueError(
+                f"Habitat and the mesh file agree on {is_same.mean():.0%} of what the start sees: "
+                "Habitat shows another world, or the same turned. Do up and front in the stage "
+                "config name the axes of a GLB (a PLY is never turned), and do the faces have "
+                "their front inside the rooms?"
+            )
+
+
+class _Habitat:
+    """The calls to Habitat-Sim: one agent with two sensors in its origin."""
+
+    def __init__(
+        self, library: tuple[Any, Any, Any], file: Path, camera: Camera, fov: float, gpu: int
+    ) -> None:
+        """Starts it on a scene's file; `fov` is the horizontal field of view [deg]."""
+        habitat_sim, magnum, self._quaternion = library
+        settings = habitat_sim.SimulatorConfiguration()
+        settings.scene_id = str(file)
+        settings.gpu_device_id = gpu
+        settings.enable_physics = False
+        sensors: list[Any] = []
+        kinds = {"rgb": habitat_sim.SensorType.COLOR, "depth": habitat_sim.SensorType.DEPTH}
+        for name, kind in kinds.items():
+            sensor = habitat_sim.CameraSensorSpec()
+            sensor.uuid = name
+            sensor.sensor_type = kind
+            sensor.sensor_subtype = habitat_sim.SensorSubType.PINHOLE
+            sensor.resolution = [camera.height, camera.width]
+            sensor.hfov = magnum.Deg(fov)
+            sensor.position = [0.0, 0.0, 0.0]  # by default 1.5 m above the agent
+            sensors.append(sensor)
+        agent = habitat_sim.agent.AgentConfiguration()
+        agent.sensor_specifications = sensors
+        agent.action_space = {}
+        self._new_state = habitat_sim.AgentState
+        with _without_noise():
+            self._simulator = habitat_sim.Simulator(habitat_sim.Configuration(settings, [agent]))
+
+    def observe(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colors [H, W, 3] uint8 and z-depth [H, W] float32 from a place in Habitat's world.
+
+        The arrays may be Habitat's own: the next call may change them.
+
+        Args:
+            position: of the camera [3] [m].
+            rotation: its OpenGL axes in Habitat's world, [3, 3].
+        """
+        state = self._new_state()
+        state.position = position
+        state.rotation = self._quaternion.from_rotation_matrix(rotation)
+        self._simulator.get_agent(0).set_state(state)
+        seen = self._simulator.get_sensor_observations()
+        return np.asarray(seen["rgb"])[..., :3], np.asarray(seen["depth"], np.float32)
+
+
+@contextlib.contextmanager
+def _without_noise() -> Generator[None]:
+    """Keeps the lines of `_NOISE` from the terminal; everything else arrives there.
+
+    Habitat writes from C++, to the descriptor, and may end the process: so it is another process
+    that passes the rest on, however this one ends.
+    """
+    sys.stderr.flush()
+    terminal = os.dup(2)
+    patterns = [word for pattern in _NOISE for word in ("-e", pattern)]
+    passer = ["grep", "--line-buffered", "-a", "-v", *patterns]
+    try:
+        with subprocess.Popen(passer, stdin=subprocess.PIPE, stdout=terminal) as process:
+            assert process.stdin is not None
+            os.dup2(process.stdin.fileno(), 2)
+            try:
+                yield
+            finally:
+                sys.stderr.flush()
+                os.dup2(terminal, 2)  # it closes the other end: the process comes to its end
+    finally:
+        os.close(terminal)
+
+
+def default_gpu_device() -> int:
+    """The `gpu_device_id` for this machine: 0 with CUDA, otherwise -1.
+
+    Habitat-Sim ends the whole process when it is told a CUDA device that EGL does not have, so
+    nothing is tried: the CUDA driver is asked how many devices there are, which starts none, and
+    NVIDIA's EGL must be there (containers often have CUDA alone). -1 takes the first renderer
+    that EGL offers, also one on a CPU.
+    """
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+        ctypes.CDLL("libEGL_nvidia.so.0")
+    except OSError:
+        return -1
+    count = ctypes.c_int(0)
+    if driver.cuInit(0) != 0 or driver.cuDeviceGetCount(ctypes.byref(count)) != 0:
+        return -1
+    return 0 if count.value > 0 else -1
+
+
+def _import_habitat() -> tuple[Any, Any, Any]:
+    """The modules `habitat_sim`, `magnum` and `quaternion` that come with it."""
+    for name in ("MAGNUM_LOG", "HABITAT_SIM_LOG"):
+        os.environ.setdefault(name, "quiet")  # read once, on import
+    try:
+        import habitat_sim  # pyright: ignore[reportMissingImports]
+        import magnum  # pyright: ignore[reportMissingImports]
+        import quaternion  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            f"Habitat-Sim cannot be imported ({error}). It is not on the Python package index: "
+            "conda install habitat-sim headless -c conda-forge -c aihabitat, then install r3jax in "
+            "that environment; or use the ray caster, which needs nothing: mesh:<file>, "
+            "replica:<name>"
+        ) from error
+    return habitat_sim, magnum, quaternion

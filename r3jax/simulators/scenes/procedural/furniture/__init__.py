@@ -1,0 +1,1 @@
+"""What stands and hangs in procedural rooms."""

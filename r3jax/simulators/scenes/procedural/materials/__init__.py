@@ -1,0 +1,1 @@
+"""What procedural things are made of: textures, and the finishes made with them."""

@@ -1,0 +1,234 @@
+"""Textures of building materials: plaster, wood, tiles, stone, brick, metal.
+
+Every texture tiles in both directions, has detail from the tile's size down to the texel, and
+is a read-only [h, w, 3] uint8 array that is made once per process. Colors are (r, g, b) in
+[0, 1], sRGB-encoded. Grain and brushing run along the rows.
+"""
+
+import functools
+import itertools
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from r3jax.simulators.scenes.procedural.materials.random_fields import (
+    Real,
+    blend,
+    cloud,
+    smoothstep,
+    texels,
+)
+
+Color = tuple[Real, Real, Real]
+"""Red, green and blue in [0, 1]."""
+
+Ink = tuple[int, int, int]
+"""The same as Pillow wants it: in 0 .. 255."""
+
+
+def _rgb(color: Color) -> np.ndarray:
+    return np.asarray(color, dtype=np.float32)
+
+
+@functools.cache
+def plaster(color: Color, seed: int, strength: Real = 1.0, size: int = 768) -> np.ndarray:
+    """Painted plaster: roller grain, trowel strokes, faint stains."""
+    broad = cloud(size, size, seed, 1.9)
+    strokes = cloud(size, size, seed + 1, 1.1, 3.0, 8.0)
+    grain = cloud(size, size, seed + 2, 0.5, 1.0, 60.0)
+    stain = smoothstep(0.9, 2.4, cloud(size, size, seed + 3, 2.2))
+    shade = 1.0 + strength * (0.022 * broad + 0.03 * strokes + 0.036 * grain - 0.06 * stain)
+    warmth = strength * 0.012 * np.roll(broad, size // 3, axis=1)
+    tint = np.stack([1.0 + warmth, np.ones_like(warmth), 1.0 - warmth], axis=-1)
+    return texels(_rgb(color) * tint * shade[..., None])
+
+
+@functools.cache
+def concrete(color: Color, seed: int, size: int = 768) -> np.ndarray:
+    """Cast concrete: clouds, pits, the seams and tie holes of its formwork."""
+    broad, fine = cloud(size, size, seed, 1.5), cloud(size, size, seed + 1, 0.4, 1.0, 30.0)
+    pits = smoothstep(2.1, 2.6, cloud(size, size, seed + 2, 0.9, 1.0, 24.0))
+    row, column = np.mgrid[0:size, 0:size] / size
+    seam = np.minimum(np.abs((2 * row) % 1.0 - 0.5), np.abs(column - 0.5) * 2.0) < 0.004
+    hole = np.hypot((2 * row) % 1.0 - 0.25, (2 * column) % 1.0 - 0.25) < 0.022
+    shade = 1.0 + 0.07 * broad + 0.035 * fine - 0.35 * pits - 0.3 * seam - 0.45 * hole
+    return texels(_rgb(color) * shade[..., None])
+
+
+def _grain(color: Color, seed: int, height: int, width: int, rings: Real) -> np.ndarray:
+    """Wood cut along the grain, [h, w, 3] float32."""
+    warp = cloud(height, width, seed, 2.1, 7.0)
+    fibre = cloud(height, width, seed + 1, 0.7, 24.0, 6.0)
+    row = np.arange(height, dtype=np.float32)[:, None] / height
+    # A whole number of rings across the tile keeps it seamless.
+    ring = np.sin(2.0 * np.pi * (round(rings) * row + 1.3 * warp))
+    late = smoothstep(0.2, 1.0, ring)
+    pores = smoothstep(1.4, 2.6, fibre)
+    shade = 1.0 + 0.06 * warp - 0.17 * late + 0.06 * fibre - 0.28 * pores
+    dark = _rgb(color) * np.array([0.92, 0.84, 0.76], dtype=np.float32)
+    return blend(_rgb(color), dark, late) * shade[..., None]
+
+
+@functools.cache
+def wood(color: Color, seed: int, rings: Real = 11.0, size: int = 512) -> np.ndarray:
+    """Furniture wood, grain along the rows."""
+    return texels(_grain(color, seed, size, size, rings))
+
+
+@functools.cache
+def planks(
+    color: Color, seed: int, rows: int = 14, contrast: Real = 0.16, size: int = 768
+) -> np.ndarray:
+    """A floor of staggered planks, each cut from another place of the wood."""
+    rng = np.random.default_rng(seed)
+    base = _grain(color, seed, size, size, 17.0)
+    image = np.empty_like(base)
+    edges = np.linspace(0, size, rows + 1).astype(int)
+    for top, bottom in itertools.pairwise(edges):
+        joints = np.sort(rng.integers(0, size, 2))
+        shift = np.roll(base, tuple(rng.integers(0, size, 2)), axis=(0, 1))
+        strip = np.empty((bottom - top, size, 3), dtype=np.float32)
+        for i, (start, stop) in enumerate([(0, joints[0]), tuple(joints), (joints[1], size)]):
+            tone = 1.0 + contrast * (rng.random() - 0.5) * 2.0
+            if i == 2:  # The last piece goes on in the first: the tile repeats.
+                match = float(strip[0, 0, 0] / max(shift[0, 0, 0], 1e-3))
+                tone = min(max(match, 1.0 - contrast), 1.0 + contrast)
+            piece = shift if i != 1 else np.roll(shift, size // 2, axis=1)
+            strip[:, start:stop] = piece[top:bottom, start:stop] * tone
+        strip[:2] *= 0.45
+        strip[2:4] *= 1.08
+        for joint in joints:
+            strip[:, joint : joint + 3] *= 0.5
+        image[top:bottom] = strip
+    return texels(image)
+
+
+@functools.cache
+def parquet(color: Color, seed: int, blocks: int = 6, size: int = 768) -> np.ndarray:
+    """Basket-weave parquet: square blocks of five staves, turned by turns."""
+    rng = np.random.default_rng(seed)
+    base = _grain(color, seed, size, size, 15.0)
+    image = np.empty_like(base)
+    edges = np.linspace(0, size, blocks + 1).astype(int)
+    for i in range(blocks):
+        for j in range(blocks):
+            h, w = edges[i + 1] - edges[i], edges[j + 1] - edges[j]
+            top, left = rng.integers(0, size - max(h, w), 2)
+            block = base[top : top + max(h, w), left : left + max(h, w)].copy()
+            for stave in np.array_split(np.arange(len(block)), 5):
+                block[stave] *= 1.0 + 0.3 * (rng.random() - 0.5)
+                block[stave[0]] *= 0.5
+            block[:, :2] *= 0.5
+            if (i + j) % 2:
+                block = block.transpose(1, 0, 2)
+            image[edges[i] : edges[i + 1], edges[j] : edges[j + 1]] = block[:h, :w]
+    return texels(image)
+
+
+@functools.cache
+def tiles(
+    colors: tuple[Color, ...],
+    seed: int,
+    columns: int = 6,
+    rows: int = 6,
+    grout: Color = (0.62, 0.6, 0.57),
+    bond: Real = 0.0,
+    size: int = 768,
+) -> np.ndarray:
+    """Glazed tiles with grout. `bond` shifts every other row by that share of a tile."""
+    rng = np.random.default_rng(seed)
+    row, column = np.mgrid[0:size, 0:size].astype(np.float32) / size
+    i = np.floor(row * rows).astype(int)
+    across = column * columns + bond * (i % 2)
+    j = np.floor(across).astype(int) % columns
+    drawn = rng.integers(0, len(colors), (rows, columns))[i, j]
+    which = (i + j) % 2 if len(colors) == 2 else drawn
+    tone = 1.0 + 0.07 * rng.standard_normal((rows, columns))[i, j]
+    fy, fx = row * rows - i, across - np.floor(across)
+    edge = np.minimum(
+        np.minimum(fx, 1 - fx) / columns, np.minimum(fy, 1 - fy) / rows
+    )  # in tiles of the texture
+    joint = 1.0 - smoothstep(0.0028, 0.0045, edge)
+    bevel = smoothstep(0.0045, 0.011, edge)
+    stone = 0.06 * cloud(size, size, seed + 1, 1.3) + 0.025 * cloud(size, size, seed + 2, 0.4)
+    image = np.asarray(colors, dtype=np.float32)[which]
+    image = image * (tone * (0.86 + 0.14 * bevel) + stone)[..., None]
+    dirt = 1.0 + 0.12 * cloud(size, size, seed + 3, 0.8)
+    return texels(blend(image, _rgb(grout) * dirt[..., None], joint))
+
+
+@functools.cache
+def brick(seed: int, color: Color = (0.62, 0.33, 0.25), size: int = 768) -> np.ndarray:
+    """A brick wall in running bond with rough mortar."""
+    tone = (0.72, 0.55, 0.45)
+    colors = tuple(
+        tuple(float(c * k + 0.12 * t * (k < 0.9)) for c, t in zip(color, tone, strict=True))
+        for k in (1.0, 0.82, 1.18, 0.68, 1.05, 0.9)
+    )
+    base = tiles(colors, seed, 8, 24, (0.7, 0.66, 0.6), 0.5, size).astype(np.float32) / 255.0
+    rough = 1.0 + 0.11 * cloud(size, size, seed + 7, 0.7, 1.0, 12.0)
+    return texels(base * rough[..., None])
+
+
+@functools.cache
+def marble(color: Color, vein: Color, seed: int, size: int = 768) -> np.ndarray:
+    """Polished marble: thin veins of two scales on cloudy stone."""
+    broad = cloud(size, size, seed, 1.9)
+    thick = np.exp(-np.abs(cloud(size, size, seed + 1, 1.7)) * 14.0)
+    thin = np.exp(-np.abs(cloud(size, size, seed + 2, 1.45, 1.0, 3.0)) * 18.0)
+    grain = 0.02 * cloud(size, size, seed + 3, 0.4)
+    weight = np.clip(0.75 * thick * smoothstep(-0.6, 1.2, broad) + 0.4 * thin, 0.0, 1.0)
+    stone = _rgb(color) * (1.0 + 0.05 * broad + grain)[..., None]
+    return texels(blend(stone, _rgb(vein) * (1.0 + grain)[..., None], weight))
+
+
+@functools.cache
+def terrazzo(color: Color, chips: tuple[Color, ...], seed: int, size: int = 768) -> np.ndarray:
+    """Terrazzo: angular chips of several sizes in cement."""
+    rng = np.random.default_rng(seed)
+    image = Image.new("RGB", (size, size), tuple(int(255 * c) for c in color))
+    draw = ImageDraw.Draw(image)
+    for _ in range(1500):
+        center, radius = rng.random(2) * size, 4.0 + 16.0 * rng.random() ** 2.5
+        angles = np.sort(rng.random(6)) * 2.0 * np.pi
+        shade = 0.8 + 0.35 * rng.random()
+        fill = tuple(int(255 * min(1.0, c * shade)) for c in chips[rng.integers(len(chips))])
+        ring = np.stack([np.cos(angles), np.sin(angles)], 1) * radius * (0.6 + 0.4 * rng.random())
+        for wrap in np.array([[0, 0], [size, 0], [0, size], [-size, 0], [0, -size]]):
+            draw.polygon([tuple(p) for p in (center + ring + wrap)], fill=fill)
+    grain = 1.0 + 0.035 * cloud(size, size, seed, 1.0)
+    return texels(np.asarray(image, dtype=np.float32) / 255.0 * grain[..., None])
+
+
+@functools.cache
+def metal(color: Color, seed: int, size: int = 384) -> np.ndarray:
+    """Brushed metal with smudges."""
+    brushed = cloud(size, size, seed, 0.5, 40.0)
+    smudge = cloud(size, size, seed + 1, 1.7)
+    shade = 1.0 + 0.06 * brushed + 0.05 * smudge
+    return texels(_rgb(color) * shade[..., None])
+
+
+@functools.cache
+def enamel(color: Color, seed: int, size: int = 384) -> np.ndarray:
+    """Lacquer, ceramic, plastic: nearly even, with wear, dust and scratches."""
+    broad, fine = cloud(size, size, seed, 1.7), cloud(size, size, seed + 1, 0.5, 1.0, 20.0)
+    scratch = smoothstep(2.2, 3.2, cloud(size, size, seed + 2, 0.8, 12.0, 10.0))
+    shade = 1.0 + 0.05 * broad + 0.035 * fine - 0.12 * scratch
+    return texels(_rgb(color) * shade[..., None])
+
+
+@functools.cache
+def acoustic(seed: int, size: int = 768) -> np.ndarray:
+    """Suspended ceiling of perforated mineral tiles (4 x 4 to the texture)."""
+    row, column = np.mgrid[0:size, 0:size].astype(np.float32) / size * 4.0
+    edge = np.minimum(
+        np.minimum(row % 1.0, 1.0 - row % 1.0), np.minimum(column % 1.0, 1.0 - column % 1.0)
+    )
+    holes = smoothstep(1.5, 2.2, cloud(size, size, seed, 0.35, 1.0, 40.0))
+    bar = 1.0 - smoothstep(0.018, 0.024, edge)
+    tone = np.random.default_rng(seed).normal(0.0, 0.025, (4, 4))
+    tile_tone = tone[np.floor(row).astype(int), np.floor(column).astype(int)]
+    board = 0.84 + tile_tone + 0.02 * cloud(size, size, seed + 1, 1.6) - 0.3 * holes
+    shade = board * (1.0 - bar) + (0.93 - 0.25 * (edge > 0.015)) * bar
+    return texels(shade[..., None] * np.array([1.0, 0.995, 0.97], dtype=np.float32))

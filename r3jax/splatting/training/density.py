@@ -1,0 +1,204 @@
+"""Adaptive density control of Kerbl et al. (2023, section 5.2) at fixed capacity.
+
+Every decision is a mask over all rows. What is born goes into unused rows; where these run out,
+the Gaussians with the largest gradients are served first and the rest is counted.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from r3jax.splatting.projection import rotation_rows
+from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
+from r3jax.splatting.training.config import TrainConfig
+from r3jax.splatting.training.optimizer import Moments, forget
+
+SHRINK = 1.6
+"""The children of a split are smaller by this factor."""
+
+
+class DensityStatistics(eqx.Module):
+    """How strongly the images pull at each Gaussian's center, since the last refinement."""
+
+    gradient: Float[Array, " n"]
+    """Sum of the lengths of the gradients by the projected center [per half image]."""
+
+    count: Float[Array, " n"]
+    """Views that saw the Gaussian."""
+
+    @property
+    def mean_gradient(self) -> Float[Array, " n"]:
+        """Mean over the views that saw it; 0 where none did."""
+        return self.gradient / jnp.maximum(self.count, 1.0)
+
+
+class Refinement(NamedTuple):
+    """What one refinement did."""
+
+    born: Int[Array, ""]
+    """Rows that were put in use."""
+
+    pruned: Int[Array, ""]
+    """Rows that were given up."""
+
+    dropped: Int[Array, ""]
+    """Gaussians that wanted to be cloned or split and found no unused row."""
+
+
+def empty_statistics(capacity: int) -> DensityStatistics:
+    """Statistics of no view."""
+    return DensityStatistics(gradient=jnp.zeros(capacity), count=jnp.zeros(capacity))
+
+
+def observe(
+    statistics: DensityStatistics,
+    center_gradient: Float[Array, "n 2"],
+    in_view: Bool[Array, " n"],
+    width: int,
+    height: int,
+) -> DensityStatistics:
+    """Adds one view.
+
+    Args:
+        statistics: so far.
+        center_gradient: gradient of the loss by the projected centers [per px].
+        in_view: True where the center lies in the image.
+        width: of the image [px].
+        height: of the image [px].
+    """
+    half = 0.5 * jnp.array([width, height], dtype=jnp.float32)
+    # Centers in units of half the image, as the threshold was chosen for (NDC).
+    length = jnp.sqrt(jnp.sum((center_gradient * half[None, :]) ** 2, axis=1))
+    seen = in_view | (length > 0.0)
+    return DensityStatistics(
+        gradient=statistics.gradient + length, count=statistics.count + seen.astype(jnp.float32)
+    )
+
+
+def refine(
+    scene: GaussianScene,
+    moments: Moments,
+    statistics: DensityStatistics,
+    extent: Float[Array, ""],
+    prunes_large: Bool[Array, ""] | bool,
+    config: TrainConfig,
+    *,
+    key: PRNGKeyArray,
+) -> tuple[GaussianScene, Moments, Refinement]:
+    """Clones small and splits large Gaussians with large gradients; prunes faint ones.
+
+    A clone is an exact copy; the original keeps its moments. A split replaces the parent by two
+    Gaussians drawn from it, with scales / 1.6. Newborns start without moments.
+
+    Args:
+        scene: before.
+        moments: Adam's, before.
+        statistics: of the views since the last refinement.
+        extent: of the cameras [m].
+        prunes_large: also prune what is larger than `config.prune_size` extents.
+        config: thresholds.
+        key: of the positions of split children.
+
+    Returns:
+        The scene and the moments after; all rows that take no part are untouched.
+    """
+    size = jnp.exp(jnp.max(scene.log_scales, axis=1))
+    is_pulled = scene.is_alive & (statistics.mean_gradient >= config.gradient_threshold)
+    is_large = size > config.percent_dense * extent
+    prune = _pruned(scene, size, is_pulled & is_large, extent, prunes_large, config)
+    wants = is_pulled & ~prune
+    free = ~scene.is_alive | prune
+    scene = eqx.tree_at(
+        lambda s: s.opacity_logits, scene, jnp.where(prune, DEAD_LOGIT, scene.opacity_logits)
+    )
+    parent, child, is_served = pair_rows(wants, free, statistics.mean_gradient)
+    served = _marked(parent, is_served)
+    splits = served & is_large
+    newborn = _marked(child, is_served)
+    scene = copy_rows(scene, parent, child, is_served)
+    scene = _split(scene, splits | _marked(child, is_served & splits[parent]), key)
+    moments = forget(moments, newborn | splits | prune)
+    born = jnp.sum(newborn, dtype=jnp.int32)
+    dropped = jnp.sum(wants, dtype=jnp.int32) - born
+    return scene, moments, Refinement(born, jnp.sum(prune, dtype=jnp.int32), dropped)
+
+
+def _pruned(
+    scene: GaussianScene,
+    size: Float[Array, " n"],
+    will_split: Bool[Array, " n"],
+    extent: Float[Array, ""],
+    prunes_large: Bool[Array, ""] | bool,
+    config: TrainConfig,
+) -> Bool[Array, " n"]:
+    """Too faint, or too large even after a split."""
+    is_faint = jax.nn.sigmoid(scene.opacity_logits) < config.prune_opacity
+    size_after = jnp.where(will_split, size / SHRINK, size)
+    is_huge = jnp.asarray(prunes_large) & (size_after > config.prune_size * extent)
+    return scene.is_alive & (is_faint | is_huge)
+
+
+def pair_rows(
+    wants: Bool[Array, " n"], free: Bool[Array, " n"], priority: Float[Array, " n"]
+) -> tuple[Int[Array, " n"], Int[Array, " n"], Bool[Array, " n"]]:
+    """Gives each row that wants one a free row, those of high priority first.
+
+    Returns:
+        Row of the k-th parent, row of its child, and whether the pair is real; pairs that are
+        not real name arbitrary rows.
+    """
+    parent = jnp.argsort(jnp.where(wants, -priority, jnp.inf), stable=True)
+    child = jnp.argsort(~free, stable=True)
+    num_pairs = jnp.minimum(jnp.sum(wants), jnp.sum(free))
+    return parent, child, jnp.arange(wants.shape[0]) < num_pairs
+
+
+def _marked(rows: Int[Array, " n"], is_real: Bool[Array, " n"]) -> Bool[Array, " n"]:
+    """Mask of the rows that are named by real entries."""
+    return jnp.zeros(rows.shape[0], dtype=bool).at[rows].max(is_real)
+
+
+def copy_rows(
+    scene: GaussianScene, source: Int[Array, " m"], target: Int[Array, " m"], is_real: Array
+) -> GaussianScene:
+    """Copies rows over others; targets of real pairs differ, other pairs are ignored."""
+    target = jnp.where(is_real, target, scene.capacity)  # out of range: dropped
+    return jax.tree.map(lambda x: x.at[target].set(x[source], mode="drop"), scene)
+
+
+def _split(scene: GaussianScene, rows: Bool[Array, " n"], key: PRNGKeyArray) -> GaussianScene:
+    """Moves rows to points drawn from their own Gaussian, and shrinks them."""
+    along = jax.random.normal(key, scene.means.shape) * jnp.exp(scene.log_scales)
+    means = scene.means + rotated(scene.quats, along)
+    return eqx.tree_at(
+        lambda s: (s.means, s.log_scales),
+        scene,
+        (
+            jnp.where(rows[:, None], means, scene.means),
+            jnp.where(rows[:, None], scene.log_scales - jnp.log(SHRINK), scene.log_scales),
+        ),
+    )
+
+
+def rotated(quats: Float[Array, "n 4"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Vectors along the Gaussians' own axes, in the world."""
+    R = rotation_rows(quats)
+    return jnp.stack([sum(R[i][j] * vectors[:, j] for j in range(3)) for i in range(3)], axis=1)
+
+
+def reset_opacities(
+    scene: GaussianScene, moments: Moments, config: TrainConfig
+) -> tuple[GaussianScene, Moments]:
+    """Lowers all opacities to at most `config.reset_opacity` and forgets their moments."""
+    limit = jnp.log(config.reset_opacity / (1.0 - jnp.asarray(config.reset_opacity)))
+    logits = jnp.minimum(scene.opacity_logits, limit)
+    scene = eqx.tree_at(lambda s: s.opacity_logits, scene, logits)
+    logits_of: Callable[[Moments], tuple[Array, Array]] = lambda m: (
+        m.mean.opacity_logits,
+        m.square.opacity_logits,
+    )
+    return scene, eqx.tree_at(logits_of, moments, (jnp.zeros_like(logits),) * 2)

@@ -1,0 +1,321 @@
+"""One step of training, its loss, and one refinement: pure functions of the state, jitted.
+
+What is minimized is 0.8 L1 + 0.2 D-SSIM (Kerbl et al. 2023, eq. 7).
+
+Shape symbols: n rows of the scene, v views, b views per step; H, W image size.
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from r3jax.geometry.cameras import invert_pose, project, transform
+from r3jax.splatting.config import NEAR
+from r3jax.splatting.render import render
+from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.training import density, mcmc
+from r3jax.splatting.training.config import Schedule, TrainConfig
+from r3jax.splatting.training.density import DensityStatistics, empty_statistics
+from r3jax.splatting.training.optimizer import Moments, adam_update, empty_moments, mean_rate
+from r3jax.splatting.views import PosedImage, Views
+
+RADIUS = 5
+"""The window of SSIM has 2 x 5 + 1 pixels a side."""
+
+SIGMA = 1.5
+"""Standard deviation of the window [px]."""
+
+C1, C2 = 0.01**2, 0.03**2
+"""Stabilizers of SSIM for colors in [0, 1] (Wang et al. 2004)."""
+
+_exponents = -0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2
+_TAPS = [float(w) for w in np.exp(_exponents) / np.exp(_exponents).sum()]
+
+
+def photometric_loss(
+    rgb: Float[Array, "H W 3"],
+    target: Float[Array, "H W 3"],
+    lambda_dssim: Float[Array, ""] | float,
+) -> Float[Array, ""]:
+    """(1 - lambda) L1 + lambda (1 - SSIM)."""
+    l1 = jnp.mean(jnp.abs(rgb - target))
+    return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - structural_similarity(rgb, target))
+
+
+def structural_similarity(
+    rgb: Float[Array, "H W 3"], target: Float[Array, "H W 3"]
+) -> Float[Array, ""]:
+    """Mean SSIM in [-1, 1] with an 11 x 11 Gaussian window, both images continued by zeros.
+
+    The zeros beyond the edge and the biased variances are those of the 3DGS trainer; the SSIM
+    that evaluates (evaluation) follows scikit-image instead.
+    """
+    x, y = jnp.moveaxis(rgb, -1, 0), jnp.moveaxis(target, -1, 0)
+    blurred = blur(jnp.concatenate([x, y, x * x, y * y, x * y]))
+    mean_x, mean_y, xx, yy, xy = (blurred[3 * i : 3 * i + 3] for i in range(5))
+    variances = (xx - mean_x * mean_x) + (yy - mean_y * mean_y)
+    covariance = xy - mean_x * mean_y
+    luminance = (2.0 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
+    return jnp.mean(luminance * (2.0 * covariance + C2) / (variances + C2))
+
+
+@jax.custom_vjp
+def blur(planes: Float[Array, "c H W"]) -> Float[Array, "c H W"]:
+    """Each plane under the Gaussian window, zeros beyond the edges.
+
+    Separable, as shifted sums: XLA's convolutions are 60 times slower on CPUs.
+    """
+    height, width = planes.shape[1:]
+    padded = jnp.pad(planes, [(0, 0), (RADIUS, RADIUS), (RADIUS, RADIUS)])
+    rows = jnp.asarray(sum(w * padded[:, :, i : i + width] for i, w in enumerate(_TAPS)))
+    return jnp.asarray(sum(w * rows[:, i : i + height] for i, w in enumerate(_TAPS)))
+
+
+# The window is symmetric, so the blur is its own transpose; autodiff of the shifts is slower.
+blur.defvjp(lambda planes: (blur(planes), None), lambda _, gradient: (blur(gradient),))
+
+
+def psnr_of(mse: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Peak signal-to-noise ratio [dB] of a mean squared error of colors in [0, 1]."""
+    return -10.0 * jnp.log10(jnp.maximum(mse, 1e-10))
+
+
+DONE, OVERFLOWN, DIVERGED = 0, 1, 2
+"""Outcomes of a step. The state only advances with the first."""
+
+_ORDER, _BACKGROUND, _NOISE, _REFINE = range(4)
+"""What a key is for."""
+
+
+class TrainState(eqx.Module):
+    """All that changes during training."""
+
+    scene: GaussianScene
+    """The Gaussians."""
+
+    moments: Moments
+    """Adam's."""
+
+    statistics: DensityStatistics
+    """Since the last refinement."""
+
+    step: Int[Array, ""]
+    """Steps done."""
+
+    dropped: Int[Array, ""]
+    """Gaussians that were to be born and found no unused row. Never decreases."""
+
+
+class StepInfo(eqx.Module):
+    """What a step has to report."""
+
+    outcome: Int[Array, ""]
+    """DONE; OVERFLOWN: the budget of intersections is too small; DIVERGED: the loss, a
+    gradient or a parameter is not finite. The state is unchanged but for DONE."""
+
+    loss: Float[Array, ""]
+    """Before the step."""
+
+    psnr: Float[Array, ""]
+    """PSNR of this step's views, before the step [dB]."""
+
+    num_gaussians: Int[Array, ""]
+    """Rows in use."""
+
+    num_intersections: Int[Array, ""]
+    """Needed by the most demanding of this step's views."""
+
+
+class _ViewReport(eqx.Module):
+    """What the loss of one view reports besides its value."""
+
+    mse: Float[Array, ""]
+    num_intersections: Int[Array, ""]
+    overflow: Int[Array, ""]
+
+
+_Sums = tuple[Float[Array, ""], GaussianScene, DensityStatistics, _ViewReport]
+"""Loss, gradient, statistics and report of the views so far."""
+
+
+def start_state(scene: GaussianScene) -> TrainState:
+    """The state before the first step."""
+    return TrainState(
+        scene=scene,
+        moments=empty_moments(scene),
+        statistics=empty_statistics(scene.capacity),
+        step=jnp.zeros((), dtype=jnp.int32),
+        dropped=jnp.zeros((), dtype=jnp.int32),
+    )
+
+
+def _key(config: TrainConfig, purpose: int, number: Int[Array, ""]) -> PRNGKeyArray:
+    """A function of the seed and the step alone, so that a resumed run draws the same."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), purpose), number)
+
+
+def view_index(config: TrainConfig, number: Int[Array, ""], count: int) -> Int[Array, ""]:
+    """The view that is the `number`-th to be shown: a new random order in every epoch."""
+    order = jax.random.permutation(_key(config, _ORDER, number // count), count)
+    return order[number % count]
+
+
+@functools.partial(jax.jit, donate_argnames=("state",))
+def train_step(
+    state: TrainState,
+    views: Views,
+    extent: Float[Array, ""],
+    config: TrainConfig,
+    schedule: Schedule,
+) -> tuple[TrainState, StepInfo]:
+    """One step of the optimizer.
+
+    Args:
+        state: before; its buffers are given away.
+        views: all training views.
+        extent: of the cameras [m].
+        config: traced but for its structure; `config.raster` holds the budget.
+        schedule: traced.
+
+    Returns:
+        The state after, and what happened. Where a view needs more than the budget, or the loss
+        or a gradient is not finite, the state is that from before, step number included: to
+        repeat the step with a larger budget is to lose nothing.
+    """
+    loss, gradient, statistics, report = _gradients(state, views, config)
+    if config.strategy == "mcmc":
+        extra, slope = jax.value_and_grad(mcmc.regularization)(state.scene, config)
+        loss, gradient = loss + extra, jax.tree.map(jnp.add, gradient, slope)
+    is_finite = jnp.isfinite(loss + _squared_size(gradient) + _squared_size(state.scene))
+    bad = jnp.where(report.overflow > 0, OVERFLOWN, DIVERGED)
+    outcome = jnp.where((report.overflow == 0) & is_finite, DONE, bad)
+    gradient = _up_to_degree(gradient, state.step // schedule.sh_every)
+    rate = mean_rate(config, extent, state.step + 1)
+    scene, moments = adam_update(
+        state.scene, gradient, state.moments, rate, config, outcome == DONE
+    )
+    if config.strategy == "mcmc":
+        scene = mcmc.perturbed(scene, rate, config, key=_key(config, _NOISE, state.step))
+    after = TrainState(scene, moments, statistics, state.step + 1, state.dropped)
+    info = StepInfo(
+        outcome=outcome,
+        loss=loss,
+        psnr=psnr_of(report.mse),
+        num_gaussians=jnp.sum(state.scene.is_alive, dtype=jnp.int32),
+        num_intersections=report.num_intersections,
+    )
+    keep: Callable[[Array, Array], Array] = lambda new, old: jnp.where(outcome == DONE, new, old)
+    return jax.tree.map(keep, after, state), info
+
+
+def _squared_size(scene: GaussianScene) -> Float[Array, ""]:
+    """Sum of all squares: not finite if any entry is not, or would overflow Adam's moments."""
+    return jnp.asarray(sum(jnp.vdot(x, x) for x in jax.tree.leaves(scene)))
+
+
+def _gradients(
+    state: TrainState, views: Views, config: TrainConfig
+) -> tuple[Float[Array, ""], GaussianScene, DensityStatistics, _ViewReport]:
+    """Loss and gradient, means over this step's views, which are taken one after the other."""
+    num = config.views_per_step
+    background = _background(config, state.step)
+
+    def add_view(carry: _Sums, slot: Int[Array, ""]) -> tuple[_Sums, None]:
+        total, gradient, statistics, report = carry
+        view = views.view(view_index(config, state.step * num + slot, len(views)))
+        (loss, found), (slope, pull) = jax.value_and_grad(_view_loss, argnums=(0, 1), has_aux=True)(
+            state.scene, jnp.zeros((state.scene.capacity, 2)), view, background, config
+        )
+        statistics = density.observe(
+            statistics, pull, _in_view(state.scene, view), views.width, views.height
+        )
+        report = _ViewReport(
+            mse=report.mse + found.mse / num,
+            num_intersections=jnp.maximum(report.num_intersections, found.num_intersections),
+            overflow=report.overflow + found.overflow,
+        )
+        gradient = jax.tree.map(lambda a, b: a + b / num, gradient, slope)
+        return (total + loss / num, gradient, statistics, report), None
+
+    zero = jnp.zeros((), dtype=jnp.int32)
+    start = (
+        jnp.zeros(()),
+        jax.tree.map(jnp.zeros_like, state.scene),
+        state.statistics,
+        _ViewReport(mse=jnp.zeros(()), num_intersections=zero, overflow=zero),
+    )
+    if num == 1:
+        return add_view(start, zero)[0]
+    return jax.lax.scan(add_view, start, jnp.arange(num))[0]
+
+
+def _view_loss(
+    scene: GaussianScene,
+    center_offsets: Float[Array, "n 2"],
+    view: PosedImage,
+    background: Float[Array, " 3"],
+    config: TrainConfig,
+) -> tuple[Float[Array, ""], _ViewReport]:
+    rendering = render(
+        scene,
+        view.camera,
+        view.T_world_camera,
+        background,
+        config.raster,
+        center_offsets=center_offsets,
+    )
+    loss = photometric_loss(rendering.rgb, view.rgb, config.lambda_dssim)
+    mse = jnp.mean((jnp.clip(rendering.rgb, 0.0, 1.0) - view.rgb) ** 2)
+    return loss, _ViewReport(mse, rendering.num_intersections, rendering.overflow)
+
+
+def _up_to_degree(gradient: GaussianScene, degree: Int[Array, ""]) -> GaussianScene:
+    """No gradient for harmonics above the degree: they stay as they are, 0 at first."""
+    k = jnp.arange(gradient.sh.shape[1])
+    sh = jnp.where((k < (degree + 1) ** 2)[None, :, None], gradient.sh, 0.0)
+    return eqx.tree_at(lambda s: s.sh, gradient, sh)
+
+
+def _in_view(scene: GaussianScene, view: PosedImage) -> Bool[Array, " n"]:
+    """True where the center lies in the image."""
+    pixels, z = project(view.camera, transform(invert_pose(view.T_world_camera), scene.means))
+    size = jnp.array([view.camera.width, view.camera.height], dtype=jnp.float32)
+    inside = (pixels > 0.0) & (pixels < size[None, :])
+    return scene.is_alive & (z > NEAR) & inside.all(axis=1)
+
+
+def _background(config: TrainConfig, step: Int[Array, ""]) -> Float[Array, " 3"]:
+    if config.background == "random":
+        return jax.random.uniform(_key(config, _BACKGROUND, step), (3,))
+    return jnp.full(3, 1.0 if config.background == "white" else 0.0)
+
+
+@functools.partial(jax.jit, donate_argnames=("state",))
+def refine_step(
+    state: TrainState, extent: Float[Array, ""], config: TrainConfig, schedule: Schedule
+) -> tuple[TrainState, density.Refinement]:
+    """Refines the Gaussians by the strategy of the config, and begins new statistics."""
+    key = _key(config, _REFINE, state.step)
+    if config.strategy == "mcmc":
+        found = mcmc.refine(state.scene, state.moments, config, key=key)
+    else:
+        was_reset = state.step > schedule.reset_every
+        found = density.refine(
+            state.scene, state.moments, state.statistics, extent, was_reset, config, key=key
+        )
+    scene, moments, refinement = found
+    statistics = empty_statistics(scene.capacity)
+    dropped = state.dropped + refinement.dropped
+    return TrainState(scene, moments, statistics, state.step, dropped), refinement
+
+
+@functools.partial(jax.jit, donate_argnames=("state",))
+def reset_step(state: TrainState, config: TrainConfig) -> TrainState:
+    """Resets the opacities."""
+    scene, moments = density.reset_opacities(state.scene, state.moments, config)
+    return TrainState(scene, moments, state.statistics, state.step, state.dropped)

@@ -1,0 +1,168 @@
+"""The map of all pictures and the maps of all but some: against maps made the plain way."""
+
+import functools
+import tempfile
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from r3jax.apps.audit import capture_maps as real
+from r3jax.apps.audit.capture_maps import Seen, see
+from r3jax.apps.audit.source import Source, source_of
+from r3jax.apps.audit.survey import RANGE, AuditSettings, Survey, survey_of
+from r3jax.formats.recordings import read_recording
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.update import integrate
+from tests.apps.audit.room import round_poses, write_recording
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+
+pytestmark = pytest.mark.full
+
+SETTINGS = AuditSettings(voxel_size=0.1, folds=4)
+NUM = 8
+
+
+@functools.cache
+def room() -> tuple[Source, Survey]:
+    with tempfile.TemporaryDirectory() as name:
+        folder = write_recording(Path(name) / "room", round_poses(NUM))
+        source = source_of(read_recording(folder, "z"), "room")
+        pictures = [source.read(i) for i in range(len(source))]
+    source = Source(
+        source.name, source.poses, source.lenses, source.labels, "depth", True, None, 1,
+        pictures.__getitem__,
+    )  # fmt: skip
+    return source, survey_of(source, SETTINGS)
+
+
+@functools.cache
+def seen() -> Seen:
+    return see(*room(), folds=4)
+
+
+def plain(numbers) -> MapState:
+    """The map of some pictures, one after the other."""
+    source, survey = room()
+    state = empty_map(1 << 15, survey.voxel_size)
+    for i in numbers:
+        state = integrate(state, source.frame(i, survey.alignment), RANGE)
+    return state
+
+
+def by_key(state: MapState) -> dict[tuple[int, int], tuple]:
+    """What is known of each voxel that was measured, but for marks."""
+    rows = np.flatnonzero(np.asarray(state.count) > 0)
+    key = np.asarray(state.key)[:, rows].T.tolist()
+    columns = (state.count, state.mean[0], state.mean[1], state.mean[2], state.m2)
+    values = np.stack([np.asarray(x)[rows] for x in columns], axis=1)
+    return {tuple(k): v for k, v in zip(key, values, strict=True)}
+
+
+def assert_same(a: MapState, b: MapState) -> None:
+    first, second = by_key(a), by_key(b)
+    assert first.keys() == second.keys()
+    for key, value in first.items():
+        np.testing.assert_allclose(value, second[key], atol=2e-5)
+
+
+def law_statistics(modules: Modules) -> None:
+    """Colors and counts are those of plain integration, of all and of all but a fold."""
+    found = modules["capture_maps"].see(*room(), folds=4)
+    assert_same(found.state, plain(range(NUM)))
+    for fold in (0, 3):
+        others = [i for i in range(NUM) if i % 4 != fold]
+        assert_same(found.without(fold), plain(others))
+
+
+def test_colors_and_counts_are_those_of_plain_integration():
+    law_statistics({"capture_maps": real})
+
+
+def law_marks(modules: Modules) -> None:
+    """No mark comes from a picture that is left out, and none is missing."""
+    found = modules["capture_maps"].see(*room(), folds=NUM)
+    for fold in (1, 5):
+        without, part = found.without(fold), found.folds[fold]
+        union = np.asarray(without.visited) | np.asarray(part.visited)
+        np.testing.assert_array_equal(union, found.state.visited)
+        best = np.maximum(without.resolution, part.resolution)
+        np.testing.assert_array_equal(best, found.state.resolution)
+        only = np.asarray(part.visited) & ~np.asarray(without.visited)
+        assert only.any()  # so the picture's own marks do leave with it
+        # A picture marks one direction of a voxel.
+        assert np.bitwise_count(np.asarray(part.visited)).sum(axis=0).max() == 1
+
+
+def test_marks_leave_with_their_picture():
+    law_marks({"capture_maps": real})
+
+
+def test_every_part_has_the_rows_of_the_whole():
+    for part in seen().folds:
+        np.testing.assert_array_equal(part.key, seen().state.key)
+        assert int(part.dropped) == 0
+    assert seen().fold_of.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
+
+
+def test_the_order_of_the_pictures_does_not_matter():
+    source, survey = room()
+    order = [5, 2, 7, 0, 1, 6, 3, 4]
+    turned = Source(
+        source.name, source.poses[order], source.lenses, source.labels, "depth", True, None, 1,
+        lambda i: source.read(order[i]),
+    )  # fmt: skip
+    other = see(turned, survey, folds=2)
+    assert_same(other.state, seen().state)
+    order_of = lambda state: np.lexsort(np.asarray(state.key)[:, np.asarray(state.occupied)])
+    for name in ("visited", "resolution"):
+        one, two = (
+            np.asarray(getattr(s, name))[..., np.asarray(s.occupied)][..., order_of(s)]
+            for s in (seen().state, other.state)
+        )
+        np.testing.assert_allclose(one, two, rtol=1e-6)
+
+
+def test_the_camera_stands_in_free_space():
+    source, _ = room()
+    grid = seen().grid
+    cells = np.floor((source.poses[:, :3, 3] - np.asarray(grid.origin)) / float(grid.cell_size))
+    assert np.asarray(grid.free)[tuple(cells.astype(int).T)].all()
+
+
+def test_voxels_that_are_far_too_small_are_refused(monkeypatch):
+    source, survey = room()
+    monkeypatch.setattr(real, "_MOST_ROWS", 1 << 10)
+    monkeypatch.setattr(real, "_CAPACITY", 1 << 10)
+    with pytest.raises(ValueError, match="larger --voxel-size"):
+        see(source, survey, folds=2)
+
+
+def test_more_folds_than_pictures_leave_one_each():
+    source, survey = room()
+    found = see(source, survey, folds=99)
+    assert len(found.folds) == NUM
+    jax.tree.map(np.testing.assert_array_equal, found.state.key, seen().state.key)
+
+
+CHAIN = ("r3jax.apps.audit.capture_maps",)
+MUTANTS = [
+    Mutant("capture_maps", "if i != fold", "if i == fold", law_statistics),
+    Mutant("capture_maps", "(b.count, b.mean, b.m2)", "(a.count, b.mean, b.m2)", law_statistics),
+    Mutant("capture_maps", "(b.count, b.mean, b.m2)", "(b.count, b.mean, a.m2)", law_statistics),
+    Mutant("capture_maps", "a.visited | b.visited", "a.visited & b.visited", law_marks),
+    Mutant("capture_maps", "whole, marks(part)), frame", "whole, marks(whole)), frame", law_marks),
+]
+
+
+@pytest.mark.mutant
+def test_laws_hold_without_a_fault():
+    modules = load(CHAIN)
+    law_statistics(modules)
+    law_marks(modules)
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)

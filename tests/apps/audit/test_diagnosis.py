@@ -1,0 +1,71 @@
+"""Where people could stand: in the open, near where the camera was, away from everything."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r3jax.apps.audit.diagnosis import places_in_free_space, places_in_hull
+from r3jax.apps.audit.survey import MARGIN
+from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid, empty_grid
+
+
+def grid_of(free: np.ndarray) -> OccupancyGrid:
+    """Cells of 0.2 m from the origin: free, and else occupied."""
+    grid = empty_grid(np.array([[0.2, 0.2, 0.2], (np.array(free.shape) - 1) * 0.2]), 0.2)
+    assert grid.log_odds.shape == free.shape
+    odds = np.where(free, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT).astype(np.float32)
+    return eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(odds))
+
+
+def two_rooms() -> np.ndarray:
+    """Two rooms of 3 x 3 x 2.4 m side by side, with a wall without a door between them."""
+    free = np.zeros((33, 17, 14), bool)
+    free[1:16, 1:16, 1:13] = free[17:32, 1:16, 1:13] = True
+    return free
+
+
+def test_places_lie_in_the_room_of_the_camera_at_its_heights_with_a_margin():
+    grid = grid_of(two_rooms())
+    cameras = np.array([[1.0, 1.0, 1.3], [2.0, 1.5, 1.5]])
+    places = places_in_free_space(grid, cameras)
+    assert len(places) > 100
+    assert (places[:, 0] < 3.2).all()  # nobody walks through the wall
+    assert np.abs(places[:, 2] - 1.4).max() <= 0.1 + MARGIN + 1e-6
+    walls = np.array([[0.2, 0.2], [3.2, 3.2]])
+    assert (np.abs(places[:, None, :2] - walls[None]).min(axis=(1, 2)) >= MARGIN - 1e-6).all()
+
+
+def test_a_camera_close_to_a_wall_still_means_its_room():
+    places = places_in_free_space(grid_of(two_rooms()), np.array([[0.3, 0.3, 1.4]]))
+    assert len(places) > 20
+    assert (places[:, 0] < 3.2).all()
+
+
+def test_nothing_is_reached_from_inside_a_wall_far_away():
+    far = np.array([[40.0, 1.0, 1.4]])
+    assert len(places_in_free_space(grid_of(two_rooms()), far)) == 0
+    assert len(places_in_free_space(grid_of(np.zeros((5, 5, 5), bool)), far)) == 0
+
+
+@given(st.integers(0, 500))
+def test_the_hull_keeps_its_margins(seed):
+    rng = np.random.default_rng(seed)
+    cameras = rng.uniform(0, 3, (int(rng.integers(1, 7)), 3))
+    cameras[:, 2] = 1.4  # flat, as most captures
+    voxels = rng.uniform(-1, 4, (60, 3))
+    places = places_in_hull(cameras, voxels)
+    for place in places:
+        assert np.linalg.norm(voxels - place, axis=1).min() >= MARGIN - 1e-9
+        assert abs(place[2] - 1.4) <= MARGIN + 1e-9
+        # A supporting direction of the hull would show a place outside of it.
+        directions = rng.normal(size=(20, 3))
+        support = (cameras @ directions.T).max(axis=0) + MARGIN * np.abs(directions).sum(axis=1)
+        assert (directions @ place <= support + 1e-9).all()
+
+
+def test_one_camera_alone_leaves_the_box_round_it():
+    places = places_in_hull(np.array([[1.0, 2.0, 3.0]]), np.array([[9.0, 9.0, 9.0]]))
+    assert len(places) > 4
+    assert np.abs(places - [1, 2, 3]).max() <= MARGIN

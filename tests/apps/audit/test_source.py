@@ -1,0 +1,122 @@
+"""Thinned and straightened images: against COLMAP's own library, and what must not move.
+
+Sparse depth from points: each where the camera shows it, and nothing that is hidden.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r3jax.apps.audit.source import distorted, sampling_table, sparse_depth, thinned
+from r3jax.formats.lenses import MODELS, Lens
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.geometry.cameras import Camera
+from tests.apps.audit.room import FOCAL, HEIGHT, WIDTH, picture, round_poses, wall_points
+
+SOME = {
+    "SIMPLE_RADIAL": (400.0, 320.0, 240.0, -0.12),
+    "RADIAL": (400.0, 320.0, 240.0, -0.12, 0.03),
+    "OPENCV": (400.0, 410.0, 320.0, 240.0, -0.12, 0.03, 0.002, -0.003),
+    "FULL_OPENCV": (400.0, 410.0, 320.0, 240.0, -0.1, 0.02, 0.002, -0.003, 0.01, 0.05, 0.01, 0.0),
+    "OPENCV_FISHEYE": (400.0, 410.0, 320.0, 240.0, 0.05, -0.01, 0.003, 0.001),
+    "SIMPLE_RADIAL_FISHEYE": (400.0, 320.0, 240.0, 0.05),
+    "RADIAL_FISHEYE": (400.0, 320.0, 240.0, 0.05, -0.01),
+}
+
+
+@pytest.mark.parametrize("model", SOME)
+def test_distortion_is_colmaps(model):
+    pycolmap = pytest.importorskip("pycolmap")
+    lens = Lens(model, 640, 480, SOME[model])
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-0.7, 0.7, (2, 50))
+    camera = pycolmap.Camera(model=model, width=640, height=480, params=list(SOME[model]))
+    expected = np.asarray(camera.img_from_cam(np.stack([x, y, np.ones_like(x)], axis=1)))
+    fx, fy, cx, cy = lens.intrinsics
+    found_x, found_y = distorted(lens, x, y)
+    found = np.stack([fx * found_x + cx, fy * found_y + cy], axis=1)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@given(width=st.integers(1, 60), height=st.integers(1, 60), stride=st.integers(1, 7))
+def test_a_thinned_pixel_looks_where_the_pixel_that_it_takes_looks(width, height, stride):
+    lens = Lens("PINHOLE", width, height, (31.0, 37.0, 0.4 * width, 0.6 * height))
+    table, camera = sampling_table(lens, stride), thinned(lens.camera, stride)
+    assert table.row.shape == (camera.height, camera.width)
+    assert table.is_there.all()
+    fx, fy, cx, cy = lens.intrinsics
+    column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    slope = lambda at, center, focal: (at - float(center)) / float(focal)
+    np.testing.assert_allclose(
+        slope(column, camera.cx, camera.fx), (table.column + 0.5 - cx) / fx, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        slope(row, camera.cy, camera.fy), (table.row + 0.5 - cy) / fy, atol=1e-4
+    )
+
+
+def test_nothing_is_invented_where_the_lens_saw_nothing():
+    lens = Lens("SIMPLE_RADIAL", 64, 48, (40.0, 32.0, 24.0, 0.6))  # bends corners far outwards
+    table = sampling_table(lens, 1)
+    assert 0.3 < table.is_there.mean() < 1.0
+    image = np.full((48, 64, 3), 200, np.uint8)
+    taken = table.take(image)
+    np.testing.assert_array_equal(taken[~table.is_there], 0)
+    np.testing.assert_array_equal(taken[table.is_there], 200)
+    assert table.is_there[24, 32]
+    assert (image == 200).all()
+
+
+def test_a_lens_nobody_straightens_here_is_named():
+    params = (40.0, 40.0, 32.0, 24.0, *[0.1] * (len(MODELS["THIN_PRISM_FISHEYE"][1]) - 4))
+    with pytest.raises(ForeignFileError, match="THIN_PRISM_FISHEYE lens are not straightened"):
+        sampling_table(Lens("THIN_PRISM_FISHEYE", 64, 48, params), 2)
+
+
+CAMERA = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+POSES = round_poses()
+
+
+@given(st.integers(0, len(POSES) - 1))
+def test_a_pixel_has_the_depth_of_the_wall_that_it_shows(index):
+    """A point lies anywhere in its pixel: its depth lies between those of the pixels around.
+
+    In a corner of the room it is deeper than all of them, by less than a pixel is wide.
+    """
+    xyz, rgb = wall_points()
+    depth, colors = sparse_depth(CAMERA, POSES[index], xyz, rgb, hides=True)
+    truth_rgb, truth = picture(POSES[index])
+    row, column = np.nonzero(depth)
+    inner = (row > 0) & (row < HEIGHT - 1) & (column > 0) & (column < WIDTH - 1)
+    row, column = row[inner], column[inner]
+    around = np.stack([truth[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    assert len(row) > 60
+    assert (depth[row, column] >= around.min(axis=0) - 1e-3).all()
+    assert (depth[row, column] <= around.max(axis=0) * (1 + 1 / FOCAL)).all()
+    off = np.abs(colors[row, column].astype(int) - truth_rgb[row, column]).max(axis=1)
+    assert np.median(off) < 8
+    assert not colors[depth == 0].any()
+
+
+def test_a_near_point_hides_the_one_behind_it_only_if_asked():
+    camera = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
+    xyz = np.array([[0.02, 0.0, 2.0], [0.0, 0.0, 4.0], [1.5, 0.0, 4.0], [0.0, 0.0, -3.0]])
+    rgb = np.arange(12, dtype=np.uint8).reshape(4, 3)
+    every = sparse_depth(camera, np.eye(4), xyz, rgb, hides=False)[0]
+    front = sparse_depth(camera, np.eye(4), xyz, rgb, hides=True)[0]
+    assert sorted(every[every > 0]) == [2.0, 4.0, 4.0]
+    assert sorted(front[front > 0]) == [2.0, 4.0]  # the one aside stays
+    # In one pixel the nearest counts, hidden or not.
+    column = xyz[:2] * [0.0, 1.0, 1.0]
+    depth, colors = sparse_depth(camera, np.eye(4), column, rgb[:2], hides=False)
+    assert depth[depth > 0].tolist() == [2.0]
+    assert colors[depth > 0].tolist() == [rgb[0].tolist()]
+
+
+def test_no_points_are_no_depth():
+    none = np.zeros((0, 3))
+    depth, colors = sparse_depth(CAMERA, np.eye(4), none, none.astype(np.uint8), hides=True)
+    assert depth.shape == (HEIGHT, WIDTH)
+    assert not depth.any()
+    assert not colors.any()

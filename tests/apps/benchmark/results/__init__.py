@@ -1,1 +1,0 @@
-"""Tests of the same folder of the package."""

@@ -1,0 +1,92 @@
+"""A state on the timeline is the one that the frames rebuild, whichever way one came there."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from r3jax.apps.viewer.story import Timeline
+from r3jax.exploration.replay import rebuild
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import read_run
+from tests.apps.viewer.conftest import VIEWS
+
+pytestmark = pytest.mark.full
+
+
+def content(map_state) -> dict:
+    """Voxels by key: rows may stand in another order."""
+    used = np.asarray(map_state.occupied)
+    keys = map(tuple, np.asarray(map_state.key)[:, used].T.tolist())
+    rows = zip(
+        np.asarray(map_state.count)[used],
+        np.asarray(map_state.visited)[:, used].T.tolist(),
+        np.asarray(map_state.resolution)[used],
+        strict=True,
+    )
+    return dict(zip(keys, [(float(c), tuple(v), float(r)) for c, v, r in rows], strict=True))
+
+
+@pytest.fixture(scope="module")
+def expected(run):
+    return [rebuild([run], step + 1) for step in range(VIEWS)]
+
+
+def assert_is(moment, step, expected):
+    map_state, grid = expected[step]
+    assert moment.step == step
+    assert content(moment.map_state) == content(map_state)
+    np.testing.assert_array_equal(moment.grid.log_odds, grid.log_odds)
+
+
+@pytest.mark.parametrize("memory", [1 << 30, 1])
+@pytest.mark.parametrize("order", [(4, 0, 2, 4, 1), (0, 1, 2, 3, 4), (3, 3, 0, 1)])
+def test_any_way_through_the_views_gives_the_rebuilt_states(run, expected, memory, order):
+    timeline = Timeline(run, memory)
+    for step in order:
+        assert_is(timeline.at(step), step, expected)
+
+
+def test_with_little_memory_few_states_are_kept(run):
+    timeline = Timeline(run, 1)
+    assert timeline.stride == 3  # two of five views
+    for _ in timeline.follow():
+        pass
+    assert len(timeline._kept) == 2
+
+
+def test_following_gives_every_state_in_order_whatever_else_is_asked(run, expected):
+    timeline = Timeline(run)
+    for step, moment in enumerate(timeline.follow()):
+        assert_is(moment, step, expected)
+        assert_is(timeline.at((3 * step) % VIEWS), (3 * step) % VIEWS, expected)
+    assert step == VIEWS - 1
+
+
+def test_the_last_state_comes_from_the_checkpoint_without_reading_a_frame(run, expected, tmp_path):
+    copy = shutil.copytree(run.path, tmp_path / "copy")
+    shutil.rmtree(copy / "frames")
+    timeline = Timeline(read_run(copy))
+    assert_is(timeline.at(VIEWS - 1), VIEWS - 1, expected)
+    with pytest.raises(RunError, match="missing"):
+        timeline.at(0)
+
+
+def test_without_checkpoints_frames_will_do(run, expected, tmp_path):
+    copy = shutil.copytree(run.path, tmp_path / "copy")
+    shutil.rmtree(copy / "checkpoints")
+    assert_is(Timeline(read_run(copy)).at(VIEWS - 1), VIEWS - 1, expected)
+
+
+def test_a_view_that_is_not_there_is_named(run):
+    with pytest.raises(IndexError, match="views 0 to 4, not 5"):
+        Timeline(run).at(5)
+
+
+def test_a_frame_that_was_changed_is_named(run, tmp_path):
+    copy = shutil.copytree(run.path, tmp_path / "copy")
+    shutil.copy(copy / "frames" / "000001.png", copy / "frames" / "000002.png")
+    timeline = Timeline(read_run(copy))
+    timeline.at(1)
+    with pytest.raises(RunError, match="differ from those recorded"):
+        timeline.at(2)

@@ -1,0 +1,229 @@
+"""Tables: numbers recomputed another way, marks, ties, gaps, refusals, faults put in."""
+
+import numpy as np
+import pytest
+
+from experiments.pages.comparison_tables import difference_table, tail_table
+from r3jax.apps.benchmark.tables import quality_table
+from tests.evaluation.records import SKILL, benchmark, record
+from tests.mutants import Mutant, assert_caught, each, load
+
+CHAIN = ("r3jax.apps.benchmark.tables", "experiments.pages.comparison_tables")
+
+
+def fields(table):
+    """Every entry by its labels and column."""
+    return {
+        (*row.labels, column): entry
+        for row in table.rows
+        for column, entry in zip(table.columns, row.entries, strict=True)
+    }
+
+
+def fixed(**psnr):
+    """One record of one view for each policy."""
+    return [record(policy.replace("_", "-"), psnr=[x]) for policy, x in psnr.items()]
+
+
+def law_quality(modules) -> None:
+    """Every field is a mean of means taken from the raw records."""
+    cells = benchmark()
+    found = fields(modules["tables"].quality_table(cells[::-1]))
+    assert len(found) == len(SKILL) * 3 * 3
+    for title, name in (("PSNR [dB]", "psnr"), ("SSIM", "ssim"), ("LPIPS", "lpips")):
+        for policy in SKILL:
+            by_scene = {
+                scene: np.mean([
+                    np.mean(c["views"][name])
+                    for c in cells
+                    if (c["policy"], c["scene"]) == (policy, scene)
+                ])
+                for scene in ("flat", "house")
+            }  # fmt: skip
+            for scene, mean in by_scene.items():
+                assert found[policy, title, scene].value == pytest.approx(mean)
+            mean = np.mean(list(by_scene.values()))
+            assert found[policy, title, "mean"].value == pytest.approx(mean)
+            decimals = 2 if name == "psnr" else 3
+            assert found[policy, title, "mean"].text == f"{mean:.{decimals}f}"
+
+
+def law_marks(modules) -> None:
+    """The best and the second best of each column, whichever way is better."""
+    found = fields(modules["tables"].quality_table(benchmark()))
+    for title in ("PSNR [dB]", "SSIM", "LPIPS"):
+        for column in ("flat", "house", "mean"):
+            ours = {m: entry for (m, t, c), entry in found.items() if (t, c) == (title, column)}
+            order = sorted(ours, key=lambda m: ours[m].value, reverse=title != "LPIPS")
+            assert [ours[m].rank for m in order] == [1, 2] + [0] * (len(order) - 2)
+
+
+def law_ties(modules) -> None:
+    """Numbers that read the same share a mark."""
+    quality = modules["tables"].quality_table
+    ranks = lambda **psnr: {
+        key[0]: entry.rank
+        for key, entry in fields(quality(fixed(**psnr))).items()
+        if key[1:] == ("PSNR [dB]", "mean")
+    }
+    assert ranks(ours=30.001, ours_pano=29.999, random=20.0, frontier=19.0) == {
+        "ours": 1, "ours-pano": 1, "random": 2, "frontier": 0,
+    }  # fmt: skip
+    assert ranks(ours=30.0, random=20.0, frontier=20.0) == {"ours": 1, "random": 2, "frontier": 2}
+    assert ranks(ours=30.0) == {"ours": 0}
+
+
+def law_gaps(modules) -> None:
+    """No record, no number; and no mean over other scenes than the others' means."""
+    tables, comparison = modules["tables"], modules["comparison_tables"]
+    cells = [c for c in benchmark() if (c["policy"], c["scene"]) != ("ours", "house")]
+    cells = [c for c in cells if (c["policy"], c["scene"], c["seed"]) != ("random", "flat", 2)]
+    for cell in cells:
+        if cell["policy"] == "active-gs":
+            cell["views"]["lpips"] = None
+    found = fields(tables.quality_table(cells))
+    assert [found["ours", "SSIM", c].value is None for c in ("flat", "house", "mean")] == [
+        False, True, True,
+    ]  # fmt: skip
+    assert found["ours-pano", "PSNR [dB]", "mean"].rank == 1
+    assert found["active-gs", "LPIPS", "flat"].value is None
+    assert found["active-gs", "SSIM", "flat"].value is not None
+    table = comparison.tail_table(cells, resamples=50)
+    assert all(e.value is None for key, e in fields(table).items() if key[0] == "ours")
+    assert {row.labels[0]: row.seeds for row in table.rows} == {
+        **dict.fromkeys(SKILL, "3"), "ours": "0-3", "random": "2-3",
+    }  # fmt: skip
+    assert "2 to 3 seeds per cell, fewer than the 3 of the protocol." in table.notes
+    assert "No record of ours in house." in table.notes
+    for row in comparison.difference_table(cells, "ours", resamples=50).rows:
+        assert [entry.value is None for entry in row.entries] == [False, True, True]
+
+
+def law_tails(modules) -> None:
+    """101 views with known order; LPIPS has its tail at the other end."""
+    tail = modules["comparison_tables"].tail_table
+    values = np.random.default_rng(0).permutation(101).astype(float)
+    cells = [
+        record(policy, scene, psnr=values / 2 + add)
+        for policy in ("random", "ours")
+        for scene, add in (("flat", 0.0), ("house", 50.5))
+    ]
+    found = fields(tail(cells, resamples=100))
+    mine = {column: found["ours", column] for column in tail(cells, resamples=10).columns}
+    assert mine["mean"].value == pytest.approx(50.25)
+    low, high = mine["mean"].extra["low"], mine["mean"].extra["high"]
+    assert low < 50.25 < high
+    assert mine["mean"].text == f"50.25 [{low:.2f}, {high:.2f}]"
+    assert (mine["worst scene"].value, mine["worst scene"].text) == (25.0, "25.00 (flat)")
+    assert mine["median"].value == pytest.approx(50.25)
+    assert mine["5th percentile"].value == pytest.approx(np.percentile(np.arange(202) / 2, 5))
+    assert mine["worst view"].value == 0.0
+    assert mine["views < 20 dB [%]"].value == pytest.approx(100 * 40 / 202)
+    lpips = fields(tail(cells, metric="lpips", resamples=10))
+    assert lpips["ours", "worst scene"].text.endswith("(flat)")
+    assert lpips["ours", "worst view"].value == max(cells[0]["views"]["lpips"])
+    assert lpips["ours", "95th percentile"].value > lpips["ours", "median"].value
+    assert not any("20 dB" in column for _, column in lpips)
+
+
+def law_difference(modules) -> None:
+    """The reference minus the others, on the seeds that both have."""
+    difference = modules["comparison_tables"].difference_table
+    cells = benchmark(("random", "active-gs", "ours"))
+    kept = [c for c in cells if (c["policy"], c["seed"]) != ("random", 1)]
+    table = difference(kept, "ours", resamples=200)
+    found = fields(table)
+    assert [row.labels for row in table.rows] == [("random",), ("active-gs",)]
+    assert [row.seeds for row in table.rows] == ["2", "3"]
+
+    def mean(policy, scene, seeds):
+        chosen = [c for c in cells if c["policy"] == policy and c["scene"] == scene]
+        return np.mean([c["views"]["psnr"] for c in chosen if c["seed"] in seeds])
+
+    for policy, seeds in (("random", (0, 2)), ("active-gs", (0, 1, 2))):
+        gaps = [mean("ours", s, seeds) - mean(policy, s, seeds) for s in ("flat", "house")]
+        entry = found[policy, "flat"]
+        assert entry.value == pytest.approx(gaps[0])
+        assert found[policy, "mean"].value == pytest.approx(np.mean(gaps))
+        low, high = entry.extra["low"], entry.extra["high"]
+        assert low < entry.value < high
+        assert entry.text == f"{gaps[0]:+.2f} [{low:+.2f}, {high:+.2f}]"
+
+
+def test_titles_and_notes_tell_the_terms():
+    cells = benchmark(("random", "ours"), seeds=(0, 1))
+    assert quality_table(cells).title == "views:60"
+    assert tail_table(cells, resamples=9).title == "views:60, PSNR [dB]"
+    measured = tail_table(cells, metric="psnr_measured", resamples=9)
+    assert measured.title == "views:60, PSNR [dB], holes left out"
+    assert "views < 20 dB [%]" in measured.columns
+    assert quality_table(cells, "mine").title == "mine"
+    assert difference_table(cells, "ours", resamples=9).title.endswith("ours minus the others")
+    terms, seeds, made = quality_table(cells).notes
+    for told in ("views:60", "model clock", "256 px", "2000 iterations", "128 px"):
+        assert told in terms
+    assert seeds == "2 seeds per cell, fewer than the 3 of the protocol."
+    assert made == "Made on two cores from commit abc1234."
+    assert quality_table(benchmark(("random", "ours"))).notes[1] == "3 seeds per cell."
+    single = quality_table([record(commit=None)]).notes
+    assert single[1].startswith("1 seed per cell,")
+    assert single[2] == "Made on two cores from commit unknown."
+    cells = benchmark(("random", "ours"), settings={"pool": 9}, commit="0123456789abc-dirty")
+    table = quality_table(cells)
+    assert [row.labels[0] for row in table.rows[::3]] == ["random", "ours"]
+    assert "Settings of all policies: pool=9." in table.notes
+    assert table.notes[-1].endswith("from commit 0123456789-dirty.")
+
+
+def test_unequal_terms_and_unknown_names_are_refused():
+    cells = benchmark(("random", "ours"))
+    cells[3]["test_views"]["hash"] = "another"
+    for make in (quality_table, tail_table, lambda c: difference_table(c, "ours")):
+        with pytest.raises(ValueError, match="the hash of the test views"):
+            make(cells)
+    with pytest.raises(ValueError, match="no metric 'mse'; there are psnr, psnr_measured, ssim"):
+        tail_table(cells, metric="mse")
+    with pytest.raises(ValueError, match="no record of 'mine'; there are random, ours"):
+        difference_table(benchmark(("random", "ours")), "mine")
+
+
+MUTANTS = [
+    Mutant("tables", "np.nanmean(scores[scene])", "np.nanmean(scores[scene][:1])", law_quality),
+    Mutant(
+        "tables",
+        "rows[method, name] for method in methods for name in PAPER_METRICS",
+        "rows[method, 'psnr'] for method in methods for name in PAPER_METRICS",
+        law_quality,
+    ),
+    Mutant("tables", "set(scores) != set(scenes)", "not scores", law_gaps),
+    Mutant(
+        "comparison_tables",
+        "set(scores.get(method, ())) == set(scenes)",
+        "method in scores",
+        law_gaps,
+    ),
+    Mutant("comparison_tables", "95 if metric.lower_is_better else 5)", "5)", law_tails),
+    Mutant("comparison_tables", "max if metric.lower_is_better else min", "min", law_tails),
+    Mutant("comparison_tables", "views < POOR_PSNR)", "views <= POOR_PSNR)", law_tails),
+    Mutant("comparison_tables", "np.median(views)", "np.mean(scores['flat'])", law_tails),
+    Mutant(
+        "comparison_tables", "{*seeds[reference][s]} & {*seeds[method][s]}", "{0}", law_difference
+    ),
+    Mutant(
+        "comparison_tables", "(ours[s], theirs[s]) if", "(theirs[s], ours[s]) if", law_difference
+    ),
+    Mutant(
+        "comparison_tables", "if not found or len(found) < len(pairs)", "if not found", law_gaps
+    ),
+]
+LAWS = [law_quality, law_marks, law_ties, law_gaps, law_tails, law_difference]
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_laws_hold_without_a_fault(law):
+    law(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_mutant_is_caught(mutant):
+    assert_caught(CHAIN, mutant)

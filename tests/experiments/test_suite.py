@@ -1,0 +1,114 @@
+"""The benchmark's tables and figures from records by hand; the sizes of the suite."""
+
+import csv
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import degeneracy, quality_over_budget, replica_dense
+from experiments.pages.artifacts import Origin
+from experiments.suite import Options, request_of
+from r3jax.planning.registry import policy_names
+from r3jax.trace.writer import RunWriter
+from tests.evaluation.records import record
+from tests.trace.runs import make_header, make_view
+
+SOURCE = Origin("python -m experiments.some", "a machine", "abc")
+POLICIES = ("random", "active-gs", "ours", "ours-pano")
+
+
+@pytest.fixture(scope="module")
+def records():
+    return [
+        record(policy, scene, seed, snapshot)
+        for policy in POLICIES
+        for scene in ("flat", "office")
+        for seed in (0, 1)
+        for snapshot in (30, 60)
+    ]
+
+
+def data_of(path):
+    lines = path.read_text().splitlines()
+    assert lines[0] == f"# command: {SOURCE.command}"
+    return list(csv.DictReader(line for line in lines if not line.startswith("#")))
+
+
+@pytest.mark.parametrize("size", ["smoke", "small", "paper"])
+@pytest.mark.parametrize("unit", ["views", "seconds"])
+def test_every_size_is_a_benchmark_that_can_run(size, unit):
+    request = request_of(Options(size=size), unit)
+    assert set(request.policies) <= set(policy_names())
+    assert {"ours", "ours-pano", "active-gs", "random"} <= set(request.policies)
+    conditions = request.conditions
+    assert conditions.budget == conditions.snapshots[-1]
+    assert conditions.budget.startswith(unit)
+    assert len(conditions.snapshots) >= 2
+    assert conditions.clock == ("wall" if unit == "seconds" else "model")
+    if size == "paper":
+        assert conditions.budget in ("views:300", "seconds:300")
+        assert len(request.seeds) == 3
+    other = request_of(Options(size=size, scenes=("loft",), policies=("cover",)), unit)
+    assert (other.scenes, other.policies) == (("loft",), ("cover",))
+
+
+def test_tables_hold_the_last_snapshot(records, tmp_path):
+    replica_dense.write_tables(tmp_path, "page", records, SOURCE)
+    page = (tmp_path / "page.md").read_text()
+    assert SOURCE.commit in page
+    for kind in ("quality", "tails", "differences"):
+        assert "\\toprule" in (tmp_path / f"{kind}.tex").read_text()
+    rows = data_of(tmp_path / "quality.csv")
+    chosen = [r for r in records if r["policy"] == "ours" and r["snapshot"] == "views:60"]
+    expected = np.mean([r["views"]["psnr"] for r in chosen if r["scene"] == "flat"])
+    (found,) = [r for r in rows if r["method"] == "ours" and r["metric"].startswith("PSNR")]
+    assert float(found["flat"]) == pytest.approx(expected, abs=1e-6)
+    without = [r for r in records if r["policy"] != "ours-pano"]
+    assert "differences" not in replica_dense.tables_of(without[1::2])
+
+
+def test_the_page_of_the_budget_shows_all_its_pictures(records, tmp_path):
+    quality_over_budget.write_page(tmp_path, records, SOURCE)
+    page = (tmp_path / "quality_over_budget.md").read_text()
+    for name in (*quality_over_budget.CURVES, "psnr_by_view"):
+        assert f"({name}.png)" in page
+        with Image.open(tmp_path / f"{name}.png") as picture:
+            assert SOURCE.commit in picture.info["Description"]
+            assert min(picture.size) > 200
+    assert {row["method"] for row in data_of(tmp_path / "areas.csv")} == set(POLICIES)
+
+
+def poses(places, directions):
+    found = np.tile(np.eye(4), (len(places), 1, 1))
+    found[:, :3, 3], found[:, :3, 2] = places, directions
+    return found
+
+
+def test_revisits_by_hand():
+    x, y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+    turned = [np.cos(0.5), np.sin(0.5), 0.0]  # 29 degrees from x
+    here, near, far = [0.0, 0.0, 0.0], [0.0, 0.0, 0.45], [0.0, 0.0, 0.95]
+    assert degeneracy.revisit_rate(poses([here], [x])) == 0.0
+    assert degeneracy.revisit_rate(poses([here, near], [x, turned])) == 1.0
+    assert degeneracy.revisit_rate(poses([here, near], [x, y])) == 0.0
+    assert degeneracy.revisit_rate(poses([here, far], [x, x])) == 0.0
+    # The third is far from the first, near the second; the fourth is new.
+    chain = poses([here, near, [0.0, 0.0, 0.9], here], [x, x, x, y])
+    assert degeneracy.revisit_rate(chain) == pytest.approx(2 / 3)
+
+
+def test_positions_come_from_the_runs_up_to_the_snapshot(tmp_path):
+    with RunWriter(tmp_path / "run", make_header()) as writer:
+        for step in range(3):
+            writer.add(*make_view(step))
+    taken = [record(policy, snapshot=2, budget=2) | {"run": "run"} for policy in POLICIES[:2]]
+    found = degeneracy.missions(tmp_path, taken)
+    assert [len(mission["poses"]) for mission in found] == [2, 2]
+    degeneracy.write_page(tmp_path / "out", tmp_path, taken, SOURCE)
+    rows = data_of(tmp_path / "out" / "missions.csv")
+    assert [row["policy"] for row in rows] == list(POLICIES[:2])
+    assert float(rows[0]["revisit_rate"]) == degeneracy.revisit_rate(found[0]["poses"])
+    assert (tmp_path / "out" / "flat.png").exists()
+    page = (tmp_path / "out" / "degeneracy.md").read_text()
+    assert "| random |" in page.replace("| random  ", "| random ")

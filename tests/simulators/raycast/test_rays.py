@@ -1,0 +1,79 @@
+"""Hits on a box, worked out on paper."""
+
+import numpy as np
+import pytest
+
+from r3jax.simulators.raycast.rays import TriangleScene, join
+from tests.simulators.rooms import box_quads, box_room, world_of
+
+
+@pytest.fixture(scope="module")
+def room():
+    world = box_room()
+    return TriangleScene(world.vertices, world.faces)
+
+
+def rays(*pairs):
+    origins, directions = zip(*pairs, strict=True)
+    return np.array(origins, np.float32), np.array(directions, np.float32)
+
+
+def test_distance_is_in_lengths_of_the_direction(room):
+    hits = room.cast(*rays(((1, 2, 1), (1, 0, 0)), ((1, 2, 1), (0, 0, 2)), ((1, 2, 1), (5, 0, 5))))
+    np.testing.assert_allclose(hits.distance, [5.0, 1.0, 0.4], rtol=1e-6)
+
+
+def test_barycentric_weights_give_the_point_that_was_hit():
+    world = box_room()
+    rng = np.random.default_rng(0)
+    origins = np.full((200, 3), (2.0, 1.5, 1.2), np.float32)
+    directions = rng.normal(size=(200, 3)).astype(np.float32)
+    hits = TriangleScene(world.vertices, world.faces).cast(origins, directions)
+    corners = world.vertices[world.faces[hits.face]]
+    weights = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=1)
+    by_weights = np.einsum("nk,nkj->nj", weights, corners)
+    np.testing.assert_allclose(by_weights, origins + hits.distance[:, None] * directions, atol=1e-5)
+
+
+def test_a_miss_has_no_face_and_infinite_distance(room):
+    hits = room.cast(*rays(((-1, 2, 1), (-1, 0, 0))))
+    assert hits.face[0] == -1
+    assert np.isinf(hits.distance[0])
+    assert not hits.is_back[0]
+
+
+def test_back_faces_are_seen_from_without_only(room):
+    hits = room.cast(*rays(((1, 2, 1), (0, 1, 0)), ((-1, 2, 1), (1, 0, 0))))
+    assert hits.is_back.tolist() == [False, True]
+
+
+def test_culling_looks_through_back_faces_to_the_next_front_face(room):
+    hits = room.cast(*rays(((-1, 2, 1), (1, 0, 0))), cull_back_faces=True)
+    np.testing.assert_allclose(hits.distance, [7.0], rtol=1e-5)
+    assert not hits.is_back[0]
+
+
+def test_culling_a_solid_seen_from_within_leaves_nothing():
+    world = world_of(box_quads((0, 0, 0), (1, 1, 1), inward=False))
+    scene = TriangleScene(world.vertices, world.faces)
+    hits = scene.cast(*rays(((0.5, 0.5, 0.5), (1, 0.1, 0))), cull_back_faces=True)
+    assert hits.face[0] == -1
+    assert np.isinf(hits.distance[0])
+
+
+def test_no_ray_slips_through_the_edges_of_a_closed_box(room):
+    corners = np.array([[x, y, z] for x in (0, 6) for y in (0, 4) for z in (0, 3)], float)
+    ends = [(1 - s) * a + s * b for a in corners for b in corners for s in (0.25, 0.5)]
+    origin = np.array([1.7, 2.1, 1.3])
+    directions = (np.array(ends) - origin).astype(np.float32)
+    hits = room.cast(np.full(directions.shape, origin, np.float32), directions)
+    assert np.isfinite(hits.distance).all()
+
+
+def test_batches_join_and_an_empty_batch_is_allowed(room):
+    origins, directions = rays(((1, 2, 1), (1, 0, 0)), ((1, 2, 1), (0, 1, 0)))
+    whole = room.cast(origins, directions)
+    parts = join([room.cast(origins[k : k + 1], directions[k : k + 1]) for k in (0, 1)])
+    np.testing.assert_array_equal(whole.distance, parts.distance)
+    np.testing.assert_array_equal(whole.face, parts.face)
+    assert len(room.cast(origins[:0], directions[:0]).face) == 0
