@@ -251,6 +251,11 @@ def loop_of_options(options: ExploreOptions) -> ExplorationConfig:
         allow_growth=not options.fixed_capacity,
         clock=options.clock,
         until=options.until,
+        capture_every=options.capture_every,
+        capture_rate=options.capture_rate,
+        gaze=options.gaze,
+        exposure=options.exposure,
+        blur=options.blur,
     )
     if config.allow_growth and config.capacity < LEAST_CAPACITY:
         config = dataclasses.replace(config, capacity=LEAST_CAPACITY)
@@ -264,7 +269,8 @@ def motion_of_options(options: ExploreOptions) -> Motion:
     Raises:
         ValueError: a setting that cannot work.
     """
-    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Motion)}
+    names = [field.name for field in dataclasses.fields(Motion)]
+    given = {name: getattr(options, name, None) for name in names}
     return make_motion(options.motion, **{k: v for k, v in given.items() if v is not None})
 
 

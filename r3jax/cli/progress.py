@@ -36,11 +36,18 @@ _LOG_LINES = 10
 class RunProgress:
     """Follows a run; hand its methods to `explore`."""
 
-    def __init__(self, console: Console, budget: Budget):
-        """Shows nothing before it is entered."""
+    def __init__(self, console: Console, budget: Budget, captured: int = 0):
+        """Shows nothing before it is entered.
+
+        Args:
+            console: where to.
+            budget: of the run.
+            captured: frames on the way that were recorded before the run goes on.
+        """
         self._console = console
         self._budget = budget
         self._views = 0
+        self._captured = captured
         self._logged = -1
         self._bar = progress_bar(
             console,
@@ -66,8 +73,11 @@ class RunProgress:
 
     def on_step(self, row: StepRow) -> None:
         """A view is done."""
-        self._views = row.step + 1
-        share = self._budget.spent_share(views=self._views, seconds=row.seconds, metres=row.metres)
+        self._captured += row.captured
+        self._views = row.step + 1 - self._captured
+        share = self._budget.spent_share(
+            views=self._views, frames=row.step + 1, seconds=row.seconds, metres=row.metres
+        )
         facts = (
             f"{100 * row.coverage.known_share:.0f} % explored, "
             f"R {row.coverage.mean_renderability:.2f}, {row.seconds:.0f} s on the clock"

@@ -1,10 +1,14 @@
-"""How long a run may last: views, seconds of the mission clock, or meters."""
+"""How long a run may last: views, frames, seconds of the mission clock, or meters.
+
+Views are those that a policy chose, and the one at the start; frames count those captured on
+the way, too. Without captures they are the same.
+"""
 
 import math
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
-Unit = Literal["views", "seconds", "metres"]
+Unit = Literal["views", "frames", "seconds", "metres"]
 
 
 @dataclass(frozen=True)
@@ -14,16 +18,16 @@ class Budget:
     unit: Unit
     amount: float
 
-    def allows(self, *, views: int, seconds: float, metres: float) -> bool:
+    def allows(self, *, views: int, frames: int, seconds: float, metres: float) -> bool:
         """True if a mission of that size lies within the budget."""
-        spent = {"views": views, "seconds": seconds, "metres": metres}[self.unit]
-        return spent <= self.amount
+        spent = {"views": views, "frames": frames, "seconds": seconds, "metres": metres}
+        return spent[self.unit] <= self.amount
 
-    def spent_share(self, *, views: int, seconds: float, metres: float) -> float:
+    def spent_share(self, *, views: int, frames: int, seconds: float, metres: float) -> float:
         """Share of the budget that such a mission has used, in [0, 1]."""
-        spent = {"views": views, "seconds": seconds, "metres": metres}[self.unit]
+        spent = {"views": views, "frames": frames, "seconds": seconds, "metres": metres}
         # Mapping the last picture may exceed the budget: only its arrival has to lie within.
-        return min(1.0, spent / self.amount)
+        return min(1.0, spent[self.unit] / self.amount)
 
     def __str__(self) -> str:
         """As `parse_budget` reads it."""
@@ -33,10 +37,10 @@ class Budget:
 
 
 def parse_budget(text: str) -> Budget:
-    """Reads `views:N`, `seconds:S` or `metres:M`.
+    """Reads `views:N`, `frames:N`, `seconds:S` or `metres:M`.
 
     Raises:
-        ValueError: anything else, an amount that is not positive, views that are not whole.
+        ValueError: anything else, an amount that is not positive, views or frames not whole.
     """
     example = "use views:100, seconds:300 or metres:25"
     unit, separator, amount_text = text.strip().partition(":")
@@ -48,6 +52,6 @@ def parse_budget(text: str) -> Budget:
         raise ValueError(f"budget {text!r}: {amount_text!r} is not a number; {example}") from None
     if not (math.isfinite(amount) and amount > 0.0):
         raise ValueError(f"budget {text!r}: the amount must be positive and finite; {example}")
-    if unit == "views" and amount != int(amount):
-        raise ValueError(f"budget {text!r}: views are counted in whole numbers; {example}")
+    if unit in ("views", "frames") and amount != int(amount):
+        raise ValueError(f"budget {text!r}: {unit} are counted in whole numbers; {example}")
     return Budget(cast(Unit, unit), amount)

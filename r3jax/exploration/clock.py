@@ -41,8 +41,11 @@ class WallClock:
 class ModelClock:
     """Charges a fixed cost per stage, so that the same run twice is the same run."""
 
-    costs: dict[str, float] = field(default_factory=lambda: {"planning": 0.3, "mapping": 0.02})
-    """Seconds per call, by stage."""
+    costs: dict[str, float] = field(
+        default_factory=lambda: {"planning": 0.3, "mapping": 0.02, "gaze": 0.01, "gaze plan": 0.1}
+    )
+    """Seconds per call, by stage; `gaze` per frame that is captured on the way, `gaze plan` per
+    frame of a path whose directions are planned together."""
 
     measures: bool = False
 

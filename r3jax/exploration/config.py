@@ -2,12 +2,18 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from r3jax.mapping.config import MappingConfig
 from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 
 ClockName = Literal["wall", "model"]
+
+GazeName = Literal["ahead", "blend", "panorama", "planned"]
+"""Where the camera looks on the way; `planning.gaze` says how each finds its directions."""
+
+LEAST_PIECE = 0.05
+"""Frames that are captured on the way lie at least so far apart [m]: the edge of a voxel."""
 
 # One step less: the largest stored value means "beyond the range", not a depth.
 LARGEST_DEPTH = (BEYOND_RANGE - 1) / DEPTH_STEPS_PER_METRE
@@ -58,6 +64,34 @@ class ExplorationConfig(MappingConfig):
     until_every: int = 5
     """Views from one look at the forecast to the next; it takes most of a second."""
 
+    capture_every: float | None = None
+    """Longest piece of a path between two frames [m]: those between two views are captured on the
+    way. None: the camera is blind on the way, unless `capture_rate` says otherwise."""
+
+    capture_rate: float | None = None
+    """Frames per second of the flight [Hz], instead of `capture_every`: at speed v the pieces are
+    at most v / rate long."""
+
+    gaze: GazeName = "panorama"
+    """Where the camera looks when it captures a frame on the way."""
+
+    exposure: float = 0.0
+    """Time that the shutter is open for a frame on the way [s]; 0: nothing blurs."""
+
+    blur: float = 1.0
+    """Pixels by which a turning camera may move the image meanwhile, in its middle [px]."""
+
+    @property
+    def captures(self) -> bool:
+        """True if frames are captured on the way."""
+        return self.capture_every is not None or self.capture_rate is not None
+
+    def piece_at(self, speed: float) -> float:
+        """Longest piece of a path between two frames at a speed [m/s], [m]; inf: no captures."""
+        if self.capture_rate is not None:
+            return max(speed / self.capture_rate, LEAST_PIECE)
+        return math.inf if self.capture_every is None else self.capture_every
+
     def check_scales(self) -> None:
         """Refuses lengths that do not fit together; what was recorded with them is still read.
 
@@ -84,3 +118,20 @@ class ExplorationConfig(MappingConfig):
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.clock not in ("wall", "model"):
             raise ValueError(f"clock must be `wall` or `model`, got {self.clock!r}")
+        self._check_captures()
+
+    def _check_captures(self) -> None:
+        """Refuses captures that cannot work."""
+        every, rate = self.capture_every, self.capture_rate
+        if every is not None and rate is not None:
+            raise ValueError("give capture_every or capture_rate, not both")
+        if every is not None and not LEAST_PIECE <= every < math.inf:
+            raise ValueError(f"capture_every must be at least {LEAST_PIECE:g} m, got {every}")
+        if rate is not None and not 0.0 < rate < math.inf:
+            raise ValueError(f"capture_rate must be positive and finite [Hz], got {rate}")
+        if self.gaze not in get_args(GazeName):
+            raise ValueError(f"gaze must be one of {get_args(GazeName)}, got {self.gaze!r}")
+        if not 0.0 <= self.exposure < math.inf:
+            raise ValueError(f"exposure must be a finite time >= 0 [s], got {self.exposure}")
+        if not 0.0 < self.blur < math.inf:
+            raise ValueError(f"blur must be positive and finite [px], got {self.blur}")

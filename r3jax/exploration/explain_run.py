@@ -10,12 +10,20 @@ Shape symbols: m voxels that a view sees; k cells.
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
-from r3jax.exploration.replay import check_decided_alone, planner_config_of, states_of
+from r3jax.exploration.captures import scoring_on_the_way
+from r3jax.exploration.replay import (
+    check_decided_alone,
+    config_of,
+    planner_config_of,
+    states_of,
+)
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
 from r3jax.planning.decision import explain_way, initial_state
+from r3jax.planning.gaze import count_look
 from r3jax.scoring.explain import Explanation
 from r3jax.trace.reader import Run
 
@@ -70,14 +78,15 @@ def explain_run(
             That after a view is asked for when the reason of the next one is.
 
     Yields:
-        The reason of each view; None for the first, which nobody chose.
+        The reason of each view; None for the first, which nobody chose. Where frames were captured
+        on the way, it stands in the first row of the path, as the choice does.
 
     Raises:
         RunError: the run was merged, a setting of it is not known, a frame is missing or broken.
     """
     # First: rebuilding the map takes minutes, and would show a map nobody decided on.
     check_decided_alone(run)
-    config = planner_config_of(run)
+    config, scoring = planner_config_of(run), scoring_on_the_way(config_of(run))
     after_views = iter(states_of(run) if states is None else states)
     memory, before = None, None
     for row in run.rows:
@@ -94,3 +103,6 @@ def explain_run(
             yield reason_of(explanation, grid)
         if row is not run.rows[-1]:  # nothing was decided on the last map
             before = np.asarray(row.pose, dtype=np.float64), next(after_views)
+            if row.captured:
+                camera, pose = run.camera, jnp.asarray(row.pose)
+                memory = count_look(memory, *before[1], camera, pose, scoring)

@@ -16,7 +16,7 @@ def record_view(
     begin = time.perf_counter()
     # The view first: a resume ignores a checkpoint that has no row, and can do without one.
     recorder.add(view.row, view.frame)
-    if state.views % config.checkpoint_every == 0:
+    if not view.row.captured and state.chosen % config.checkpoint_every == 0:
         recorder.checkpoint(view.row.step, state_tables(state))
     seconds = time.perf_counter() - begin
     recorder.add_timings(view.row.step, view.stages | {"record": seconds})

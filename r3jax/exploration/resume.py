@@ -16,8 +16,14 @@ from r3jax.trace.checkpoints import Tables, map_tables
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
-_LOOP = tuple(field.name for field in fields(LoopState) if field.name != "planner")
-"""Fields of the state in the table `loop`; what the planner holds has tables of its own."""
+_APART = ("planner", "leg")
+
+_LOOP = tuple(field.name for field in fields(LoopState) if field.name not in _APART)
+"""Fields of the state in the table `loop`; what the planner holds has tables of its own, and a leg
+is decided again."""
+
+_LATER = {"captured": np.asarray(0)}
+"""Fields that came after the first checkpoints, as they were then."""
 
 
 def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
@@ -54,7 +60,7 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
         grid=fill(like.grid, tables["grid"]),
         policy_state=fill(like.policy_state, tables.get("policy", {})),
     )
-    return LoopState(planner=planner, **fill(rest, tables["loop"]))
+    return LoopState(planner=planner, **fill(rest, _LATER | dict(tables["loop"])))
 
 
 def continued(run: Run, mission: Mission, start: LoopState, *, decided_from: int = 0) -> LoopState:
@@ -81,8 +87,9 @@ def _newest(run: Run, start: LoopState) -> LoopState:
     """The newest usable checkpoint; the start if there is none."""
     # Newest first: every view after a checkpoint costs one more mapping and decision.
     for step in reversed(run.checkpoint_steps()):
-        # The trace was cut before it: its map holds views that the run no longer has.
-        if step >= len(run.rows):
+        # The trace was cut before it: its map holds views that the run no longer has. Or a path is
+        # under way: it is decided again, from where it begins.
+        if step >= len(run.rows) or run.rows[step].captured:
             continue
         try:
             state = state_of(run.load_checkpoint(step), start)

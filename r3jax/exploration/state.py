@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from r3jax.exploration.budget import Budget
+from r3jax.exploration.captures import Leg, Rules
 from r3jax.exploration.clock import Clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
@@ -17,6 +18,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Policy
+from r3jax.planning.robot.motion import motion_of
 from r3jax.trace.rows import StepRow
 
 
@@ -73,6 +75,17 @@ class LoopState:
     still_views: int = 0
     """Views in a row that were taken without moving."""
 
+    captured: int = 0
+    """Of the frames in the map, those that were captured on the way."""
+
+    leg: Leg | None = None
+    """The path under way; None where a decision comes next."""
+
+    @property
+    def chosen(self) -> int:
+        """Views that were chosen, and the one at the start."""
+        return self.views - self.captured
+
     @property
     def map_state(self) -> MapState:
         """The planner's map."""
@@ -125,4 +138,9 @@ class Mission:
     """Asked every `config.until_every` views: why no further view is needed, or None."""
 
     on_stage: Callable[[str], None] = lambda stage: None
-    """Told what happens next: `forecast`, `plan`, `render`, `map`, `measure`, `record`."""
+    """Told what happens next: `forecast`, `plan`, `gaze`, `render`, `map`, `measure`, `record`."""
+
+    @property
+    def rules(self) -> Rules:
+        """What decides on the frames of a path."""
+        return Rules(self.config, motion_of(self.policy), self.simulator.camera)

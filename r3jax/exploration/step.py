@@ -1,28 +1,38 @@
 """One step of the loop: decide, fly, look, map. On the host, round jitted parts.
 
-Only the frame at the end of a path enters the map. What the simulator and the bookkeeping take
-is not on the mission clock.
+A step takes one frame: the view that was chosen, or one on the way to it if the settings ask for
+captures; without them only the frame at the end of a path enters the map. What the simulator and
+the bookkeeping take is not on the mission clock.
 """
 
 import time
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from r3jax.exploration.captures import (
+    Leg,
+    Rules,
+    aim,
+    begin_leg,
+    observe_on_the_way,
+    with_plan,
+)
 from r3jax.exploration.clock import timed
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, TakenView
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import angle_between
 from r3jax.mapping.occupancy import MAX_CELLS
-from r3jax.planning.planner import decide, follow, observe, start
+from r3jax.planning.planner import Planner, decide, follow, observe, start
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import motion_of
 from r3jax.trace.images import frame_hash, stored_form
-from r3jax.trace.rows import StepRow, make_choice
+from r3jax.trace.rows import Choice, StepRow, make_choice
 
 _LEAST_EXTENT = 1.0
 """Smaller worlds have no place with half a meter free all round [m]."""
@@ -108,10 +118,12 @@ def check_world(bounds: np.ndarray, cell_size: float) -> None:
 def step(
     state: LoopState, mission: Mission, *, exchange: float = 0.0
 ) -> tuple[LoopState, TakenView | Stop]:
-    """One view: decide where to go (the first view is taken at the start), fly, look, map.
+    """One frame: decide where to go (the first view is taken at the start), fly, look, map.
+
+    Where a path is under way nothing is decided: the next frame on it is taken.
 
     Args:
-        state: before the view.
+        state: before the frame.
         mission: what the run is asked for.
         exchange: seconds on the mission clock that went into hearing from others since the last
             view.
@@ -123,8 +135,9 @@ def step(
     charged = {"exchange": exchange} if exchange else {}
     if state.views == 0:
         # Free of charge: the camera stands there already, and nobody chose the view.
-        before = {"planning": 0.0} | charged
-        return _look(state, mission, state.T_world_camera, None, {}, before)
+        return _look(state, mission, _Shot(state.T_world_camera), {}, {"planning": 0.0} | charged)
+    if state.leg is not None:
+        return _next_frame(state, mission, state.leg, {}, {"planning": 0.0} | charged)
     # Before deciding: a spent budget must not pay for a decision that cannot be carried out.
     stop = _spent(state, mission, seconds=exchange, metres=0.0)
     # After the budget: a forecast takes most of a second, and a spent run needs none.
@@ -143,21 +156,60 @@ def step(
     if decision is None:
         return state, _no_decision(state, mission, info)
     planning = mission.clock.charge("planning", measured)
-    flight = _flight(decision, mission)
-    seconds = exchange + planning + flight
-    # And after it: the view has to arrive within the budget, its path included.
-    stop = _spent(state, mission, seconds=seconds, metres=decision.length)
+    leg = begin_leg(decision, info, state.T_world_camera, mission.rules)
+    return _next_frame(state, mission, leg, stages, {"planning": planning} | charged)
+
+
+def _next_frame(
+    state: LoopState,
+    mission: Mission,
+    leg: Leg,
+    stages: dict[str, float],
+    before: dict[str, float],
+) -> tuple[LoopState, TakenView | Stop]:
+    """Flies the next piece of a path and takes the frame at its end.
+
+    Args:
+        state: before the frame.
+        mission: what the run is asked for.
+        leg: the path.
+        stages: seconds that stages took so far.
+        before: what is charged for the time until the camera begins to fly [s].
+    """
+    pose = leg.decision.T_world_camera
+    if not leg.is_last:
+        mission.on_stage("gaze")
+        leg, pose, took = _aimed(state, mission, leg)
+        stages, before = stages | {"gaze": took.measured}, before | {"gaze": took.charged}
+    seconds = sum(before.values()) + leg.flight
+    # The view has to arrive within the budget, its path included.
+    stop = _spent(state, mission, seconds=seconds, metres=leg.length)
     if stop is not None:
         return state, stop
-    before = {"planning": planning} | charged
-    return _look(state, mission, decision.T_world_camera, (decision, info), stages, before)
+    return _look(state, mission, _Shot(pose, leg), stages, before)
 
 
-def _flight(decision: Decision, mission: Mission) -> float:
-    """Seconds from one view to the next: the policy's own account of its motion, if it has one."""
-    if decision.seconds is not None:
-        return decision.seconds
-    return decision.length / mission.config.speed
+class _Took(NamedTuple):
+    """What a stage took, and what it is charged [s]."""
+
+    measured: float
+    charged: float
+
+
+def _aimed(state: LoopState, mission: Mission, leg: Leg) -> tuple[Leg, np.ndarray, _Took]:
+    """The pose of the next frame on the way; before the first one they may be planned together."""
+    rules, clock = mission.rules, mission.clock
+    measured = charged = 0.0
+    if leg.taken == 0 and rules.gaze == "planned":
+        leg, measured = timed(with_plan, leg, state.planner, rules, repeat_compiled=clock.measures)
+        each = measured / (len(leg.places) - 1)
+        charged = (len(leg.places) - 1) * clock.charge("gaze plan", each)
+    pose, seconds = timed(
+        aim, leg, state.T_world_camera, state.planner, rules, repeat_compiled=clock.measures
+    )
+    if rules.gaze != "planned":
+        charged += clock.charge("gaze", seconds)
+    return leg, pose, _Took(measured + seconds, charged)
 
 
 def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
@@ -172,9 +224,13 @@ def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
 
 def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float) -> Stop | None:
     """Why a view that costs so much more must not be taken: it must arrive within the budget."""
-    spent = f"{state.views} views, {state.seconds:.1f} s, {state.metres:.1f} m"
+    way = f" and {state.captured} frames on the way" if state.captured else ""
+    spent = f"{state.chosen} views{way}, {state.seconds:.1f} s, {state.metres:.1f} m"
     if not mission.budget.allows(
-        views=state.views + 1, seconds=state.seconds + seconds, metres=state.metres + metres
+        views=state.chosen + 1,
+        frames=state.views + 1,
+        seconds=state.seconds + seconds,
+        metres=state.metres + metres,
     ):
         return Stop(StopReason.BUDGET, f"{spent}: the next view would exceed {mission.budget}")
     # A policy that only turns spends no meters: such a budget alone would never end the run.
@@ -187,28 +243,50 @@ def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float)
 
 def _good_enough(state: LoopState, mission: Mission) -> Stop | None:
     """Why no further view is needed; asked beside the mission, not on its clock."""
-    if mission.is_enough is None or state.views % mission.config.until_every:
+    if mission.is_enough is None or state.chosen % mission.config.until_every:
         return None
     mission.on_stage("forecast")
     reason = mission.is_enough(state)
     return None if reason is None else Stop(StopReason.FORECAST, reason)
 
 
+@dataclass(frozen=True)
+class _Shot:
+    """A frame that is to be taken."""
+
+    T_world_camera: np.ndarray
+    """Its pose, [4, 4]."""
+
+    leg: Leg | None = None
+    """The path to it; None: the camera is there."""
+
+    @property
+    def captured(self) -> bool:
+        """True for a frame on the way."""
+        return self.leg is not None and not self.leg.is_last
+
+    @property
+    def choice(self) -> Choice | None:
+        """The decision, with the first frame of its path."""
+        if self.leg is None or self.leg.taken > 0:
+            return None
+        return make_choice(self.leg.decision, self.leg.info)
+
+
 def _look(
     state: LoopState,
     mission: Mission,
-    T_world_camera: np.ndarray,
-    choice: tuple[Decision, PlanInfo] | None,
+    shot: _Shot,
     stages: dict[str, float],
     before: dict[str, float],
 ) -> tuple[LoopState, TakenView]:
-    """Takes the view at a pose, integrates it and measures what is known now.
+    """Takes a frame, integrates it and measures what is known now.
 
     `before` holds what is charged for the time until the camera begins to fly [s].
     """
     mission.on_stage("render")
     begin = time.perf_counter()
-    pose = np.asarray(T_world_camera, dtype=np.float64)
+    pose = np.asarray(shot.T_world_camera, dtype=np.float64)
     # Announced first, so that a picture that nobody chose is noticed.
     mission.simulator.commit(state.views, pose)
     # Rounded as it will be on disk before the map sees it: a replay integrates the same bits.
@@ -220,13 +298,19 @@ def _look(
     stages = stages | {"render": rendered - begin}
 
     mission.on_stage("map")
-    planner, measured = timed(observe, state.planner, frame, repeat_compiled=mission.clock.measures)
-    state = replace(state, planner=planner)
+    planner, measured = timed(
+        _observe,
+        state.planner,
+        frame,
+        mission.rules,
+        captured=shot.captured,
+        repeat_compiled=mission.clock.measures,
+    )
     mapping = mission.clock.charge("mapping", measured)
-    length = 0.0 if choice is None else choice[0].length
-    flight = 0.0 if choice is None else _flight(choice[0], mission)
+    length, flight = (0.0, 0.0) if shot.leg is None else (shot.leg.length, shot.leg.flight)
     charged = before | {"mapping": mapping, "flight": flight}
-    state = _arrive(state, frame, length, charged)
+    state = _arrive(state, planner, frame, length, charged, captured=shot.captured)
+    state = replace(state, leg=None if shot.leg is None else shot.leg.after)
     mission.on_stage("measure")
     begin = time.perf_counter()
     coverage = measure_coverage(
@@ -241,12 +325,13 @@ def _look(
         # The frame's float32, not what was asked for: a replay has no other pose.
         pose=np.asarray(frame.T_world_camera),
         sha256=frame_hash(frame),
-        choice=None if choice is None else make_choice(*choice),
+        choice=shot.choice,
         seconds=state.seconds,
         metres=state.metres,
         radians=state.radians,
         charged=charged,
         coverage=coverage,
+        captured=shot.captured,
     )
     stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
     return state, TakenView(row, frame, stages)
@@ -255,39 +340,75 @@ def _look(
 def relive(
     state: LoopState, mission: Mission, row: StepRow, frame: Frame, *, decides: bool = True
 ) -> LoopState:
-    """The state after a view that was recorded: as `step` leaves it, without the simulator.
+    """The state after a frame that was recorded: as `step` leaves it, without the simulator.
 
     Args:
-        state: before the view.
+        state: before the frame.
         mission: what the run was asked for.
-        row: what the trace says of the view.
+        row: what the trace says of it.
         frame: its frame, read back.
         decides: ask the policy again, for what it remembers of its decision. Policies are pure:
             the same state and key give the same decision. False for a policy that did not
             choose this view: it is told the path.
     """
+    leg = state.leg
     if row.choice is not None:
         if decides:
             # Only its memory is used: the row knows the pose and what was charged, and a decision
             # timed again would put other seconds on the mission clock.
             key = jax.random.fold_in(mission.key, state.views)
-            _, planner, _ = decide(state.planner, state.T_world_camera, key)
+            decision, planner, info = decide(state.planner, state.T_world_camera, key)
+            leg = _leg_again(state, mission, decision, info) if row.captured else None
         else:
-            planner = follow(state.planner, state.T_world_camera, row.choice.waypoints)
+            planner, leg = follow(state.planner, state.T_world_camera, row.choice.waypoints), None
         state = replace(state, planner=planner)
-    state = replace(state, planner=observe(state.planner, frame))
-    return _arrive(state, frame, 0.0 if row.choice is None else row.choice.length, row.charged)
+    planner = _observe(state.planner, frame, mission.rules, captured=row.captured)
+    length, metres = row.metres - state.metres, row.metres
+    if row.choice is not None and not row.captured:  # a whole path
+        length = row.choice.length
+        metres = state.metres + length
+    state = _arrive(state, planner, frame, length, row.charged, captured=row.captured)
+    # A path ends with the view that was chosen, whatever became of it.
+    leg = leg.after if leg is not None and row.captured else None
+    return replace(state, metres=metres, leg=leg)
 
 
-def _arrive(state: LoopState, frame: Frame, length: float, charged: dict[str, float]) -> LoopState:
-    """One view more: the pose is the frame's, and the totals count the way to it.
+def _leg_again(
+    state: LoopState, mission: Mission, decision: Decision | None, info: PlanInfo
+) -> Leg | None:
+    """The path of a decision that was made again, before its first frame."""
+    if decision is None:
+        return None
+    leg = begin_leg(decision, info, state.T_world_camera, mission.rules)
+    return with_plan(leg, state.planner, mission.rules)
+
+
+def _observe(planner: Planner, frame: Frame, rules: Rules, *, captured: bool) -> Planner:
+    """The planner with one frame more."""
+    if captured:
+        return observe_on_the_way(planner, frame, rules)
+    return observe(planner, frame)
+
+
+def _arrive(
+    state: LoopState,
+    planner: Planner,
+    frame: Frame,
+    length: float,
+    charged: dict[str, float],
+    *,
+    captured: bool,
+) -> LoopState:
+    """One frame more: the pose is the frame's, and the totals count the way to it.
 
     The recorded pose (float32) is the pose from here on: a run read back goes on the same way.
     """
     pose = np.asarray(frame.T_world_camera, dtype=np.float64)
     return replace(
         state,
+        planner=planner,
         views=state.views + 1,
+        captured=state.captured + captured,
         T_world_camera=pose,
         # One sum per view, as when it was flown: `_agrees` compares the clock bit by bit.
         seconds=state.seconds + sum(charged.values()),

@@ -128,13 +128,15 @@ def policy_fields(policy: Policy) -> dict[str, Any]:
 def settings_of(policy: object) -> dict[str, Any]:
     """What JSON can hold of a policy's settings.
 
-    A free-flying camera's motion is left out, and so is refinement where there is none: that is
-    what their absence has always meant.
+    A free-flying camera's motion is left out, and so are refinement where there is none and the
+    mounting of a camera that turns by itself: that is what their absence has always meant.
     """
     settings = plain_settings(getattr(policy, "config", {}))
     # Left out where it changes nothing: headers from before there was this setting stay equal.
     if settings.get("motion") == plain_settings(Motion()):
         del settings["motion"]
+    elif not settings.get("motion", {}).get("fixed_camera", True):
+        del settings["motion"]["fixed_camera"]
     if settings.get("refine") == 0:
         del settings["refine"], settings["refine_radius"]
     return settings

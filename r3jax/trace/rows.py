@@ -88,7 +88,9 @@ class StepRow:
     """Hash of the stored pixels."""
 
     choice: Choice | None
-    """How the view was chosen; None for the start pose."""
+    """How the view was chosen; None for the start pose. Where frames are captured on the way, the
+    decision stands in the first row of its path: what comes before a row is what was known when it
+    was made."""
 
     seconds: float
     """Mission clock after the view: planning, mapping and flight [s]."""
@@ -100,10 +102,13 @@ class StepRow:
     """Angle turned so far, along the shortest rotations [rad]."""
 
     charged: dict[str, float]
-    """What this view added to the mission clock: `planning`, `mapping`, `flight`, and
-    `exchange` where others told what they had seen [s]."""
+    """What this view added to the mission clock: `planning`, `mapping`, `flight`, `gaze` where it
+    was captured on the way, and `exchange` where others told what they had seen [s]."""
 
     coverage: Coverage
+
+    captured: bool = False
+    """True if the frame was captured on the way to a view, and not chosen itself."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +146,16 @@ def make_choice(decision: Decision, info: PlanInfo) -> Choice:
     )
 
 
+def path_between(before: StepRow, row: StepRow) -> np.ndarray:
+    """Waypoints of the path from one row's view to the next one's, [K, 3] float32 [m].
+
+    Straight between frames that were captured on the way.
+    """
+    if row.choice is None or row.captured or len(row.choice.waypoints) < 2:
+        return np.stack([before.pose[:3, 3], row.pose[:3, 3]])
+    return row.choice.waypoints
+
+
 def finite_or_none(value: float) -> float | None:
     """JSON knows neither inf nor NaN."""
     return float(value) if math.isfinite(value) else None
@@ -150,6 +165,8 @@ def to_json(row: StepRow | EndRow) -> str:
     """One line of trace.jsonl, keys in a fixed order."""
     kind = "step" if isinstance(row, StepRow) else "end"
     plain = {"kind": kind, **dataclasses.asdict(row, dict_factory=_plain_dict)}
+    if not plain.get("captured", True):
+        del plain["captured"]  # as rows were before there were captures
     # No blanks and a fixed order: under the model clock equal runs are equal bytes.
     return json.dumps(sealed(plain), allow_nan=False, separators=(",", ":"))
 

@@ -28,7 +28,7 @@ def test_nonsense_is_refused_with_an_example(text):
 
 def test_a_budget_limits_its_own_unit_only():
     budget = parse_budget("seconds:300")
-    assert budget.allows(views=10**6, seconds=300.0, metres=1e9)
-    assert not budget.allows(views=1, seconds=300.01, metres=0.0)
-    assert budget.spent_share(views=0, seconds=150.0, metres=0.0) == 0.5
+    assert budget.allows(views=10**6, frames=10**6, seconds=300.0, metres=1e9)
+    assert not budget.allows(views=1, frames=1, seconds=300.01, metres=0.0)
+    assert budget.spent_share(views=0, frames=0, seconds=150.0, metres=0.0) == 0.5
     assert str(budget) == "seconds:300"

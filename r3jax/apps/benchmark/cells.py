@@ -16,7 +16,10 @@ from r3jax.trace.header import plain_settings, settings_of
 IDENTITY_VERSION = 1
 """Raised when results of an older version of this package must not be taken over."""
 
-_LATER = {"drop_edges": True}
+_LATER = {
+    "drop_edges": True,
+    "capture_every": None, "capture_rate": None, "gaze": "panorama", "exposure": 0.0, "blur": 1.0,
+}  # fmt: skip
 """Settings of the loop that came after the first cells, with the values that these had: they count
 only where they differ, so that what was done before stays done."""
 
@@ -88,12 +91,15 @@ def identity(cell: Cell) -> dict[str, Any]:
         del conditions[name]
     exploration = dataclasses.asdict(cell.conditions.exploration_config())
     policy = cell.conditions.policy(cell.policy, cell.settings)
+    planner: dict[str, Any] = FORMER_SETTINGS | settings_of(policy)
+    if not cell.conditions.exploration_config().captures and "motion" in planner:
+        planner["motion"].pop("fixed_camera", None)  # it decides on frames on the way alone
     return {
         "version": IDENTITY_VERSION,
         "scene": cell.scene_hash,
         "policy": cell.policy,
         # What was done before a policy had settings of its own stays done.
-        "planner": FORMER_SETTINGS | settings_of(policy),
+        "planner": planner,
         "given": plain_settings(cell.settings),
         "seed": cell.seed,
         "conditions": conditions,

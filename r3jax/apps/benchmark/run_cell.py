@@ -209,12 +209,18 @@ def steps_within(run: Run, snapshot: str) -> tuple[StepRow, ...]:
     after.
     """
     budget = parse_budget(snapshot)
+    chosen = itertools.accumulate((not row.captured for row in run.rows), initial=0)
 
-    def is_within(row: StepRow) -> bool:
+    def is_within(numbered: tuple[int, StepRow]) -> bool:
+        before, row = numbered
         seconds = row.seconds - row.charged.get("mapping", 0.0)
-        return budget.allows(views=row.step + 1, seconds=seconds, metres=row.metres)
+        # A frame on the way belongs to the view that it was captured on the way to.
+        return budget.allows(
+            views=before + 1, frames=row.step + 1, seconds=seconds, metres=row.metres
+        )
 
-    return tuple(itertools.takewhile(is_within, run.rows))
+    within = itertools.takewhile(is_within, zip(chosen, run.rows, strict=False))
+    return tuple(row for _, row in within)
 
 
 def _do_snapshot(

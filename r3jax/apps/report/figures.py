@@ -1,5 +1,7 @@
 """The figures of a run. Each function makes one `matplotlib` figure from what was recorded."""
 
+import itertools
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -14,6 +16,10 @@ from r3jax.apps.report.summary import map_row_bytes, stage_times
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.reader import Run
+from r3jax.trace.rows import path_between
+
+_DOT, _CAPTURED_DOT = 26, 8
+"""Areas of the marks of views, and of frames that were captured on the way [pt^2]."""
 
 _NEVER_SEEN = "#9ca3af"
 """Color of directions that meet unexplored space."""
@@ -68,9 +74,9 @@ def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
     order = np.arange(len(run.rows))
     segments: list[np.ndarray] = []
     colors: list[int] = []
-    for row in run.rows[1:]:
-        if row.choice is not None and len(row.choice.waypoints) > 1:
-            segments.append(row.choice.waypoints[:, :2])
+    for before, row in itertools.pairwise(run.rows):
+        if row.choice is not None or before.captured:  # else another run of a merged one begins
+            segments.append(path_between(before, row)[:, :2])
             colors.append(row.step)
     span = (0, max(1, len(order) - 1))
     edge = LineCollection(segments, linewidths=4.0, colors="white", capstyle="round")
@@ -96,7 +102,7 @@ def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
         cmap=style.PATH_MAP,
         vmin=span[0],
         vmax=span[1],
-        s=26,
+        s=[_CAPTURED_DOT if row.captured else _DOT for row in run.rows],
         edgecolors="white",
         linewidths=0.8,
         zorder=3,

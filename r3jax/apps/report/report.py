@@ -20,7 +20,7 @@ from r3jax.apps.report.model_report import (
 from r3jax.apps.report.page import image, page, section
 from r3jax.apps.report.pictures import panorama_picture
 from r3jax.apps.report.reasons import reasons_figure, utility_by_cause
-from r3jax.apps.report.summary import StageTime, stage_times, summary
+from r3jax.apps.report.summary import StageTime, count_of_views, stage_times, summary
 from r3jax.exploration.replay import states_of
 from r3jax.files import write_atomic
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -195,7 +195,7 @@ def _cards(run: Run, model: EvaluatedModel | None) -> dict[str, str]:
     return cards | {
         "mean renderability": f"{last.coverage.mean_renderability:.2f}",
         "explored": f"{100 * last.coverage.known_share:.0f} %",
-        "views": str(len(run.rows)),
+        "views": count_of_views(run),
         "path": f"{last.metres:.1f} m",
         "mission clock": f"{last.seconds:.1f} s",
     }

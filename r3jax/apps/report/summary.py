@@ -56,6 +56,13 @@ def stage_times(run: Run) -> list[StageTime]:
     return table
 
 
+def count_of_views(run: Run) -> str:
+    """Views, and the frames that were captured on the way beside them."""
+    captured = sum(row.captured for row in run.rows)
+    views = str(len(run.rows) - captured)
+    return f"{views} + {captured} on the way" if captured else views
+
+
 def summary(run: Run) -> dict[str, str]:
     """What happened, as short texts under short names."""
     header = run.header
@@ -65,7 +72,7 @@ def summary(run: Run) -> dict[str, str]:
         "budget": header.budget,
         "seed": str(header.seed),
         "outcome": run.outcome,
-        "views": str(len(run.rows)),
+        "views": count_of_views(run),
     }
     if not run.rows:
         return texts

@@ -81,9 +81,10 @@ def _check_apart(runs: list[Run]) -> None:
 
 def _header(runs: list[Run]) -> RunHeader:
     views = [views for run in runs for views in parts_of(run)]
+    unit = "frames" if any(row.captured for run in runs for row in run.rows) else "views"
     return dataclasses.replace(
         runs[0].header,
-        budget=f"views:{sum(views)}",
+        budget=f"{unit}:{sum(views)}",
         packages=package_versions(),
         parent={"merged": [str(run.path) for run in runs], "merged_views": views},
     )

@@ -166,7 +166,10 @@ class Film:
         """The path so far, the views along it, and the newest one larger."""
         rows = self.run.rows[: step + 1]
         segments, colors = path_segments(rows, len(self.run.rows))
-        frusta = [frustum_segments(self.run.camera, row.pose, 0.14) for row in rows]
+        frusta = [
+            frustum_segments(self.run.camera, row.pose, 0.05 if row.captured else 0.14)
+            for row in rows
+        ]
         newest = frustum_segments(self.run.camera, rows[-1].pose, 0.45)
         return [
             lines(segments, colors[:, 0], 0.02, 1.5 * least),

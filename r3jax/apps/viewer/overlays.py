@@ -13,7 +13,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.splatting.harmonics import C0
 from r3jax.splatting.scene import GaussianScene
 from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow
+from r3jax.trace.rows import StepRow, path_between
 
 POINT_BUDGET = 200_000
 """Recorded points that are drawn at most."""
@@ -34,9 +34,7 @@ def path_segments(rows: Sequence[StepRow], num_views: int) -> tuple[np.ndarray, 
     """
     ends, order = [np.zeros((0, 2, 3))], [np.zeros(0)]
     for before, row in itertools.pairwise(rows):
-        path = None if row.choice is None else row.choice.waypoints
-        if path is None or len(path) < 2:
-            path = np.stack([before.pose[:3, 3], row.pose[:3, 3]])
+        path = path_between(before, row)
         ends.append(np.stack([path[:-1], path[1:]], axis=1))
         order.append(np.full(len(path) - 1, row.step / max(num_views - 1, 1)))
     colors = paint(np.concatenate(order), ORDER)

@@ -46,6 +46,15 @@ class Moment:
         return sum(x.nbytes for x in jax.tree.leaves((self.map_state, self.grid)))
 
 
+def why_no_choice(row: StepRow) -> str:
+    """Why no decision stands with a view."""
+    if row.captured:
+        return "captured on the way"
+    if row.charged.get("flight"):
+        return "the end of a path: what was chosen stands with its first frame"
+    return "the start: nothing was chosen"
+
+
 class Timeline:
     """The states of a run. For one thread at a time."""
 
@@ -255,7 +264,7 @@ class RecordedStory:
     def reason(self, step: int) -> Reason | str:
         """What a view promised when it was chosen; known once the views before are replayed."""
         if self._run.rows[step].choice is None:
-            return "the start: nothing was chosen"
+            return why_no_choice(self._run.rows[step])
         reason = self._reasons[step] if step < len(self._reasons) else None
         return reason or self._problem or _WORKING
 
@@ -317,6 +326,8 @@ class LiveStory:
         """Takes in one view more; takes as long as a frame takes to join the grid."""
         start = np.asarray(view.row.pose, np.float64)
         grid = view.grid or first_grid(self._bounds, [start], self._config)
+        if view.row.choice is None and self._moment is not None:
+            grid = self._moment.grid  # further on a path: no decision was made since
         grid = add_to_grid(grid, view.frame, self._config)
         image = np.rint(np.asarray(view.frame.rgb) * 255.0).astype(np.uint8)
         step = max(1, max(image.shape[:2]) // _THUMBNAIL)

@@ -89,6 +89,7 @@ def _request(options: BenchmarkOptions) -> Request:
         capacity=options.capacity,
         backend=options.backend,
         lpips=options.lpips,
+        loop={name: getattr(options, name) for name in ("capture_every", "capture_rate", "gaze")},
     )
     conditions.exploration_config().check_scales()
     return Request(

@@ -49,7 +49,9 @@ def run_explore(options: ExploreOptions) -> int:
             feed = stack.enter_context(page(expedition))
             policy, on_view = feed.watch(policy), feed.on_step
             console.say(f"live      {feed.url}")
-        progress = stack.enter_context(RunProgress(console, settings.budget))
+        recorded = expedition.recorded.rows if expedition.recorded else ()
+        captured = sum(row.captured for row in recorded)
+        progress = stack.enter_context(RunProgress(console, settings.budget, captured))
 
         def on_step(row: StepRow) -> None:
             progress.on_step(row)
@@ -165,9 +167,10 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
     except (RunError, OSError) as error:
         console.say(f"the report could not be written: {one_line(error)}")
         return
-    last = result.rows[-1]
+    last, state = result.rows[-1], result.state
+    way = f" and {state.captured} frames on the way" if state.captured else ""
     console.say(
-        f"{len(result.rows)} views, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
+        f"{state.chosen} views{way}, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
         f"{100 * last.coverage.known_share:.0f} % of the box explored, mean renderability "
         f"{last.coverage.mean_renderability:.2f}",
     )

@@ -16,6 +16,15 @@ class ExplorationOptions:
     clock: Literal["wall", "model"] = "wall"
     """`wall`: measured planning and mapping + flight. `model`: fixed costs, repeatable."""
 
+    capture_every: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
+    """All policies capture frames on the way, at most so far apart [m]; by default none does."""
+
+    capture_rate: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
+    """The same by frames per second of the flight [Hz]."""
+
+    gaze: Literal["ahead", "blend", "panorama", "planned"] = "panorama"
+    """Where the camera looks on the way, as `r3jax explore --help` tells."""
+
     resolution: int = 256
     """Width and height of the explored images [px]."""
 

@@ -100,6 +100,30 @@ class MotionOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """Frames on the way from view to view."""
+
+    TITLE: ClassVar[str] = "captures on the way"
+
+    capture_every: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
+    """Capture frames on the way from view to view, at most so far apart [m]; by default none."""
+
+    capture_rate: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
+    """The same by frames per second of the flight [Hz]."""
+
+    gaze: Literal["ahead", "blend", "panorama", "planned"] = "panorama"
+    """Where the camera looks on the way: `ahead`: along the path; `blend`: it turns evenly from
+    view to view; `panorama`: at each place in the direction that adds most; `planned`: in those
+    that add most together."""
+
+    exposure: float = 0.0
+    """Time that the shutter is open for a frame on the way [s]; 0: turning blurs nothing."""
+
+    blur: float = 1.0
+    """So many pixels the image may move meanwhile by turning [px]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class GrowthOptions(MapOptions):
     """What the map is made of, and whether it grows."""
 
@@ -148,6 +172,7 @@ class ExploreOptions(
     ImageOptions,
     DepthOptions,
     MotionOptions,
+    CaptureOptions,
     PlanningOptions,
     SceneOptions,
     GrowthOptions,
@@ -169,7 +194,8 @@ class ExploreOptions(
     """Who chooses the next view: `ours-pano` by default; `r3jax policies` lists them."""
 
     budget: Annotated[str | None, tyro.conf.arg(metavar="BUDGET")] = None
-    """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `metres:M`."""
+    """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `metres:M`, or
+    `frames:N`, those captured on the way included."""
 
     until: Annotated[str | None, tyro.conf.arg(metavar="GOAL")] = None
     """Stop before the budget is spent, when the forecast of the image quality says that the views

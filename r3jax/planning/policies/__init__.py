@@ -20,6 +20,7 @@ HOMES = {
         "ours": "renderability:Ours",
         "ours-pano": "renderability:OursPano",
         "ours-ahead": "ahead:OursAhead",
+        "r3con": "r3con:R3con",
         "active-gs": "active_gs:ActiveGS",
         "active-gs-no-depth": "active_gs:ActiveGSNoDepth",
         "active-gamer": "active_gamer:ActiveGamer",

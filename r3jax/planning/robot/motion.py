@@ -60,6 +60,9 @@ class Motion:
     """Largest turn from one view to the next for each meter between them, in a straight line
     [deg/m]: who turns on the spot blurs the images. None: any turn, anywhere."""
 
+    fixed_camera: bool = False
+    """Whether the camera turns with what carries it only: frames on the way look along it."""
+
     def __post_init__(self) -> None:
         """Refuses what cannot work, and says what to do."""
         if self.heights is not None:
@@ -121,12 +124,13 @@ class Motion:
 MOTIONS = {
     "free": Motion(),
     "ground": Motion(
-        heights=(0.0, 0.0), elevations=(0.0, 0.0), body=1.0, speed=0.5, turn_rate=60.0
+        heights=(0.0, 0.0), elevations=(0.0, 0.0), body=1.0, speed=0.5, turn_rate=60.0,
+        fixed_camera=True,
     ),
     "gimbal": Motion(elevations=(-90.0, 30.0), speed=1.0, turn_rate=90.0),
     "handheld": Motion(
         heights=(-0.6, 0.4), elevations=(-60.0, 60.0), speed=0.5, turn_rate=45.0,
-        turn_per_meter=90.0,
+        turn_per_meter=90.0, fixed_camera=True,
     ),
 }  # fmt: skip
 """Motions by name: a free-flying camera; a robot on wheels whose camera is level and stays at the

@@ -4,7 +4,7 @@ Laws on a box room. What a member may know when it decides is worked out from th
 """
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import ModuleType
 from unittest import mock
 
@@ -102,6 +102,27 @@ def test_a_team_of_one_is_the_camera_alone(name):
         assert_equal(result.state.policy_state, alone.state.policy_state)
         assert (result.reason, result.message) == (alone.reason, alone.message)
         assert team.seconds == alone.state.seconds
+
+
+def test_a_team_captures_on_the_way_and_merges_all_of_it():
+    """One alone takes the frames that it would take without a team; two tell each other theirs."""
+    config = replace(CONFIG, capture_every=0.2, gaze="ahead")
+    alone = explore(BoxRoom(), Wander(reach=1.2), budget="views:3", seed=3, config=config)
+    member = Member(BoxRoom(), Wander(reach=1.2))
+    (one,) = explore_team([member], budget="views:3", seed=3, config=config).members
+    assert [row.sha256 for row in one.rows] == [row.sha256 for row in alone.rows]
+    members = wanderers(reach=1.2)
+    team = explore_team(members, budget="views:3", config=config)
+    for result in team.members:
+        assert sum(not row.captured for row in result.rows) == 3 < len(result.rows)
+    poses = [list(member.simulator.rendered) for member in members]  # not rounded to float32
+    rows = [(row.seconds, n, row.step) for n, r in enumerate(team.members) for row in r.rows]
+    frames = [
+        stored_form(members[n].simulator.render(poses[n][step])) for _, n, step in sorted(rows)
+    ]
+    map_state, grid = of_one_camera(members, frames)
+    assert_equal(team.map_state, map_state)
+    assert_equal(team.grid, grid)
 
 
 def law_merged_is_one_cameras(

@@ -141,8 +141,14 @@ class App:
         height = max(1, round(_THUMBNAIL * camera.height / camera.width))
         for step in steps:
             thumbnail = fitted(self.story.image(step), _THUMBNAIL, height)
-            pose = np.asarray(self.story.rows[step].pose, np.float64)
-            self.canvas.add_view(step, pose, thumbnail, functools.partial(self._go_to, step))
+            row = self.story.rows[step]
+            self.canvas.add_view(
+                step,
+                np.asarray(row.pose, np.float64),
+                thumbnail,
+                functools.partial(self._go_to, step),
+                small=row.captured,
+            )
 
     def _place_eye(self, bounds: np.ndarray) -> None:
         """Outside and above, looking at the middle of the scene."""

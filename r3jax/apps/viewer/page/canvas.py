@@ -94,10 +94,13 @@ class Canvas:
         T_world_camera: np.ndarray,
         thumbnail: np.ndarray,
         on_click: Callable[[], None],
+        *,
+        small: bool = False,
     ) -> None:
         """A view along the path, with its picture [H, W, 3] uint8; it can be clicked."""
+        scale = 0.05 if small else 0.12
         handle = self._add_frustum(
-            f"/views/{step:06d}", T_world_camera, 0.12, 0.004, _VIEW_COLOR, thumbnail
+            f"/views/{step:06d}", T_world_camera, scale, 0.004, _VIEW_COLOR, thumbnail
         )
         self._views[step] = handle
 

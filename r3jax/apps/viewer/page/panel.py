@@ -14,6 +14,7 @@ import viser
 from r3jax.apps.report.reasons import COLORS
 from r3jax.apps.viewer.color_maps import paint
 from r3jax.apps.viewer.preview import TERMS, CameraPreview, QuickPreview
+from r3jax.apps.viewer.story import why_no_choice
 from r3jax.exploration.explain_run import Reason
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.scoring.explain import CAUSES
@@ -76,7 +77,7 @@ def view_html(row: StepRow, num_views: int) -> str:
 def _candidates(row: StepRow) -> str:
     """A table of the best candidates' utilities, best first; the first one was taken."""
     if row.choice is None:
-        return '<div style="opacity:.65;margin-top:4px">the start: nothing was chosen</div>'
+        return f'<div style="opacity:.65;margin-top:4px">{why_no_choice(row)}</div>'
     choice = row.choice
     head = (
         f'<div style="margin-top:4px;opacity:.65">chosen from {choice.num_candidates} candidates, '

@@ -1,0 +1,247 @@
+"""The frames of one path: those captured on the way, and the view that was chosen, the last one.
+
+A path is cut into equal pieces, with a frame at the end of each. The flight takes as long as the
+decision says, with or without captures: the camera turns while it moves, never so far that it would
+be late for the chosen view (`planning.gaze`). Without captures a path is one piece.
+
+Shape symbols: n frames; K waypoints.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning.gaze import (
+    Turning,
+    along,
+    axes_within,
+    count_look,
+    direction_of,
+    exhausted_cells,
+    panorama_scores,
+    pose_towards,
+    worthwhile_grid,
+)
+from r3jax.planning.gaze_plan import plan_gaze
+from r3jax.planning.planner import Planner, observe
+from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.planning.robot.motion import Motion
+from r3jax.scoring.config import ScoringConfig
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What decides on the frames of all paths of a run."""
+
+    config: ExplorationConfig
+    """How long pieces are, and where to look."""
+
+    motion: Motion
+    """What carries the camera."""
+
+    camera: Camera
+    """Of the frames."""
+
+    @property
+    def scoring(self) -> ScoringConfig:
+        """Settings of the utility of a look on the way."""
+        return scoring_on_the_way(self.config)
+
+    @property
+    def gaze(self) -> str:
+        """Where the camera looks; one that cannot turn by itself looks ahead."""
+        return "ahead" if self.motion.fixed_camera else self.config.gaze
+
+    @property
+    def speed(self) -> float:
+        """Along the path [m/s]."""
+        return self.motion.speed or self.config.speed
+
+    def flight(self, decision: Decision) -> float:
+        """Seconds to the chosen view: the policy's own account of its motion, if it has one."""
+        if decision.seconds is not None:
+            return decision.seconds
+        return decision.length / self.config.speed
+
+
+def scoring_on_the_way(config: ExplorationConfig) -> ScoringConfig:
+    """Settings of the utility of a look on the way: the same for every policy."""
+    return ScoringConfig(max_range=jnp.asarray(config.max_range, jnp.float32))
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A path under way."""
+
+    decision: Decision
+    info: PlanInfo
+
+    places: np.ndarray
+    """Of the frames, [n, 3] [m]; the last one is that of the chosen view."""
+
+    lengths: np.ndarray
+    """Of the pieces of the path, [n] [m]."""
+
+    seconds: np.ndarray
+    """Of the flight over each piece, [n]; the last one with what is left of the turn."""
+
+    turning: Turning
+    """How far the camera can turn on each piece."""
+
+    taken: int = 0
+    """Frames that were captured so far."""
+
+    directions: np.ndarray | None = None
+    """Of the frames on the way if they are planned together, [n - 1, 2] [rad]."""
+
+    @property
+    def is_last(self) -> bool:
+        """True if the next frame is the chosen view."""
+        return self.taken == len(self.places) - 1
+
+    @property
+    def length(self) -> float:
+        """Of the piece to the next frame [m]."""
+        return float(self.lengths[self.taken])
+
+    @property
+    def flight(self) -> float:
+        """Time for the piece to the next frame [s]."""
+        return float(self.seconds[self.taken])
+
+    @property
+    def after(self) -> "Leg | None":
+        """The leg once the next frame is taken; None: it has ended."""
+        return None if self.is_last else replace(self, taken=self.taken + 1)
+
+
+def begin_leg(decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: Rules) -> Leg:
+    """Cuts the path of a decision into pieces.
+
+    A path no longer than a piece, or too short for its turn, has no frame on the way.
+
+    Args:
+        decision: where to.
+        info: of the decision.
+        T_world_camera: where from, [4, 4].
+        rules: how long pieces are.
+    """
+    longest = rules.config.piece_at(rules.speed)
+    num = max(1, math.ceil(decision.length / longest - 1e-6))
+    if num > 1:
+        leg = _in_pieces(num, decision, info, T_world_camera, rules)
+        if leg.turning.is_possible:
+            return leg
+    ends = direction_of(T_world_camera), direction_of(decision.T_world_camera)
+    return Leg(
+        decision,
+        info,
+        places=decision.T_world_camera[None, :3, 3],
+        lengths=np.array([decision.length]),
+        seconds=np.array([rules.flight(decision)]),
+        turning=Turning(*ends, np.array([np.inf]), _elevations(rules.motion)),
+    )
+
+
+def _in_pieces(
+    num: int, decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: Rules
+) -> Leg:
+    """The leg of a path in `num` pieces, two or more."""
+    config, motion = rules.config, rules.motion
+    places = points_along(decision.waypoints, num)
+    places[-1] = decision.T_world_camera[:3, 3]
+    flight = rules.flight(decision)
+    piece = min(decision.length / rules.speed, flight) / num
+    seconds = np.full(num, piece)
+    seconds[-1] = flight - (num - 1) * piece
+    allowed = np.full(num, np.inf)
+    if config.exposure > 0.0:  # the chosen view is taken at rest
+        allowed[:-1] = config.blur * piece / (float(rules.camera.focal) * config.exposure)
+    if motion.turn_rate is not None:
+        allowed = np.minimum(allowed, math.radians(motion.turn_rate) * seconds)
+    if motion.turn_per_meter is not None:
+        stops = np.concatenate([T_world_camera[None, :3, 3], places])
+        straight = np.linalg.norm(np.diff(stops, axis=0), axis=1)
+        allowed = np.minimum(allowed, math.radians(motion.turn_per_meter) * straight)
+    ends = direction_of(T_world_camera), direction_of(decision.T_world_camera)
+    turning = Turning(*ends, allowed, _elevations(motion))
+    return Leg(decision, info, places, np.full(num, decision.length / num), seconds, turning)
+
+
+def _elevations(motion: Motion) -> tuple[float, float]:
+    low, high = np.radians(motion.elevations)
+    return float(low), float(high)
+
+
+def points_along(waypoints: np.ndarray, num: int) -> np.ndarray:
+    """The ends of `num` pieces of equal length of the path over waypoints [K, 3], [num, 3]."""
+    lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    done = np.concatenate([[0.0], np.cumsum(lengths)])
+    at = done[-1] * np.arange(1, num + 1) / num
+    return np.stack([np.interp(at, done, waypoints[:, axis]) for axis in range(3)], axis=1)
+
+
+def with_plan(leg: Leg, planner: Planner, rules: Rules) -> Leg:
+    """The leg with the directions of all its frames, if the gaze is planned; else as it is.
+
+    Args:
+        leg: before its first frame.
+        planner: what is known then.
+        rules: where to look.
+    """
+    if rules.gaze != "planned" or leg.is_last:
+        return leg
+    grid = _grid_for(leg, planner)
+    places = leg.places[:-1]
+    plan = plan_gaze(planner.map_state, grid, rules.camera, places, leg.turning, rules.scoring)
+    return replace(leg, directions=plan.directions)
+
+
+def aim(leg: Leg, T_world_camera: np.ndarray, planner: Planner, rules: Rules) -> np.ndarray:
+    """Finds the pose of the next frame on the way, [4, 4] float64.
+
+    Args:
+        leg: which frame it is.
+        T_world_camera: of the frame before, [4, 4].
+        planner: what is known, that frame included.
+        rules: where to look.
+    """
+    now, piece, place = direction_of(T_world_camera), leg.taken, leg.places[leg.taken]
+    turning = leg.turning
+    if leg.directions is not None:
+        return pose_towards(place, leg.directions[piece])
+    if rules.gaze == "panorama":
+        grid = _grid_for(leg, planner)
+        scores = panorama_scores(planner.map_state, grid, rules.camera, place, rules.scoring)
+        axes, directions = axes_within(turning.elevations, len(scores))
+        return pose_towards(place, turning.best(piece, now, directions, scores[axes]))
+    if rules.gaze == "ahead":
+        wanted = along(leg.places[piece + 1] - place, now)
+    else:
+        wanted = turning.at_share((piece + 1) / len(leg.places))
+    return pose_towards(place, turning.nearest(piece, now, wanted))
+
+
+def _grid_for(leg: Leg, planner: Planner) -> OccupancyGrid:
+    exhausted = exhausted_cells(planner.policy_state)
+    return worthwhile_grid(planner.grid, leg.places[leg.taken :], exhausted)
+
+
+def observe_on_the_way(planner: Planner, frame: Frame, rules: Rules) -> Planner:
+    """`observe` of a frame that no decision follows: what it failed to show is counted here."""
+    planner = observe(planner, frame)
+    state = count_look(
+        planner.policy_state,
+        planner.map_state,
+        planner.grid,
+        frame.camera,
+        frame.T_world_camera,
+        rules.scoring,
+    )
+    return replace(planner, policy_state=state)

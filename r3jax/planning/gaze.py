@@ -1,0 +1,228 @@
+"""Where the camera looks on its way from view to view: what it can turn to in time, and what pays.
+
+A direction is an azimuth and an elevation [rad]. A turn is as long as the straight line between two
+directions, azimuth wrapped: what a camera without roll turns through, and no less than the angle of
+the rotation. Every piece of a path allows for a turn of some size. A direction is feasible if the
+camera can turn to it on the piece before, and from it to the view at the end on the pieces after:
+no look on the way makes the camera late.
+
+On the host: NumPy. Shape symbols: n pieces of a path, the last one ends at the chosen view; m
+directions; B bins of a panorama.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r3jax.geometry.cameras import Camera
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.decision import ENOUGH_LOOKS, PlannerState
+from r3jax.planning.robot.explorable import mask_unexplorable
+from r3jax.scoring.batch import score_positions
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.utility import visible_unexplored
+
+_SAME = 1e-6
+"""Turns that differ by no more than this are one [rad]: float32 poses are no better."""
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How far the camera can turn on each piece of a path."""
+
+    start: np.ndarray
+    """Direction of the view where the path begins, [2] [rad]."""
+
+    end: np.ndarray
+    """Direction of the chosen view, [2] [rad]."""
+
+    allowed: np.ndarray
+    """Largest turn on each piece, [n] [rad]; inf: any."""
+
+    elevations: tuple[float, float]
+    """Lowest and highest elevation of a line of sight [rad]."""
+
+    @property
+    def is_possible(self) -> bool:
+        """True if the camera can turn from the start to the end on the path."""
+        return bool(turn(self.start, self.end) <= self.allowed.sum() + _SAME)
+
+    def feasible(self, piece: int, now: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Which directions the camera may have after a piece.
+
+        Args:
+            piece: number of the piece.
+            now: direction before it, [2].
+            directions: to choose from, [m, 2].
+
+        Returns:
+            [m] bool.
+        """
+        in_time = turn(now, directions) <= self.allowed[piece] + _SAME
+        return in_time & (turn(directions, self.end) <= self.allowed[piece + 1 :].sum() + _SAME)
+
+    def evenly(self) -> np.ndarray:
+        """Directions after the pieces of a camera that turns straight to the end, [n, 2].
+
+        Each piece has the share of the turn that it has of what is allowed: feasible throughout.
+        """
+        is_free = np.isinf(self.allowed)
+        share = is_free.astype(float) if is_free.any() else self.allowed
+        done = np.cumsum(share) / max(share.sum(), 1e-12)
+        whole = _difference(self.start, self.end)
+        return self.start + done[:, None] * whole
+
+    def at_share(self, share: float) -> np.ndarray:
+        """The direction at a share of the straight turn from the start to the end, [2]."""
+        return self.start + share * _difference(self.start, self.end)
+
+    def nearest(self, piece: int, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """The feasible direction nearest to a wanted one, [2]; to the spacing of a lattice."""
+        wanted = np.array([wanted[0], np.clip(wanted[1], *self.elevations)])
+        allowed = self.allowed[piece]
+        own = np.stack([wanted, _towards(now, wanted, allowed), _towards(now, self.end, allowed)])
+        directions = np.concatenate([own, axes_within(self.elevations)[1]])
+        return self.best(piece, now, directions, -turn(directions, wanted))
+
+    def best(
+        self, piece: int, now: np.ndarray, directions: np.ndarray, scores: np.ndarray
+    ) -> np.ndarray:
+        """The feasible direction with the greatest score; if there is none, on towards the end.
+
+        Args:
+            piece: number of the piece.
+            now: direction before it, [2].
+            directions: to choose from, [m, 2].
+            scores: of each, [m].
+        """
+        is_feasible = self.feasible(piece, now, directions)
+        if not is_feasible.any():
+            return _towards(now, self.end, self.allowed[piece])
+        return directions[np.argmax(np.where(is_feasible, scores, -np.inf))]
+
+
+def turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Length of the turn between directions [..., 2], [...] [rad]."""
+    difference = _difference(first, second)
+    return np.asarray(np.hypot(difference[..., 0], difference[..., 1]))
+
+
+def _difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """From one direction to another, [..., 2], round the shorter side."""
+    difference = np.asarray(second, dtype=np.float64) - first
+    azimuth = np.pi - np.mod(np.pi - difference[..., 0], 2.0 * np.pi)
+    return np.stack([azimuth, difference[..., 1]], axis=-1)
+
+
+def _towards(now: np.ndarray, goal: np.ndarray, most: float) -> np.ndarray:
+    """The direction after a turn of at most `most` [rad] straight to a goal."""
+    whole = float(turn(now, goal))
+    return now + min(1.0, most / max(whole, 1e-12)) * _difference(now, goal)
+
+
+def direction_of(T_world_camera: np.ndarray) -> np.ndarray:
+    """Azimuth and elevation [2] of a pose [4, 4] without roll, as its level axis has it."""
+    x, y, z = T_world_camera[:3, 2]
+    azimuth = np.arctan2(T_world_camera[0, 0], -T_world_camera[1, 0])
+    return np.array([azimuth, np.arctan2(z, np.hypot(x, y))])
+
+
+def pose_towards(position: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """The pose without roll at a position [3] that looks in a direction [2], [4, 4] float64."""
+    azimuth, elevation = direction
+    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    forward = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
+    right = np.array([level[1], -level[0], 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = position
+    return pose
+
+
+def along(offset: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """The direction [2] of an offset [3]; of one that is vertical or nothing the azimuth stays."""
+    level = float(np.hypot(offset[0], offset[1]))
+    azimuth = now[0] if level < 1e-6 else np.arctan2(offset[1], offset[0])
+    return np.array([azimuth, np.arctan2(offset[2], level)])
+
+
+def axes_within(
+    elevations: tuple[float, float], num_bins: int = 526
+) -> tuple[np.ndarray, np.ndarray]:
+    """The axes of a panorama that a camera may have, moved into what it may tilt to.
+
+    Those whose bins, caps of 1 / B of the sphere, reach into the allowed elevations; at least those
+    that are nearest.
+
+    Returns:
+        Their numbers [m] and directions [m, 2].
+    """
+    x, y, z = fibonacci_lattice(num_bins).T
+    elevation = np.arcsin(z)
+    allowed = np.clip(elevation, *elevations)
+    gap = np.abs(elevation - allowed)
+    chosen = np.flatnonzero(gap <= max(np.arccos(1.0 - 2.0 / num_bins), gap.min()))
+    return chosen, np.stack([np.arctan2(y, x), allowed], axis=1)[chosen]
+
+
+def worthwhile_grid(
+    grid: OccupancyGrid, places: np.ndarray, exhausted: np.ndarray | None
+) -> OccupancyGrid:
+    """The grid for a look on the way: without cells that nobody could look at, or did in vain.
+
+    Args:
+        grid: the grid.
+        places: of the robot, now and on its path, [n, 3] [m].
+        exhausted: cells that enough views failed to show, [X, Y, Z] bool; None: not known.
+    """
+    shape = np.array(grid.log_odds.shape)
+    cells = np.floor((places - np.asarray(grid.origin)) / float(grid.cell_size)).astype(int)
+    reached = np.zeros(tuple(shape), dtype=bool)
+    reached[tuple(np.clip(cells, 0, shape - 1).T)] = True
+    return mask_unexplorable(grid, reached, exhausted)
+
+
+def exhausted_cells(policy_state: Any) -> np.ndarray | None:
+    """Cells that enough views failed to show, [X, Y, Z] bool; None if the policy does not count."""
+    if not isinstance(policy_state, PlannerState):
+        return None
+    return np.asarray(policy_state.looks) >= ENOUGH_LOOKS
+
+
+def count_look(
+    policy_state: Any,
+    map_state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    scoring: ScoringConfig,
+) -> Any:
+    """The policy's memory with the cells counted that a frame in map and grid failed to show.
+
+    What `prepare_decision` does for the view that a decision is made from.
+    """
+    if not isinstance(policy_state, PlannerState):
+        return policy_state
+    visible = visible_unexplored(map_state, grid, camera, T_world_camera, scoring)
+    looks = policy_state.looks + visible.astype(jnp.int32)
+    return eqx.tree_at(lambda s: s.looks, policy_state, looks)
+
+
+def panorama_scores(
+    map_state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    position: np.ndarray,
+    scoring: ScoringConfig,
+) -> np.ndarray:
+    """What a view in the direction of each axis of a panorama would add, [B]: one depth buffer."""
+    place = np.asarray(position, dtype=np.float32)[None]
+    return np.asarray(
+        score_positions(map_state, grid, camera, place, scoring).direction_scores[0], np.float64
+    )

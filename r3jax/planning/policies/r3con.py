@@ -1,0 +1,153 @@
+"""R3CON: the rule of the paper's own code, which differs from its text (arXiv 2601.07484).
+
+    utility = 1000 * unexplored cells in sight all round + sum of (1 - R) over voxels in sight
+    total   = utility / sum of utilities - w * path / sum of paths
+    w       = the greatest mean of (1 - R) over what a candidate sees
+
+Candidates are centers of cells within 2 m, none at the frontier, and the present one is left out.
+The field of view plays no part in the utility: the direction is chosen afterwards, the axis round
+which a cone of half the smaller field of view holds the greatest sum. The weight of the path falls
+as the place becomes well rendered. Re-implemented from the facts on this project's map, whose R it
+takes; nothing is copied. As there, every unexplored cell counts, however often it was looked at.
+
+Shape symbols: C candidates; B bins of the panorama.
+"""
+
+import functools
+import math
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from r3jax.geometry.cameras import Camera
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import Candidates, candidates_along, candidates_at, host_generator
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.decision import net_utility
+from r3jax.planning.greedy import Drawn, GreedyPolicy
+from r3jax.planning.policy import Situation
+from r3jax.scoring.batch import map_over_devices
+from r3jax.scoring.cells import Cells, unexplored_by_direction, visible_cells
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.deficit import deficit_per_bin
+from r3jax.scoring.gather import gather_in_range
+from r3jax.visibility.depth_buffer import seen_in
+from r3jax.visibility.views import panorama_view
+
+
+@dataclass(frozen=True)
+class R3conConfig(PlannerConfig):
+    """Settings of `r3con`: the authors' values. It has no `lambda1`, `lambda2` and frontier."""
+
+    num_candidates: int = 50
+    """Positions that are scored per decision."""
+
+    radius: float = 2.0
+    """Candidates lie within this distance of the robot [m]."""
+
+    num_frontier: int = 0
+    """None is aimed at the frontier."""
+
+    cell_weight: float = 1000.0
+    """Weight of a visible unexplored cell against a voxel that renders badly."""
+
+    def __post_init__(self) -> None:
+        """Refuses values that would fail later, and says which."""
+        super().__post_init__()
+        if not (math.isfinite(self.cell_weight) and self.cell_weight >= 0.0):
+            raise ValueError(f"cell_weight must be a finite number >= 0, got {self.cell_weight}")
+
+
+@dataclass(frozen=True)
+class R3con(GreedyPolicy):
+    """The authors' own code: utility all round, then the direction; an adaptive path weight."""
+
+    config: R3conConfig = field(default_factory=R3conConfig)
+
+    name = "r3con"
+    source = "the authors' code, jkff00/R3CON d980adc"
+    Config = R3conConfig
+
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """Centers of different safe cells within the radius."""
+        travel, num = situation.travel, self.config.num_candidates
+        cells = np.argwhere(travel.goals)
+        is_other = np.any(cells != np.array(travel.start_cell), axis=1)
+        stops = travel.stops(cells[is_other])
+        stops = stops[np.linalg.norm(stops - travel.start, axis=1) <= self.config.radius]
+        if len(stops) == 0:
+            return Drawn(candidates_at(np.zeros((0, 3))), situation.memory)
+        chosen = host_generator(key).permutation(len(stops))[:num]
+        return Drawn(candidates_at(stops[chosen]).padded(num), situation.memory)
+
+    def score(
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+        """Utility all round of every position, and the direction that it would look in."""
+        del key
+        positions, scoring = candidates.position, self.config.scoring
+        places = jnp.asarray(positions, dtype=jnp.float32)
+        at_hand = gather_in_range(situation.map_state, situation.grid, places, scoring)
+        allowed = situation.limits.allowed_axes(positions, scoring.panorama_bins)
+        weight = jnp.asarray(self.config.cell_weight, dtype=jnp.float32)
+        look = functools.partial(_look_round, *at_hand[:2], situation.camera, scoring, weight)
+        axis, cells, lack, voxels = map_over_devices(look, (places, jnp.asarray(allowed)))
+        turned = candidates_along(positions, np.asarray(axis, dtype=np.float64))
+        turned = eqx.tree_at(lambda c: c.valid, turned, candidates.valid)
+        cells, lack, voxels = (np.asarray(x, dtype=np.float64) for x in (cells, lack, voxels))
+        return turned, {
+            "exploration": cells,
+            "rendering": lack,
+            "mean_lack": np.where(voxels > 0.0, lack / np.maximum(voxels, 1.0), 1.0),
+            "utility": self.config.cell_weight * cells + lack,
+        }
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """The shares of utility and path; what cannot be reached does not weigh paths."""
+        path = utilities["path"]  # inf for padding, too
+        counts = np.isfinite(path)
+        weight = utilities["mean_lack"][counts].max() if counts.any() else 0.0
+        return net_utility(utilities["utility"], path, float(weight))
+
+
+@jax.jit
+def _look_round(
+    voxels: MapState,
+    cells: Cells,
+    camera: Camera,
+    config: ScoringConfig,
+    cell_weight: Float[Array, ""],
+    places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
+) -> tuple[Float[Array, "C 3"], Float[Array, " C"], Float[Array, " C"], Float[Array, " C"]]:
+    """Best axis, visible unexplored cells, sum of (1 - R) and visible voxels of each position."""
+    num_bins = config.panorama_bins
+    lattice = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)
+    cone = (lattice @ lattice.T >= jnp.cos(_cone_angle(camera))).astype(jnp.float32)
+
+    def look(
+        place: tuple[Float[Array, " 3"], Bool[Array, " B"]],
+    ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+        position, allowed = place
+        view = panorama_view(position, config)
+        buffer, visible = seen_in(voxels, view, config)
+        seen = visible_cells(cells, view, buffer)
+        lack = deficit_per_bin(voxels, visible, position, camera.focal, config.forms, num_bins)
+        empty = unexplored_by_direction(cells, seen, position, num_bins)
+        sums = cone @ (lack + cell_weight * empty)
+        best = jnp.argmax(jnp.where(allowed, sums, -jnp.inf))
+        num_voxels = jnp.sum(visible.mask & voxels.present, dtype=jnp.float32)
+        return lattice[best], empty.sum(), lack.sum(), num_voxels
+
+    return jax.lax.map(look, places)
+
+
+def _cone_angle(camera: Camera) -> Float[Array, ""]:
+    """Half the smaller field of view [rad]."""
+    return jnp.minimum(
+        jnp.arctan(0.5 * camera.width / camera.fx), jnp.arctan(0.5 * camera.height / camera.fy)
+    )
