@@ -71,7 +71,7 @@ class RunProgress:
         total = f"/{self._budget.amount:.0f}" if self._budget.unit == "views" else ""
         self._bar.update(self._task, description=f"view {self._views + 1}{total}: {what}")
 
-    def on_step(self, row: StepRow) -> None:
+    def on_row(self, row: StepRow) -> None:
         """A view is done."""
         self._captured += row.captured
         self._views = row.step + 1 - self._captured

@@ -15,8 +15,9 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.recording import record_end, record_view
 from r3jax.exploration.resume import continued
-from r3jax.exploration.state import LoopState, Mission, Stop, StopReason
+from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, TakenView
 from r3jax.exploration.step import start_state, step
+from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Policy
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RecordingStopped
@@ -46,7 +47,7 @@ def explore(
     resume: Run | None = None,
     decided_from: int = 0,
     is_enough: Callable[[LoopState], str | None] | None = None,
-    on_step: Callable[[StepRow], None] | None = None,
+    on_view: Callable[[TakenView, Planner], None] | None = None,
     on_stage: Callable[[str], None] | None = None,
 ) -> Result:
     """Explores an unknown scene until the budget is spent or no view is left.
@@ -64,7 +65,8 @@ def explore(
             is shown the frames, but not asked what it would have decided.
         is_enough: asked every `config.until_every` views; the reason why no further view is needed
             ends the run, None lets it go on. Must come with `config.until`, which records it.
-        on_step: called with the row of every view.
+        on_view: called with every view once it is recorded, and with the planner that has seen it;
+            both may be kept, as they never change.
         on_stage: called with the name of what happens next.
 
     Returns:
@@ -106,7 +108,7 @@ def explore(
     if resume is not None:
         state = continued(resume, mission, state, decided_from=decided_from)
         rows = list(resume.rows)
-    state, stop = _go(state, mission, rows, recorder, on_step or (lambda row: None))
+    state, stop = _go(state, mission, rows, recorder, on_view or (lambda view, planner: None))
     return Result(state, tuple(rows), stop.reason, stop.message)
 
 
@@ -115,7 +117,7 @@ def _go(
     mission: Mission,
     rows: list[StepRow],
     recorder: RunWriter | None,
-    on_step: Callable[[StepRow], None],
+    on_view: Callable[[TakenView, Planner], None],
 ) -> tuple[LoopState, Stop]:
     """Steps until something ends the run; adds to `rows`, and records the end."""
     try:
@@ -133,7 +135,7 @@ def _go(
             # Only once it is recorded: a disk that is full ends the run at what is on it.
             state = after
             rows.append(output.row)
-            on_step(output.row)
+            on_view(output, state.planner)
     # The view under way is dropped; if its row is on the disk already, a resume finds it there.
     except KeyboardInterrupt:
         stop = Stop(StopReason.INTERRUPTED, f"interrupted by the user after {len(rows)} views")

@@ -79,7 +79,7 @@ def continued(run: Run, mission: Mission, start: LoopState, *, decided_from: int
     for row in run.rows[state.views :]:
         mission.on_stage("map")
         decides = row.step >= decided_from
-        state = relive(state, mission, row, run.frame(row.step), decides=decides)
+        state, _ = relive(state, mission, row, run.frame(row.step), decides=decides)
     return state
 
 

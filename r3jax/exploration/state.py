@@ -17,7 +17,7 @@ from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.planner import Planner
-from r3jax.planning.policy import Policy
+from r3jax.planning.policy import Decision, Policy
 from r3jax.planning.robot.motion import motion_of
 from r3jax.trace.rows import StepRow
 
@@ -112,6 +112,10 @@ class TakenView:
 
     stages: dict[str, float] = field(default_factory=dict[str, float])
     """Seconds that the stages really took, those off the mission clock included."""
+
+    decision: Decision | None = None
+    """What sent the camera here, with all that was on offer; None: nothing was decided since the
+    frame before."""
 
 
 @dataclass(frozen=True)

@@ -266,11 +266,16 @@ class _Shot:
         return self.leg is not None and not self.leg.is_last
 
     @property
-    def choice(self) -> Choice | None:
+    def decision(self) -> Decision | None:
         """The decision, with the first frame of its path."""
-        if self.leg is None or self.leg.taken > 0:
+        return None if self.leg is None or self.leg.taken > 0 else self.leg.decision
+
+    @property
+    def choice(self) -> Choice | None:
+        """What is recorded of the decision."""
+        if self.leg is None or self.decision is None:
             return None
-        return make_choice(self.leg.decision, self.leg.info)
+        return make_choice(self.decision, self.leg.info)
 
 
 def _look(
@@ -334,12 +339,12 @@ def _look(
         captured=shot.captured,
     )
     stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
-    return state, TakenView(row, frame, stages)
+    return state, TakenView(row, frame, stages, shot.decision)
 
 
 def relive(
     state: LoopState, mission: Mission, row: StepRow, frame: Frame, *, decides: bool = True
-) -> LoopState:
+) -> tuple[LoopState, Decision | None]:
     """The state after a frame that was recorded: as `step` leaves it, without the simulator.
 
     Args:
@@ -350,11 +355,14 @@ def relive(
         decides: ask the policy again, for what it remembers of its decision. Policies are pure:
             the same state and key give the same decision. False for a policy that did not
             choose this view: it is told the path.
+
+    Returns:
+        The state after the frame, and what the policy decided, where it was asked.
     """
-    leg = state.leg
+    leg, decision = state.leg, None
     if row.choice is not None:
         if decides:
-            # Only its memory is used: the row knows the pose and what was charged, and a decision
+            # Of the state only its memory is used: the row knows pose and seconds, and a decision
             # timed again would put other seconds on the mission clock.
             key = jax.random.fold_in(mission.key, state.views)
             decision, planner, info = decide(state.planner, state.T_world_camera, key)
@@ -370,7 +378,7 @@ def relive(
     state = _arrive(state, planner, frame, length, row.charged, captured=row.captured)
     # A path ends with the view that was chosen, whatever became of it.
     leg = leg.after if leg is not None and row.captured else None
-    return replace(state, metres=metres, leg=leg)
+    return replace(state, metres=metres, leg=leg), decision
 
 
 def _leg_again(

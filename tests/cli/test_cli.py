@@ -231,7 +231,7 @@ def test_progress_says_what_is_happening():
     terminal = Console(file=io.StringIO(), force_terminal=True, width=160)
     with RunProgress(terminal, parse_budget("views:4")) as progress:
         progress.on_stage("render")
-        progress.on_step(make_view(0)[0])
+        progress.on_row(make_view(0)[0])
         progress.on_stage("plan")
         progress._bar.refresh()
     text = terminal.file.getvalue()
@@ -240,5 +240,5 @@ def test_progress_says_what_is_happening():
     log = Console(file=io.StringIO(), force_terminal=False)
     with RunProgress(log, parse_budget("views:1000")) as progress:
         for step in range(50):
-            progress.on_step(make_view(step)[0])
+            progress.on_row(make_view(step)[0])
     assert 1 <= len(log.file.getvalue().splitlines()) <= 11

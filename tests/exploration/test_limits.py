@@ -53,9 +53,9 @@ class Watch:
     processor: list[float] = field(default_factory=list)
     """Of all cores together, from the start of the process to after every view [s]."""
 
-    def on_step(self, row) -> None:
+    def on_view(self, view, planner) -> None:
         self.processor.append(time.process_time())
-        if (row.step + 1) % self.every != self.every // 2:
+        if (view.row.step + 1) % self.every != self.every // 2:
             return
         self.look()
 
@@ -85,7 +85,7 @@ def long_run(
             budget=f"views:{views}",
             config=config,
             recorder=recorder,
-            on_step=watch.on_step,
+            on_view=watch.on_view,
         )
     return watch
 

@@ -8,15 +8,14 @@ import pytest
 from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.seen import rows_in_view
-from r3jax.planning.policies.active_gs.confidence import aligned, no_sightings, see
-from r3jax.planning.policies.active_gs.glance import glance
+from r3jax.planning.policies.active_gs.confidence import aligned, glance, no_sightings, see
 from r3jax.planning.registry import make_policy
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.test_active_gs_confidence import RANGE, frames, maps
 
 pytestmark = pytest.mark.full
 
-CHAIN = ("r3jax.planning.policies.active_gs.glance",)
+CHAIN = ("r3jax.planning.policies.active_gs.confidence",)
 REACH = jnp.float32(RANGE)
 
 
@@ -34,7 +33,7 @@ def law_glance(modules: Modules) -> None:
     numbers = []
     in_float64 = lambda x: np.asarray(x, dtype=np.float64)
     for frame, state, before, touched in history():
-        after = modules["glance"].glance(before, touched, state, frame, REACH)
+        after = modules["confidence"].glance(before, touched, state, frame, REACH)
         seen = np.asarray(rows_in_view(state, frame, REACH))
         is_touched = np.asarray(touched.views) > np.asarray(before.views)
         known = np.asarray(touched.views) > 0
@@ -93,10 +92,10 @@ def test_the_policy_takes_note_of_pixels_and_glances(name):
 
 
 MUTANTS = [
-    Mutant("glance", "(touched.views == before.views)", "True", law_glance),
-    Mutant("glance", "rows_in_view(state, frame, max_range) & ", "", law_glance),
-    Mutant("glance", "1.0 - distance / max_range", "1.0", law_glance),
-    Mutant("glance", "touched.normal * direction", "-touched.normal * direction", law_glance),
+    Mutant("confidence", "(touched.views == before.views)", "True", law_glance),
+    Mutant("confidence", "rows_in_view(state, frame, max_range) & ", "", law_glance),
+    Mutant("confidence", "1.0 - distance / max_range", "1.0", law_glance),
+    Mutant("confidence", "touched.normal * direction", "-touched.normal * direction", law_glance),
 ]
 
 

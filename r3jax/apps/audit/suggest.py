@@ -11,10 +11,11 @@ exactly, after `simulate_view`:
 in voxels: 1 is a voxel that could not be rendered at all, and then perfectly. Only voxels that the
 view shows can change, and only those that lack something can gain.
 
-Of all candidates the one with the largest gain is taken, the map goes on as if it had been, the
-unexplored cells that it shows count no longer, and the others are asked again: lazy greedy (Minoux
-1978). A gain hardly ever grows by other views, so an old one is as good as an upper bound, and only
-candidates whose old gain is above the best new one are asked again.
+Of all candidates the one with the largest gain is taken (`LazyGreedy`, the policy that `decide`
+asks), the map goes on as if it had been, the unexplored cells that it shows count no longer, and
+the others are asked again: lazy greedy (Minoux 1978). A gain hardly ever grows by other views, so
+an old one is as good as an upper bound, and only candidates whose old gain is above the best new
+one are asked again.
 
 Beside it, as many views at random from the same places say how much of the gain is owed to the
 choice.
@@ -24,7 +25,8 @@ Shape symbols: p places or standpoints; B bins of the panorama; C candidates; N 
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,11 +42,15 @@ from r3jax.apps.audit.diagnosis import (
     diagnose,
     score_from_standpoints,
 )
+from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
+from r3jax.planning.planner import Planner, decide
+from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 from r3jax.scoring.batch import map_over_devices, score_positions
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import score_voxels
@@ -225,6 +231,76 @@ class Task:
         return answers, diagnose(state, self.demand, answers)
 
 
+@dataclass(frozen=True)
+class Memory:
+    """What is remembered from one suggestion to the next."""
+
+    gains: np.ndarray
+    """Gain of every candidate when it was last asked, inf before that, [C] [voxels]."""
+
+    diagnosis: Diagnosis | None = None
+    """Diagnosis of the map that the latest view was chosen on; None before the first."""
+
+
+@dataclass(frozen=True, eq=False)
+class LazyGreedy:
+    """Policy of an audit: of all candidates, the view that gains most (see the module)."""
+
+    task: Task
+
+    poses: np.ndarray
+    """Candidates, [C, 4, 4] [audit units]."""
+
+    name: str = "audit"
+
+    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Memory:
+        """Knows no gain yet."""
+        del camera, grid, key
+        return Memory(np.full(len(self.poses), np.inf))
+
+    def observe(self, state: Memory, map_state: MapState, frame: Frame) -> Memory:
+        """Forgets all gains: what was really seen may raise them, unlike what is imagined."""
+        del state, map_state, frame
+        return Memory(np.full(len(self.poses), np.inf))
+
+    def decide(
+        self,
+        state: Memory,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, Memory, PlanInfo]:
+        """The candidate with the largest gain; None where none gains a voxel."""
+        del key  # nothing is drawn
+        gains, num = state.gains.copy(), len(self.poses)
+        answers, diagnosis = self.task.evaluate(map_state)
+        best = _best(gains, map_state, grid, self.task, answers, self.poses)
+        memory = Memory(gains, diagnosis)
+        if best is None:
+            return None, memory, PlanInfo(DecisionOutcome.NO_CANDIDATE, num, num)
+        pose = self.poses[best]
+        # A person finds the way: it costs nothing, and leads straight.
+        way = np.stack([T_world_camera[:3, 3], pose[:3, 3]])
+        length = float(np.linalg.norm(way[1] - way[0]))
+        utilities = {"total": gains, "path": np.zeros(num)}
+        decision = Decision(pose, way, length, float(gains[best]), self.poses, utilities)
+        return decision, memory, PlanInfo(DecisionOutcome.MOVED, num, num)
+
+    def follow(
+        self,
+        state: Memory,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        waypoints: np.ndarray,
+    ) -> Memory:
+        """Remembers nothing of a path."""
+        del map_state, grid, T_world_camera, waypoints
+        return state
+
+
 def suggest(
     state: MapState,
     grid: OccupancyGrid,
@@ -246,23 +322,28 @@ def suggest(
         seed: of the random views.
         on_view: called after each view.
     """
-    answers, now = task.evaluate(state)
-    before = now
-    views: list[Suggestion] = []
-    imagined, open_grid = state, grid
-    poses = candidate_poses(state, grid, task, places) if num else np.zeros((0, 4, 4))
-    gains = np.full(len(poses), np.inf)
+    greedy = LazyGreedy(task, candidate_poses(state, grid, task, places) if num else _NO_POSES)
+    key = jax.random.key(seed)
+    memory = greedy.init(task.camera, grid, key=key)
+    planner = Planner(state, grid, memory, greedy, MappingConfig())
+    diagnoses, taken, here = list[Diagnosis](), list[_Taken](), np.eye(4)
     for _ in range(num):
-        best = _best(gains, imagined, open_grid, task, answers, poses)
-        if best is None:
+        decision, planner, _ = decide(planner, here, key)
+        if decision is None:
             break
-        pose, gain = poses[best], float(gains[best])
-        imagined, open_grid, shown, cells = _take(imagined, open_grid, task, pose)
-        answers, after = task.evaluate(imagined)
-        views.append(_suggestion(pose, gain, cells, shown, now, after))
-        now = after
+        diagnoses.append(planner.policy_state.diagnosis)
+        planner, view = _imagine(planner, task, decision)
+        taken.append(view)
+        here = decision.T_world_camera
         on_view()
-    return SuggestedViews(tuple(views), before, now, _random(state, task, places, len(views), seed))
+    diagnoses.append(task.evaluate(planner.map_state)[1])
+    steps = zip(taken, diagnoses[:-1], diagnoses[1:], strict=True)
+    views = tuple(_suggestion(view, now, after) for view, now, after in steps)
+    random_mean = _random(state, task, places, len(views), seed)
+    return SuggestedViews(views, diagnoses[0], diagnoses[-1], random_mean)
+
+
+_NO_POSES = np.zeros((0, 4, 4))
 
 
 def candidate_poses(
@@ -322,31 +403,34 @@ def _best(
     return None
 
 
-def _take(
-    state: MapState, grid: OccupancyGrid, task: Task, pose: np.ndarray
-) -> tuple[MapState, OccupancyGrid, np.ndarray, np.ndarray]:
-    """Map and grid once a view is taken, the rows and the unexplored cells that it shows."""
-    T = jnp.asarray(pose, dtype=jnp.float32)
-    cells = visible_unexplored(state, grid, task.camera, T, task.config)
-    after, shown = simulate_view(state, task.camera, T, task.config)
+class _Taken(NamedTuple):
+    """A view that was chosen, and what it shows."""
+
+    decision: Decision
+    shown: np.ndarray
+    """Rows of the voxels, as in `Suggestion`."""
+    cells: np.ndarray
+    """Unexplored cells, as in `Suggestion`."""
+
+
+def _imagine(planner: Planner, task: Task, decision: Decision) -> tuple[Planner, _Taken]:
+    """The planner as if a view had been taken, and what that view shows."""
+    T = jnp.asarray(decision.T_world_camera, dtype=jnp.float32)
+    cells = visible_unexplored(planner.map_state, planner.grid, task.camera, T, task.config)
+    after, shown = simulate_view(planner.map_state, task.camera, T, task.config)
     rows, edges = (np.flatnonzero(np.asarray(mask)) for mask in (shown, cells))
-    return after, grid.ignoring(cells), rows, edges
+    imagined = replace(planner, map_state=after, grid=planner.grid.ignoring(cells))
+    return imagined, _Taken(decision, rows, edges)
 
 
-def _suggestion(
-    pose: np.ndarray,
-    gain: float,
-    cells: np.ndarray,
-    shown: np.ndarray,
-    now: Diagnosis,
-    after: Diagnosis,
-) -> Suggestion:
+def _suggestion(view: _Taken, now: Diagnosis, after: Diagnosis) -> Suggestion:
+    shown = view.shown
     bad = shown[now.is_seen[shown] & (now.value[shown] < FINE)]
     counts = np.bincount(now.cause[bad], minlength=len(CAUSES))
     return Suggestion(
-        pose=pose,
-        gain=gain,
-        cells=cells,
+        pose=view.decision.T_world_camera,
+        gain=view.decision.score,
+        cells=view.cells,
         shown=shown,
         num_mended=int((after.value[bad] >= FINE).sum()),
         causes={name: int(n) for name, n in zip(CAUSES, counts, strict=True) if n},

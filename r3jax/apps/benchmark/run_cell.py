@@ -180,7 +180,7 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
             config=config,
             recorder=recorder,
             resume=begun,
-            on_step=lambda row: on_stage(f"exploring, {row.step + 1} views"),
+            on_view=lambda view, _: on_stage(f"exploring, {view.row.step + 1} views"),
         )
     if result.reason is StopReason.INTERRUPTED:
         raise KeyboardInterrupt

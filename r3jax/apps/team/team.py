@@ -117,7 +117,7 @@ def explore_team(
     meet_every: float = 0.0,
     recorders: Sequence[RunWriter] | None = None,
     resume: Sequence[Run] | None = None,
-    on_step: Callable[[int, StepRow], None] | None = None,
+    on_row: Callable[[int, StepRow], None] | None = None,
     on_stage: Callable[[str], None] | None = None,
 ) -> TeamResult:
     """Explores an unknown scene with several cameras at once.
@@ -133,7 +133,7 @@ def explore_team(
         resume: what was recorded of each member before the team was cut off. All of it is decided
             and mapped again, only the pictures are not taken again; under the model clock the
             result is the one of a team that was never cut off, bit for bit.
-        on_step: called with a member's number and the row of every view.
+        on_row: called with a member's number and the row of every view.
         on_stage: called with the name of what happens next.
 
     Returns:
@@ -158,7 +158,7 @@ def explore_team(
         )
         for number, recorded in enumerate(resume or [None] * len(members))
     ]
-    return _fly(flying, meet_every, on_step or (lambda number, row: None))
+    return _fly(flying, meet_every, on_row or (lambda number, row: None))
 
 
 def _check(members: Sequence[Member], meet_every: float) -> None:
@@ -207,7 +207,7 @@ def _set_out(
 
 
 def _fly(
-    flying: list[_Flying], meet_every: float, on_step: Callable[[int, StepRow], None]
+    flying: list[_Flying], meet_every: float, on_row: Callable[[int, StepRow], None]
 ) -> TeamResult:
     """Steps until nobody flies any more, and lets all meet at the end."""
     first = flying[0]
@@ -227,7 +227,7 @@ def _fly(
             flying[me.number] = me
             if sight is not None:
                 common = replace(common, waiting=(*common.waiting, sight))
-                on_step(me.number, me.rows[-1])
+                on_row(me.number, me.rows[-1])
     except KeyboardInterrupt:
         _stop_all(flying, StopReason.INTERRUPTED, "interrupted by the user")
     except RecordingStopped as error:
@@ -305,7 +305,8 @@ def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Sig
     if me.recorded is not None and me.state.views < len(me.recorded.rows):
         row = me.recorded.rows[me.state.views]
         frame = me.recorded.frame(row.step)
-        after = _decided_by(relive(state, mission, row, frame), mission.policy)
+        after, _ = relive(state, mission, row, frame)
+        after = _decided_by(after, mission.policy)
     else:
         after, output = step(state, mission, exchange=me.owed)
         after = _decided_by(after, mission.policy)

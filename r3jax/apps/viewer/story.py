@@ -13,15 +13,14 @@ from typing import Protocol, runtime_checkable
 import jax
 import numpy as np
 
-from r3jax.apps.viewer.decisions import Offer
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.apps.viewer.decisions import Offer, offer_of
 from r3jax.exploration.explain_run import Reason, explain_run
 from r3jax.exploration.replay import config_of, grid_before
-from r3jax.frame import Frame
+from r3jax.exploration.state import TakenView
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.planning.planner import add_frame, add_to_grid, first_grid
+from r3jax.planning.planner import Planner, add_frame
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow
@@ -269,22 +268,6 @@ class RecordedStory:
         return reason or self._problem or _WORKING
 
 
-@dataclass(frozen=True)
-class NewView:
-    """What the loop hands over after a view: references, nothing is computed."""
-
-    row: StepRow
-    frame: Frame
-
-    map_state: MapState
-    """The frame is in it."""
-
-    grid: OccupancyGrid | None
-    """The frame is not in it yet; None: it is the first view."""
-
-    offer: Offer | None
-
-
 class LiveStory:
     """A run that is going on. Of the map only the newest state is kept."""
 
@@ -293,20 +276,15 @@ class LiveStory:
     def __init__(
         self,
         camera: Camera,
-        bounds: np.ndarray,
-        config: ExplorationConfig,
         earlier: Run | None = None,
     ):
         """Knows the views that were recorded before, if any, but not their map.
 
         Args:
             camera: of every view.
-            bounds: of the scene, [2, 3] [m].
-            config: of the loop.
             earlier: the run that is gone on with.
         """
-        self._camera, self._bounds, self._config = camera, bounds, config
-        self._earlier = earlier
+        self._camera, self._earlier = camera, earlier
         self._rows: list[StepRow] = [] if earlier is None else list(earlier.rows)
         self._images: dict[int, np.ndarray] = {}
         self._offers: dict[int, Offer] = {}
@@ -322,20 +300,20 @@ class LiveStory:
         """What the trace says of the views so far."""
         return self._rows
 
-    def add(self, view: NewView) -> None:
-        """Takes in one view more; takes as long as a frame takes to join the grid."""
-        start = np.asarray(view.row.pose, np.float64)
-        grid = view.grid or first_grid(self._bounds, [start], self._config)
-        if view.row.choice is None and self._moment is not None:
-            grid = self._moment.grid  # further on a path: no decision was made since
-        grid = add_to_grid(grid, view.frame, self._config)
+    def add(self, view: TakenView, planner: Planner) -> None:
+        """Takes in one view more.
+
+        Args:
+            view: the view.
+            planner: has seen it.
+        """
         image = np.rint(np.asarray(view.frame.rgb) * 255.0).astype(np.uint8)
         step = max(1, max(image.shape[:2]) // _THUMBNAIL)
         self._images[view.row.step] = np.ascontiguousarray(image[::step, ::step])
-        if view.offer is not None:
-            self._offers[view.row.step] = view.offer
+        if view.decision is not None:
+            self._offers[view.row.step] = offer_of(view.decision)
         self._offers.pop(view.row.step - _OFFERS_KEPT, None)
-        self._moment = Moment(view.row.step, view.map_state, grid)
+        self._moment = Moment(view.row.step, planner.map_state, planner.grid)
         self._rows.append(view.row)
 
     def image(self, step: int) -> np.ndarray:

@@ -17,11 +17,11 @@ from r3jax.cli.from_options import policy_of_options, run_settings, scene_settin
 from r3jax.cli.options import ExploreOptions
 from r3jax.cli.progress import RunProgress, Stages
 from r3jax.exploration.loop import Result, explore
-from r3jax.exploration.state import StopReason
+from r3jax.exploration.state import StopReason, TakenView
+from r3jax.planning.planner import Planner
 from r3jax.planning.robot.motion import motion_of
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run, read_run
-from r3jax.trace.rows import StepRow
 
 EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
 """Exit codes of a run that can be gone on with; 0 for all others."""
@@ -44,23 +44,23 @@ def run_explore(options: ExploreOptions) -> int:
             raise UserError(one_line(error)) from error
         settings, recorder = expedition.settings, stack.enter_context(expedition.recorder)
         stack.enter_context(resumable("explore", recorder.path))
-        policy, on_view = settings.policy, lambda row: None
+        feed = None
         if page is not None:
             feed = stack.enter_context(page(expedition))
-            policy, on_view = feed.watch(policy), feed.on_step
             console.say(f"live      {feed.url}")
         recorded = expedition.recorded.rows if expedition.recorded else ()
         captured = sum(row.captured for row in recorded)
         progress = stack.enter_context(RunProgress(console, settings.budget, captured))
 
-        def on_step(row: StepRow) -> None:
-            progress.on_step(row)
-            on_view(row)
+        def on_view(view: TakenView, planner: Planner) -> None:
+            progress.on_row(view.row)
+            if feed is not None:
+                feed.on_view(view, planner)
 
         try:
             result = explore(
                 expedition.simulator,
-                policy,
+                settings.policy,
                 budget=settings.budget,
                 seed=expedition.seed,
                 config=settings.config,
@@ -68,7 +68,7 @@ def run_explore(options: ExploreOptions) -> int:
                 resume=expedition.recorded,
                 decided_from=expedition.decided_from,
                 is_enough=stopping_rule(settings.config, expedition.simulator.camera),
-                on_step=on_step,
+                on_view=on_view,
                 on_stage=progress.on_stage,
             )
         except RunError as error:

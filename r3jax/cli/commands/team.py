@@ -43,7 +43,7 @@ def run_team(options: TeamOptions) -> int:
                 meet_every=crew.meet_every,
                 recorders=crew.recorders,
                 resume=crew.recorded,
-                on_step=lambda number, row: progress.on_step(row),
+                on_row=lambda number, row: progress.on_row(row),
                 on_stage=progress.on_stage,
             )
         except RunError as error:

@@ -182,7 +182,7 @@ def law_nobody_knows_more_or_less(meet_every: float, seed: int = 1, team=real_te
         seed=seed,
         config=CONFIG,
         meet_every=meet_every,
-        on_step=lambda number, row: order.append((number, row)),
+        on_row=lambda number, row: order.append((number, row)),
     )
     frames = frames_by_clock(members, result)
     begins = {

@@ -56,7 +56,7 @@ def fly(folder, name, views=VIEWS, resume=False, order=None):
             meet_every=MEET_EVERY,
             recorders=recorders,
             resume=runs,
-            on_step=lambda number, row: None if order is None else order.append(number),
+            on_row=lambda number, row: None if order is None else order.append(number),
         )
     finally:
         for recorder in recorders:

@@ -12,19 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 import viser
 
-from r3jax.apps.viewer.decisions import Offer, WatchedPolicy, offer_of
 from r3jax.apps.viewer.page.app import App
 from r3jax.apps.viewer.page.server import url_of
-from r3jax.apps.viewer.story import LiveStory, NewView
+from r3jax.apps.viewer.story import LiveStory
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.frame import Frame
+from r3jax.exploration.state import TakenView
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
-from r3jax.planning.policy import Decision, Policy
+from r3jax.planning.planner import Planner
 from r3jax.scoring.config import ScoringConfig
 from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow
+
+_Item = tuple[TakenView, Planner] | threading.Event | None
+"""A view and the planner that has seen it; an event to be set on the way; None: the end."""
 
 
 def open_live(
@@ -48,7 +47,7 @@ def open_live(
         subtitle: more about it.
         earlier: what was recorded of the run, if it is gone on with.
     """
-    story = LiveStory(camera, np.asarray(bounds, np.float64), config, earlier)
+    story = LiveStory(camera, earlier)
     max_range = jnp.asarray(config.max_range, dtype=jnp.float32)
     scoring = ScoringConfig(max_range=max_range)
     app = App(server, story, scoring, bounds, title=title, subtitle=subtitle)
@@ -69,24 +68,15 @@ class LiveFeed:
         self.url = url_of(server)
         """Where the page is."""
         self.app, self._story = app, story
-        self._frame: Frame | None = None
-        self._map_state: MapState | None = None
-        self._grid: OccupancyGrid | None = None
-        self._offer: Offer | None = None
-        self._queue: queue.SimpleQueue[NewView | threading.Event | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[TakenView, Planner] | threading.Event | None] = (
+            queue.SimpleQueue()
+        )
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self._thread.start()
 
-    def watch(self, policy: Policy) -> Policy:
-        """The policy to explore with: decides as `policy` does, and this feed sees what it sees."""
-        return WatchedPolicy(policy, self._on_decision, self._on_frame)
-
-    def on_step(self, row: StepRow) -> None:
-        """A view is done: it goes into the queue."""
-        if self._frame is None or self._map_state is None:
-            return
-        self._queue.put(NewView(row, self._frame, self._map_state, self._grid, self._offer))
-        self._offer = None
+    def on_view(self, view: TakenView, planner: Planner) -> None:
+        """A view is done, as `explore` tells it: into the queue it goes."""
+        self._queue.put((view, planner))
 
     def settle(self, timeout: float) -> bool:
         """Returns when every view so far is on the page; False if that takes longer [s]."""
@@ -94,18 +84,12 @@ class LiveFeed:
         self._queue.put(is_empty)
         return is_empty.wait(timeout) and self.app.worker.wait(timeout)
 
-    def _on_decision(self, decision: Decision, grid: OccupancyGrid) -> None:
-        self._grid, self._offer = grid, offer_of(decision)
-
-    def _on_frame(self, map_state: MapState, frame: Frame) -> None:
-        self._map_state, self._frame = map_state, frame
-
     def _run(self) -> None:
         while (view := self._queue.get()) is not None:
             if isinstance(view, threading.Event):
                 view.set()
                 continue
-            self._story.add(view)
+            self._story.add(*view)
             self.app.grow()
 
     def __enter__(self) -> "LiveFeed":

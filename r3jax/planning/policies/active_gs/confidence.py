@@ -22,6 +22,7 @@ from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.voxels import EMPTY_WORD, unpack, voxel_center
 from r3jax.mapping.associate import Groups, group_by_voxel, points_of_pixels
 from r3jax.mapping.join import CHUNK
+from r3jax.mapping.seen import rows_in_view
 from r3jax.mapping.state import MapState
 from r3jax.mapping.table import find
 from r3jax.planning.policies.active_gs.normals import pixel_normals
@@ -183,3 +184,42 @@ def _sight(
 def _unit(x: Float[Array, "3 M"]) -> Float[Array, "3 M"]:
     length = safe_norm(x, axis=0)
     return x / jnp.where(length > 0.0, length, 1.0)[None, :]
+
+
+@jax.jit
+def glance(
+    before: Sightings,
+    touched: Sightings,
+    state: MapState,
+    frame: Frame,
+    max_range: Float[Array, ""],
+) -> Sightings:
+    """Adds one sighting of every known voxel in view that the frame has not touched.
+
+    No pixel of the frame fell into these; the map counts them as seen for every policy
+    (`mapping.seen`), and without the same rule here the noise in front of a surface would keep
+    Active-GS looking for ever. The normal is the one known so far: only pixels tell of normals.
+
+    Args:
+        before: the sightings before the frame, row by row those of the map (`aligned`).
+        touched: the same after `see`.
+        state: the map, the frame integrated.
+        frame: the frame.
+        max_range: d_max, the sensor's range [m].
+    """
+    # Whole numbers are exact in float32: an equal count means that no pixel fell in.
+    is_new = rows_in_view(state, frame, max_range) & (touched.views == before.views)
+    center = voxel_center(jnp.stack(unpack(state.key[0], state.key[1])), state.voxel_size)
+    offset = frame.position[:, None] - center
+    distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
+    direction = offset / distance[None, :]
+    cosine = jnp.maximum(0.0, jnp.sum(touched.normal * direction, axis=0))
+    weight = jnp.maximum(0.0, 1.0 - distance / max_range)
+    add: Callable[[Array, Array | float], Array] = lambda x, more: x + jnp.where(is_new, more, 0.0)
+    return Sightings(
+        key=touched.key,
+        views=add(touched.views, 1.0),
+        direction_sum=touched.direction_sum + jnp.where(is_new[None, :], direction, 0.0),
+        cosine_sum=add(touched.cosine_sum, weight * cosine),
+        normal_sum=touched.normal_sum,
+    )

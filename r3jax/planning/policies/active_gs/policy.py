@@ -34,8 +34,7 @@ from r3jax.planning.greedy import (
     draw_lots,
     score_by_pixels,
 )
-from r3jax.planning.policies.active_gs.confidence import aligned, no_sightings, see
-from r3jax.planning.policies.active_gs.glance import glance
+from r3jax.planning.policies.active_gs.confidence import aligned, glance, no_sightings, see
 from r3jax.planning.policies.active_gs.regions import aimed_views, low_confidence, regions_of
 from r3jax.scoring.pixels import PixelView, Value
 

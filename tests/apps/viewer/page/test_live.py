@@ -9,7 +9,6 @@ pytest.importorskip("viser", reason="the viewer needs viser, which is not instal
 
 import r3jax.apps.viewer.page.live as live
 from r3jax.apps.runs.settings import open_run_scene, settings_of_run
-from r3jax.apps.viewer.decisions import WatchedPolicy
 from r3jax.apps.viewer.page.live import open_live
 from r3jax.apps.viewer.page.server import close_server, open_server
 from r3jax.apps.viewer.story import LiveStory
@@ -37,16 +36,16 @@ def server():
     close_server(server)
 
 
-def go(world, policy, on_step=None):
+def go(world, on_view):
     plan, simulator = world
-    return explore(simulator, policy, budget=plan.budget, config=plan.config, on_step=on_step)
+    return explore(simulator, plan.policy, budget=plan.budget, config=plan.config, on_view=on_view)
 
 
 def test_a_watched_run_is_the_run_that_nobody_watched(run, world, server):
     plan, simulator = world
     words = {"title": "live", "subtitle": "here"}
     with open_live(server, simulator.camera, simulator.bounds, plan.config, **words) as feed:
-        result = go(world, feed.watch(plan.policy), feed.on_step)
+        result = go(world, feed.on_view)
     assert [row.sha256 for row in result.rows] == [row.sha256 for row in run.rows]
     for mine, recorded in zip(result.rows, run.rows, strict=True):
         assert mine.coverage == recorded.coverage
@@ -58,7 +57,7 @@ def test_the_page_ends_with_the_last_view_and_its_map(run, world, server):
     plan, simulator = world
     words = {"title": "live", "subtitle": "here"}
     with open_live(server, simulator.camera, simulator.bounds, plan.config, **words) as feed:
-        result = go(world, feed.watch(plan.policy), feed.on_step)
+        result = go(world, feed.on_view)
         feed.settle(PATIENCE)
         app = feed.app
         assert len(app.story.rows) == VIEWS
@@ -81,31 +80,21 @@ def test_the_loop_does_not_wait_for_the_page(world, server, monkeypatch):
     gate, stuck = threading.Event(), threading.Event()
     add = LiveStory.add
 
-    def slow_add(self, view):
+    def slow_add(self, view, planner):
         stuck.set()
         assert gate.wait(PATIENCE)
-        add(self, view)
+        add(self, view, planner)
 
     monkeypatch.setattr(LiveStory, "add", slow_add)
     words = {"title": "live", "subtitle": "here"}
     with open_live(server, simulator.camera, simulator.bounds, plan.config, **words) as feed:
-        result = go(world, feed.watch(plan.policy), feed.on_step)
+        result = go(world, feed.on_view)
         assert len(result.rows) == VIEWS  # the run is over, and the page has shown nothing yet
         assert stuck.wait(PATIENCE)
         assert len(feed.app.story.rows) == 0
         gate.set()
         feed.settle(PATIENCE)
         assert len(feed.app.story.rows) == VIEWS
-
-
-def test_a_watched_policy_answers_what_the_policy_answers(world):
-    plan, _ = world
-    seen = []
-    watched = WatchedPolicy(plan.policy, lambda decision, grid: seen.append(decision))
-    assert watched.name == plan.policy.name
-    plain, result = go(world, plan.policy), go(world, watched)
-    assert [r.sha256 for r in result.rows] == [r.sha256 for r in plain.rows]
-    assert len(seen) == VIEWS - 1 or len(seen) == VIEWS  # the last one may be beyond the budget
 
 
 def test_the_command_writes_the_same_bytes_live_and_goes_on_live(run, tmp_path, capsys):
