@@ -256,6 +256,7 @@ def loop_of_options(options: ExploreOptions) -> ExplorationConfig:
         gaze=options.gaze,
         exposure=options.exposure,
         blur=options.blur,
+        plan_while_moving=options.plan_while_moving,
     )
     if config.allow_growth and config.capacity < LEAST_CAPACITY:
         config = dataclasses.replace(config, capacity=LEAST_CAPACITY)

@@ -24,6 +24,8 @@ T = TypeVar("T")
 _STAGES = {
     "forecast": "forecasting the quality",
     "plan": "planning",
+    "plan ahead": "planning the view after",
+    "gaze": "finding where to look on the way",
     "render": "rendering",
     "map": "mapping",
     "measure": "measuring coverage",

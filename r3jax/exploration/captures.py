@@ -100,6 +100,9 @@ class Leg:
     directions: np.ndarray | None = None
     """Of the frames on the way if they are planned together, [n - 1, 2] [rad]."""
 
+    hidden: float = 0.0
+    """Planning of the decision that the flight before it hid [s]."""
+
     @property
     def is_last(self) -> bool:
         """True if the next frame is the chosen view."""

@@ -42,10 +42,17 @@ class ModelClock:
     """Charges a fixed cost per stage, so that the same run twice is the same run."""
 
     costs: dict[str, float] = field(
-        default_factory=lambda: {"planning": 0.3, "mapping": 0.02, "gaze": 0.01, "gaze plan": 0.1}
+        default_factory=lambda: {
+            "planning": 0.3,
+            "reconsidering": 0.05,
+            "mapping": 0.02,
+            "gaze": 0.01,
+            "gaze plan": 0.1,
+        }
     )
-    """Seconds per call, by stage; `gaze` per frame that is captured on the way, `gaze plan` per
-    frame of a path whose directions are planned together."""
+    """Seconds per call, by stage; `reconsidering` a decision that was made on the way, `gaze` per
+    frame that is captured on the way, `gaze plan` per frame of a path whose directions are planned
+    together."""
 
     measures: bool = False
 

@@ -81,6 +81,10 @@ class ExplorationConfig(MappingConfig):
     blur: float = 1.0
     """Pixels by which a turning camera may move the image meanwhile, in its middle [px]."""
 
+    plan_while_moving: bool = False
+    """Whether the next decision is made during the flight, on the map as it will be, and only
+    reconsidered on arrival. The mission clock is charged for what the flight does not hide."""
+
     @property
     def captures(self) -> bool:
         """True if frames are captured on the way."""

@@ -16,11 +16,11 @@ from r3jax.trace.checkpoints import Tables, map_tables
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
-_APART = ("planner", "leg")
+_APART = ("planner", "leg", "planned")
 
 _LOOP = tuple(field.name for field in fields(LoopState) if field.name not in _APART)
-"""Fields of the state in the table `loop`; what the planner holds has tables of its own, and a leg
-is decided again."""
+"""Fields of the state in the table `loop`; what the planner holds has tables of its own, and what
+is under way is decided again."""
 
 _LATER = {"captured": np.asarray(0)}
 """Fields that came after the first checkpoints, as they were then."""
@@ -75,7 +75,8 @@ def continued(run: Run, mission: Mission, start: LoopState, *, decided_from: int
     Raises:
         RunError: a frame that is needed is missing, broken, or not the one that was recorded.
     """
-    state = _newest(run, start)
+    # A decision that began before the checkpoint's view is not in it: all is lived through again.
+    state = start if mission.config.plan_while_moving else _newest(run, start)
     for row in run.rows[state.views :]:
         mission.on_stage("map")
         decides = row.step >= decided_from

@@ -51,6 +51,25 @@ class StopReason(enum.Enum):
 
 
 @dataclass(frozen=True)
+class PlannedAhead:
+    """A decision that is made while the camera flies, for when it arrives."""
+
+    decision: Decision
+    """Of the policy, on the map as it was expected to be."""
+
+    charge: float
+    """What it takes on the mission clock [s]."""
+
+    flight: float
+    """How long the camera flies meanwhile [s]."""
+
+    @property
+    def hidden(self) -> float:
+        """Part of the charge that the flight hides [s]."""
+        return min(self.charge, self.flight)
+
+
+@dataclass(frozen=True)
 class LoopState:
     """Everything that the next step depends on."""
 
@@ -80,6 +99,9 @@ class LoopState:
 
     leg: Leg | None = None
     """The path under way; None where a decision comes next."""
+
+    planned: PlannedAhead | None = None
+    """The decision that comes next, as far as it was made on the way."""
 
     @property
     def chosen(self) -> int:

@@ -23,11 +23,26 @@ from r3jax.exploration.captures import (
 )
 from r3jax.exploration.clock import timed
 from r3jax.exploration.coverage import measure_coverage, view_renderability
-from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, TakenView
+from r3jax.exploration.state import (
+    LoopState,
+    Mission,
+    PlannedAhead,
+    Stop,
+    StopReason,
+    TakenView,
+)
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import angle_between
 from r3jax.mapping.occupancy import MAX_CELLS
-from r3jax.planning.planner import Planner, decide, follow, observe, start
+from r3jax.planning.planner import (
+    Planner,
+    decide,
+    decide_ahead,
+    follow,
+    observe,
+    reconsider,
+    start,
+)
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import motion_of
@@ -145,19 +160,80 @@ def step(
         stop = _good_enough(state, mission)
     if stop is not None:
         return state, stop
+    chosen = _choose(state, mission)
+    if chosen.decision is None:
+        return replace(state, planner=chosen.planner), _no_decision(state, mission, chosen.info)
+    leg = begin_leg(chosen.decision, chosen.info, state.T_world_camera, mission.rules)
+    leg = replace(leg, hidden=chosen.hidden)
+    state = replace(state, planner=chosen.planner, planned=None)
+    if mission.config.plan_while_moving:
+        state, seconds = _plan_ahead(state, mission, leg)
+        chosen.stages["plan ahead"] = seconds
+    return _next_frame(state, mission, leg, chosen.stages, {"planning": chosen.charge} | charged)
+
+
+class _Chosen(NamedTuple):
+    """A decision, and what it takes."""
+
+    decision: Decision | None
+    planner: Planner
+    info: PlanInfo
+    charge: float
+    """Seconds on the mission clock."""
+    hidden: float
+    """Seconds that the flight before hid."""
+    stages: dict[str, float]
+    """Seconds that it really took."""
+
+
+def _choose(state: LoopState, mission: Mission) -> _Chosen:
+    """Decides where to go; what was decided on the way is only reconsidered, if it still holds."""
     mission.on_stage("plan")
+    clock, planned = mission.clock, state.planned
     # By the number of the view, so that a resumed run draws what it would have drawn.
     key = jax.random.fold_in(mission.key, state.views)
+    here, charge, hidden, stages = state.T_world_camera, 0.0, 0.0, dict[str, float]()
+    if planned is not None:
+        (decision, planner, info), measured = timed(
+            reconsider, state.planner, here, planned.decision, key, repeat_compiled=clock.measures
+        )
+        hidden = planned.hidden
+        charge = planned.charge - hidden + clock.charge("reconsidering", measured)
+        stages = {"reconsider": measured}
+        if decision is not None:
+            return _Chosen(decision, planner, info, charge, hidden, stages)
     (decision, planner, info), measured = timed(
-        decide, state.planner, state.T_world_camera, key, repeat_compiled=mission.clock.measures
+        decide, state.planner, here, key, repeat_compiled=clock.measures
     )
-    stages = {"plan": measured} | {f"plan.{k}": v for k, v in info.stage_seconds.items()}
-    state = replace(state, planner=planner)
+    stages |= {"plan": measured} | {f"plan.{k}": v for k, v in info.stage_seconds.items()}
+    charge += clock.charge("planning", measured)
+    return _Chosen(decision, planner, info, charge, hidden, stages)
+
+
+def _plan_ahead(state: LoopState, mission: Mission, leg: Leg) -> tuple[LoopState, float]:
+    """The state with the decision for when the camera has flown a path, and the seconds it took.
+
+    The decision takes the view at the end of the path as taken, and nothing of those on the way:
+    where the camera looks there is found on the way.
+    """
+    mission.on_stage("plan ahead")
+    rules, clock = mission.rules, mission.clock
+    key = jax.random.fold_in(mission.key, state.views + len(leg.places))
+    target = leg.decision.T_world_camera
+    (decision, planner, _), measured = timed(
+        decide_ahead,
+        state.planner,
+        rules.camera,
+        target,
+        key,
+        rules.scoring,
+        repeat_compiled=clock.measures,
+    )
     if decision is None:
-        return state, _no_decision(state, mission, info)
-    planning = mission.clock.charge("planning", measured)
-    leg = begin_leg(decision, info, state.T_world_camera, mission.rules)
-    return _next_frame(state, mission, leg, stages, {"planning": planning} | charged)
+        return state, measured
+    charge = clock.charge("planning", measured)
+    planned = PlannedAhead(decision, charge, float(leg.seconds.sum()))
+    return replace(state, planner=planner, planned=planned), measured
 
 
 def _next_frame(
@@ -337,6 +413,7 @@ def _look(
         charged=charged,
         coverage=coverage,
         captured=shot.captured,
+        hidden=0.0 if shot.leg is None or shot.leg.taken else shot.leg.hidden,
     )
     stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
     return state, TakenView(row, frame, stages, shot.decision)
@@ -362,14 +439,15 @@ def relive(
     leg, decision = state.leg, None
     if row.choice is not None:
         if decides:
-            # Of the state only its memory is used: the row knows pose and seconds, and a decision
-            # timed again would put other seconds on the mission clock.
-            key = jax.random.fold_in(mission.key, state.views)
-            decision, planner, info = decide(state.planner, state.T_world_camera, key)
-            leg = _leg_again(state, mission, decision, info) if row.captured else None
+            # Of the decision only its memory is used: the row knows pose and seconds, and one
+            # that is timed again would put other seconds on the mission clock.
+            chosen = _choose(state, mission)
+            decision = chosen.decision
+            state = replace(state, planner=chosen.planner, planned=None)
+            state, leg = _leg_again(state, mission, chosen)
         else:
-            planner, leg = follow(state.planner, state.T_world_camera, row.choice.waypoints), None
-        state = replace(state, planner=planner)
+            planner = follow(state.planner, state.T_world_camera, row.choice.waypoints)
+            state, leg = replace(state, planner=planner, planned=None), None
     planner = _observe(state.planner, frame, mission.rules, captured=row.captured)
     length, metres = row.metres - state.metres, row.metres
     if row.choice is not None and not row.captured:  # a whole path
@@ -381,14 +459,14 @@ def relive(
     return replace(state, metres=metres, leg=leg), decision
 
 
-def _leg_again(
-    state: LoopState, mission: Mission, decision: Decision | None, info: PlanInfo
-) -> Leg | None:
-    """The path of a decision that was made again, before its first frame."""
-    if decision is None:
-        return None
-    leg = begin_leg(decision, info, state.T_world_camera, mission.rules)
-    return with_plan(leg, state.planner, mission.rules)
+def _leg_again(state: LoopState, mission: Mission, chosen: _Chosen) -> tuple[LoopState, Leg | None]:
+    """The path of a decision that was made again, and what was decided on that path."""
+    if chosen.decision is None:
+        return state, None
+    leg = begin_leg(chosen.decision, chosen.info, state.T_world_camera, mission.rules)
+    if mission.config.plan_while_moving:
+        state, _ = _plan_ahead(state, mission, leg)
+    return state, with_plan(leg, state.planner, mission.rules)
 
 
 def _observe(planner: Planner, frame: Frame, rules: Rules, *, captured: bool) -> Planner:

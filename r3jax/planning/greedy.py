@@ -42,6 +42,9 @@ from r3jax.planning.robot.travel import Travel
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.pixels import Value, score_pixels
 
+RECONSIDERED = 8
+"""Candidates of an earlier decision that are scored again."""
+
 
 @dataclass(frozen=True)
 class Drawn:
@@ -79,6 +82,9 @@ class GreedyPolicy(ABC):
     climbs: ClassVar[bool] = False
     """True where `utility` is that of `scoring.utility`, and `total` the net of it: `decide` then
     refines the best candidates if the settings ask for it."""
+
+    scores_by_notes: ClassVar[bool] = False
+    """True where scores need what drawing noted: `reconsider` keeps their order then."""
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
         """What the policy keeps beside the map, before the first frame: nothing."""
@@ -130,6 +136,79 @@ class GreedyPolicy(ABC):
         key: Array,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
         """The candidate with the greatest total, of those that the carrier may take."""
+        draw = lambda situation, key: self.draw(situation, key=key)
+        return self._choose(state, map_state, grid, T_world_camera, draw, key=key)
+
+    def reconsider(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        planned: Decision,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
+        """Decides again, among the best candidates of a decision that was made on less.
+
+        Args:
+            state: what the policy remembers.
+            map_state: the map as it has come out.
+            grid: the grid as it has come out.
+            T_world_camera: where the latest view was taken.
+            planned: the decision, with its candidates.
+            key: randomness of this decision.
+
+        Returns:
+            As `decide`; None if no path leads to any of them.
+        """
+        finite = np.isfinite(planned.utilities["path"])
+        total = np.where(finite, planned.utilities["total"], -np.inf)
+        best = np.argsort(-total, kind="stable")[:RECONSIDERED]
+        poses = planned.candidates[best]
+        # One shape whatever was on offer, so that it compiles once.
+        views = candidates_along(poses[:, :3, 3], poses[:, :3, 2]).padded(RECONSIDERED)
+        if self.scores_by_notes:
+            order = np.resize(total[best], RECONSIDERED)
+            return self._first_in_reach(state, map_state, grid, T_world_camera, views, order)
+        draw = lambda situation, key: Drawn(views, situation.memory)
+        return self._choose(state, map_state, grid, T_world_camera, draw, key=key)
+
+    def _first_in_reach(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        views: Candidates,
+        total: np.ndarray,
+    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
+        """The view of the greatest `total` [C] that a path leads to now."""
+        stopwatch = Stopwatch()
+        with stopwatch.part("travel"):
+            state, travel, _ = prepare_decision(state, map_state, grid, T_world_camera, self.config)
+            pose = np.asarray(T_world_camera, dtype=np.float64)
+            limits = Limits(self.config.motion, pose, travel.heights)
+            views = limits.project_to_feasible(views)
+            path = limits.path_costs(path_lengths(travel, views), views.direction)
+        if not np.isfinite(path).any():
+            decision, info = no_decision(travel, self.config, stopwatch)
+            return decision, state, info
+        utilities = {"total": total, "path": path}
+        _, decision, state, info = select_best(state, travel, views, utilities, limits, stopwatch)
+        return decision, state, info
+
+    def _choose(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        draw: Callable[[Situation, Array], Drawn],
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
+        """The best of the views that `draw` offers in a situation."""
         stopwatch = Stopwatch()
         # Two keys: a policy that draws more must not change the lots of its scores.
         draw_key, score_key = jax.random.split(key)
@@ -144,7 +223,7 @@ class GreedyPolicy(ABC):
             situation = Situation(
                 map_state, grid, masked, travel, state.camera, state.memory, limits
             )
-            drawn = self.draw(situation, key=draw_key)
+            drawn = draw(situation, draw_key)
             # No view on offer is an outcome, not an error: the loop ends with the reason.
             if not drawn.candidates.valid.any():
                 decision, info = no_decision(travel, self.config, stopwatch)
@@ -162,6 +241,10 @@ class GreedyPolicy(ABC):
             # After the projection, which may change heights: the ways lead to views on offer.
             lengths = path_lengths(travel, candidates)
             path = limits.path_costs(lengths, candidates.direction)
+            # What was drawn is within reach; what was drawn before the last view may not be.
+            if not np.isfinite(path).any():
+                decision, info = no_decision(travel, self.config, stopwatch)
+                return decision, replace(state, memory=situation.memory), info
             utilities = utilities | {"path": path}
         if self.climbs and self.config.refine:
             with stopwatch.part("refining"):

@@ -26,8 +26,11 @@ from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
-from r3jax.planning.policy import Decision, PlanInfo, Policy
+from r3jax.planning.decision import PlannerState
+from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PlansAhead, Policy
 from r3jax.planning.registry import make_policy
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.simulated import imagine_view
 
 _integrate_depth = jax.jit(integrate_depth)
 _mark_free_ball = jax.jit(mark_free_ball)
@@ -124,6 +127,56 @@ def decide(
         planner.policy_state, planner.map_state, planner.grid, pose, key=key
     )
     return decision, replace(planner, policy_state=policy_state), info
+
+
+def decide_ahead(
+    planner: Planner, camera: Camera, T_next: np.ndarray, key: Array, scoring: ScoringConfig
+) -> tuple[Decision | None, Planner, PlanInfo]:
+    """Decides on the view after the next one, on the map as that one is expected to leave it.
+
+    Args:
+        planner: what is known while the camera is on its way.
+        camera: of the view that it is on its way to.
+        T_next: pose of that view, [4, 4].
+        key: randomness of this decision.
+        scoring: range and size of the depth buffer of the imagined view.
+
+    Returns:
+        As `decide`; None also for a policy that cannot `reconsider`. Of the policy's memory only
+        what drawing and choosing noted: the way has not been flown, and nothing was looked at.
+    """
+    if not isinstance(planner.policy, PlansAhead):
+        return None, planner, PlanInfo(DecisionOutcome.NO_CANDIDATE)
+    pose = jnp.asarray(T_next, dtype=jnp.float32)
+    map_state, grid = imagine_view(planner.map_state, planner.grid, camera, pose, scoring)
+    decision, state, info = planner.policy.decide(
+        planner.policy_state, map_state, grid, np.asarray(T_next, np.float64), key=key
+    )
+    if isinstance(planner.policy_state, PlannerState):
+        state = replace(planner.policy_state, memory=state.memory)
+    return decision, replace(planner, policy_state=state), info
+
+
+def reconsider(
+    planner: Planner, T_world_camera: np.ndarray, planned: Decision, key: Array
+) -> tuple[Decision | None, Planner, PlanInfo]:
+    """Decides again among the best candidates of `decide_ahead`, on what has come in since.
+
+    Args:
+        planner: what is known now.
+        T_world_camera: where the camera has arrived, [4, 4].
+        planned: what `decide_ahead` decided.
+        key: randomness of this decision.
+
+    Returns:
+        As `decide`; None if no path leads to any of these candidates.
+    """
+    policy = planner.policy
+    assert isinstance(policy, PlansAhead)  # or `decide_ahead` had decided nothing
+    decision, state, info = policy.reconsider(
+        planner.policy_state, planner.map_state, planner.grid, T_world_camera, planned, key=key
+    )
+    return decision, replace(planner, policy_state=state), info
 
 
 def tell_policy(planner: Planner, frame: Frame) -> Planner:

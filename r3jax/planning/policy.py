@@ -141,3 +141,24 @@ class Policy(Protocol):
             waypoints: the way to the next one, [K, 3] [m].
         """
         ...
+
+
+@runtime_checkable
+class PlansAhead(Policy, Protocol):
+    """A policy whose decisions can begin before the camera has arrived."""
+
+    def reconsider(
+        self,
+        state: Any,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        planned: Decision,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, Any, PlanInfo]:
+        """Decides again among the best candidates of a decision, on what has come in since.
+
+        None: no path leads to any of them, and the policy is asked to decide anew.
+        """
+        ...

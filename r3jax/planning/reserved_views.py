@@ -25,8 +25,7 @@ from r3jax.mapping.occupancy import OccupancyGrid, frontier_unexplored, squared_
 from r3jax.mapping.state import MapState
 from r3jax.planning.policy import Decision, PlanInfo, Policy
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.simulated import simulate_view
-from r3jax.scoring.utility import visible_unexplored
+from r3jax.scoring.simulated import imagine_view
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class ReservedViews:
         # One after the other: what the first promises to show, the second cannot promise again.
         for view in self.promised:
             pose = jnp.asarray(view.T_world_camera, dtype=jnp.float32)
-            map_state, grid = after_promise(map_state, grid, view.camera, pose, self.scoring)
+            map_state, grid = imagine_view(map_state, grid, view.camera, pose, self.scoring)
         others = jnp.asarray([view.T_world_camera[:3, 3] for view in self.promised], jnp.float32)
         here = jnp.asarray(T_world_camera[:3, 3], dtype=jnp.float32)
         # After the promises, so that "nothing left" counts what they leave.
@@ -94,30 +93,6 @@ class ReservedViews:
     ) -> Any:
         """As the policy does."""
         return self.policy.follow(state, map_state, grid, T_world_camera, waypoints)
-
-
-@jax.jit
-def after_promise(
-    map_state: MapState,
-    grid: OccupancyGrid,
-    camera: Camera,
-    T_world_camera: Float[Array, "4 4"],
-    scoring: ScoringConfig,
-) -> tuple[MapState, OccupancyGrid]:
-    """Map and grid for a decision that takes a view as taken.
-
-    The unexplored cells that the view would show are not worth a look.
-
-    Args:
-        map_state: the map.
-        grid: the coarse grid.
-        camera: of the promised view.
-        T_world_camera: its pose.
-        scoring: range and size of the depth buffer.
-    """
-    shown = visible_unexplored(map_state, grid, camera, T_world_camera, scoring)
-    after, _ = simulate_view(map_state, camera, T_world_camera, scoring)
-    return after, grid.ignoring(shown)
 
 
 @jax.jit

@@ -20,10 +20,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.seen import mark_rows
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells, visible_cells
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.utility import visible_unexplored
 from r3jax.visibility.depth_buffer import seen_in
 from r3jax.visibility.selection import Selection
 from r3jax.visibility.views import pinhole_view
@@ -49,6 +51,30 @@ def simulate_view(
     """
     _, visible = seen_in(state, pinhole_view(camera, T_world_camera, config), config)
     return observed(state, visible, T_world_camera[:3, 3], camera.focal), visible.mask
+
+
+@jax.jit
+def imagine_view(
+    map_state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+) -> tuple[MapState, OccupancyGrid]:
+    """Map and grid for a decision that takes a view as taken.
+
+    The unexplored cells that the view would show are not worth a look.
+
+    Args:
+        map_state: the map before.
+        grid: the coarse grid before.
+        camera: of the view.
+        T_world_camera: pose of the view.
+        config: range and size of the depth buffer.
+    """
+    shown = visible_unexplored(map_state, grid, camera, T_world_camera, config)
+    after, _ = simulate_view(map_state, camera, T_world_camera, config)
+    return after, grid.ignoring(shown)
 
 
 @jax.jit

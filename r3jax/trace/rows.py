@@ -110,6 +110,9 @@ class StepRow:
     captured: bool = False
     """True if the frame was captured on the way to a view, and not chosen itself."""
 
+    hidden: float = 0.0
+    """Planning of this row's decision that the flight before it hid: not on the clock [s]."""
+
 
 @dataclass(frozen=True)
 class EndRow:
@@ -167,6 +170,8 @@ def to_json(row: StepRow | EndRow) -> str:
     plain = {"kind": kind, **dataclasses.asdict(row, dict_factory=_plain_dict)}
     if not plain.get("captured", True):
         del plain["captured"]  # as rows were before there were captures
+    if not plain.get("hidden", True):
+        del plain["hidden"]  # nor was there planning on the way
     # No blanks and a fixed order: under the model clock equal runs are equal bytes.
     return json.dumps(sealed(plain), allow_nan=False, separators=(",", ":"))
 

@@ -21,7 +21,7 @@ from tests.scoring.test_simulated import CAMERA, CONFIG, poses_of, seen_map
 
 pytestmark = pytest.mark.full
 
-CHAIN = ("r3jax.planning.reserved_views",)
+CHAIN = ("r3jax.scoring.simulated", "r3jax.planning.reserved_views")
 WORLD = OccupancyGrid(
     log_odds=jnp.zeros((20, 20, 16)).at[3:8].set(-3.0),
     origin=jnp.asarray([-1.0, -2.0, -1.6]),
@@ -83,7 +83,7 @@ def law_left(modules: Modules) -> None:
 def law_promise(modules: Modules) -> None:
     """The same view explores nothing any more; the map is the foreseen one, and nothing else."""
     state, (pose, _) = seen_map(), poses_of(3)
-    after, dark = modules["reserved_views"].after_promise(state, WORLD, CAMERA, pose, CONFIG)
+    after, dark = modules["simulated"].imagine_view(state, WORLD, CAMERA, pose, CONFIG)
     first = view_utility(state, WORLD, CAMERA, pose, CONFIG)
     again = view_utility(after, dark, CAMERA, pose, CONFIG)
     assert first.exploration > 100.0
@@ -124,7 +124,7 @@ def law_decision(modules: Modules) -> None:
     np.testing.assert_array_equal(T, pose)
     after, dark = state, WORLD
     for view in poses:
-        after, dark = promised.after_promise(after, dark, CAMERA, view, CONFIG)
+        after, dark = modules["simulated"].imagine_view(after, dark, CAMERA, view, CONFIG)
     others = jnp.stack([view[:3, 3] for view in poses])
     left = promised.without_yielded(dark, jnp.asarray(pose[:3, 3], jnp.float32), others)
     np.testing.assert_array_equal(map_state.visited, after.visited)
@@ -147,9 +147,9 @@ MUTANTS = [
     Mutant("reserved_views", "nearest < squared", "nearest > squared", law_yielded),
     Mutant("reserved_views", "is_yielded & is_left", "is_yielded", law_left),
     Mutant("reserved_views", "(grid.ignoring(is_yielded)))", "(grid))", law_left),
-    Mutant("reserved_views", "after, _ = simulate_view(",
+    Mutant("simulated", "after, _ = simulate_view(",
            "after = map_state; simulate_view(", law_promise),
-    Mutant("reserved_views", "after, grid.ignoring(shown)", "after, grid", law_promise),
+    Mutant("simulated", "after, grid.ignoring(shown)", "after, grid", law_promise),
     Mutant("reserved_views", "(T_world_camera[:3, 3]", "(T_world_camera[:3, 2]", law_decision),
     Mutant("reserved_views", "in self.promised:", "in self.promised[:1]:", law_decision),
 ]  # fmt: skip

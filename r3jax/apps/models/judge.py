@@ -198,10 +198,13 @@ def _sheet(judgment: Judgment, worst: int):
     place = {row.view: i for i, row in enumerate(rows)}
     lines: list[SheetView] = []
     for row in worst_rows(rows, worst):
-        i, expected = place[row.view], None
+        i, expected, beyond = place[row.view], None, None
         if judgment.state is not None:
-            expected = expected_image(judgment.state, judgment.test.capture.source.frame(row.view))
-        lines.append(SheetView(row, np.asarray(judgment.views.rgb[i]), renders[i], expected))
+            frame = judgment.test.capture.source.frame(row.view)
+            expected = expected_image(judgment.state, frame)
+            beyond = np.isinf(np.asarray(frame.depth))
+        truth = np.asarray(judgment.views.rgb[i])
+        lines.append(SheetView(row, truth, renders[i], expected, beyond))
     psnr = judgment.summaries[0]
     title = (
         f"The worst {len(lines)} of {judgment.described}\n"

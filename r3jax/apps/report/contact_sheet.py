@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from r3jax.apps.report import style
+from r3jax.apps.report.pictures import BEYOND
 from r3jax.evaluation.scores import ViewRow
 
 ERROR_SCALE = 0.3
@@ -19,7 +20,7 @@ _ERROR_MAP = "magma"
 _NOTHING = "#d1d5db"
 _SCALES = {
     "error": f"mean |error| over RGB, saturates at {ERROR_SCALE:g}",
-    "renderability": "R of the voxel seen (gray: none known)",
+    "renderability": "R of the voxel seen (gray: never seen, blue: out of range)",
 }
 _MARGIN, _LINE, _HEADING, _CAPTION, _CELL, _GAP, _BAR, _BAR_TEXT = (
     0.1, 0.2, 0.25, 0.95, 2.1, 0.06, 0.07, 0.4
@@ -43,6 +44,10 @@ class SheetView:
 
     renderability: np.ndarray | None = None
     """R of what each pixel sees, [h, w] in [0, 1] of any resolution; None without a map."""
+
+    beyond: np.ndarray | None = None
+    """True where the sensor found nothing within its range, [H, W] of any resolution; None: not
+    known."""
 
 
 def error_picture(truth: np.ndarray, render: np.ndarray) -> np.ndarray:
@@ -112,18 +117,27 @@ def _draw_line(axes: list[Axes], view: SheetView) -> list[AxesImage]:
     ]
     if len(axes) == 3:
         return pictures
+    return [*pictures, _draw_renderability(axes[3], view)]
+
+
+def _draw_renderability(axes: Axes, view: SheetView) -> AxesImage:
+    """Draws R of a view over what lies beyond the sensor's range, and over what was never seen."""
     height, width = view.truth.shape[:2]
+    whole = (0, width, height, 0)
+    axes.set_facecolor(_NOTHING)
+    if view.beyond is not None:
+        blue = np.zeros((*view.beyond.shape, 4))
+        blue[view.beyond] = (*BEYOND, 1.0)
+        axes.imshow(blue, interpolation="nearest", extent=whole)
     known = np.zeros((1, 1)) if view.renderability is None else view.renderability
-    expected = axes[3].imshow(
+    return axes.imshow(
         np.where(known > 0.0, known, np.nan),
         cmap=style.SCORE_MAP,
         vmin=0.0,
         vmax=1.0,
         interpolation="nearest",
-        extent=(0, width, height, 0),
+        extent=whole,
     )
-    axes[3].set_facecolor(_NOTHING)
-    return [*pictures, expected]
 
 
 def _caption(row: ViewRow) -> str:

@@ -11,6 +11,9 @@ STAGES = {
     "plan.candidates": "– candidates",
     "plan.travel": "– travel",
     "plan.scoring": "– scoring",
+    "plan ahead": "planning on the way",
+    "reconsider": "reconsidering on arrival",
+    "gaze": "gaze on the way",
     "map": "mapping",
     "map.voxels": "mapping: voxels",
     "map.grid": "mapping: grid",
@@ -22,7 +25,16 @@ STAGES = {
 """Stages of timings.jsonl in the order of a table, and how a reader calls them; older runs have
 mapping in three parts."""
 
-ON_CLOCK = ("plan", "map", "map.voxels", "map.grid", "map.policy")
+ON_CLOCK = (
+    "plan",
+    "plan ahead",
+    "reconsider",
+    "gaze",
+    "map",
+    "map.voxels",
+    "map.grid",
+    "map.policy",
+)
 """Stages that the mission clock charges (beside the flight)."""
 
 

@@ -36,6 +36,9 @@ from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import BenchmarkOptions
 from r3jax.evaluation.comparison import snapshots_of
 
+_LOOP = ("capture_every", "capture_rate", "gaze", "plan_while_moving")
+"""Options that are settings of the loop."""
+
 
 def run_benchmark(options: BenchmarkOptions) -> int:
     """Runs what is left of a benchmark and prints its table.
@@ -89,7 +92,7 @@ def _request(options: BenchmarkOptions) -> Request:
         capacity=options.capacity,
         backend=options.backend,
         lpips=options.lpips,
-        loop={name: getattr(options, name) for name in ("capture_every", "capture_rate", "gaze")},
+        loop={name: getattr(options, name) for name in _LOOP},
     )
     conditions.exploration_config().check_scales()
     return Request(

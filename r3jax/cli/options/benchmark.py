@@ -25,6 +25,9 @@ class ExplorationOptions:
     gaze: Literal["ahead", "blend", "panorama", "planned"] = "panorama"
     """Where the camera looks on the way, as `r3jax explore --help` tells."""
 
+    plan_while_moving: bool = False
+    """All policies decide on the next view during the flight."""
+
     resolution: int = 256
     """Width and height of the explored images [px]."""
 

@@ -122,6 +122,10 @@ class CaptureOptions:
     blur: float = 1.0
     """So many pixels the image may move meanwhile by turning [px]."""
 
+    plan_while_moving: bool = False
+    """Decide on the next view during the flight, on the map as it will be, and only reconsider on
+    arrival: the clock is charged for what the flight does not hide."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class GrowthOptions(MapOptions):

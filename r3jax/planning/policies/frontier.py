@@ -43,6 +43,7 @@ class Frontier(GreedyPolicy):
     """The nearest view of a frontier cell by path length; random views when none is left."""
 
     name = "frontier"
+    scores_by_notes = True
     source = "Yamauchi, CIRA 1997: the nearest frontier"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> np.ndarray:

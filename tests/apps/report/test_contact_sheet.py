@@ -1,5 +1,6 @@
 """The contact sheet: the right pictures in the right places, numbers of their own view."""
 
+import dataclasses
 import io
 
 import numpy as np
@@ -8,6 +9,7 @@ from PIL import Image
 
 from r3jax.apps.report import style
 from r3jax.apps.report.contact_sheet import ERROR_SCALE, SheetView, contact_sheet, error_picture
+from r3jax.apps.report.pictures import BEYOND
 from tests.evaluation.test_scores import row
 
 HEIGHT, WIDTH = 6, 8
@@ -50,6 +52,20 @@ def test_every_line_shows_its_view():
         np.testing.assert_array_equal(render, view.render)
         np.testing.assert_allclose(error, error_picture(view.truth, view.render))
         np.testing.assert_allclose(expected, view.renderability)
+
+
+def test_what_is_out_of_range_is_told_apart_from_what_was_never_seen():
+    view = sheet_view(2)
+    known, beyond = np.array(view.renderability), np.zeros((HEIGHT, WIDTH), bool)
+    known[0], beyond[:2, : WIDTH // 2] = 0.0, True
+    view = dataclasses.replace(view, renderability=known, beyond=beyond)
+    axes = [axes for axes in contact_sheet([view], "title").axes if len(axes.images) == 2]
+    (axes,) = axes
+    blue, values = (np.asarray(image.get_array()) for image in axes.images)
+    np.testing.assert_array_equal(blue[..., 3] == 1.0, beyond)
+    np.testing.assert_allclose(blue[beyond][:, :3], np.broadcast_to(BEYOND, (beyond.sum(), 3)))
+    assert np.isnan(values.astype(float).filled(np.nan)[0]).all()
+    assert axes.get_facecolor()[:3] != BEYOND
 
 
 def test_captions_and_scales_are_told():

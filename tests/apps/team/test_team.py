@@ -24,9 +24,10 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.state import empty_map
 from r3jax.planning.planner import add_frame, first_grid
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
-from r3jax.planning.reserved_views import after_promise, without_yielded
+from r3jax.planning.reserved_views import without_yielded
 from r3jax.scoring.batch import score_views
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.simulated import imagine_view
 from r3jax.trace.images import stored_form
 from tests.exploration.killed_run import CONFIG, SCORING, small_policy
 from tests.exploration.test_guard import Cheat
@@ -210,7 +211,7 @@ def law_nobody_knows_more_or_less(meet_every: float, seed: int = 1, team=real_te
             if under_way is not None and (begins[under_way[:2]], under_way[1]) < (now, number):
                 frame = under_way[2]
                 scoring = ScoringConfig(max_range=jnp.asarray(CONFIG.max_range, jnp.float32))
-                after, dark = after_promise(*expected, frame.camera, frame.T_world_camera, scoring)
+                after, dark = imagine_view(*expected, frame.camera, frame.T_world_camera, scoring)
                 here = np.asarray(rows[k - 1].pose)[:3, 3]
                 expected = after, without_yielded(dark, jnp.asarray(here), frame.position[None])
             assert_equal((map_state, grid), expected)

@@ -64,6 +64,7 @@ class ActiveGamer(GreedyPolicy):
     """Scores poses [C, 4, 4], as `score_pixels` does."""
 
     name = "active-gamer"
+    scores_by_notes = True
     source = "ActiveGAMER, Chen et al., CVPR 2025"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Pools:
