@@ -295,7 +295,7 @@ def _kill_at_random_moments(path, views, kills, span, rng):
     ("views", "kills", "span"),
     [
         (6, 1, 1.5),
-        pytest.param(12, 5, 1.5, marks=pytest.mark.full),
+        pytest.param(8, 3, 1.5, marks=pytest.mark.full),
         pytest.param(40, 30, 2.5, marks=pytest.mark.slow),
     ],
 )

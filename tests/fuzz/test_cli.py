@@ -37,7 +37,7 @@ from tests.trace.runs import make_header
 
 pytestmark = pytest.mark.full
 
-CASES = 300
+CASES = 120
 """In the normal suite."""
 
 COMMANDS = (

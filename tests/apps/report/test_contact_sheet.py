@@ -64,7 +64,7 @@ def test_what_is_out_of_range_is_told_apart_from_what_was_never_seen():
     blue, values = (np.asarray(image.get_array()) for image in axes.images)
     np.testing.assert_array_equal(blue[..., 3] == 1.0, beyond)
     np.testing.assert_allclose(blue[beyond][:, :3], np.broadcast_to(BEYOND, (beyond.sum(), 3)))
-    assert np.isnan(values.astype(float).filled(np.nan)[0]).all()
+    assert np.isnan(np.ma.filled(values.astype(float), np.nan)[0]).all()
     assert axes.get_facecolor()[:3] != BEYOND
 
 
