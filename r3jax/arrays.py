@@ -2,7 +2,7 @@
 
 DLPack is how PyTorch, CuPy, TensorFlow and others hand over memory without copying it
 (https://dmlc.github.io/dlpack). Everything is copied here all the same: a camera's driver writes
-the next picture into the buffer of the last one, and JAX arrays must never change.
+the next image into the buffer of the last one, and JAX arrays must never change.
 
 Shape symbols: H W image size.
 """

@@ -47,7 +47,7 @@ def _refuse_far(depth: ArrayLike) -> None:
     # A sample is enough: millimeters taken for meters are off by 1000, not by a few percent.
     rows, columns = (max(1, size // _LOOK) for size in array.shape)
     some = array[::rows, ::columns].astype(np.float64)
-    # 0 and inf are messages, not distances: a picture full of either must not move the median.
+    # 0 and inf are messages, not distances: an image full of either must not move the median.
     measured = some[(some > 0.0) & np.isfinite(some)]
     # The median, not the maximum: a few stray pixels are no reason to refuse a frame.
     if len(measured) and (median := float(np.median(measured))) > FAR:

@@ -50,7 +50,7 @@ _FARTHEST = 1e6
 """From the origin [m]; beyond that tenths of millimeters are no whole 64-bit numbers."""
 
 _LEAST_SEEN = 0.5
-"""A view with less surface than this share of the picture is left out."""
+"""A view with less surface than this share of the image is left out."""
 
 _SEED = 0
 """Seed of the choice among positions where `max_views` is given."""

@@ -26,7 +26,7 @@ class Budget:
     def spent_share(self, *, views: int, frames: int, seconds: float, metres: float) -> float:
         """Share of the budget that such a mission has used, in [0, 1]."""
         spent = {"views": views, "frames": frames, "seconds": seconds, "metres": metres}
-        # Mapping the last picture may exceed the budget: only its arrival has to lie within.
+        # Mapping the last image may exceed the budget: only its arrival has to lie within.
         return min(1.0, spent[self.unit] / self.amount)
 
     def __str__(self) -> str:

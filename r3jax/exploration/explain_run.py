@@ -22,7 +22,7 @@ from r3jax.exploration.replay import (
 )
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
-from r3jax.planning.decision import explain_way, initial_state
+from r3jax.planning.decision import explain_path, initial_state
 from r3jax.planning.gaze import count_look
 from r3jax.scoring.explain import Explanation
 from r3jax.trace.reader import Run
@@ -97,7 +97,7 @@ def explain_run(
             memory = memory or initial_state(run.camera, grid, motion=config.motion)
             choice = row.choice
             # The memory goes from view to view: cells that were given up count for nothing later.
-            memory, explanation = explain_way(
+            memory, explanation = explain_path(
                 memory, map_state, grid, pose, choice.pose, choice.waypoints, config
             )
             yield reason_of(explanation, grid)

@@ -1,4 +1,4 @@
-"""The loop's own way to a simulator: no picture but from where the camera has just arrived.
+"""The loop's own way to a simulator: no image but from where the camera has just arrived.
 
 A policy never gets a simulator. Should one find its way to the loop's all the same, it finds this
 one, whose `render` answers for the pose to which the loop has committed itself, once.
@@ -12,7 +12,7 @@ from r3jax.simulators.base import Simulator
 
 
 class OracleReadError(RuntimeError):
-    """A picture was asked for from where the camera is not."""
+    """An image was asked for from where the camera is not."""
 
 
 class GuardedSimulator:
@@ -23,14 +23,14 @@ class GuardedSimulator:
 
         Args:
             simulator: the world.
-            views: pictures of the run that were taken before, by a process that was killed.
+            views: images of the run that were taken before, by a process that was killed.
         """
         # In a closure: an attribute would hand the whole world to a policy that finds the guard.
         render = simulator.render
 
         def render_committed(T_world_camera: np.ndarray) -> Frame:
             self._check(T_world_camera)
-            # Spent before the world is asked: a picture that fails is not asked for again, either.
+            # Spent before the world is asked: an image that fails is not asked for again, either.
             self._pose = None
             self.views += 1
             return render(T_world_camera)
@@ -58,14 +58,14 @@ class GuardedSimulator:
         return self._start_pose.copy()
 
     def commit(self, view: int, T_world_camera: np.ndarray) -> None:
-        """The camera has arrived: the next picture is taken from here.
+        """The camera has arrived: the next image is taken from here.
 
         Args:
-            view: its number. Pictures are counted, so that none is taken behind the loop's back.
+            view: its number. Images are counted, so that none is taken behind the loop's back.
             T_world_camera: its pose, [4, 4].
 
         Raises:
-            OracleReadError: another number of pictures was taken so far.
+            OracleReadError: another number of images was taken so far.
         """
         if view != self.views:
             raise OracleReadError(

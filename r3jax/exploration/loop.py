@@ -53,7 +53,7 @@ def explore(
     """Explores an unknown scene until the budget is spent or no view is left.
 
     Args:
-        simulator: the world; all that is asked of it is the picture where the camera is.
+        simulator: the world; all that is asked of it is the image where the camera is.
         policy: chooses the views.
         budget: a limit, or its text such as `views:100`.
         seed: all randomness follows from it: step k uses `fold_in(key, k)`.
@@ -77,7 +77,7 @@ def explore(
         ValueError: a budget that is not understood, a start outside the scene's box, a goal in the
             config without an `is_enough` that judges it.
         RunError: a recorded frame that is needed to go on is missing or broken.
-        OracleReadError: something beside the loop asked the simulator for a picture.
+        OracleReadError: something beside the loop asked the simulator for an image.
     """
     config = config or ExplorationConfig()
     # run.json records the goal as text: a rule without it could not be repeated by a resume.
@@ -91,7 +91,7 @@ def explore(
     # Apart: how a policy starts must not change what it draws later.
     init_key, key = jax.random.split(jax.random.key(seed))
     mission = Mission(
-        # A resumed run reads its old pictures from the disk: the guard counts them as taken.
+        # A resumed run reads its old images from the disk: the guard counts them as taken.
         GuardedSimulator(simulator, views=0 if resume is None else len(resume.rows)),
         policy,
         budget,

@@ -1,6 +1,6 @@
 """One step of the loop: decide, fly, look, map. On the host, round jitted parts.
 
-A step takes one frame: the view that was chosen, or one on the way to it if the settings ask for
+A step takes one frame: the view that was chosen, or one on the path to it if the settings ask for
 captures; without them only the frame at the end of a path enters the map. What the simulator and
 the bookkeeping take is not on the mission clock.
 """
@@ -368,7 +368,7 @@ def _look(
     mission.on_stage("render")
     begin = time.perf_counter()
     pose = np.asarray(shot.T_world_camera, dtype=np.float64)
-    # Announced first, so that a picture that nobody chose is noticed.
+    # Announced first, so that an image that nobody chose is noticed.
     mission.simulator.commit(state.views, pose)
     # Rounded as it will be on disk before the map sees it: a replay integrates the same bits.
     frame = stored_form(mission.simulator.render(pose))
@@ -485,7 +485,7 @@ def _arrive(
     *,
     captured: bool,
 ) -> LoopState:
-    """One frame more: the pose is the frame's, and the totals count the way to it.
+    """One frame more: the pose is the frame's, and the totals count the path to it.
 
     The recorded pose (float32) is the pose from here on: a run read back goes on the same way.
     """

@@ -34,7 +34,7 @@ _KNOWN = (
 
 @dataclass(frozen=True)
 class Capture:
-    """Posed pictures on disk; with depth, unless they are posed images without."""
+    """Posed images on disk; with depth, unless they are posed images without."""
 
     path: Path
     source: Run | Recording | PosedImages

@@ -8,14 +8,14 @@ The model, per cell and frame (log-odds as in Active-GS, Jin et al. 2025):
     else    0, and the sum is clipped to +-4.5
 
 One look decides (a cell at 5 m gets 1.4 > ln 4). *Seen through* is asked of the centers of the
-cell's eight octants. Such a point passes if it lies in the picture, within range, and before
+cell's eight octants. Such a point passes if it lies in the image, within range, and before
 the nearest measurement of its block of pixels (about one degree wide), short of it by a quarter
 of a cell. Asking the cells, not walking the rays, leaves no gaps far away, lets no ray that only
 grazes a cell's corner clear it, and costs one gather per point.
 
 Consequences worth knowing: the nearest measurement rules its block, so rays that pass beside a
 thin object cannot carve it away; a cell called free may still hold a surface in the half that
-was not in the picture; and a wall seen with 1 % noise at 4 m is a cell thicker than it is.
+was not in the image; and a wall seen with 1 % noise at 4 m is a cell thicker than it is.
 
 Shape symbols: X Y Z cells along the axes; H W image size; h w blocks; n points.
 """
@@ -192,7 +192,7 @@ def mark_free_ball(
 ) -> OccupancyGrid:
     """Marks the cells whose center lies in a ball as free, on the caller's word.
 
-    For space that no picture shows: the ball round the start, which the simulator promises to
+    For space that no image shows: the ball round the start, which the simulator promises to
     be free, and the robot's own body. A cell that was measured to be occupied stays so, and a
     single later hit undoes the mark.
 
@@ -286,7 +286,7 @@ def _passed_cells(
     R = T_camera_world[:3, :3]
     shift = R @ grid.origin + T_camera_world[:3, 3]
     nearest, block = _nearest_by_block(camera, frame.depth)
-    # The image of the blocks is a picture of its own: in it a pixel is a block.
+    # The image of the blocks is an image of its own: in it a pixel is a block.
     fx, fy, cx, cy = (p / block for p in (camera.fx, camera.fy, camera.cx, camera.cy))
     num_rows, num_columns = nearest.shape
     width, height = camera.width / block, camera.height / block

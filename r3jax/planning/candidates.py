@@ -123,7 +123,7 @@ def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -
         return np.zeros((0, 3))
     # With repetition: near walls there may be fewer cells than candidates.
     chosen = rng.integers(len(cells), size=num)
-    # Stops, not centers: a carrier with a range of heights cannot be at every center.
+    # Stops, not centers: a robot with a range of heights cannot be at every center.
     centers = travel.stops(cells[chosen])
     positions = _jitter(centers, travel.cell_size, rng)
     is_far = np.linalg.norm(positions - travel.start, axis=1) > radius

@@ -122,7 +122,7 @@ def _with_start(state: PlannerState, height: float) -> PlannerState:
     return replace(state, start_height=jnp.asarray(height, dtype=jnp.float32))
 
 
-def follow_way(
+def follow_path(
     state: PlannerState,
     map_state: MapState,
     grid: OccupancyGrid,
@@ -133,10 +133,10 @@ def follow_way(
     """The memory of a robot that goes a way which its policy did not choose."""
     # As for a decision of its own: looks in vain count, whoever chose the way.
     state, travel, _ = prepare_decision(state, map_state, grid, T_world_camera, config)
-    return _with_way(state, travel, waypoints)
+    return _with_path(state, travel, waypoints)
 
 
-def explain_way(
+def explain_path(
     state: PlannerState,
     map_state: MapState,
     grid: OccupancyGrid,
@@ -145,7 +145,7 @@ def explain_way(
     waypoints: np.ndarray,
     config: PlannerConfig,
 ) -> tuple[PlannerState, Explanation]:
-    """As `follow_way`, and what the view at the end of the way promises when it is chosen.
+    """As `follow_path`, and what the view at the end of the path promises when it is chosen.
 
     Args:
         state: the policy's memory.
@@ -153,17 +153,17 @@ def explain_way(
         grid: the grid, the same.
         T_world_camera: where the latest view was taken.
         T_chosen: the view that was chosen, by whatever rule.
-        waypoints: the way to it, [K, 3] [m].
+        waypoints: the path to it, [K, 3] [m].
         config: of the policy.
 
     Returns:
-        The memory with the way counted in, and the utility by cause; of the unexplored cells those
+        The memory with the path counted in, and the utility by cause; of the unexplored cells those
         count that decisions are scored on (`prepare_decision`).
     """
     state, travel, scoring_grid = prepare_decision(state, map_state, grid, T_world_camera, config)
     pose = jnp.asarray(T_chosen, dtype=jnp.float32)
     explanation = explain_view(map_state, scoring_grid, state.camera, pose, config.scoring)
-    return _with_way(state, travel, waypoints), explanation
+    return _with_path(state, travel, waypoints), explanation
 
 
 def no_decision(
@@ -186,7 +186,7 @@ def select_best(
     limits: Limits,
     stopwatch: Stopwatch,
 ) -> tuple[int, Decision, PlannerState, PlanInfo]:
-    """Takes the candidate of the greatest `total` and finds the way to it.
+    """Takes the candidate of the greatest `total` and finds the path to it.
 
     Args:
         state: the policy's memory.
@@ -194,18 +194,18 @@ def select_best(
         candidates: at least one of them reachable.
         utilities: per candidate, [C] each; `total` and `path` among them. A candidate whose
             path is infinite is never taken.
-        limits: what the way and the turn cost.
+        limits: what the path and the turn cost.
         stopwatch: what took how long.
 
     Returns:
-        Which candidate it is, the decision, the memory with the way counted in, and the info.
+        Which candidate it is, the decision, the memory with the path counted in, and the info.
     """
     with stopwatch.part("travel"):
         is_reachable = np.isfinite(utilities["path"])
         # Padding has an infinite path too, so that it can never win.
         best = int(np.argmax(np.where(is_reachable, utilities["total"], -np.inf)))
         waypoints = travel.path(candidates.position[best])
-    # Measured anew: shortcuts may have made the way shorter than the length that was weighed.
+    # Measured anew: shortcuts may have made the path shorter than the length that was weighed.
     length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
     # The edge: matrices for whoever renders or records, without the padding.
     poses, on_offer = candidates.T_world_camera, candidates.valid
@@ -220,10 +220,10 @@ def select_best(
     )
     num_reachable = int(is_reachable.sum())
     info = PlanInfo(DecisionOutcome.MOVED, candidates.num_valid, num_reachable, stopwatch.seconds)
-    return best, decision, _with_way(state, travel, waypoints), info
+    return best, decision, _with_path(state, travel, waypoints), info
 
 
-def _with_way(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> PlannerState:
+def _with_path(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> PlannerState:
     # All cells that the lines cross, not the waypoints alone: the way back must be connected.
     return replace(state, trail=state.trail | travel.cells_along(waypoints))
 
@@ -241,7 +241,7 @@ def net_utility(
 
     Args:
         utility: of each candidate.
-        path: length of the way to it, or what it costs; inf: unreachable.
+        path: length of the path to it, or what it costs; inf: unreachable.
         lambda2: weight of the path.
         among: utilities and paths of the candidates that the sums are over; None: these.
     """

@@ -28,7 +28,7 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decision import (
     PlannerState,
     Stopwatch,
-    follow_way,
+    follow_path,
     initial_state,
     net_utility,
     no_decision,
@@ -65,7 +65,7 @@ class GreedyPolicy(ABC):
     """Draws candidates, scores them, weighs the path, takes the best.
 
     What a policy draws, and what it turns while scoring, becomes the nearest view that the
-    carrier of the camera may take: no policy has to know the carrier.
+    robot may take: no policy has to know the robot.
     """
 
     config: PlannerConfig = field(default_factory=PlannerConfig)
@@ -135,7 +135,7 @@ class GreedyPolicy(ABC):
         *,
         key: Array,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """The candidate with the greatest total, of those that the carrier may take."""
+        """The candidate with the greatest total, of those that the robot may take."""
         draw = lambda situation, key: self.draw(situation, key=key)
         return self._choose(state, map_state, grid, T_world_camera, draw, key=key)
 
@@ -238,7 +238,7 @@ class GreedyPolicy(ABC):
             )
             candidates = limits.project_to_feasible(candidates)
         with stopwatch.part("travel"):
-            # After the projection, which may change heights: the ways lead to views on offer.
+            # After the projection, which may change heights: the paths lead to views on offer.
             lengths = path_lengths(travel, candidates)
             path = limits.path_costs(lengths, candidates.direction)
             # What was drawn is within reach; what was drawn before the last view may not be.
@@ -272,7 +272,7 @@ class GreedyPolicy(ABC):
         waypoints: np.ndarray,
     ) -> PlannerState:
         """The cells on the way, and what the latest view failed to show."""
-        return follow_way(state, map_state, grid, T_world_camera, waypoints, self.config)
+        return follow_path(state, map_state, grid, T_world_camera, waypoints, self.config)
 
 
 def free_views(situation: Situation, num: int, radius: float, *, key: Array) -> Candidates:
@@ -369,4 +369,4 @@ def draw_positions(
 
 
 ScoreViews = Callable[..., Any]
-"""`scoring.batch.score_views` or `score_positions`, or a stand-in for one of them."""
+"""`scoring.batch.score_views` or `score_positions`, or another function of their kind."""

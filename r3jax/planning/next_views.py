@@ -62,7 +62,7 @@ def next_views(
     """The k most useful views, each on top of those before it. Not to be called under jit.
 
     For one camera that will take them all, for several that take one each, for a person with a
-    list. The way between them is not counted: a robot's next view is a policy's `decide`.
+    list. The path between them is not counted: a robot's next view is a policy's `decide`.
 
     Args:
         state: the map.

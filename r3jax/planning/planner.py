@@ -143,7 +143,7 @@ def decide_ahead(
 
     Returns:
         As `decide`; None also for a policy that cannot `reconsider`. Of the policy's memory only
-        what drawing and choosing noted: the way has not been flown, and nothing was looked at.
+        what drawing and choosing noted: the path has not been flown, and nothing was looked at.
     """
     if not isinstance(planner.policy, PlansAhead):
         return None, planner, PlanInfo(DecisionOutcome.NO_CANDIDATE)

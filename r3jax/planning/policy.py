@@ -90,7 +90,7 @@ class Situation:
     """What the policy keeps beside the map."""
 
     limits: Limits = field(default_factory=Limits)
-    """What the carrier of the camera may do next. Candidates need not lie within them: `decide`
+    """What the robot may do next. Candidates need not lie within them: `decide`
     sees to that."""
 
     notes: Any = None
@@ -138,7 +138,7 @@ class Policy(Protocol):
             map_state: the map, the latest view included.
             grid: the grid, the same.
             T_world_camera: where the latest view was taken.
-            waypoints: the way to the next one, [K, 3] [m].
+            waypoints: the path to the next one, [K, 3] [m].
         """
         ...
 

@@ -1,4 +1,4 @@
-"""A smooth stand-in for the utility of a view, round one place: what gradients can climb.
+"""A smooth surrogate for the utility of a view, round one place: what gradients can climb.
 
 The utility counts what is in the image and not hidden. It is piecewise constant but for R, and its
 gradient says nothing of what comes into sight a step aside. Here
@@ -98,7 +98,7 @@ def soft_utility(
     R: Float[Array, "3 3"],
     softness: Softness,
 ) -> Float[Array, ""]:
-    """The stand-in for the utility of a view.
+    """The surrogate for the utility of a view.
 
     Args:
         around: what may be seen.

@@ -16,7 +16,7 @@ from r3jax.visibility.views import pinhole_view
 
 
 class ViewUtility(eqx.Module):
-    """What a view promises, before the way to it is paid for."""
+    """What a view promises, before the path to it is paid for."""
 
     exploration: Float[Array, ""]
     """U_G: visible unexplored cells."""

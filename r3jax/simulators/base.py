@@ -1,4 +1,4 @@
-"""What the loop may know of a world: a camera, a box, a start, and pictures from where it is."""
+"""What the loop may know of a world: a camera, a box, a start, and images from where it is."""
 
 from typing import Protocol, runtime_checkable
 

@@ -1,4 +1,4 @@
-"""What the evaluation protocol may know of a world: its free space, and pictures from anywhere.
+"""What the evaluation protocol may know of a world: its free space, and images from anywhere.
 
 The free space is sampled by nodes a tenth of a meter apart. A node is free if every surface is at
 least the margin away; the nodes that a camera can reach are those connected to its start. Two

@@ -119,7 +119,7 @@ def _image_covariance(
     """J W S W^T J^T + 0.3 I as (xx, xy, yy) [px^2], with J the Jacobian of the projection.
 
     J is taken at a point at most 30 % of half the image outside the image: further out the
-    linearization means nothing and would smear Gaussians over the whole picture.
+    linearization means nothing and would smear Gaussians over the whole image.
     """
     rotation = rotation_rows(scene.quats)
     scales = [jnp.exp(scene.log_scales[:, i]) for i in range(3)]

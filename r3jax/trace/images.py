@@ -73,7 +73,7 @@ def frame_hash(frame: Frame) -> str:
 
 def encode_png(image: np.ndarray) -> bytes:
     """A PNG of [H, W, 3] uint8 or [H, W] uint16."""
-    from PIL import Image  # a run is read without pictures more often than with them
+    from PIL import Image  # a run is read without images more often than with them
 
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="png", compress_level=_PNG_LEVEL)

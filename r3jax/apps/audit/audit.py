@@ -38,7 +38,7 @@ _WORTH_OF_UNSEEN = 0.05
 capture wants it to render well first, and larger second."""
 
 _IN_VAIN = 3
-"""Unexplored cells that so many pictures looked at in vain (glass, black) are left alone."""
+"""Unexplored cells that so many images looked at in vain (glass, black) are left alone."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class EvaluatedFrame:
     """One frame of the path that is evaluated."""
 
     index: int
-    """Number of the picture in the capture, or of the pose in the path."""
+    """Number of the image in the capture, or of the pose in the path."""
 
     label: str
     """How the reader calls it."""
@@ -69,7 +69,7 @@ class Audit:
     """Settings of all scores."""
 
     lens: Lens
-    """Lens of the suggested views: that of most pictures."""
+    """Lens of the suggested views: that of most images."""
 
     places: np.ndarray
     """Where views were looked for, [p, 3] [audit units]."""
@@ -102,7 +102,7 @@ class Audit:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the suggested views, thinned out as the map's pictures were."""
+        """Camera of the suggested views, thinned out as the map's images were."""
         return thinned(self.lens.camera, self.source.stride)
 
     @property

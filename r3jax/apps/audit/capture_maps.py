@@ -1,14 +1,14 @@
-"""What a capture has seen, as a map of all pictures and of all but some.
+"""What a capture has seen, as a map of all images and of all but some.
 
-A picture must not be in the map that it is scored by. Maps cannot forget; so the pictures
+An image must not be in the map that it is scored by. Maps cannot forget; so the images
 are dealt into folds, and every fold gets a map of its own over *the same rows*:
 
-    1. all pictures join one map: now the surfaces are known;
-    2. each picture joins the map of its fold, an empty one with the rows of the first.
-       What it looks at (`mark_seen`) is told by the surfaces of all pictures.
+    1. all images join one map: now the surfaces are known;
+    2. each image joins the map of its fold, an empty one with the rows of the first.
+       What it looks at (`mark_seen`) is told by the surfaces of all images.
 
 Maps with the same rows unite row by row, so the map without a fold is the union of the others. No
-result depends on the order of the pictures.
+result depends on the order of the images.
 
 Shape symbols: N rows; F folds.
 """
@@ -36,40 +36,40 @@ _MOST_ROWS = 1 << 22
 """Beyond this the folds would not fit into memory."""
 
 _SPARSE_REACH = 1.1
-"""A picture without depth images looks this many times as far as its farthest point."""
+"""An image without depth images looks this many times as far as its farthest point."""
 
 OnFrame = Callable[[], None]
-"""Called after each picture, twice for each."""
+"""Called after each image, twice for each."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Everything that the pictures have seen."""
+    """Everything that the images have seen."""
 
     state: MapState
-    """Map of all pictures."""
+    """Map of all images."""
 
     grid: OccupancyGrid
     """Free and occupied space; all unexplored where no depth images say what is free."""
 
     folds: tuple[MapState, ...]
-    """Maps of the pictures of each fold, on the rows of `state`."""
+    """Maps of the images of each fold, on the rows of `state`."""
 
     fold_of: np.ndarray
-    """Fold of each picture used, in the order of `Survey.chosen`."""
+    """Fold of each image used, in the order of `Survey.chosen`."""
 
     def without(self, fold: int) -> MapState:
-        """The map of all pictures but those of a fold."""
+        """The map of all images but those of a fold."""
         return united([part for i, part in enumerate(self.folds) if i != fold])
 
 
 def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: None) -> Seen:
-    """Reads every picture twice and maps it.
+    """Reads every image twice and maps it.
 
     Args:
-        source: the pictures.
+        source: the images.
         survey: which of them, and how fine.
-        folds: as many, or one for each picture where there are fewer.
+        folds: as many, or one for each image where there are fewer.
         on_frame: for a progress bar.
 
     Raises:
@@ -125,7 +125,7 @@ def _grown(state: MapState, frame: Frame, drop_edges: bool) -> MapState:
 
 
 def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
-    """How far a picture looks [audit units]."""
+    """How far an image looks [audit units]."""
     if source.is_dense:
         return jnp.float32(RANGE)
     farthest = float(jnp.max(frame.depth))

@@ -1,7 +1,7 @@
 """How well every surface would render for somebody who stands somewhere else, and why not better.
 
 Renderability belongs to a voxel *and* a place from which it is asked. The places here are spread
-over all where somebody could stand, to take a picture or to look at the result; of each voxel the
+over all where somebody could stand, to take an image or to look at the result; of each voxel the
 answers of those that see it are averaged. With depth images they lie in known free space, a margin
 from everything that is not known to be free, connected to where the camera was, at heights at
 which it was held. Without, they lie within the hull of the camera's positions and a margin round
@@ -161,7 +161,7 @@ FINE = 0.5
 """A voxel whose mean renderability is at least this counts as fine."""
 
 FEW = 3
-"""A voxel that was measured in fewer pictures was seen too rarely."""
+"""A voxel that was measured in fewer images was seen too rarely."""
 
 
 class Demand(eqx.Module):
@@ -343,12 +343,12 @@ def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diag
 def cause_of(value: np.ndarray, costs: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Index into `CAUSES` of each voxel, [N]: the dearest term, where the product is not fine.
 
-    A low bias of a voxel that hardly any picture has measured is called rare; of others, angle.
+    A low bias of a voxel that hardly any image has measured is called rare; of others, angle.
 
     Args:
         value: mean renderability, [N].
         costs: sums of -log of bias, noise and resolution, [3, N].
-        count: pictures that have measured the voxel, [N].
+        count: images that have measured the voxel, [N].
     """
     dearest = np.argmax(costs, axis=0)
     of_bias = np.where(count < FEW, CAUSES.index("rare"), CAUSES.index("angle"))

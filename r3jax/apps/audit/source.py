@@ -1,4 +1,4 @@
-"""What is audited: posed pictures with some depth, whoever recorded them.
+"""What is audited: posed images with some depth, whoever recorded them.
 
 An audit needs no more pixels than fall into a voxel each, and no more exactness than a voxel: so
 images are thinned out, not averaged, and lenses are straightened by taking the nearest pixel. Where
@@ -8,7 +8,7 @@ Captures without depth get sparse depth images from points. Where a structure fr
 image sees which point, that is taken; of a mere cloud (nerfstudio's `ply_file_path`) an image sees
 the points that no nearer one hides.
 
-Shape symbols: n pictures; m points; H, W image size; h, w size of a thinned picture.
+Shape symbols: n images; m points; H, W image size; h, w size of a thinned image.
 """
 
 import dataclasses
@@ -174,7 +174,7 @@ def sparse_depth(
 
 
 MAX_SIDE = 640
-"""Pictures are thinned out until their longer side has no more pixels."""
+"""Images are thinned out until their longer side has no more pixels."""
 
 _MAX_POINTS = 500_000
 """Larger clouds are thinned out: a voxel needs one point."""
@@ -187,7 +187,7 @@ Kind = Literal["depth", "tracks", "cloud"]
 
 @dataclass(frozen=True)
 class Source:
-    """Posed pictures, in the capture's own coordinates, read one by one."""
+    """Posed images, in the capture's own coordinates, read one by one."""
 
     name: str
     """What the reader calls the capture."""
@@ -196,10 +196,10 @@ class Source:
     """`T_world_camera`, [n, 4, 4] float64: OpenCV axes."""
 
     lenses: tuple[Lens, ...]
-    """One per picture."""
+    """One per image."""
 
     labels: tuple[str, ...]
-    """Names of the pictures."""
+    """Names of the images."""
 
     kind: Kind
     """Where depth comes from: depth images, tracks of points, or a cloud of points."""
@@ -214,16 +214,16 @@ class Source:
     """Every so many pixels are read."""
 
     read: Callable[[int], Picture]
-    """The thinned picture of an index."""
+    """The thinned image of an index."""
 
     has_images: bool = True
     """False where only points are there: their colors say nothing about noise."""
 
     remark: str | None = None
-    """What the capture holds beside its pictures, a sentence."""
+    """What the capture holds beside its images, a sentence."""
 
     def __len__(self) -> int:
-        """Number of pictures."""
+        """Number of images."""
         return len(self.poses)
 
     @property
@@ -232,11 +232,11 @@ class Source:
         return self.kind == "depth"
 
     def camera(self, index: int) -> Camera:
-        """The pinhole of a thinned picture."""
+        """The pinhole of a thinned image."""
         return thinned(self.lenses[index].camera, self.stride)
 
     def frame(self, index: int, alignment: Alignment) -> Frame:
-        """One picture in the audit's coordinates.
+        """One image in the audit's coordinates.
 
         Raises:
             FormatError, RunError: a file is missing or broken.
@@ -261,7 +261,7 @@ def source_of(capture: Run | Recording | PosedImages, name: str) -> Source:
         name: for the reader.
 
     Raises:
-        FormatError: no pictures, neither depth nor points, a damaged cloud, or a lens that cannot
+        FormatError: no images, neither depth nor points, a damaged cloud, or a lens that cannot
             be straightened.
     """
     if not len(capture.rows if isinstance(capture, Run) else capture):
@@ -327,7 +327,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
 
 
 def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:
-    """One for all pictures: resolutions are compared between them."""
+    """One for all images: resolutions are compared between them."""
     return max(-(-max(lens.width, lens.height) // MAX_SIDE) for lens in lenses)
 
 

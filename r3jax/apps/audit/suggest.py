@@ -26,7 +26,7 @@ Shape symbols: p places or standpoints; B bins of the panorama; C candidates; N 
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -157,7 +157,7 @@ _APART = 40.0
 """Between the directions of one place [deg]."""
 
 OVERLAP = 0.4
-"""Share of a view's pixels that must show what is known already: a picture of nothing but the
+"""Share of a view's pixels that must show what is known already: an image of nothing but the
 unknown cannot be registered with the others."""
 
 _BATCH = 8
@@ -251,7 +251,7 @@ class LazyGreedy:
     poses: np.ndarray
     """Candidates, [C, 4, 4] [audit units]."""
 
-    name: str = "audit"
+    name: ClassVar[str] = "audit"
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Memory:
         """Knows no gain yet."""

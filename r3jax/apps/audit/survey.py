@@ -1,17 +1,17 @@
-"""A first look at some pictures: do they fit together, how large is the place, how fine to audit?
+"""A first look at some images: do they fit together, how large is the place, how fine to audit?
 
 Do depth images and poses tell of one world? A unit that is wrong shows without knowing any room: a
 point of one depth image is where another one sees a surface, unless something hides it. With
 depths that are too long or too short by a factor it is elsewhere, as soon as the cameras stood
-apart: so the factor that brings most points together is known from the pictures alone. (It is
+apart: so the factor that brings most points together is known from the images alone. (It is
 the scale of monocular reconstruction, asked the other way round.)
 
 Everything downstream counts in rooms: a range of 5, free cells of 0.2, a margin of 0.3. A capture
 in meters with depths of a room's size stays as it is; every other is scaled so that what its
-pictures show (95 % of the depths) lies within the range. COLMAP's models have no meters at all:
+images show (95 % of the depths) lies within the range. COLMAP's models have no meters at all:
 their units stay their own in all that is written, and only the audit sees them scaled.
 
-Shape symbols: n points; h, w size of a picture.
+Shape symbols: n points; h, w size of an image.
 """
 
 from collections.abc import Sequence
@@ -34,17 +34,17 @@ _TOLERANCE = 0.05
 """Surfaces that lie so close agree, as a share of their distance: noise, edges, drift of poses."""
 
 _POINTS, _PICTURES = 100, 24
-"""Taken of each picture, and pictures taken: 50,000 comparisons for each factor."""
+"""Taken of each image, and images taken: 50,000 comparisons for each factor."""
 
 _FEWEST_POINTS = 400
-"""Fewer comparisons say nothing: the pictures hardly overlap."""
+"""Fewer comparisons say nothing: the images hardly overlap."""
 
 _FITS = 0.9
 """Share of the points that agree where nothing needs to be explained."""
 
 _THROUGH = 0.8
 """Points that others look through, for each that they see: 0.01 to 0.03 in good captures, 0.4 if
-the poses are off by 5 cm, 1 and more if the poses belong to other pictures."""
+the poses are off by 5 cm, 1 and more if the poses belong to other images."""
 
 _SURE = 0.2
 """A factor that brings fewer together explains nothing."""
@@ -78,12 +78,12 @@ class DepthImage:
 def check_agreement(images: Sequence[DepthImage]) -> None:
     """Refuses depth images that contradict the poses, or each other.
 
-    Nothing is said where pictures do not overlap, or were taken from one place: no depth is wrong
+    Nothing is said where images do not overlap, or were taken from one place: no depth is wrong
     there.
 
     Raises:
         ValueError: another factor explains them far better; or nearly as many points lie where
-            another picture looks through them as where it sees a surface.
+            another image looks through them as where it sees a surface.
     """
     chosen = np.unique(np.linspace(0, len(images) - 1, _PICTURES).round().astype(int))
     pictures = _Pictures([images[i] for i in chosen])
@@ -112,10 +112,10 @@ def check_agreement(images: Sequence[DepthImage]) -> None:
 
 
 class _Pictures:
-    """Pictures that are compared, each with every other one."""
+    """Images that are compared, each with every other one."""
 
     def __init__(self, images: Sequence[DepthImage]):
-        """Takes some points of each picture."""
+        """Takes some points of each image."""
         rng = np.random.default_rng(0)
         self._local = [look.points(_POINTS, rng) for look in images]
         self._poses = np.stack([look.pose for look in images])
@@ -132,7 +132,7 @@ class _Pictures:
         """Compares them, all depths multiplied by a factor.
 
         Returns:
-            Comparisons, the share of points that lie where the other picture sees a surface, and
+            Comparisons, the share of points that lie where the other image sees a surface, and
             the share that it looks through.
         """
         numbers = np.zeros(3, dtype=np.int64)
@@ -187,7 +187,7 @@ _PIXELS = 3.0
 """A voxel at the median depth is at least this wide [px], or it is seen by chance."""
 
 _SURVEYED = 32
-"""Pictures that are looked at."""
+"""Images that are looked at."""
 
 _VALUES = 4000
 """Depths taken of each."""
@@ -222,10 +222,10 @@ class AuditSettings:
     """Vertical axis of the capture, such as `y` or `-y`; None: as the format or the cameras say."""
 
     max_frames: int = 400
-    """Pictures that are used at most, evenly spread."""
+    """Images that are used at most, evenly spread."""
 
     folds: int = 8
-    """Every picture is evaluated by a map that lacks one picture in so many: its own among them."""
+    """Every image is evaluated by a map that lacks one image in so many: its own among them."""
 
     num_views: int = 10
     """Views to suggest."""
@@ -251,10 +251,10 @@ class Survey:
     """From the capture's coordinates to the audit's."""
 
     chosen: np.ndarray
-    """Indices of the pictures that are used, ascending."""
+    """Indices of the images that are used, ascending."""
 
     bounds: np.ndarray
-    """Box round what the pictures show and where they were taken, [2, 3] [audit units]."""
+    """Box round what the images show and where they were taken, [2, 3] [audit units]."""
 
     voxel_size: float
     """Edge of a voxel [audit units]."""
@@ -277,11 +277,11 @@ class Survey:
 
 
 def survey_of(source: Source, settings: AuditSettings) -> Survey:
-    """Looks at some pictures and decides.
+    """Looks at some images and decides.
 
     Raises:
         ValueError: a setting that makes no sense; depth images that contradict the poses.
-        FormatError: no picture has any depth; or a file is missing or broken.
+        FormatError: no image has any depth; or a file is missing or broken.
     """
     _check(settings)
     count = min(len(source), settings.max_frames)
@@ -362,7 +362,7 @@ def _check_depth(images: list[DepthImage], median: float) -> None:
 
 
 def _range(far: float, is_metric: bool, wanted: float | None) -> float:
-    """How far pictures show things [capture units]."""
+    """How far images show things [capture units]."""
     if wanted is not None:
         if wanted > _FARTHEST * far:
             raise ValueError(

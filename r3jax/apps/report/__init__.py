@@ -1,1 +1,1 @@
-"""The page that a run leaves behind, and what its pictures share with other pages."""
+"""The page that a run leaves behind, and what its images share with other pages."""

@@ -13,7 +13,7 @@ from r3jax.apps.report.pictures import BEYOND
 from r3jax.evaluation.scores import ViewRow
 
 ERROR_SCALE = 0.3
-"""Mean absolute error over RGB at which the color of the error picture saturates. Fixed, so that
+"""Mean absolute error over RGB at which the color of the error image saturates. Fixed, so that
 sheets can be compared."""
 
 _ERROR_MAP = "magma"
@@ -25,8 +25,8 @@ _SCALES = {
 _MARGIN, _LINE, _HEADING, _CAPTION, _CELL, _GAP, _BAR, _BAR_TEXT = (
     0.1, 0.2, 0.25, 0.95, 2.1, 0.06, 0.07, 0.4
 )  # fmt: skip
-"""Margin, line of the title, headings of the columns, width of the captions, width of a picture,
-space between pictures, height of a color bar and of the text below it [inch]."""
+"""Margin, line of the title, headings of the columns, width of the captions, width of an image,
+space between images, height of a color bar and of the text below it [inch]."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ def contact_sheet(views: Sequence[SheetView], title: str) -> Figure:
         top + (cell + _GAP) * len(views) + _BAR + _BAR_TEXT,
     )
     figure = style.new_figure(*size)
-    figure.set_layout_engine("none")  # pictures of one size, with the same space between all
+    figure.set_layout_engine("none")  # images of one size, with the same space between all
 
     def place(line: int, column: int, height: float = cell, inset: float = 0.0) -> Axes:
-        """Axes for a picture, or for the bar below the last one."""
+        """Axes for an image, or for the bar below the last one."""
         left = _MARGIN + _CAPTION + (_CELL + _GAP) * column + inset
         lower = size[1] - top - (cell + _GAP) * line - height
         wide = _CELL - 2.0 * inset
@@ -97,13 +97,13 @@ def contact_sheet(views: Sequence[SheetView], title: str) -> Figure:
     for column, (name, picture) in enumerate(zip(titles, drawn[0], strict=True)):
         picture.axes.set_title(name, fontsize=9, color=style.MUTED, loc="left", pad=3)
         if name in _SCALES:
-            # Narrower than the pictures, so that the numbers at the ends do not meet.
+            # Narrower than the images, so that the numbers at the ends do not meet.
             _color_bar(figure, picture, place(len(views), column, _BAR, 0.12), _SCALES[name])
     return figure
 
 
 def _draw_line(axes: list[Axes], view: SheetView) -> list[AxesImage]:
-    """Draws one view; returns its pictures."""
+    """Draws one view; returns its images."""
     left = axes[0]
     left.annotate(
         _caption(view.row), (0.0, 1.0), xycoords="axes fraction", xytext=(-72.0 * _CAPTION, 0.0),
@@ -151,7 +151,7 @@ def _caption(row: ViewRow) -> str:
 
 
 def _color_bar(figure: Figure, image: AxesImage, axes: Axes, label: str) -> None:
-    """A bar below a column of pictures."""
+    """A bar below a column of images."""
     bar = figure.colorbar(image, cax=axes, orientation="horizontal")
     bar.outline.set_visible(False)
     bar.set_ticks(list(np.linspace(*image.get_clim(), 3)))

@@ -1,4 +1,4 @@
-"""An HTML page that opens from disk: a title, large numbers, sections with pictures inside."""
+"""An HTML page that opens from disk: a title, large numbers, sections with images inside."""
 
 import base64
 import html
@@ -82,6 +82,6 @@ def section(title: str, note: str, body: str) -> str:
 
 
 def image(png: bytes, alt: str = "") -> str:
-    """A picture inside the page, so that the page can be sent as one file."""
+    """An image inside the page, so that the page can be sent as one file."""
     data = base64.b64encode(png).decode()
     return f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{data}">'

@@ -1,6 +1,6 @@
-"""Pictures computed from a map: the floor from above, and everything round a position.
+"""Images computed from a map: the floor from above, and everything round a position.
 
-Shape symbols: N rows of the map; h w picture size.
+Shape symbols: N rows of the map; h w image size.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ BEYOND = (0.78, 0.85, 0.94)
 """Color of directions that are free up to the sensor's range."""
 
 _HEIGHT, _WIDTH = 256, 512
-"""Size of a panorama picture [px]."""
+"""Size of a panorama image [px]."""
 
 _LARGEST = 2048
-"""Width and height of a floor picture at most, unless the grid itself has more cells [px]."""
+"""Width and height of a floor image at most, unless the grid itself has more cells [px]."""
 
 _HEADROOM = 0.35
-"""The floor picture shows what lies below the cameras' height plus this [m]."""
+"""The floor image shows what lies below the cameras' height plus this [m]."""
 
 
 def floor_picture(
@@ -43,7 +43,7 @@ def floor_picture(
         height: typical height of the cameras [m].
 
     Returns:
-        The picture [h, w, 3] in [0, 1], row 0 at the lowest y, and its extent in meters
+        The image [h, w, 3] in [0, 1], row 0 at the lowest y, and its extent in meters
         (left, right, bottom, top).
     """
     origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
@@ -73,7 +73,7 @@ def floor_picture(
 
 @dataclass(frozen=True)
 class PanoramaPicture:
-    """An equirectangular picture round a position; the middle column looks along +x."""
+    """An equirectangular image round a position; the middle column looks along +x."""
 
     rgb: np.ndarray
     """Mean color of the voxel seen, [h, w, 3]; blue or gray where there is none."""
@@ -172,7 +172,7 @@ def _nearest_rows(map_state: MapState, position: np.ndarray, max_range: float) -
     picture = np.full((_HEIGHT, _WIDTH), map_state.capacity)
     for row, y0, y1, x0, x1 in zip(rows, top, bottom, left, right, strict=True):
         picture[y0:y1, max(x0, 0) : x1] = row
-        if x0 < 0:  # the picture closes on itself
+        if x0 < 0:  # the image closes on itself
             picture[y0:y1, x0:] = row
         if x1 > _WIDTH:
             picture[y0:y1, : x1 - _WIDTH] = row

@@ -94,7 +94,7 @@ def write_report(
         on_progress: for a progress bar; a long run is looked back at for minutes.
 
     Returns:
-        The HTML page; the pictures are inside it, so it can be sent as one file.
+        The HTML page; the images are inside it, so it can be sent as one file.
 
     Raises:
         RunError: a run without a view, or images that cannot be read.
@@ -207,7 +207,7 @@ def _figure_section(name: str, png: bytes, extra: str) -> str:
 
 
 def _picture_section(title: str, note: str, png: bytes, extra: str = "") -> str:
-    """A title, a note, a picture (if it is not empty) and more."""
+    """A title, a note, an image (if it is not empty) and more."""
     return section(title, note, (image(png, title) if png else "") + extra)
 
 

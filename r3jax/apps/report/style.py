@@ -58,7 +58,7 @@ def dress(axes: Axes, title: str = "", x: str = "", y: str = "") -> Axes:
 
 
 def blank(axes: Axes, title: str = "") -> Axes:
-    """Axes for a picture: no ticks, no grid."""
+    """Axes for an image: no ticks, no grid."""
     dress(axes, title)
     axes.grid(visible=False)
     axes.set_xticks([])

@@ -131,7 +131,7 @@ def explore_team(
             they meet when all are done. The frames between two meetings are kept in memory.
         recorders: where each member's run is written; None keeps nothing.
         resume: what was recorded of each member before the team was cut off. All of it is decided
-            and mapped again, only the pictures are not taken again; under the model clock the
+            and mapped again, only the images are not taken again; under the model clock the
             result is the one of a team that was never cut off, bit for bit.
         on_row: called with a member's number and the row of every view.
         on_stage: called with the name of what happens next.
@@ -144,7 +144,7 @@ def explore_team(
         ValueError: no member, worlds with different boxes, a budget that is not understood, a
             negative interval, a start outside the scene's box.
         RunError: a recorded frame is missing or broken.
-        OracleReadError: something beside the loop asked a simulator for a picture.
+        OracleReadError: something beside the loop asked a simulator for an image.
     """
     config = config or ExplorationConfig()
     budget = parse_budget(budget) if isinstance(budget, str) else budget

@@ -1,4 +1,4 @@
-"""`r3jax view`: a run in the browser, or as pictures and a film without one."""
+"""`r3jax view`: a run in the browser, or as images and a film without one."""
 
 import contextlib
 import os
@@ -18,7 +18,7 @@ _THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 
 
 def run_view(options: ViewOptions) -> int:
-    """Shows a run until Ctrl-C, or writes its pictures.
+    """Shows a run until Ctrl-C, or writes its images.
 
     Raises:
         UserError: not a run, no views, a port that is in use, a folder that holds something, a
@@ -86,7 +86,7 @@ def end_at_once() -> None:
 
 
 def _export(run: Run, out: Path, video: bool, console: Console) -> int:
-    """Writes the pictures.
+    """Writes the images.
 
     Raises:
         FormatError, RunError, ImportError, OSError: as `export_film`.

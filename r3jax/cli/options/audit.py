@@ -25,10 +25,10 @@ class AuditTermOptions:
     cameras were held."""
 
     max_frames: int = 400
-    """Pictures to use at most, evenly spread."""
+    """Images to use at most, evenly spread."""
 
     folds: int = 8
-    """Own frames are judged by a map without every N-th picture, themselves among them."""
+    """Own frames are judged by a map without every N-th image, themselves among them."""
 
     trust_depth: bool = False
     """Take the depth images as they are, even if they contradict the poses or each other."""

@@ -98,7 +98,7 @@ class ExportOptions:
 class ViewOptions:
     """Look at a run in the browser: the map over time, and what a camera that you drag would see.
 
-    Or, with --export, write the pictures without a browser.
+    Or, with --export, write the images without a browser.
     """
 
     EXAMPLES: ClassVar[tuple[str, ...]] = (
@@ -127,7 +127,7 @@ class ViewOptions:
     """Do not open the scene that the run was recorded in: no true image, no mesh."""
 
     export: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Write pictures of the map and one for every view into a folder that does not exist yet."""
+    """Write images of the map and one for every view into a folder that does not exist yet."""
 
     video: bool = False
     """With --export: a film of the run too (MP4)."""

@@ -95,7 +95,7 @@ def _parts(path: Path, folder: Path) -> list[Path]:
 def _left_out(
     folder: Path, models: Mapping[Path, ColmapModel], image_paths: tuple[Path, ...]
 ) -> str | None:
-    """A sentence on the other models and the pictures that this one has no pose for."""
+    """A sentence on the other models and the images that this one has no pose for."""
     posed = set(image_paths)
     suffixes = {path.suffix for path in posed}
     beside = {file for place in {path.parent for path in posed} for file in _files(place)}

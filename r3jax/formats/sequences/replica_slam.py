@@ -71,7 +71,7 @@ def read_replica_slam(path: Path | str) -> PosedImages:
 
 
 def _numbered(folder: Path, start: str) -> tuple[Path, ...]:
-    """The pictures whose names start like this, by their names."""
+    """The images whose names start like this, by their names."""
     if not folder.is_dir():
         raise FormatError(folder, "the folder is missing")
     kinds = (".png", ".jpg", ".jpeg")

@@ -25,7 +25,7 @@ from r3jax.formats.validation.images import image_size
 from r3jax.formats.validation.names import below
 
 _MAX_GAP = 0.02
-"""Pictures and poses farther apart than this do not belong together [s]."""
+"""Images and poses farther apart than this do not belong together [s]."""
 
 _UNIT = DepthUnit(1.0 / 5000.0)
 _SIZE = (640, 480)
@@ -92,7 +92,7 @@ def nearest(times: np.ndarray, others: np.ndarray, max_gap: float = _MAX_GAP) ->
 
 
 def _pictures(folder: Path, name: str) -> tuple[np.ndarray, list[Path]]:
-    """Times [n] and paths of a list of pictures."""
+    """Times [n] and paths of a list of images."""
     source = folder / name
     times: list[float] = []
     paths: list[Path] = []

@@ -35,7 +35,7 @@ _STOPS_PER_TARGET = 4
 _ATTEMPT_COSINE = 0.9
 _ATTEMPT_REACH = 3.0
 """Frontier cells within 26 degrees of the line of sight and 3 m count as looked at too: they lie
-inside the picture of any camera with 52 degrees or more."""
+inside the image of any camera with 52 degrees or more."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def nearest_views(
         travel: where the robot may stop, and how far that is.
         targets: free cells to look at, [X, Y, Z] bool.
         num: places wanted.
-        limits: of the carrier; the allowed view nearest to the target must still show it.
+        limits: of the robot; the allowed view nearest to the target must still show it.
         key: draws the targets that are considered, if there are very many.
 
     Returns:

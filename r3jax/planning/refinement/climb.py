@@ -1,4 +1,4 @@
-"""Climbs the smooth stand-in for the utility of a view, from many starts.
+"""Climbs the smooth surrogate for the utility of a view, from many starts.
 
 A view without roll is five numbers: a position, an azimuth and an elevation. What is allowed is a
 box of them, on which projecting is exact: jaxopt's projected gradient, with a line search. Where

@@ -1,10 +1,10 @@
 """The best few candidates climb: each may give way to a better view near it.
 
 Candidates are drawn by chance, and a panorama knows directions to 10 degrees. From the best few the
-utility is climbed over position and direction (`planning.refinement.climb`), on a smooth stand-in
+utility is climbed over position and direction (`planning.refinement.climb`), on a smooth surrogate
 (`scoring.soft`), within a box of free space: boxes are
 convex, so that what climbs in one need not look out. Where a climb ends becomes the
-nearest view that the carrier may take; and then the exact utility decides: a view replaces its
+nearest view that the robot may take; and then the exact utility decides: a view replaces its
 start only if it is worth more, both alone and net of the way. On the host; scores are jitted.
 
 Shape symbols: C candidates; K starts, always `config.refine`, so that climbing compiles once.
@@ -76,7 +76,7 @@ def refine_best(
     # float32 rounds: the box is kept to the last bit here, and the directions below.
     positions = np.clip(numbers[:, :3], low, high)
     directions = directions_along(*numbers[:, 3:].T)
-    # A climb knows boxes and elevations, but not how far the carrier may turn on the way.
+    # A climb knows boxes and elevations, but not how far the robot may turn on the way.
     climbed = limits.project_to_feasible(Candidates(positions, directions, starts.valid))
     # Starts are scored again with the ends: the gain is a difference on the same voxels.
     both = jnp.concatenate([starts.poses_on_device(), climbed.poses_on_device()])

@@ -21,7 +21,7 @@ _SAME = 1e-6
 
 @dataclass(frozen=True)
 class Limits:
-    """What the carrier may do next. The default allows everything."""
+    """What the robot may do next. The default allows everything."""
 
     motion: Motion = MOTIONS["free"]
 
@@ -75,7 +75,7 @@ class Limits:
         return nearness >= np.minimum(cap, nearness.max(axis=1, keepdims=True))
 
     def may_turn(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Where the way is long enough for the turn, elevation clipped; as `nearness` [bool]."""
+        """Where the path is long enough for the turn, elevation clipped; as `nearness` [bool]."""
         # The elevation is clipped first: a tilt that stops short is no turn cut short.
         azimuth, elevation = self.clipped(*_angles_along(directions))
         turned = self._turned(positions, azimuth, elevation)
@@ -145,7 +145,7 @@ def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
     """The pose where a mission begins, [4, 4]: its elevation becomes one that is allowed.
 
     Raises:
-        ValueError: the carrier cannot be at that height.
+        ValueError: the robot cannot be at that height.
     """
     height = float(T_world_camera[2, 3])
     low, high = motion.heights_from(height)

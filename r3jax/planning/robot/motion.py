@@ -1,6 +1,6 @@
 """What carries the camera: where it may be, how it may look, how fast it goes and turns.
 
-Constraints are data: they change which candidates there are and what ways cost, and nothing else.
+Constraints are data: they change which candidates there are and what paths cost, and nothing else.
 `Limits` is a motion at a moment; every policy's candidates pass through it.
 """
 
@@ -11,7 +11,7 @@ from typing import Any, Literal
 from r3jax.formats.validation.choices import did_you_mean
 
 UNLIMITED = (-math.inf, math.inf)
-"""Heights of a carrier that may be at any [m]."""
+"""Heights of a robot that may be at any [m]."""
 
 _LEVEL = 90.0
 """Elevation of a camera that looks straight up [deg]."""
@@ -51,7 +51,7 @@ class Motion:
     round it within the safety margin, may be known to be occupied."""
 
     speed: float | None = None
-    """Along the way [m/s]; None: that of the loop's own settings, and turning takes no time."""
+    """Along the path [m/s]; None: that of the loop's own settings, and turning takes no time."""
 
     turn_rate: float | None = None
     """How fast the line of sight turns [deg/s], after the way; None: in no time."""
@@ -104,7 +104,7 @@ class Motion:
         return self.heights is not None and self.heights_above == "start"
 
     def heights_from(self, start: float) -> tuple[float, float]:
-        """Allowed heights of the camera [m], world, of a carrier that started at height `start`."""
+        """Allowed heights of the camera [m], world, of a robot that started at height `start`."""
         if self.heights is None:
             return UNLIMITED
         base = start if self.is_relative else 0.0
@@ -154,7 +154,7 @@ def make_motion(name: str = "free", **changes: Any) -> Motion:
 
 
 def check_height(height: float, heights: tuple[float, float]) -> None:
-    """Refuses a camera at a height [m] that its carrier cannot be at.
+    """Refuses a camera at a height [m] that its robot cannot be at.
 
     Raises:
         ValueError: says what to do.

@@ -1,4 +1,4 @@
-"""Shortest ways from one cell of a grid to all others, in machine code.
+"""Shortest paths from one cell of a grid to all others, in machine code.
 
 Dijkstra's algorithm with buckets (Dial 1969): a bucket holds cells whose costs differ by less than
 one, and no step is shorter than that, so that none of them can lie on the shortest way to another
@@ -29,7 +29,7 @@ def shortest_paths(
     """Length of the shortest way to each cell, and the cell before it.
 
     Args:
-        usable: cells that ways may cross.
+        usable: cells that paths may cross.
         start: where they begin, a usable cell; None: nothing can be reached.
 
     Returns:

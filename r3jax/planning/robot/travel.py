@@ -106,7 +106,7 @@ class Travel:
         return places
 
     def distance(self, cell: np.ndarray | tuple[int, int, int]) -> float:
-        """Length of the way from the robot to its stop in a cell [m]; inf if there is none."""
+        """Length of the path from the robot to its stop in a cell [m]; inf if there is none."""
         x, y, z = (int(i) for i in np.asarray(cell))
         if not self.contains((x, y, z)):
             return float("inf")
@@ -116,7 +116,7 @@ class Travel:
     def lengths(self, positions: np.ndarray) -> np.ndarray:
         """Path lengths [m] to positions [n, 3]; inf where there is no way.
 
-        The straight line where it is safe, else the way over the cells' centers: no shorter
+        The straight line where it is safe, else the path over the cells' centers: no shorter
         than what `path` returns.
         """
         return np.array([self._length(position) for position in positions])
@@ -200,7 +200,7 @@ def plan_travel(
     heights: tuple[float, float] = UNLIMITED,
     body: float = 0.0,
 ) -> Travel:
-    """Shortest ways from a position to everywhere that is safe. Once per decision.
+    """Shortest paths from a position to everywhere that is safe. Once per decision.
 
     Args:
         grid: what is known.

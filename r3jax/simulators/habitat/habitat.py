@@ -1,4 +1,4 @@
-"""Habitat-Sim 0.3.x as a simulator, for who wants its pictures instead of the ray caster's.
+"""Habitat-Sim 0.3.x as a simulator, for who wants its images instead of the ray caster's.
 
 Habitat-Sim is not on the Python package index, so there is no extra for it; it comes from conda:
 

@@ -22,10 +22,10 @@ from r3jax.scoring.renderability import term_images
 from r3jax.scoring.simulated import simulate_view
 
 _FINE_BUFFER = 320
-"""Pixels along the longer side of pictures of the map."""
+"""Pixels along the longer side of images of the map."""
 
 _SAMPLED = 500
-"""Voxels of a view that are looked for in other pictures."""
+"""Voxels of a view that are looked for in other images."""
 
 _EMPTY = 0.93
 """Gray of pixels that show no voxel."""
@@ -103,7 +103,7 @@ def panorama_strip(audit: Audit, count: int = 3) -> Figure:
 
 
 def view_figures(audit: Audit) -> list[Figure]:
-    """Draws the nearest picture, the map, and R before and after for each suggested view."""
+    """Draws the nearest image, the map, and R before and after for each suggested view."""
     fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
     figures: list[Figure] = []
     state = audit.seen.state
@@ -130,7 +130,7 @@ def worst_frames(audit: Audit, count: int = 4) -> list[EvaluatedFrame]:
 
 
 def worst_figure(audit: Audit, count: int = 4) -> Figure:
-    """The worst frames: the picture (or the map, where there is none) above its renderability."""
+    """The worst frames: the image (or the map, where there is none) above its renderability."""
     fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
     frames = worst_frames(audit, count)
     pictures: list[tuple[np.ndarray, np.ndarray]] = []
@@ -160,7 +160,7 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
 
 
 def likest_picture(audit: Audit, view: Suggestion) -> tuple[int, float]:
-    """The picture with most of what a view shows, and how far away it was taken [audit units].
+    """The image with most of what a view shows, and how far away it was taken [audit units].
 
     What hides it is not asked. A radian between the two axes and a unit between the two places
     cost a tenth of the view each.
@@ -196,7 +196,7 @@ def _pictures(
 
 
 def _row(*pictures: tuple[str, np.ndarray]) -> Figure:
-    """Pictures side by side, each under its name; those without colors are renderability."""
+    """Images side by side, each under its name; those without colors are renderability."""
     heights = [picture.shape[0] / picture.shape[1] for _, picture in pictures]
     figure = style.new_figure(10.0, 10.0 / len(pictures) * max(heights) + 0.25)
     line = np.atleast_1d(np.asarray(figure.subplots(1, len(pictures))))
@@ -216,39 +216,39 @@ def _short(name: str) -> str:
 
 
 _TRIED = 6
-"""Pictures of which the depth is looked at."""
+"""Images of which the depth is looked at."""
 
 _SLACK = 0.5
-"""A region this far behind or before the depth of its pixel is not what the picture shows there
+"""A region this far behind or before the depth of its pixel is not what the image shows there
 [audit units]."""
 
 _BEST_DISTANCE = 2.0
-"""From here a region is in the picture with what is around it [audit units]."""
+"""From here a region is in the image with what is around it [audit units]."""
 
 _PER_LINE = 5
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A picture that shows a region."""
+    """An image that shows a region."""
 
     index: int
-    """Number of the picture in the capture."""
+    """Number of the image in the capture."""
 
     column: float
-    """Column of the region's middle in the thinned picture [px]."""
+    """Column of the region's middle in the thinned image [px]."""
 
     row: float
-    """Row of the region's middle in the thinned picture [px]."""
+    """Row of the region's middle in the thinned image [px]."""
 
     radius: float
     """Radius of the region [px]."""
 
 
 def best_picture(audit: Audit, region: Region) -> Finding | None:
-    """The picture with the region near its middle, at a good distance, and not hidden.
+    """The image with the region near its middle, at a good distance, and not hidden.
 
-    Only depth images tell what is hidden. None: no picture has the region's middle in it.
+    Only depth images tell what is hidden. None: no image has the region's middle in it.
     """
     poses = audit.survey.alignment.poses(audit.source.poses[audit.survey.chosen])
     local = np.einsum("nji,nj->ni", poses[:, :3, :3], region.center - poses[:, :3, 3])
@@ -281,7 +281,7 @@ def _shows(audit: Audit, finding: Finding, z: float) -> bool:
 
 
 def region_figure(audit: Audit) -> Figure | None:
-    """The worst regions in pictures of the capture; None where no picture shows any."""
+    """The worst regions in images of the capture; None where no image shows any."""
     shown = [
         (number, region, finding)
         for number, region in enumerate(audit.regions)

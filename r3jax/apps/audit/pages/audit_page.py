@@ -29,7 +29,7 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         files: what lies beside the page, to be named on it.
 
     Returns:
-        The page; its pictures are inside it, so that it can be sent as one file.
+        The page; its images are inside it, so that it can be sent as one file.
 
     Raises:
         OSError: the disk is full, not writable, ...

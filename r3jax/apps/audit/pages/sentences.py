@@ -124,9 +124,9 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
 
 
 def directions(audit: Audit, view: Suggestion, like: int) -> str:
-    """The way from a picture of the capture to a suggested view, as a person would follow it.
+    """The way from an image of the capture to a suggested view, as a person would follow it.
 
-    Forward and left are those of the picture, in the plane; a picture that looks straight up or
+    Forward and left are those of the image, in the plane; an image that looks straight up or
     down is faced as its upper edge.
     """
     here = audit.survey.alignment.poses(audit.source.poses[[like]])[0]

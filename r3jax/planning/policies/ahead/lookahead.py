@@ -3,9 +3,9 @@
 A path is worth what its views add (`scoring.simulated`) over what it costs, in seconds:
 
     rate = sum of the utility of each view after those before it
-           / sum over its views of (seconds of a view + of the way and the turn)
+           / sum over its views of (seconds of a view + of the path and the turn)
 
-The carrier's motion says how long ways and turns take and which views there are; a camera that
+The robot's motion says how long paths and turns take and which views there are; a camera that
 flies goes 1 m/s and turns in no time.
 
 The beam holds the paths of the greatest rate. From each, some places are tried whose panorama was
@@ -37,7 +37,7 @@ from r3jax.scoring.panorama_cache import PanoramaCache
 from r3jax.scoring.simulated import simulate_view_near
 
 _NEIGHBORS = 8
-"""Straight ways are looked for to so many of the nearest places."""
+"""Straight paths are looked for to so many of the nearest places."""
 
 _APART = 0.7
 """Views from places this far apart are two choices [m]."""
@@ -66,7 +66,7 @@ class AheadConfig(PlannerConfig):
     """Places that it tries for the next view of each path."""
 
     view_seconds: float = 4.0
-    """What it counts for a view, beside the way to it [s]. With 1 it saves meters, looks
+    """What it counts for a view, beside the path to it [s]. With 1 it saves meters, looks
     at what is near once more, and 60 views of an office come out 1 dB worse."""
 
     def __post_init__(self) -> None:
@@ -171,7 +171,7 @@ def search(problem: BeamProblem) -> list[Path]:
 
 
 def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
-    """Lengths of ways between positions [C, 3] that the robot can come to, [C, C] [m].
+    """Lengths of paths between positions [C, 3] that the robot can come to, [C, C] [m].
 
     Over straight lines between near ones, each safe throughout, or back past the robot: no
     shorter than the shortest way. Unreachable positions are infinitely far from all others.

@@ -145,5 +145,5 @@ class OursAhead(GreedyPolicy):
         return kept.replaced(padded, others)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """The rate of the best path: the way is in it."""
+        """The rate of the best path: the path is in it."""
         return utilities["ahead"]
