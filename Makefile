@@ -5,6 +5,7 @@
 #   make mutants    plants every listed fault and asks whether a law notices
 #   make stress     kill loops, thousands of damaged files, long runs: hours
 #   make docs       the documentation, to open from its folder
+#   make gpu-check  tests, benchmarks and one experiment on this machine's GPU: one table
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -15,7 +16,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/r3jax
 # Python keeps what it compiled, too: a test process saves six seconds each time.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-all test-added mutants stress lint docs notebooks benchmark clean
+.PHONY: setup demo test test-all test-added mutants stress lint docs notebooks benchmark gpu-check clean
 
 setup: $(STAMP)
 
@@ -63,6 +64,10 @@ notebooks: setup
 
 benchmark: setup
 	$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only --benchmark-columns=min,median,rounds
+
+# For a machine with an NVIDIA GPU, in an environment that has JAX's CUDA plug-in.
+gpu-check:
+	$(PYTHON) -m experiments.gpu_check
 
 clean:
 	rm -rf $(VENV) .cache build *.egg-info
