@@ -22,6 +22,11 @@ _WEDGE = 0.45
 _TOO_NEAR = 0.35
 """Letters nearer to each other than this would cover each other [audit units]."""
 
+_MARKER = 0.24
+"""Width of a numbered marker [inch]."""
+
+_PUSHES = 200
+
 _HALO = withStroke(linewidth=2.0, foreground="white")
 
 _PALE = 0.55
@@ -61,7 +66,7 @@ def plan_figure(audit: Audit) -> Figure:
     left.set_facecolor("#eef0f3")
     _draw_path(left, audit, unit)
     _draw_regions(left, audit, unit)
-    _draw_views(left, audit, unit)
+    _draw_views(left, audit, unit, float(_MARKER * max(size) / panel))
     values, where = _value_picture(audit, height)
     right.set_facecolor("#eef0f3")
     image = right.imshow(
@@ -183,11 +188,34 @@ def _labels(regions: tuple[Region, ...]) -> list[tuple[np.ndarray, str, str]]:
     return places
 
 
-def _draw_views(axes: Axes, audit: Audit, unit: float) -> None:
-    """Suggested views: a numbered wedge over the field of view."""
+def apart(places: np.ndarray, least: float) -> np.ndarray:
+    """Places [n, 2] moved as little as it takes for each two to be `least` apart, about.
+
+    Pairs that are too near push each other away, again and again; two on one spot part sideways.
+    """
+    moved = np.array(places, dtype=np.float64)
+    for _ in range(_PUSHES):
+        gap = moved[:, None] - moved[None]
+        distance = np.linalg.norm(gap, axis=-1)
+        is_near = (distance < least) & ~np.eye(len(moved), dtype=bool)
+        if not is_near.any():
+            break
+        order = np.sign(np.arange(len(moved))[:, None] - np.arange(len(moved))[None])
+        aside = np.stack([order.astype(float), np.zeros_like(distance)], axis=-1)
+        safe = np.maximum(distance, 1e-9)[..., None]
+        direction = np.where(distance[..., None] > 1e-9, gap / safe, aside)
+        push = np.where(is_near, 0.5 * (least - distance), 0.0)[..., None] * direction
+        moved += push.sum(axis=1)
+    return moved
+
+
+def _draw_views(axes: Axes, audit: Audit, unit: float, least: float) -> None:
+    """Suggested views: a wedge over the field of view, and numbers that do not cover each other."""
     camera = audit.camera
     half = float(np.arctan(0.5 * camera.width / float(camera.fx)))
-    for number, view in enumerate(audit.plan.views, start=1):
+    eyes = np.array([view.pose[:2, 3] for view in audit.plan.views]).reshape(-1, 2)
+    labels = apart(eyes, least)
+    for number, (view, label) in enumerate(zip(audit.plan.views, labels, strict=True), start=1):
         eye, ahead = view.pose[:2, 3], view.pose[:2, 2]
         azimuth, level = np.arctan2(ahead[1], ahead[0]), float(np.linalg.norm(ahead))
         angles = azimuth + np.linspace(-half, half, 9)
@@ -199,8 +227,9 @@ def _draw_views(axes: Axes, audit: Audit, unit: float) -> None:
                     linewidth=0.9, zorder=6)
         )  # fmt: skip
         axes.annotate(
-            str(number), tuple(unit * eye), ha="center", va="center", fontsize=8.5,
-            fontweight="bold", color="white", zorder=7,
+            str(number), tuple(unit * eye), tuple(unit * label), ha="center", va="center",
+            fontsize=8.5, fontweight="bold", color="white", zorder=7,
+            arrowprops={"arrowstyle": "-", "color": "#075985", "linewidth": 0.8},
             bbox={"boxstyle": "circle,pad=0.18", "facecolor": "#075985", "edgecolor": "white",
                   "linewidth": 0.8},
         )  # fmt: skip

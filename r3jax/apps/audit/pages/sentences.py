@@ -47,7 +47,8 @@ def length(audit: Audit, in_audit: float) -> str:
 def area(audit: Audit, in_audit: float) -> str:
     """An area of the audit to two digits, in the capture's units: voxels count no finer."""
     value = float(f"{in_audit * audit.survey.length(1.0) ** 2:.2g}")
-    return f"{value:g} {audit.survey.unit}²"
+    digits = f"{value:.0f}" if value >= 10.0 else f"{value:#.2g}"
+    return f"{digits} {audit.survey.unit}²"
 
 
 def point(position: np.ndarray) -> str:
