@@ -46,9 +46,13 @@ def length(audit: Audit, in_audit: float) -> str:
 
 def area(audit: Audit, in_audit: float) -> str:
     """An area of the audit to two digits, in the capture's units: voxels count no finer."""
-    value = float(f"{in_audit * audit.survey.length(1.0) ** 2:.2g}")
-    digits = f"{value:.0f}" if value >= 10.0 else f"{value:#.2g}"
-    return f"{digits} {audit.survey.unit}²"
+    return f"{two_digits(in_audit * audit.survey.length(1.0) ** 2)} {audit.survey.unit}²"
+
+
+def two_digits(value: float) -> str:
+    """A positive number with two digits that count: 0.012, 2.0, 76, 1200."""
+    rounded = float(f"{value:.2g}")
+    return f"{rounded:.0f}" if rounded >= 10.0 else f"{rounded:#.2g}"
 
 
 def point(position: np.ndarray) -> str:
