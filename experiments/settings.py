@@ -44,10 +44,13 @@ _OF_CONDITIONS = {
 }
 """Settings for which `Conditions` has fields, by name."""
 
-_OF_MISSION = ("speed", "num_probes", "max_still_views", "until", "until_every")
+_OF_MISSION = (
+    "speed", "num_probes", "max_still_views", "until", "until_every",
+    "capture_every", "capture_rate", "gaze", "exposure", "blur", "plan_while_moving",
+)  # fmt: skip
 """Fields of `ExplorationConfig` that concern neither the map nor the grid."""
 
-_WORDS = ("until",)
+_OPTIONAL: dict[str, type] = {"until": str, "capture_every": float, "capture_rate": float}
 """Optional fields that are no whole numbers."""
 
 
@@ -134,9 +137,8 @@ def _defaults(config: type, leave_out: tuple[str, ...] = ()) -> dict[str, Any]:
 
 
 def _setting(name: str, config: type, part: Part, field: str, default: Value) -> Setting:
-    # Of what is optional there is no default that the kind could be taken from: it is a whole
-    # number, but for the goal.
-    kind = type(default) if default is not None else str if field in _WORDS else int
+    # Of what is optional there is no default that the kind could be taken from.
+    kind = type(default) if default is not None else _OPTIONAL.get(field, int)
     sentence = sentences_of(config).get(field.removeprefix("scoring."), "")
     return Setting(name, default, kind, sentence, part, field)
 

@@ -187,8 +187,7 @@ class GreedyPolicy(ABC):
         stopwatch = Stopwatch()
         with stopwatch.part("travel"):
             state, travel, _ = prepare_decision(state, map_state, grid, T_world_camera, self.config)
-            pose = np.asarray(T_world_camera, dtype=np.float64)
-            limits = Limits(self.config.motion, pose, travel.heights)
+            limits = self._limits(T_world_camera, travel)
             views = limits.project_to_feasible(views)
             path = limits.path_costs(path_lengths(travel, views), views.direction)
         if not np.isfinite(path).any():
@@ -216,9 +215,7 @@ class GreedyPolicy(ABC):
             state, travel, masked = prepare_decision(
                 state, map_state, grid, T_world_camera, self.config
             )
-        # float64 on the host: waypoints begin exactly where the robot is.
-        pose = np.asarray(T_world_camera, dtype=np.float64)
-        limits = Limits(self.config.motion, pose, travel.heights)
+        limits = self._limits(T_world_camera, travel)
         with stopwatch.part("candidates"):
             situation = Situation(
                 map_state, grid, masked, travel, state.camera, state.memory, limits
@@ -262,6 +259,12 @@ class GreedyPolicy(ABC):
         )
         memory = self.conclude(situation, candidates, utilities, best)
         return decision, replace(state, memory=memory), info
+
+    def _limits(self, T_world_camera: np.ndarray, travel: Travel) -> Limits:
+        """What the robot may do next from a pose [4, 4]."""
+        # float64 on the host: waypoints begin exactly where the robot is.
+        pose = np.asarray(T_world_camera, dtype=np.float64)
+        return Limits(self.config.motion, pose, travel.heights)
 
     def follow(
         self,

@@ -94,7 +94,7 @@ def test_unexplored_cells_can_be_left_out(flat, poses, monkeypatch):
 
 
 def test_what_has_no_score_is_refused():
-    turning = {"ours-pano", "ours-ahead"}
+    turning = {"ours-pano", "ours-ahead", "r3con"}
     assert set(policy_names()) - set(SCORED) == turning | {"frontier"}
     with pytest.raises(ValueError, match=r"frontier cannot choose.*unseen-depth"):
         Options(policies=("ours", "frontier"))

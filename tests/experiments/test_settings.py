@@ -26,6 +26,7 @@ CELL = Cell("flat", "a" * 64, "ours", 0, CONDITIONS, "b" * 64, 100)
 ODD = {
     "policy.kappa": "one", "policy.delta": "pairwise", "training.strategy": "mcmc",
     "training.background": "white", "loop.until": "psnr:20", "training.sh_degree": 1,
+    "loop.gaze": "ahead",
 }  # fmt: skip
 
 
@@ -39,7 +40,7 @@ def changed(setting):
         return ODD[setting.name]
     if setting.kind is bool:
         return not setting.default
-    return 2 * setting.default if setting.default else 7
+    return 2 * setting.default if setting.default else setting.kind(7)
 
 
 @pytest.mark.parametrize("name", KNOWN)

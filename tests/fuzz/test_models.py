@@ -28,7 +28,7 @@ from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
 
-CASES = 700
+CASES = 300
 """In the normal suite."""
 
 METRIC = {

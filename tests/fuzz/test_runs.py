@@ -22,7 +22,7 @@ from tests.trace.runs import make_header, make_view
 
 pytestmark = pytest.mark.full
 
-CASES = 700
+CASES = 300
 """In the normal suite."""
 
 

@@ -170,8 +170,7 @@ def _sight(
     normal_sum = at(seen.normal_sum) + _unit(turned)
     # With this frame counted in: n is the normal as known after frame t.
     cosine = jnp.maximum(0.0, jnp.sum(_unit(normal_sum) * direction, axis=0))
-    # Rays within range by depth may be longer than it off the axis: no negative weights.
-    weight = jnp.maximum(0.0, 1.0 - distance / max_range)
+    weight = _weight(distance, max_range)
     return Sightings(
         key=seen.key,
         views=put(seen.views, at(seen.views) + 1.0),
@@ -184,6 +183,12 @@ def _sight(
 def _unit(x: Float[Array, "3 M"]) -> Float[Array, "3 M"]:
     length = safe_norm(x, axis=0)
     return x / jnp.where(length > 0.0, length, 1.0)[None, :]
+
+
+def _weight(distance: Float[Array, " N"], max_range: Float[Array, ""]) -> Float[Array, " N"]:
+    """What a sighting counts by its distance: all at the camera, nothing at the range."""
+    # Rays within range by depth may be longer than it off the axis: no negative weights.
+    return jnp.maximum(0.0, 1.0 - distance / max_range)
 
 
 @jax.jit
@@ -214,7 +219,7 @@ def glance(
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     direction = offset / distance[None, :]
     cosine = jnp.maximum(0.0, jnp.sum(touched.normal * direction, axis=0))
-    weight = jnp.maximum(0.0, 1.0 - distance / max_range)
+    weight = _weight(distance, max_range)
     add: Callable[[Array, Array | float], Array] = lambda x, more: x + jnp.where(is_new, more, 0.0)
     return Sightings(
         key=touched.key,
