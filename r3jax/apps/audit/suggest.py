@@ -26,7 +26,7 @@ Shape symbols: p places or standpoints; B bins of the panorama; C candidates; N 
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -251,7 +251,7 @@ class LazyGreedy:
     poses: np.ndarray
     """Candidates, [C, 4, 4] [audit units]."""
 
-    name: ClassVar[str] = "audit"
+    name = "audit"
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Memory:
         """Knows no gain yet."""
