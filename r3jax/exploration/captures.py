@@ -17,7 +17,8 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.planning.gaze import (
+from r3jax.planning.gaze.gaze_plan import plan_gaze
+from r3jax.planning.gaze.turning import (
     Turning,
     along,
     axes_within,
@@ -28,7 +29,6 @@ from r3jax.planning.gaze import (
     pose_towards,
     worthwhile_grid,
 )
-from r3jax.planning.gaze_plan import plan_gaze
 from r3jax.planning.planner import Planner, observe
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.robot.motion import Motion
@@ -46,7 +46,7 @@ class Rules:
     """What carries the camera."""
 
     camera: Camera
-    """Of the frames."""
+    """Camera of the frames."""
 
     @property
     def scoring(self) -> ScoringConfig:
@@ -83,13 +83,13 @@ class Leg:
     info: PlanInfo
 
     places: np.ndarray
-    """Of the frames, [n, 3] [m]; the last one is that of the chosen view."""
+    """Places of the frames, [n, 3] [m]; the last one is that of the chosen view."""
 
     lengths: np.ndarray
-    """Of the pieces of the path, [n] [m]."""
+    """Lengths of the pieces of the path, [n] [m]."""
 
     seconds: np.ndarray
-    """Of the flight over each piece, [n]; the last one with what is left of the turn."""
+    """Time for each piece, [n] [s]; the last one with what is left of the turn."""
 
     turning: Turning
     """How far the camera can turn on each piece."""
@@ -98,7 +98,7 @@ class Leg:
     """Frames that were captured so far."""
 
     directions: np.ndarray | None = None
-    """Of the frames on the way if they are planned together, [n - 1, 2] [rad]."""
+    """Directions of the frames on the way if they are planned together, [n - 1, 2] [rad]."""
 
     hidden: float = 0.0
     """Planning of the decision that the flight before it hid [s]."""
@@ -110,7 +110,7 @@ class Leg:
 
     @property
     def length(self) -> float:
-        """Of the piece to the next frame [m]."""
+        """Length of the piece to the next frame [m]."""
         return float(self.lengths[self.taken])
 
     @property

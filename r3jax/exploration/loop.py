@@ -13,8 +13,7 @@ from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.recording import record_end, record_view
-from r3jax.exploration.resume import continued
+from r3jax.exploration.recording import continued, record_end, record_view
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, TakenView
 from r3jax.exploration.step import start_state, step
 from r3jax.planning.planner import Planner

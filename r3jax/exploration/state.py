@@ -55,7 +55,7 @@ class PlannedAhead:
     """A decision that is made while the camera flies, for when it arrives."""
 
     decision: Decision
-    """Of the policy, on the map as it was expected to be."""
+    """What the policy decided, on the map as it was expected to be."""
 
     charge: float
     """What it takes on the mission clock [s]."""
@@ -95,7 +95,7 @@ class LoopState:
     """Views in a row that were taken without moving."""
 
     captured: int = 0
-    """Of the frames in the map, those that were captured on the way."""
+    """Frames in the map that were captured on the way."""
 
     leg: Leg | None = None
     """The path under way; None where a decision comes next."""

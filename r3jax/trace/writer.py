@@ -216,7 +216,7 @@ class RunWriter:
             append_line(self.path / "timings.jsonl", json.dumps(line))
 
     def checkpoint(self, step: int, tables: Tables, *, wait: bool = False) -> None:
-        """Stores the state after view `step` (`exploration.resume.state_tables`) in the background.
+        """Stores the state after view `step` (`recording.state_tables`) in the background.
 
         Left out if the state before is still being stored, unless `wait` is True.
 

@@ -17,7 +17,7 @@ from r3jax.apps.report.model_report import read_evaluated_model
 from r3jax.apps.runs.settings import open_run_scene, settings_of_run
 from r3jax.cli.main import main
 from r3jax.exploration import explore
-from r3jax.exploration.resume import state_tables
+from r3jax.exploration.recording import state_tables
 from r3jax.formats.captures import open_capture
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import empty_scene

@@ -18,7 +18,7 @@ from r3jax.exploration.state import StopReason
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate
-from r3jax.planning.gaze import direction_of, turn
+from r3jax.planning.gaze.turning import direction_of, turn
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import MOTIONS, Motion

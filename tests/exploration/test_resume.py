@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from r3jax.exploration import explore
-from r3jax.exploration.resume import state_of, state_tables
+from r3jax.exploration.recording import state_of, state_tables
 from r3jax.exploration.state import StopReason
 from r3jax.trace.checkpoints import CheckpointWriter, load_checkpoint
 from r3jax.trace.errors import RunError

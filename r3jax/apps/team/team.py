@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.apps.team.reserved_views import PromisedView, ReservedViews
 from r3jax.apps.team.sharing import Common, Sight, Told, in_order, last_meeting, tell
 from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.clock import make_clock, timed
@@ -31,7 +32,6 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.planner import add_frame, tell_policy
 from r3jax.planning.policy import Policy
-from r3jax.planning.reserved_views import PromisedView, ReservedViews
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RecordingStopped

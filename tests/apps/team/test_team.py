@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.apps.team import team as real_team
+from r3jax.apps.team.reserved_views import without_yielded
 from r3jax.apps.team.team import Member, explore_team
 from r3jax.exploration import explore
 from r3jax.exploration.guard import OracleReadError
@@ -24,7 +25,6 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.state import empty_map
 from r3jax.planning.planner import add_frame, first_grid
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
-from r3jax.planning.reserved_views import without_yielded
 from r3jax.scoring.batch import score_views
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.simulated import imagine_view

@@ -27,7 +27,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.gaze import Turning, axes_within, pose_towards, turn
+from r3jax.planning.gaze.turning import Turning, axes_within, pose_towards, turn
 from r3jax.scoring.batch import cache_positions_near
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
@@ -50,7 +50,7 @@ class GazePlan:
     """The best chain that was found."""
 
     directions: np.ndarray
-    """Of the frames, [n, 2] [rad]."""
+    """Directions of the frames, [n, 2] [rad]."""
 
     gain: float
     """What they add together."""

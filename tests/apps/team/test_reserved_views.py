@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from r3jax.apps.team.reserved_views import PromisedView
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.planning.reserved_views import PromisedView
 from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.utility import view_utility
 from tests.mutants import Modules, Mutant, assert_caught, each, load
@@ -21,7 +21,7 @@ from tests.scoring.test_simulated import CAMERA, CONFIG, poses_of, seen_map
 
 pytestmark = pytest.mark.full
 
-CHAIN = ("r3jax.scoring.simulated", "r3jax.planning.reserved_views")
+CHAIN = ("r3jax.scoring.simulated", "r3jax.apps.team.reserved_views")
 WORLD = OccupancyGrid(
     log_odds=jnp.zeros((20, 20, 16)).at[3:8].set(-3.0),
     origin=jnp.asarray([-1.0, -2.0, -1.6]),

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from r3jax.geometry.cameras import pose_along
-from r3jax.planning.gaze import (
+from r3jax.planning.gaze.gaze_plan import _nodes, plan_gaze
+from r3jax.planning.gaze.turning import (
     Turning,
     along,
     axes_within,
@@ -20,7 +21,6 @@ from r3jax.planning.gaze import (
     turn,
     worthwhile_grid,
 )
-from r3jax.planning.gaze_plan import _nodes, plan_gaze
 from r3jax.scoring.panorama import panorama
 from tests.planning.known_hall import CAMERA, SCORING, after_view, for_scoring
 from tests.planning.rooms import center, grid_of, two_rooms
