@@ -4,6 +4,7 @@ Shape symbols: n points; H W picture size.
 """
 
 import functools
+from collections.abc import Iterable
 
 import matplotlib
 import numpy as np
@@ -55,6 +56,11 @@ def paint(values: np.ndarray, name: str = SCORES) -> np.ndarray:
     is_number = ~np.isnan(values)
     index = np.rint(np.where(is_number, values, 0.0).clip(0.0, 1.0) * 255.0).astype(np.intp)
     return np.where(is_number[..., None], _table(name)[index], np.asarray(UNSEEN, np.uint8))
+
+
+def css_color(color: Iterable[int]) -> str:
+    """A color of three bytes as browsers write it, such as `#0f766e`."""
+    return "#" + "".join(f"{int(part):02x}" for part in color)
 
 
 def spread(values: np.ndarray) -> np.ndarray:
