@@ -136,7 +136,7 @@ def _add_sightings(
     return for_selected(visible, add, totals)
 
 
-BUDGET = 120_000
+BUDGET = 300_000
 """Blocks that a browser gets at most."""
 
 QUANTITIES = (*TERMS, "color")

@@ -82,7 +82,7 @@ def open_run_page(
             scoring_of(header),
             np.asarray(header.bounds, np.float64),
             title=title_of(header),
-            subtitle=f"{run.path}; {run.outcome}",
+            subtitle=_summary(run),
             extras=extras,
         )
         try:
@@ -91,6 +91,14 @@ def open_run_page(
             app.close()
     finally:
         close_server(server)
+
+
+def _summary(run: Run) -> str:
+    """Where a run lies, how long it is and how it ended."""
+    last, end = run.rows[-1], run.end
+    is_used_up = end is not None and end.outcome == "budget"
+    ended = "budget used up" if is_used_up else run.outcome
+    return f"{run.path} · {len(run.rows)} views, {last.metres:.1f} m · {ended}"
 
 
 def _decisions(run: Run) -> Iterator[tuple[int, Offer | None]]:

@@ -9,7 +9,7 @@ import pytest
 from r3jax.apps.report.reasons import COLORS
 from r3jax.apps.viewer.blocks import Blocks, block_causes, cause_colors
 from r3jax.apps.viewer.color_maps import UNSEEN
-from r3jax.apps.viewer.page.panel import reason_html
+from r3jax.apps.viewer.page.facts import reason_html
 from r3jax.apps.viewer.story import RecordedStory
 from r3jax.exploration.explain_run import Reason, explain_run
 from r3jax.scoring.explain import CAUSES
@@ -33,7 +33,7 @@ def story(run):
 def test_reasons_come_as_the_run_is_replayed(story, reasons):
     assert story.reason(0) == "the start: nothing was chosen"
     for step in range(1, VIEWS):
-        assert story.reason(step) == "being worked out …"
+        assert story.reason(step) == "is being computed …"
     num_turns = 0
     while story.advance():
         num_turns += 1
@@ -78,7 +78,7 @@ def make_reason() -> Reason:
 
 def test_the_panel_tells_the_shares():
     text = reason_html(make_reason())
-    assert ">80</b>" in text
+    assert "<b>80</b>" in text
     found = re.findall(r"<span style=\"flex:1\">([^<]*)</span><span[^>]*>(\d+) (\w+)", text)
     numbers = ["3", "3", "2", "2"]
     units = ["cells", "voxels", "voxels", "voxels"]

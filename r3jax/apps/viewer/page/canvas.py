@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from r3jax.apps.viewer.color_maps import linear_light, to_bytes
 from r3jax.apps.viewer.overlays import pose_of, quaternion
 from r3jax.apps.viewer.stills import overview
 from r3jax.geometry.cameras import Camera
@@ -124,7 +125,7 @@ class Canvas:
             shadow_opacity=0.0,
             position=(float(middle[0]), float(middle[1]), below),
         )
-        start = np.array([first[0] + 1.0, first[1], below])
+        start = np.array([np.ceil(low[0]), np.floor(low[1]), below])  # right before the scene
         ends = np.stack([start, start + np.array([1.0, 0.0, 0.0])])[None].astype(np.float32)
         self.show_lines("/scale", ends, np.full((1, 2, 3), _INK, np.uint8), 0.04)
         self._server.scene.add_label(
@@ -158,7 +159,7 @@ class Canvas:
         small: bool = False,
     ) -> None:
         """A view along the path, with its picture [H, W, 3] uint8; it can be clicked."""
-        scale = 0.05 if small else 0.12
+        scale = 0.05 if small else 0.1
         handle = self._add_frustum(
             f"/views/{step:06d}", T_world_camera, scale, 0.004, _VIEW_COLOR, thumbnail
         )
@@ -214,7 +215,9 @@ class Canvas:
     ) -> None:
         """Lines of a thickness [m]: ends [s, 2, 3] [m], colors [s, 2, 3] uint8; none: nothing."""
         if len(segments):
-            self._server.scene.add_line_segments(name, segments, colors, thickness=thickness)
+            # What viser takes the colors of lines for: encoded ones would be washed out.
+            light = to_bytes(linear_light(colors / 255.0))
+            self._server.scene.add_line_segments(name, segments, light, thickness=thickness)
         else:
             self._server.scene.remove_by_name(name)
 
@@ -236,15 +239,17 @@ class Canvas:
     def show_splats(
         self, name: str, arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     ) -> None:
-        """Gaussians, as `shapes.splat_arrays` gives them."""
+        """Gaussians, as `overlays.splat_arrays` gives them."""
         self._server.scene.add_gaussian_splats(name, *arrays)
 
     def show_mesh(self, name: str, glb: bytes) -> None:
         """The scene's own triangles."""
         self._server.scene.add_glb(name, glb, cast_shadow=False, receive_shadow=False)
 
-    def show_only(self, name: str, names: Sequence[str]) -> None:
+    def show_only(self, name: str, names: Sequence[str], *, is_splats: bool = False) -> None:
         """Leaves only one of the nodes called `names` visible; those not there stay away."""
+        # Splats are drawn last, over all that leaves no depth; before all else, no test is best.
+        self.gizmo.depth_test = is_splats
         for other in names:
             handle = self._server.scene.get_handle_by_name(other)
             if handle is not None:

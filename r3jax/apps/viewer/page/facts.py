@@ -41,7 +41,7 @@ _SHARE = (
     '<div title="{hint}" style="display:flex;align-items:baseline;gap:7px;cursor:help">'
     '<span style="width:9px;height:9px;border-radius:5px;border:1px solid #8888;'
     'background:{color}"></span><span style="flex:1">{name}</span>'
-    '<span style="opacity:.65">{count}</span><span style="width:44px;text-align:right;'
+    '<span style="opacity:.65">{count}</span><span style="width:54px;text-align:right;'
     'font-variant-numeric:tabular-nums">{percent:.1f} %</span></div>'
 )
 _NUMBER = (
@@ -91,12 +91,12 @@ def view_html(row: StepRow, num_views: int, image: np.ndarray, reason: Reason | 
     """
     coverage, total = row.coverage, sum(row.charged.values())
     facts = {
-        "clock": f"{row.seconds:.1f} s",
+        "mission clock": f"{row.seconds:.1f} s",
         "this view cost": f'<span title="{_e(_costs(row))}">{total:.1f} s</span>',
         "path": f"{row.metres:.1f} m",
         "explored": f"{100 * coverage.known_share:.0f} %",
-        "R of the map": f"{coverage.mean_renderability:.2f}",
-        "R on arrival": f"{coverage.arrival_renderability:.2f}",
+        "mean renderability": f"{coverage.mean_renderability:.2f}",
+        "R before this view": f"{coverage.arrival_renderability:.2f}",
     }
     table = "".join(_row(name, value) for name, value in facts.items())
     head = (
@@ -169,10 +169,10 @@ def _ordinal(number: int) -> str:
 
 def reason_html(reason: Reason | str) -> str:
     """What a view promised when it was chosen, by cause; or why that is not known."""
-    hint = _e(HINTS["utility"])
+    hint = _e(HINTS["promise"])
     head = f'<div title="{hint}" style="margin-top:6px;cursor:help">{{}}</div>'
     if isinstance(reason, str):
-        words = head.format("utility when it was chosen")
+        words = head.format("what it promised")
         return f'{words}<div id="r3jax-reason" style="opacity:.65">{_e(reason)}</div>'
     total = reason.utility
     shares = reason.totals / total if total > 0.0 else np.zeros(len(CAUSES))
@@ -180,8 +180,8 @@ def reason_html(reason: Reason | str) -> str:
         f'<span style="width:{100.0 * share:.1f}%;background:{color}"></span>'
         for share, color in zip(shares, COLORS, strict=True)
     )
-    counts = [f"{len(reason.cells):,} cells"] + [
-        f"{voxels:,} voxels" for voxels in (reason.shares > 0.0).sum(axis=1).tolist()
+    counts = [_count(len(reason.cells), "cell")] + [
+        _count(voxels, "voxel") for voxels in (reason.shares > 0.0).sum(axis=1).tolist()
     ]
     lines = "".join(
         _SHARE.format(
@@ -189,11 +189,15 @@ def reason_html(reason: Reason | str) -> str:
         )
         for name, color, count, share in zip(CAUSES, COLORS, counts, shares, strict=True)
     )
-    words = head.format(f"utility when it was chosen: <b>{total:,.0f}</b>")
+    words = head.format(f"what it promised: utility <b>{total:,.0f}</b>")
     return (
         f'{words}<div style="display:flex;height:9px;border-radius:4px;overflow:hidden;'
         f'margin:2px 0 4px;background:#8884">{parts}</div><div id="r3jax-reason">{lines}</div>'
     )
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number:,} {name}" if number == 1 else f"{number:,} {name}s"
 
 
 def pending_html() -> str:

@@ -69,7 +69,7 @@ def legend_html(caption: Caption, with_candidates: bool = False) -> str:
     )
     if with_candidates:
         rows.append(_bar(UTILITY_MAP, "candidates: worst", "best", HINTS["candidates"]))
-    rows.append(_swatches([("transparent", "grid: 1 m", "Each square of the grid is 1 m wide.")]))
+    rows.append('<div style="font-size:12px;opacity:.75">Squares of the grid are 1 m wide.</div>')
     return _BOX.format("".join(rows))
 
 

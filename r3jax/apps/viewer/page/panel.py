@@ -115,7 +115,7 @@ class Controls:
         self._add_choices(gui, menu)
         self._add_view(gui, menu)
         self._add_camera(gui, menu)
-        self._add_legend(gui, menu.title)
+        self._add_legend(gui)
 
     def _add_choices(self, gui: viser.GuiApi, menu: Menu) -> None:
         """What is drawn."""
@@ -135,7 +135,7 @@ class Controls:
         )
         with gui.add_folder("View on the slider"):
             self._facts = _Section(gui.add_html(""))
-            self._candidates = gui.add_checkbox("draw its candidates", False, hint=words.CANDIDATES)
+            self._candidates = gui.add_checkbox("candidates", False, hint=words.CANDIDATES)
             self._frusta = gui.add_checkbox("earlier views", True, hint=words.FRUSTA)
 
     def _add_camera(self, gui: viser.GuiApi, menu: Menu) -> None:
@@ -149,10 +149,10 @@ class Controls:
             self._turn = gui.add_button("Look along the suggested direction", hint=words.TURN)
             self._return = gui.add_button("Go to the view on the slider", hint=words.RETURN)
 
-    def _add_legend(self, gui: viser.GuiApi, title: str) -> None:
+    def _add_legend(self, gui: viser.GuiApi) -> None:
         """The legend over the scene, with the sign of what is being computed."""
         window = gui.add_panel()
-        with window.add_tab(title):
+        with window.add_tab("Legend"):
             self._legend = gui.add_html("")
             self._bar = gui.add_progress_bar(0.0, visible=False)
         window.float(x=_EDGE, y=_EDGE, width=_LEGEND_WIDTH)

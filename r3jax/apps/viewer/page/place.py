@@ -132,7 +132,9 @@ class PlaceLayer:
             drawing.draw()
             colors = np.tile(CAUSE_COLORS[0], (len(drawing.cells), 1))
             self._canvas.show_points(_CELLS, drawing.cells, colors, _CELL_EDGE)
-            self._canvas.show_only(_NODES[layer.surface], tuple(_NODES.values()))
+            is_splats = layer.surface == "splats"
+            nodes = tuple(_NODES.values())
+            self._canvas.show_only(_NODES[layer.surface], nodes, is_splats=is_splats)
             self.caption = Caption(layer, drawing.moment, drawing.detail)
             self._drawn = key
 
@@ -217,7 +219,7 @@ class PlaceLayer:
         centers, covariances, colors, opacities = (part[low] for part in self._gaussians)
         arrays = centers, covariances, colors, opacities
         show = functools.partial(self._canvas.show_splats, "/splats", arrays)
-        return _Drawing(show, _WHOLE, f"{share} Gaussians, in the color seen from all around")
+        return _Drawing(show, _WHOLE, f"{share} Gaussians in their mean colors")
 
     def _mesh(self, cut: float) -> _Drawing:
         """The scene's own triangles, but for those above the cut."""

@@ -4,16 +4,16 @@ from r3jax.scoring.explain import CAUSES
 
 HINTS = {
     # The view on the slider.
-    "clock": "Time that the mission has taken so far: planning, mapping and flight. Rendering the "
-    "simulator's images does not count.",
+    "mission clock": "Time that the mission has taken so far: planning, mapping and flight. "
+    "Rendering the simulator's images does not count.",
     "this view cost": "Time that this view added to the clock: planning, mapping and flight.",
     "path": "Length of the path flown so far.",
     "explored": "Share of the cells in the scene's box that are known to be free or occupied. "
     "Nothing ever shows the insides of walls and furniture, so it stays below 100 %.",
-    "R of the map": "Renderability, averaged over fixed test views in the free space that is "
+    "mean renderability": "Renderability, averaged over fixed test views in the free space that is "
     "known. 1 is perfect.",
-    "R on arrival": "Renderability of this very view just before it joined the map. A low value "
-    "means that the view was worth taking, a high one that it repeated what was known.",
+    "R before this view": "Renderability of this very view just before it joined the map. A low "
+    "value means that the view was worth taking, a high one that it repeated what was known.",
     # The camera that is dragged.
     "renderability R": "How well an image from this camera could be rendered from the views so "
     "far: 0 is not at all, 1 is perfect. R = bias x noise x resolution, averaged over the pixels.",
@@ -35,8 +35,9 @@ HINTS = {
     # Candidates and causes.
     "candidates": "Poses that the planner could choose from, best score first. Score = share of "
     "the utility minus lambda2 times share of the path.",
-    "utility": "What the view promised when it was chosen: unexplored cells (weighted by lambda1) "
-    "plus the sum of 1 - R over the voxels in view, divided among four causes.",
+    "promise": "Utility of the chosen view, worked out pixel by pixel and divided among four "
+    "causes: unexplored cells (weighted by lambda1) plus the sum of 1 - R over the voxels in view. "
+    "The planner's own number in the list above may differ, for planners estimate it faster.",
     **dict(
         zip(
             CAUSES,
