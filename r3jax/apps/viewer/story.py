@@ -375,7 +375,7 @@ class LiveStory:
     def reason(self, step: int) -> Reason | str:
         """The map that a view was chosen on is not kept."""
         del step
-        return "known when the run is over and opened again: r3jax view"
+        return "known once the run is over and opened by `r3jax view`"
 
 
 def _recorded_image(run: Run, step: int) -> np.ndarray:

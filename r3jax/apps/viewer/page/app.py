@@ -9,7 +9,7 @@ import viser
 from r3jax.apps.viewer.blocks import cut_height
 from r3jax.apps.viewer.page.canvas import Canvas
 from r3jax.apps.viewer.page.layers import PLACES, menu_of
-from r3jax.apps.viewer.page.panel import Controls, Menu
+from r3jax.apps.viewer.page.panel import PANEL_WIDTH, Controls, Menu
 from r3jax.apps.viewer.page.place import Show
 from r3jax.apps.viewer.page.queries import Extras, Query, QueryHandler
 from r3jax.apps.viewer.page.worker import LatestWorker
@@ -72,7 +72,7 @@ class App:
             idle=self._prepare,
         )
         low, high = np.asarray(bounds, np.float64)
-        self.canvas.place_eye(low, np.minimum(high, [*high[:2], heights[2]]))
+        self.canvas.place_eye(low, np.minimum(high, [*high[:2], heights[2]]), PANEL_WIDTH)
         if story.is_live:  # those of a recorded run take seconds, and come later
             self._add_views()
         if story.rows:

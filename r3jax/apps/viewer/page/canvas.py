@@ -25,7 +25,10 @@ _FIELD_OF_VIEW = 35.0
 """Vertical, of the eye that looks at the page [deg]: walls lean little."""
 
 _ASPECT = 1.1
-"""Width over height that the scene is framed for: a small window beside the panel."""
+"""Width over height that the scene is framed for where no window is known."""
+
+_PHONE = 576
+"""Windows no wider than this have the panel below the scene [px]."""
 
 _AZIMUTH, _ELEVATION = -105.0, 50.0
 """From where the page is first seen, as its film is [deg]."""
@@ -88,17 +91,26 @@ class Canvas:
             self.gizmo.wxyz = quaternion(T_world_camera[:3, :3])
             self.gizmo.position = T_world_camera[:3, 3]
 
-    def place_eye(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Frames a box, given by its corners [3] [m], as the page is first seen."""
+    def place_eye(self, low: np.ndarray, high: np.ndarray, panel: int) -> None:
+        """Frames a box as the page is first seen, in whatever window.
+
+        Args:
+            low: lower corner [3] [m].
+            high: upper corner.
+            panel: width of what stands beside the scene [px].
+        """
         corners = np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3)
-        half = np.tan(0.5 * np.deg2rad(_FIELD_OF_VIEW))
-        across = float(np.rad2deg(2.0 * np.arctan(_ASPECT * half)))
-        _, pose = overview(corners, round(1000 * _ASPECT), 1000, _AZIMUTH, _ELEVATION, across)
-        ahead = float((corners.mean(axis=0) - pose[:3, 3]) @ pose[:3, 2])
         eye = self._server.initial_camera
         eye.fov = float(np.deg2rad(_FIELD_OF_VIEW))
-        eye.position = pose[:3, 3]
-        eye.look_at = pose[:3, 3] + ahead * pose[:3, 2]
+        eye.position, eye.look_at = framing(corners, _ASPECT)
+
+        async def frame(client: viser.ClientHandle) -> None:
+            camera = client.camera
+            # A browser tells of its window first, and puts the panel in afterwards.
+            width = camera.image_width - (panel if camera.image_width > _PHONE else 0)
+            camera.position, camera.look_at = framing(corners, width / camera.image_height)
+
+        self._server.on_client_connect(frame)
 
     def show_grid(self, low: np.ndarray, high: np.ndarray, floor: float) -> None:
         """Squares of 1 m on the floor below a box, given by its corners [3] [m], and a scale.
@@ -269,3 +281,18 @@ class Canvas:
     def hide_suggestion(self) -> None:
         """Takes the arrow away."""
         self._server.scene.remove_by_name("/suggestion")
+
+
+def framing(points: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where to look from and to [m], so that points [n, 3] [m] fill a window.
+
+    Args:
+        points: what is to be in view.
+        aspect: width of the window over its height.
+    """
+    half = np.tan(0.5 * np.deg2rad(_FIELD_OF_VIEW))
+    across = float(np.rad2deg(2.0 * np.arctan(aspect * half)))
+    width = max(1, round(1000 * aspect))
+    _, pose = overview(points, width, 1000, _AZIMUTH, _ELEVATION, across)
+    position, ahead = pose[:3, 3], pose[:3, 2]
+    return position, position + float((points.mean(axis=0) - position) @ ahead) * ahead

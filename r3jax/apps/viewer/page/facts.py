@@ -103,10 +103,11 @@ def view_html(row: StepRow, num_views: int, image: np.ndarray, reason: Reason | 
         f'<div style="font-weight:600;margin-bottom:3px">view <span id="r3jax-view">{row.step + 1}'
         f"</span> of {num_views}</div>"
     )
-    photo = f'<img src="{image_url(image)}" alt="its photo" style="width:128px;border-radius:4px">'
+    photo = f'<img src="{image_url(image)}" alt="its photo" style="width:40%;border-radius:4px">'
+    beside = f'{photo}<div style="flex:1;min-width:0">{table}</div>'
     return _BOX.format(
-        f'{head}<div style="display:flex;gap:12px;align-items:flex-start">{photo}'
-        f'<div style="flex:1">{table}</div></div>{candidates_html(row)}{reason_html(reason)}'
+        f'{head}<div style="display:flex;gap:12px;align-items:flex-start">{beside}</div>'
+        f"{candidates_html(row)}{reason_html(reason)}"
     )
 
 
@@ -217,15 +218,15 @@ def stale_html(content: str, text: str = "") -> str:
     return f'{head}<div style="opacity:.3">{faint}</div>'
 
 
-def preview_html(glance: QuickPreview, look: CameraPreview | None, num_views: int) -> str:
+def preview_html(glance: QuickPreview, look: CameraPreview | None, view: int) -> str:
     """R of the dragged camera, its terms, and the utility of looking there.
 
     Args:
         glance: what takes milliseconds.
         look: the rest, once it is there.
-        num_views: views in the map that it is scored on.
+        view: number of the last view in the map that it is scored on, from 1.
     """
-    words = f"renderability R, after {num_views} views"
+    words = f"renderability R, after view {view}"
     head = _number_html("done", f"{glance.renderability:.3f}", words)
     bars = "".join(_term(name, glance.means[name]) for name in TERMS[1:])
     facts = {"known surface": f"{100 * glance.seen:.0f} % of its pixels"}

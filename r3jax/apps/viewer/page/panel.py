@@ -15,8 +15,11 @@ from r3jax.apps.viewer.page.facts import head_html, note_html, pending_html, sta
 from r3jax.apps.viewer.page.layers import PLACES, Layer
 from r3jax.apps.viewer.page.legend import busy_html
 
-_PANEL_WIDTH, _LEGEND_WIDTH = 360, 300
-"""Widths of the panel beside the scene and of the legend over it [px]."""
+PANEL_WIDTH = 360
+"""Width of the panel beside the scene [px]."""
+
+_LEGEND_WIDTH = 300
+"""Width of the legend over the scene [px]."""
 
 _EDGE = 14
 """Distance of the legend from the edges of the scene [px]."""
@@ -109,7 +112,7 @@ class Controls:
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(15, 118, 110))
         gui.set_panel_label(menu.title)
         gui.main_panel.dock_right()  # beside the scene, which is never under it
-        gui.main_panel.set_width(_PANEL_WIDTH)
+        gui.main_panel.set_width(PANEL_WIDTH)
         gui.add_html(head_html(head))
         self._note = gui.add_html("", visible=False)
         self._add_choices(gui, menu)
@@ -131,7 +134,7 @@ class Controls:
         last, is_live = max(menu.num_views, 1), menu.is_live
         self._step = gui.add_slider("view", 1, max(last, 2), 1, last, hint=words.VIEW)
         self._follow = gui.add_checkbox(
-            "follow the newest view", is_live, visible=is_live, hint=words.FOLLOW
+            "follow newest", is_live, visible=is_live, hint=words.FOLLOW
         )
         with gui.add_folder("View on the slider"):
             self._facts = _Section(gui.add_html(""))

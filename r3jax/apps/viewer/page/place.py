@@ -253,8 +253,8 @@ def _key(
 def voxel_note(blocks: Blocks) -> str:
     """How many voxels are drawn, and how."""
     if blocks.num_voxels == len(blocks.centers):
-        return f"{blocks.num_voxels:,} voxels of {100 * blocks.edge:.3g} cm"
+        return f"{blocks.num_voxels:,} voxels of {100 * blocks.edge:.3g}\u00a0cm"
     return (
         f"{blocks.num_voxels:,} voxels, drawn as {len(blocks.centers):,} blocks of "
-        f"{100 * blocks.edge:.3g} cm"
+        f"{100 * blocks.edge:.3g}\u00a0cm"
     )
