@@ -12,7 +12,6 @@ from r3jax.apps.models.folder import find_model, newest_name
 from r3jax.apps.runs.settings import scene_of_run, settings_of_run
 from r3jax.apps.viewer.blocks import scoring_of, title_of
 from r3jax.apps.viewer.decisions import Offer, decide_again
-from r3jax.apps.viewer.glb import world_glb
 from r3jax.apps.viewer.overlays import recorded_points
 from r3jax.apps.viewer.page.app import App
 from r3jax.apps.viewer.page.place import Sources
@@ -137,6 +136,8 @@ class RecordedScene:
         Raises:
             ValueError: the scene cannot be opened, or is too large to be shown.
         """
+        from r3jax.apps.viewer.glb import world_glb  # loads trimesh, which few pages need
+
         if not isinstance(self._simulator, RaycastSimulator):
             raise ValueError(self.remark or "the simulator of this scene has no mesh to show")
         return world_glb(self._simulator.world, top)

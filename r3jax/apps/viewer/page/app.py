@@ -145,7 +145,7 @@ class App:
             self._answers.look = None
         if view:
             self.controls.mark_view_stale(step)
-            self._answers.hide_candidates()
+            self._answers.forget_view()
         if scene:
             what = f"View {step + 1}" if view else layer.title
             self.controls.show_busy(f"{what}: being computed", 0.0)

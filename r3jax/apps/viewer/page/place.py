@@ -2,7 +2,7 @@
 
 import functools
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -98,25 +98,36 @@ class PlaceLayer:
         self.caption: Caption | None = None
         """What is drawn; None before the first picture."""
 
+    def is_drawn(
+        self,
+        settings: DisplaySettings,
+        T_world_camera: np.ndarray,
+        moment: Moment,
+        reason: Reason | str,
+    ) -> bool:
+        """Whether `draw` would draw what is drawn already."""
+        return self._drawn == _key(settings, T_world_camera, moment.step, reason)
+
     def draw(
         self,
         settings: DisplaySettings,
         T_world_camera: np.ndarray,
         moment: Moment,
         reason: Reason | str,
-    ) -> Iterator[Show]:
-        """What is wished for, unless it is what is drawn already.
+    ) -> Show:
+        """What is wished for.
 
         Args:
             settings: of the user.
             T_world_camera: of the dragged camera, [4, 4].
             moment: what was known.
             reason: why the moment's view was taken, or why that is not known.
+
+        Returns:
+            Draws it: everything has been worked out.
         """
         layer = settings.layer
         key = _key(settings, T_world_camera, moment.step, reason)
-        if self._drawn == key:
-            return
         if layer.surface == "points":
             drawing = self._recorded(settings.cut)
         elif layer.surface == "splats":
@@ -138,7 +149,7 @@ class PlaceLayer:
             self.caption = Caption(layer, drawing.moment, drawing.detail)
             self._drawn = key
 
-        yield show
+        return show
 
     def _voxels(self, settings: DisplaySettings, position: np.ndarray, moment: Moment) -> _Drawing:
         """The map, colored as wished and cut open."""

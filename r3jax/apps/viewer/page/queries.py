@@ -40,6 +40,9 @@ from r3jax.trace.errors import RunError
 _PATH_WIDTH = 0.03
 """Of the line along the path [m]."""
 
+_REPLAYED = 0.9
+"""Share of the work that replaying frames is said to be; the rest is drawing."""
+
 _LEVEL = 0.1
 """The grid moves when the floor is found elsewhere by so much [m]."""
 
@@ -175,15 +178,18 @@ class QueryHandler:
         self, settings: DisplaySettings, pose: np.ndarray, moment: Moment, reason: Reason | str
     ) -> Iterator[Show]:
         """The place and what it shows in words, unless it is there already."""
-        for show in self._place.draw(settings, pose, moment, reason):
-            yield show
-            yield self._show_legend
+        if self._place.is_drawn(settings, pose, moment, reason):
+            return
+        text = f"View {settings.step + 1}: drawing {settings.layer.name}"
+        yield functools.partial(self._controls.show_busy, text, _REPLAYED)
+        yield self._place.draw(settings, pose, moment, reason)
+        yield self._show_legend
 
     def _replay(self, step: int) -> Iterator[Show]:
         """Brings the story to a view; tells how many frames have been replayed."""
         for done, total in self._story.replay(step):
             text = f"View {step + 1}: replaying frame {done + 1} of {total}"
-            yield functools.partial(self._controls.show_busy, text, done / total)
+            yield functools.partial(self._controls.show_busy, text, _REPLAYED * done / total)
 
     def _ground(self, moment: Moment) -> Iterator[Show]:
         """The grid below the map, anew where the floor is seen to be elsewhere."""
@@ -282,8 +288,9 @@ class QueryHandler:
 
         return show
 
-    def hide_candidates(self) -> None:
-        """Those that are drawn belong to another view."""
+    def forget_view(self) -> None:
+        """What is shown of the view on the slider belongs to another one."""
+        self._view = None  # shown anew even if the slider comes back
         self._canvas.show_lines("/candidates", np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), 0.0)
         self._candidates = None
 

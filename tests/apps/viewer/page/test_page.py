@@ -1,6 +1,7 @@
 """The page in real Chromium: it loads, the slider moves the camera, a drag is answered."""
 
 import contextlib
+import dataclasses
 import shutil
 import time
 from pathlib import Path
@@ -18,6 +19,7 @@ pytest.importorskip(
 from playwright import sync_api
 from viser import transforms
 
+from r3jax.apps.viewer.page.queries import Query
 from r3jax.apps.viewer.recorded import open_run_page
 from tests.apps.viewer.conftest import VIEWS
 
@@ -174,6 +176,26 @@ def test_a_dragged_camera_is_answered(page, viewer):
     np.testing.assert_allclose(moved[1:], 0.0, atol=1e-3)  # along its axis and no other
     after = settle(page, viewer)
     assert after != before
+
+
+def test_what_belongs_to_another_view_says_so(page, viewer):
+    settle(page, viewer)
+    app, shown = viewer.app, page.inner_text("#r3jax-moment")
+    settings = dataclasses.replace(app.controls.settings, step=0)
+    app._mark_stale(Query(settings, app.canvas.pose), camera=True, view=True, scene=True)
+    wait_until(page, lambda: page.locator("#r3jax-busy").count() == 1)
+    assert page.inner_text("#r3jax-busy") == "View 1: being computed …"
+    assert page.inner_text("#r3jax-moment") == shown  # what is drawn until then
+    wait_until(page, lambda: page.get_by_text("opening view 1 …").count() == 1)
+    assert page.locator(NUMBER).get_attribute("data-state") == "computing"
+    assert app.canvas._server.scene.get_handle_by_name("/suggestion") is None
+    assert app.look is None
+    app._asked = None  # as it is when there is a new view
+    app.ask()
+    settle(page, viewer)
+    wait_until(page, lambda: page.locator("#r3jax-busy").count() == 0)
+    assert page.get_by_text("opening view").count() == 0
+    assert app.look is not None
 
 
 def test_the_button_turns_the_camera_along_the_suggestion(page, viewer):
