@@ -115,4 +115,15 @@ def test_a_block_has_the_cause_that_took_most_of_its_voxels():
 
 def test_causes_have_the_colors_of_the_report():
     rgb = [tuple(int(color[i : i + 2], 16) for i in (1, 3, 5)) for color in COLORS]
-    assert cause_colors(np.arange(4)).tolist() == [list(UNSEEN), *map(list, rgb[1:])]
+    own = np.tile(np.asarray(UNSEEN, np.uint8).mean().round().astype(np.uint8), (4, 3))
+    colors = cause_colors(np.arange(4), own)
+    assert colors[1:].tolist() == [list(color) for color in rgb[1:]]
+    np.testing.assert_allclose(colors[0], UNSEEN, atol=5)
+
+
+def test_what_was_not_to_be_seen_is_gray_and_as_light_as_the_map():
+    own = np.array([[0, 0, 0], [255, 255, 255], [200, 10, 0]], np.uint8)
+    dark, light, red = cause_colors(np.zeros(3, np.intp), own).astype(int)
+    assert dark.sum() < red.sum() < light.sum()
+    for color in (dark, light, red):
+        assert np.ptp(color) <= np.ptp(UNSEEN)

@@ -169,15 +169,17 @@ class PlaceLayer:
 
     def _causes(self, cut: float, moment: Moment, reason: Reason | str) -> _Drawing:
         """The map that a view was chosen on, by what the view was after; gray if unknown."""
-        if isinstance(reason, str):
-            blocks = self._known_at(moment, with_terms=False).blocks
-            causes = np.zeros(len(blocks.centers), np.intp)
-            return self._blocks(blocks, cause_colors(causes), cut, self._after(moment.step), reason)
-        before = self._story.moment(moment.step - 1)
-        blocks = self._known_at(before, with_terms=False).blocks
-        causes = block_causes(blocks, before.map_state.capacity, reason)
+        is_known = isinstance(reason, Reason)
+        before = self._story.moment(moment.step - 1) if is_known else moment
+        known = self._known_at(before, with_terms=False)
+        blocks, state = known.blocks, known.moment.map_state
+        own = block_colors(blocks, state, None, "color")
+        if not is_known:
+            colors = cause_colors(np.zeros(len(own), np.intp), own)
+            return self._blocks(blocks, colors, cut, self._after(moment.step), reason)
+        colors = cause_colors(block_causes(blocks, before.map_state.capacity, reason), own)
         text = f"just before view {moment.step + 1}"
-        drawing = self._blocks(blocks, cause_colors(causes), cut, text, voxel_note(blocks))
+        drawing = self._blocks(blocks, colors, cut, text, voxel_note(blocks))
         return replace(drawing, cells=reason.cells[reason.cells[:, 2] <= cut])
 
     def _after(self, step: int) -> str:
