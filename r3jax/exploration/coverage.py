@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy import ndimage
-from scipy.stats import qmc
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier_unexplored
@@ -42,6 +41,8 @@ def view_renderability(
 @functools.lru_cache(maxsize=4)
 def _probe_sequence(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple[np.ndarray, ...]:
     """Positions [n, 3] and directions [n, 3], evenly spread, the same for every run."""
+    from scipy.stats import qmc  # half a second, which a page that only looks on need not wait for
+
     # Not scrambled: equal runs must write equal rows, and runs of one scene share their probes.
     unit = qmc.Sobol(d=5, scramble=False).random(_NUM_DRAWN)
     positions = np.asarray(lower) + unit[:, :3] * (np.asarray(upper) - np.asarray(lower))

@@ -136,7 +136,7 @@ def _add_sightings(
     return for_selected(visible, add, totals)
 
 
-BUDGET = 120_000
+BUDGET = 300_000
 """Blocks that a browser gets at most."""
 
 QUANTITIES = (*TERMS, "color")
@@ -246,9 +246,21 @@ def block_causes(blocks: Blocks, capacity: int, reason: Reason) -> np.ndarray:
     return np.where(means.max(axis=0, initial=0.0) > 0.0, 1 + np.argmax(means, axis=0), 0)
 
 
-def cause_colors(causes: np.ndarray) -> np.ndarray:
-    """Color per block, [n, 3] uint8, of what `block_causes` found [n]."""
-    return np.stack([np.asarray(UNSEEN, np.uint8), *CAUSE_COLORS[1:]])[causes]
+_SHADE = 0.5
+"""How much the grays of what was not to be seen follow the light of the map's own colors."""
+
+
+def cause_colors(causes: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Color per block, [n, 3] uint8, of what `block_causes` found [n].
+
+    Args:
+        causes: per block; where none took anything, it is gray.
+        own: the map's own colors [n, 3] uint8: as light as they are, grays show walls and doors.
+    """
+    light = own.mean(axis=1, keepdims=True) if len(own) else np.zeros((0, 1))
+    grays = np.rint((1.0 - _SHADE) * np.asarray(UNSEEN) + _SHADE * light).astype(np.uint8)
+    table = np.stack([np.asarray(UNSEEN, np.uint8), *CAUSE_COLORS[1:]])
+    return np.where((causes == 0)[:, None], grays, table[causes])
 
 
 def block_colors(

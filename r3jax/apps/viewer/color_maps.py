@@ -57,6 +57,17 @@ def paint(values: np.ndarray, name: str = SCORES) -> np.ndarray:
     return np.where(is_number[..., None], _table(name)[index], np.asarray(UNSEEN, np.uint8))
 
 
+def linear_light(encoded: np.ndarray) -> np.ndarray:
+    """Light of sRGB-encoded colors, both [..., 3] in [0, 1]: what some renderers ask for."""
+    low = encoded / 12.92
+    return np.where(encoded <= 0.04045, low, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def css_color(color: np.ndarray | tuple[int, int, int]) -> str:
+    """A color of three bytes as browsers write it, such as `#0f766e`."""
+    return "#" + "".join(f"{int(part):02x}" for part in color)
+
+
 def spread(values: np.ndarray) -> np.ndarray:
     """Numbers shifted and scaled to [0, 1]; equal ones become 0.5, what is not finite NaN."""
     values = np.asarray(values, dtype=np.float64)

@@ -15,6 +15,7 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from r3jax.apps.viewer.color_maps import linear_light
 from r3jax.simulators.world import Material, World
 
 MAX_FACES = 500_000
@@ -58,14 +59,14 @@ def _mesh(world: World, chosen: np.ndarray, material: Material) -> trimesh.Trime
     visual = TextureVisuals(uv, material=_pbr(material))
     if world.face_color is not None:
         rgb = world.face_color[chosen].reshape(-1, 3).astype(np.float64).clip(0.0, 1.0)
-        linear = np.concatenate([_linear(rgb), np.ones((len(rgb), 1))], axis=1)
+        linear = np.concatenate([linear_light(rgb), np.ones((len(rgb), 1))], axis=1)
         visual.vertex_attributes["color"] = np.rint(linear * 255.0).astype(np.uint8)
     faces = np.arange(len(corners)).reshape(-1, 3)
     return trimesh.Trimesh(corners, faces, visual=visual, process=False)
 
 
 def _pbr(material: Material) -> PBRMaterial:
-    color = _linear(np.asarray(material.color, dtype=np.float64))
+    color = linear_light(np.asarray(material.color, dtype=np.float64))
     texture = None
     if material.texture is not None:
         texture = _Jpeg.of(material.texture)
@@ -94,12 +95,6 @@ class _Jpeg(Image.Image):
     def save(self, fp: Any, format: str | None = None, **params: Any) -> None:
         """Keeps edges of color, which Pillow's own settings for JPEG smear."""
         super().save(fp, format, quality=88, subsampling=0)
-
-
-def _linear(encoded: np.ndarray) -> np.ndarray:
-    """Light of sRGB-encoded colors: glTF's factors are linear, textures are not."""
-    low = encoded / 12.92
-    return np.where(encoded <= 0.04045, low, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _without_light(tree: dict[str, Any]) -> None:

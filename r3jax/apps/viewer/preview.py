@@ -1,13 +1,12 @@
 """What a camera at any pose would get: the numbers and pictures beside the camera that is dragged.
 
-Pure: a map, a grid, a camera and a pose go in, a `CameraPreview` comes out, and tiles of what each
-of its pixels shows.
+Pure: a map, a grid, a camera and a pose go in, a `CameraPreview` comes out, and pictures of what
+each of its pixels shows.
 
 Shape symbols: h w size of the depth buffer; H W size of a picture; B directions of the panorama.
 """
 
 import functools
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import jax.numpy as jnp
@@ -30,10 +29,6 @@ from r3jax.splatting.scene import GaussianScene
 TERMS = ("renderability", "bias", "noise", "resolution")
 """R and its factors, in the order in which they are shown."""
 
-Photographer = Callable[[np.ndarray], np.ndarray | None]
-"""The true picture at a pose `T_world_camera` [4, 4], RGB in [0, 1], [H, W, 3]; None: there is
-none."""
-
 
 @dataclass(frozen=True)
 class Surroundings:
@@ -55,9 +50,6 @@ class Surroundings:
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Behind the splats: what they were trained with."""
-
-    photographer: Photographer | None = None
-    """Takes the true picture, where the scene can be opened."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +98,8 @@ class CameraPreview:
     splats: np.ndarray | None
     """The trained splats from here, RGB in [0, 1], [H, W, 3]."""
 
-    truth: np.ndarray | None
-    """The true picture, RGB in [0, 1], [H, W, 3]."""
+    truth: np.ndarray | None = None
+    """The true picture, RGB in [0, 1], [H, W, 3], where it was asked for."""
 
 
 def quick_preview_from(around: Surroundings, T_world_camera: np.ndarray) -> QuickPreview:
@@ -133,9 +125,6 @@ def preview_from(
         around: map, grid, camera and what else is known.
         T_world_camera: [4, 4].
         glance: of the same pose, if it is at hand.
-
-    Raises:
-        ValueError: the true picture is asked for, and the pose is not rigid.
     """
     pose = jnp.asarray(T_world_camera, dtype=jnp.float32)
     state, grid, camera = around.map_state, around.grid, around.camera
@@ -150,7 +139,6 @@ def preview_from(
         best_direction=np.asarray(round_about.best_direction),
         T_suggested=np.asarray(round_about.T_world_camera),
         splats=_splats(around, pose),
-        truth=None if around.photographer is None else around.photographer(T_world_camera),
     )
 
 
@@ -241,36 +229,19 @@ def fitted(picture: np.ndarray, width: int, height: int, *, is_photo: bool = Fal
     return np.asarray(canvas)
 
 
-def tiles(pictures: Sequence[tuple[str, np.ndarray]], side: int = 176) -> np.ndarray:
-    """Pictures with a word above each, two in a row.
-
-    Args:
-        pictures: words and pictures, [H, W, 3] uint8 each; at least one.
-        side: width of a tile [px].
-    """
-    gap, head = 4, 18
-    height = max(1, round(side * pictures[0][1].shape[0] / pictures[0][1].shape[1]))
-    columns = min(2, len(pictures))
-    rows = -(-len(pictures) // columns)
-    canvas = Image.new(
-        "RGB", (columns * (side + gap) - gap, rows * (height + head + gap) - gap), _PAPER
-    )
-    pen = ImageDraw.Draw(canvas)
-    for number, (word, picture) in enumerate(pictures):
-        x = (number % columns) * (side + gap)
-        y = (number // columns) * (height + head + gap)
-        pen.text((x + 1, y + 1), word, fill=_MUTED, font=font(13))
-        canvas.paste(Image.fromarray(fitted(picture, side, height)), (x, y + head))
-    return np.asarray(canvas)
-
-
 def quick_preview_image(glance: QuickPreview, term: str) -> np.ndarray:
     """R or a term, pixel by pixel, [h, w, 3] uint8."""
     return paint(glance.images[term])
 
 
-def preview_image(look: CameraPreview, term: str = "renderability") -> np.ndarray:
-    """The view as R (or a term) sees it, as the splats show it, and as it is, as far as known."""
+def preview_pictures(
+    look: CameraPreview, term: str = "renderability"
+) -> list[tuple[str, np.ndarray]]:
+    """The view as R (or a term) sees it, as the splats show it, and as it is, as far as known.
+
+    Returns:
+        Names and pictures, [H, W, 3] uint8 each.
+    """
     pictures = [(term, quick_preview_image(look.glance, term))]
     if look.splats is not None:
         pictures.append(("splats", to_bytes(look.splats)))
@@ -279,4 +250,4 @@ def preview_image(look: CameraPreview, term: str = "renderability") -> np.ndarra
     if look.splats is not None and look.truth is not None:
         error = np.abs(look.splats - look.truth).mean(axis=-1)
         pictures.append(("error of the splats", paint(1.0 - (4.0 * error).clip(0.0, 1.0))))
-    return tiles(pictures)
+    return pictures

@@ -12,7 +12,6 @@ from r3jax.apps.models.folder import find_model, newest_name
 from r3jax.apps.runs.settings import scene_of_run, settings_of_run
 from r3jax.apps.viewer.blocks import scoring_of, title_of
 from r3jax.apps.viewer.decisions import Offer, decide_again
-from r3jax.apps.viewer.glb import world_glb
 from r3jax.apps.viewer.overlays import recorded_points
 from r3jax.apps.viewer.page.app import App
 from r3jax.apps.viewer.page.place import Sources
@@ -82,7 +81,7 @@ def open_run_page(
             scoring_of(header),
             np.asarray(header.bounds, np.float64),
             title=title_of(header),
-            subtitle=f"{run.path}; {run.outcome}",
+            subtitle=_summary(run),
             extras=extras,
         )
         try:
@@ -91,6 +90,14 @@ def open_run_page(
             app.close()
     finally:
         close_server(server)
+
+
+def _summary(run: Run) -> str:
+    """Where a run lies, how long it is and how it ended."""
+    last, end = run.rows[-1], run.end
+    is_used_up = end is not None and end.outcome == "budget"
+    ended = "budget used up" if is_used_up else run.outcome
+    return f"{run.path} · {len(run.rows)} views, {last.metres:.1f} m · {ended}"
 
 
 def _decisions(run: Run) -> Iterator[tuple[int, Offer | None]]:
@@ -129,6 +136,8 @@ class RecordedScene:
         Raises:
             ValueError: the scene cannot be opened, or is too large to be shown.
         """
+        from r3jax.apps.viewer.glb import world_glb  # loads trimesh, which few pages need
+
         if not isinstance(self._simulator, RaycastSimulator):
             raise ValueError(self.remark or "the simulator of this scene has no mesh to show")
         return world_glb(self._simulator.world, top)

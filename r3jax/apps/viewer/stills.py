@@ -287,7 +287,7 @@ class Sheet:
             ("path", f"{row.metres:.1f} m"),
             ("explored", f"{100 * row.coverage.known_share:.0f} %"),
             ("mean renderability", f"{row.coverage.mean_renderability:.2f}"),
-            ("R of this view before it", f"{row.coverage.arrival_renderability:.2f}"),
+            ("R before this view", f"{row.coverage.arrival_renderability:.2f}"),
         )
         curve = [r.coverage.mean_renderability for r in run.rows[: step + 1]]
         return Sheet(

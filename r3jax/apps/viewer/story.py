@@ -25,7 +25,7 @@ from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow
 
-MEMORY = 512 << 20
+MEMORY = 128 << 20
 """What kept states may take [bytes]."""
 
 
@@ -87,13 +87,27 @@ class Timeline:
             IndexError: the run has no such view.
             RunError: a frame is missing, broken, or not the one that was recorded.
         """
+        for _ in self.replay(step):
+            pass
+        return self._before(step)
+
+    def replay(self, step: int) -> Iterator[tuple[int, int]]:
+        """Goes to the state after view `step`, frame by frame: what is left undone takes longer.
+
+        Yields:
+            Before each frame, how many have been replayed and how many there are to replay.
+
+        Raises:
+            IndexError, RunError: as `at`.
+        """
         if not 0 <= step < len(self.run.rows):
             raise IndexError(f"the run has views 0 to {len(self.run.rows) - 1}, not {step}")
         moment = self._before(step)
-        while moment.step < step:
-            moment = self._after(moment)
+        total = step - moment.step
+        for done in range(total):
+            yield done, total
+            moment = self._shown = self._after(moment)
         self._shown = moment
-        return moment
 
     def follow(self) -> Iterator[Moment]:
         """Every state in order, each when it is asked for; `at` may be called in between.
@@ -148,7 +162,7 @@ _OFFERS_KEPT = 200
 """Decisions whose candidates are kept: 100 of them take 7 kB."""
 
 
-_WORKING = "being worked out …"
+_WORKING = "is being computed …"
 
 
 @runtime_checkable
@@ -176,6 +190,10 @@ class Story(Protocol):
 
     def moment(self, step: int) -> Moment:
         """What was known after a view; for the worker's thread only."""
+        ...
+
+    def replay(self, step: int) -> Iterator[tuple[int, int]]:
+        """Prepares `moment` bit by bit: yields how many bits are done, and how many there are."""
         ...
 
     def advance(self) -> bool:
@@ -228,6 +246,10 @@ class RecordedStory:
     def moment(self, step: int) -> Moment:
         """What was known after a view."""
         return self._timeline.at(step)
+
+    def replay(self, step: int) -> Iterator[tuple[int, int]]:
+        """Replays the frames that lead to a view."""
+        return self._timeline.replay(step)
 
     def advance(self) -> bool:
         """Replays one view more than ever before, and finds out why the next one was taken.
@@ -337,6 +359,11 @@ class LiveStory:
             raise LookupError("there is no view yet")
         return self._moment
 
+    def replay(self, step: int) -> Iterator[tuple[int, int]]:
+        """There is nothing to replay: the newest state is at hand."""
+        del step
+        return iter(())
+
     def advance(self) -> bool:
         """There is nothing to prepare."""
         return False
@@ -348,7 +375,7 @@ class LiveStory:
     def reason(self, step: int) -> Reason | str:
         """The map that a view was chosen on is not kept."""
         del step
-        return "known when the run is over and opened again: r3jax view"
+        return "known once the run is over and opened by `r3jax view`"
 
 
 def _recorded_image(run: Run, step: int) -> np.ndarray:

@@ -1,11 +1,20 @@
 """A look says what the public functions say of the same pose."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import r3jax
-from r3jax.apps.viewer.preview import TERMS, Surroundings, preview_from, quick_preview_from
+from r3jax.apps.viewer.color_maps import paint
+from r3jax.apps.viewer.preview import (
+    TERMS,
+    Surroundings,
+    preview_from,
+    preview_pictures,
+    quick_preview_from,
+)
 from r3jax.apps.viewer.story import Timeline
 from r3jax.geometry.cameras import pose_along
 from r3jax.splatting.scene import GaussianScene
@@ -83,7 +92,7 @@ def test_without_model_and_scene_there_are_no_pictures(look):
     assert look.truth is None
 
 
-def test_splats_and_true_image_are_of_the_same_pose(around, pose):
+def test_splats_are_of_the_same_pose_and_compared_with_the_true_image(around, pose):
     model = GaussianScene(
         means=jnp.asarray(pose[None, :3, 3] + pose[None, :3, 2], jnp.float32),
         quats=jnp.asarray([[1.0, 0.0, 0.0, 0.0]]),
@@ -91,12 +100,6 @@ def test_splats_and_true_image_are_of_the_same_pose(around, pose):
         opacity_logits=jnp.asarray([4.0]),
         sh=jnp.full((1, 1, 3), 1.0),
     )
-    asked = []
-
-    def photographer(T_world_camera):
-        asked.append(T_world_camera)
-        return np.full((16, 16, 3), 0.5)
-
     camera = around.camera.resized(16, 16)
     more = Surroundings(
         around.map_state,
@@ -105,7 +108,6 @@ def test_splats_and_true_image_are_of_the_same_pose(around, pose):
         picture_camera=camera,
         model=model,
         background=(0.0, 1.0, 0.0),
-        photographer=photographer,
     )
     look = preview_from(more, pose)
     expected = r3jax.render(
@@ -115,5 +117,9 @@ def test_splats_and_true_image_are_of_the_same_pose(around, pose):
     np.testing.assert_allclose(look.splats, np.asarray(expected.rgb).clip(0.0, 1.0), atol=1e-6)
     assert look.splats[8, 8, 0] > 0.3  # the Gaussian stands right ahead
     assert look.splats[0, 0].tolist() == pytest.approx([0.0, 1.0, 0.0], abs=0.05)
-    np.testing.assert_array_equal(asked[0], pose)
-    assert look.truth is not None
+    names = [name for name, _ in preview_pictures(look)]
+    assert names == ["renderability", "splats"]
+    seen = dataclasses.replace(look, truth=np.asarray(look.splats))
+    (_, error), *others = preview_pictures(seen, "bias")[::-1]
+    assert [name for name, _ in others[::-1]] == ["bias", "splats", "true image"]
+    assert (error == paint(np.ones(1))).all()  # no error is green

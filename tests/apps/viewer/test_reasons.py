@@ -9,7 +9,7 @@ import pytest
 from r3jax.apps.report.reasons import COLORS
 from r3jax.apps.viewer.blocks import Blocks, block_causes, cause_colors
 from r3jax.apps.viewer.color_maps import UNSEEN
-from r3jax.apps.viewer.page.panel import reason_html
+from r3jax.apps.viewer.page.facts import reason_html
 from r3jax.apps.viewer.story import RecordedStory
 from r3jax.exploration.explain_run import Reason, explain_run
 from r3jax.scoring.explain import CAUSES
@@ -33,7 +33,7 @@ def story(run):
 def test_reasons_come_as_the_run_is_replayed(story, reasons):
     assert story.reason(0) == "the start: nothing was chosen"
     for step in range(1, VIEWS):
-        assert story.reason(step) == "being worked out …"
+        assert story.reason(step) == "is being computed …"
     num_turns = 0
     while story.advance():
         num_turns += 1
@@ -78,7 +78,7 @@ def make_reason() -> Reason:
 
 def test_the_panel_tells_the_shares():
     text = reason_html(make_reason())
-    assert ">80</b>" in text
+    assert "<b>80</b>" in text
     found = re.findall(r"<span style=\"flex:1\">([^<]*)</span><span[^>]*>(\d+) (\w+)", text)
     numbers = ["3", "3", "2", "2"]
     units = ["cells", "voxels", "voxels", "voxels"]
@@ -115,4 +115,15 @@ def test_a_block_has_the_cause_that_took_most_of_its_voxels():
 
 def test_causes_have_the_colors_of_the_report():
     rgb = [tuple(int(color[i : i + 2], 16) for i in (1, 3, 5)) for color in COLORS]
-    assert cause_colors(np.arange(4)).tolist() == [list(UNSEEN), *map(list, rgb[1:])]
+    own = np.tile(np.asarray(UNSEEN, np.uint8).mean().round().astype(np.uint8), (4, 3))
+    colors = cause_colors(np.arange(4), own)
+    assert colors[1:].tolist() == [list(color) for color in rgb[1:]]
+    np.testing.assert_allclose(colors[0], UNSEEN, atol=5)
+
+
+def test_what_was_not_to_be_seen_is_gray_and_as_light_as_the_map():
+    own = np.array([[0, 0, 0], [255, 255, 255], [200, 10, 0]], np.uint8)
+    dark, light, red = cause_colors(np.zeros(3, np.intp), own).astype(int)
+    assert dark.sum() < red.sum() < light.sum()
+    for color in (dark, light, red):
+        assert np.ptp(color) <= np.ptp(UNSEEN)

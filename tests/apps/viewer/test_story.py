@@ -72,6 +72,23 @@ def test_the_last_state_comes_from_the_checkpoint_without_reading_a_frame(run, e
         timeline.at(0)
 
 
+def test_a_replay_tells_how_many_frames_are_done(run, expected):
+    timeline = Timeline(run)
+    assert list(timeline.replay(2)) == [(0, 3), (1, 3), (2, 3)]
+    assert list(timeline.replay(3)) == [(0, 1)]
+    assert list(timeline.replay(VIEWS - 1)) == []  # stored
+    assert_is(timeline.at(3), 3, expected)
+
+
+def test_a_replay_that_is_left_undone_is_gone_on_with(run, expected):
+    timeline = Timeline(run, 1)
+    for done, _ in timeline.replay(3):
+        if done == 2:
+            break
+    assert list(timeline.replay(3)) == [(0, 2), (1, 2)]
+    assert_is(timeline.at(3), 3, expected)
+
+
 def test_without_checkpoints_frames_will_do(run, expected, tmp_path):
     copy = shutil.copytree(run.path, tmp_path / "copy")
     shutil.rmtree(copy / "checkpoints")

@@ -9,13 +9,32 @@ from typing import Any
 import numpy as np
 import viser
 
+from r3jax.apps.viewer.color_maps import linear_light, to_bytes
 from r3jax.apps.viewer.overlays import pose_of, quaternion
+from r3jax.apps.viewer.stills import overview
 from r3jax.geometry.cameras import Camera
 
 _VIEW_COLOR = (120, 124, 134)
 _NOW_COLOR = (37, 99, 235)
 _CAMERA_COLOR = (15, 118, 110)
+_STALE_COLOR = (156, 163, 175)
 _SUGGESTED = (239, 68, 68)
+_GRID_COLOR, _INK = (214, 217, 222), (75, 85, 99)
+
+_FIELD_OF_VIEW = 35.0
+"""Vertical, of the eye that looks at the page [deg]: walls lean little."""
+
+_ASPECT = 1.1
+"""Width over height that the scene is framed for where no window is known."""
+
+_PHONE = 576
+"""Windows no wider than this have the panel below the scene [px]."""
+
+_AZIMUTH, _ELEVATION = -105.0, 50.0
+"""From where the page is first seen, as its film is [deg]."""
+
+_GRID_MARGIN = 1.0
+"""How far the grid goes beyond the scene [m]."""
 
 Color = tuple[int, int, int]
 
@@ -34,6 +53,7 @@ class Canvas:
         self._fov = float(2.0 * np.arctan(0.5 * camera.height / float(camera.fy)))
         self._aspect = camera.width / camera.height
         self._views: dict[int, viser.CameraFrustumHandle] = {}
+        self._shown_before = 0
         scene.configure_default_lights(cast_shadow=False)
         self.gizmo = scene.add_transform_controls(
             "/camera", scale=0.6, line_width=3.5, depth_test=False
@@ -71,10 +91,58 @@ class Canvas:
             self.gizmo.wxyz = quaternion(T_world_camera[:3, :3])
             self.gizmo.position = T_world_camera[:3, 3]
 
-    def place_eye(self, position: np.ndarray, target: np.ndarray) -> None:
-        """From where the page is first seen, and where to [m]."""
-        self._server.initial_camera.position = position
-        self._server.initial_camera.look_at = target
+    def place_eye(self, low: np.ndarray, high: np.ndarray, panel: int) -> None:
+        """Frames a box as the page is first seen, in whatever window.
+
+        Args:
+            low: lower corner [3] [m].
+            high: upper corner.
+            panel: width of what stands beside the scene [px].
+        """
+        corners = np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3)
+        eye = self._server.initial_camera
+        eye.fov = float(np.deg2rad(_FIELD_OF_VIEW))
+        eye.position, eye.look_at = framing(corners, _ASPECT)
+
+        async def frame(client: viser.ClientHandle) -> None:
+            camera = client.camera
+            # A browser tells of its window first, and puts the panel in afterwards.
+            width = camera.image_width - (panel if camera.image_width > _PHONE else 0)
+            camera.position, camera.look_at = framing(corners, width / camera.image_height)
+
+        self._server.on_client_connect(frame)
+
+    def show_grid(self, low: np.ndarray, high: np.ndarray, floor: float) -> None:
+        """Squares of 1 m on the floor below a box, given by its corners [3] [m], and a scale.
+
+        Args:
+            low: lower corner.
+            high: upper corner.
+            floor: height of the floor [m].
+        """
+        first = np.floor(low[:2] - _GRID_MARGIN)
+        last = np.ceil(high[:2] + _GRID_MARGIN)
+        size = last - first + (last - first) % 2  # even, so that lines are at whole meters
+        middle = first + 0.5 * size
+        below = floor - 0.01  # voxels of the floor hide it
+        self._server.scene.add_grid(
+            "/grid",
+            float(size[0]),
+            float(size[1]),
+            plane="xy",
+            cell_size=1.0,
+            cell_color=_GRID_COLOR,
+            section_size=5.0,
+            section_color=_GRID_COLOR,
+            shadow_opacity=0.0,
+            position=(float(middle[0]), float(middle[1]), below),
+        )
+        start = np.array([np.ceil(low[0]), np.floor(low[1]), below])  # right before the scene
+        ends = np.stack([start, start + np.array([1.0, 0.0, 0.0])])[None].astype(np.float32)
+        self.show_lines("/scale", ends, np.full((1, 2, 3), _INK, np.uint8), 0.04)
+        self._server.scene.add_label(
+            "/scale/label", "1 m", position=start + np.array([0.5, -0.1, 0.0]), anchor="top-center"
+        )
 
     def paint_camera(self, color: Color) -> None:
         """The color of the dragged camera's frustum."""
@@ -83,6 +151,11 @@ class Canvas:
     def fill_camera(self, image: np.ndarray) -> None:
         """The picture in the dragged camera's frustum, [H, W, 3] uint8."""
         self._body.image = image
+
+    def mark_camera_stale(self) -> None:
+        """Nothing is known of the dragged camera's pose yet."""
+        self.hide_suggestion()
+        self._body.color, self._body.image = _STALE_COLOR, None
 
     def clients(self) -> list[viser.ClientHandle]:
         """Whoever looks at the page."""
@@ -98,7 +171,7 @@ class Canvas:
         small: bool = False,
     ) -> None:
         """A view along the path, with its picture [H, W, 3] uint8; it can be clicked."""
-        scale = 0.05 if small else 0.12
+        scale = 0.05 if small else 0.1
         handle = self._add_frustum(
             f"/views/{step:06d}", T_world_camera, scale, 0.004, _VIEW_COLOR, thumbnail
         )
@@ -108,10 +181,12 @@ class Canvas:
             del event
             on_click()
 
+        handle.visible = step < self._shown_before
         handle.on_click(click)
 
     def show_views(self, before: int) -> None:
         """Those before one of them; 0 shows none."""
+        self._shown_before = before
         for step, handle in list(self._views.items()):
             handle.visible = step < before
 
@@ -152,7 +227,9 @@ class Canvas:
     ) -> None:
         """Lines of a thickness [m]: ends [s, 2, 3] [m], colors [s, 2, 3] uint8; none: nothing."""
         if len(segments):
-            self._server.scene.add_line_segments(name, segments, colors, thickness=thickness)
+            # What viser takes the colors of lines for: encoded ones would be washed out.
+            light = to_bytes(linear_light(colors / 255.0))
+            self._server.scene.add_line_segments(name, segments, light, thickness=thickness)
         else:
             self._server.scene.remove_by_name(name)
 
@@ -174,15 +251,17 @@ class Canvas:
     def show_splats(
         self, name: str, arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     ) -> None:
-        """Gaussians, as `shapes.splat_arrays` gives them."""
+        """Gaussians, as `overlays.splat_arrays` gives them."""
         self._server.scene.add_gaussian_splats(name, *arrays)
 
     def show_mesh(self, name: str, glb: bytes) -> None:
         """The scene's own triangles."""
         self._server.scene.add_glb(name, glb, cast_shadow=False, receive_shadow=False)
 
-    def show_only(self, name: str, names: Sequence[str]) -> None:
+    def show_only(self, name: str, names: Sequence[str], *, is_splats: bool = False) -> None:
         """Leaves only one of the nodes called `names` visible; those not there stay away."""
+        # Splats are drawn last, over all that leaves no depth; before all else, no test is best.
+        self.gizmo.depth_test = is_splats
         for other in names:
             handle = self._server.scene.get_handle_by_name(other)
             if handle is not None:
@@ -202,3 +281,18 @@ class Canvas:
     def hide_suggestion(self) -> None:
         """Takes the arrow away."""
         self._server.scene.remove_by_name("/suggestion")
+
+
+def framing(points: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where to look from and to [m], so that points [n, 3] [m] fill a window.
+
+    Args:
+        points: what is to be in view.
+        aspect: width of the window over its height.
+    """
+    half = np.tan(0.5 * np.deg2rad(_FIELD_OF_VIEW))
+    across = float(np.rad2deg(2.0 * np.arctan(aspect * half)))
+    width = max(1, round(1000 * aspect))
+    _, pose = overview(points, width, 1000, _AZIMUTH, _ELEVATION, across)
+    position, ahead = pose[:3, 3], pose[:3, 2]
+    return position, position + float((points.mean(axis=0) - position) @ ahead) * ahead

@@ -1,13 +1,13 @@
 """Works out what the page is to show, part by part, the quick ones first.
 
-The picture of a view and R of the dragged camera come within milliseconds; then the map, if it has
-changed; then the splats and the panorama from where the camera is.
+The photo of a view comes at once; then the map, if it has changed, and R of the dragged camera;
+then the splats and the panorama from where the camera is.
 """
 
 import functools
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,23 +15,18 @@ from r3jax.apps.viewer.color_maps import paint, to_bytes
 from r3jax.apps.viewer.decisions import Offer, offer_segments
 from r3jax.apps.viewer.overlays import path_segments
 from r3jax.apps.viewer.page.canvas import Canvas, Color
-from r3jax.apps.viewer.page.panel import (
-    PLACES,
-    Controls,
-    DisplaySettings,
-    preview_html,
-    reason_html,
-    view_html,
-)
+from r3jax.apps.viewer.page.facts import pictures_html, preview_html, view_html
+from r3jax.apps.viewer.page.layers import PLACES
+from r3jax.apps.viewer.page.legend import legend_html
+from r3jax.apps.viewer.page.panel import Controls, DisplaySettings
 from r3jax.apps.viewer.page.place import PlaceLayer, Show, Sources
 from r3jax.apps.viewer.preview import (
     CameraPreview,
-    Photographer,
     QuickPreview,
     Surroundings,
     panorama_image,
     preview_from,
-    preview_image,
+    preview_pictures,
     quick_preview_from,
     quick_preview_image,
 )
@@ -42,8 +37,22 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.views import fitted_size
 from r3jax.trace.errors import RunError
 
+_PATH_WIDTH = 0.03
+"""Of the line along the path [m]."""
+
+_REPLAYED = 0.9
+"""Share of the work that replaying frames is said to be; the rest is drawing."""
+
+_LEVEL = 0.1
+"""The grid moves when the floor is found elsewhere by so much [m]."""
+
 PICTURE_SIZE = 192
 """Longer side of rendered splats and true images [px]."""
+
+
+Photographer = Callable[[np.ndarray], np.ndarray | None]
+"""The true picture at a pose `T_world_camera` [4, 4], RGB in [0, 1], [H, W, 3]; None: there is
+none."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +91,7 @@ def picture_camera(camera: Camera) -> Camera:
 
 
 class QueryHandler:
-    """QueryHandler questions in one thread, and remembers what is on the page."""
+    """Answers questions in one thread, and remembers what is on the page."""
 
     def __init__(
         self,
@@ -90,6 +99,7 @@ class QueryHandler:
         controls: Controls,
         story: Story,
         config: ScoringConfig,
+        bounds: np.ndarray,
         extras: Extras,
         ask_again: Callable[[], None],
     ):
@@ -100,18 +110,23 @@ class QueryHandler:
             controls: where to write.
             story: what it is about.
             config: of the scores.
+            bounds: of the scene, [2, 3] [m].
             extras: what else is known.
             ask_again: called when more is known than when the last question was asked.
         """
         self._canvas, self._controls, self._story = canvas, controls, story
         self._config, self._extras, self._ask_again = config, extras, ask_again
-        self._place = PlaceLayer(canvas, controls, story, config, extras.sources, extras.remark)
+        self._place = PlaceLayer(canvas, story, config, extras.sources)
         self._view: tuple[object, ...] | None = None
         self._awaited: tuple[int, str] | None = None
         self._candidates: tuple[int, int] | None = None
         self._offers: dict[int, Offer] = {}
+        self._asking = ""
         self._deciding: threading.Thread | None = None
         self._closed = threading.Event()
+        self._bounds = np.asarray(bounds, np.float64)
+        self._grounded: int | None = None
+        self._floor: float | None = None
         self.look: CameraPreview | None = None
         """The one that stands on the page; None while it is worked out."""
 
@@ -137,42 +152,78 @@ class QueryHandler:
                 self._ask_again()
 
     def work(self, question: Query) -> Iterator[Show]:
-        """The parts of the answer to a question."""
+        """The parts of the answer to a question; what is quick, and what is looked at, first."""
         settings, pose = question.settings, question.T_world_camera
         step = min(settings.step, len(self._story.rows) - 1)
         reason = self._story.reason(step)
-        yield self._show_view(step, reason)
+        yield self._show_view(step, reason, shows_views=settings.shows_views)
+        yield from self._replay(step)
         moment = self._story.moment(step)
+        yield from self._ground(moment)
+        draw = functools.partial(self._draw, settings, pose, moment, reason)
+        if not settings.layer.has_score:  # takes no scoring: the first picture is soon there
+            yield from draw()
         around = self._around(moment)
         glance = quick_preview_from(around, pose)
-        yield functools.partial(self._show_glance, glance)
-        from_free_space = settings.place == PLACES[0]
-        if from_free_space:  # drawn anew for another moment only, and then first
-            yield from self._place.draw(settings, pose, moment, reason)
+        yield functools.partial(self._show_glance, glance, moment.step)
+        if settings.place == PLACES[0]:  # drawn anew for another moment only, and then first
+            yield from draw()
         look = preview_from(around, pose, glance)
-        yield functools.partial(self._show_look, look, settings.quantity)
-        if not from_free_space:
-            yield from self._place.draw(settings, pose, moment, reason)
+        yield functools.partial(self._show_look, look, settings.layer.quantity, moment.step)
+        yield self._show_pictures(look, settings)
+        yield from draw()
         yield self._show_candidates(step, settings.shows_candidates)
 
-    def _show_view(self, step: int, reason: Reason | str) -> Show:
+    def _draw(
+        self, settings: DisplaySettings, pose: np.ndarray, moment: Moment, reason: Reason | str
+    ) -> Iterator[Show]:
+        """The place and what it shows in words, unless it is there already."""
+        if self._place.is_drawn(settings, pose, moment, reason):
+            return
+        text = f"View {settings.step + 1}: drawing {settings.layer.name}"
+        yield functools.partial(self._controls.show_busy, text, _REPLAYED)
+        yield self._place.draw(settings, pose, moment, reason)
+        yield self._show_legend
+
+    def _replay(self, step: int) -> Iterator[Show]:
+        """Brings the story to a view; tells how many frames have been replayed."""
+        for done, total in self._story.replay(step):
+            text = f"View {step + 1}: replaying frame {done + 1} of {total}"
+            yield functools.partial(self._controls.show_busy, text, _REPLAYED * done / total)
+
+    def _ground(self, moment: Moment) -> Iterator[Show]:
+        """The grid below the map, anew where the floor is seen to be elsewhere."""
+        if moment.step == self._grounded:
+            return
+        self._grounded = moment.step
+        state = moment.map_state
+        centers = np.asarray(state.center)[:, np.asarray(state.occupied)]
+        if not centers.size:
+            return
+        floor = floor_height(centers[2], float(state.voxel_size))
+        if self._floor is None or abs(self._floor - floor) > _LEVEL:
+            self._floor = floor
+            low, high = self._bounds
+            yield functools.partial(self._canvas.show_grid, low, high, floor)
+
+    def _show_view(self, step: int, reason: Reason | str, *, shows_views: bool) -> Show:
         """The picture of a view, what the trace says of it, why it was taken, and its path."""
         rows = self._story.rows
         key = (step, len(rows), reason if isinstance(reason, str) else "")
         self._awaited = (step, reason) if isinstance(reason, str) else None
-        before = step if self._controls.shows_all_views else 0
+        before = step if shows_views else 0
         if self._view == key:
             return functools.partial(self._canvas.show_views, before)
         pose = np.asarray(rows[step].pose, np.float64)
         image = self._story.image(step)
-        facts = view_html(rows[step], len(rows)) + reason_html(reason)
+        facts = view_html(rows[step], len(rows), image, reason)
         segments, colors = path_segments(rows[: step + 1], len(rows))
 
         def show() -> None:
-            self._controls.show_view(facts, image)
+            self._controls.show_view(facts)
             self._canvas.show_view(pose, image)
             self._canvas.show_views(before)
-            self._canvas.show_lines("/path", segments, colors, 0.015)
+            self._canvas.show_lines("/path", segments, colors, _PATH_WIDTH)
             self._view = key
 
         return show
@@ -186,47 +237,62 @@ class QueryHandler:
             picture_camera(self._story.camera),
             self._extras.sources.model,
             self._extras.background,
-            self._extras.photographer,
         )
 
-    def _show_glance(self, glance: QuickPreview) -> None:
-        self._controls.show_numbers(preview_html(glance, None))
+    def _show_glance(self, glance: QuickPreview, step: int) -> None:
+        self._controls.show_numbers(preview_html(glance, None, step + 1))
         self._canvas.paint_camera(_color_of(glance))
 
-    def _show_look(self, look: CameraPreview, quantity: str) -> None:
+    def _show_look(self, look: CameraPreview, quantity: str, step: int) -> None:
         term = quantity if quantity in look.glance.images else "renderability"
         inside = (
             quick_preview_image(look.glance, term) if look.splats is None else to_bytes(look.splats)
         )
-        self._controls.show_numbers(preview_html(look.glance, look))
-        self._controls.show_pictures(preview_image(look, term), panorama_image(look))
-        self._canvas.paint_camera(_color_of(look.glance))
+        self._controls.show_numbers(preview_html(look.glance, look, step + 1))
         self._canvas.fill_camera(inside)
         self._canvas.show_suggestion(look.T_world_camera[:3, 3], look.best_direction)
         self.look = look
 
+    def _show_pictures(self, look: CameraPreview, settings: DisplaySettings) -> Show:
+        """What the camera would see, beside the true image if that is wanted."""
+        photographer, quantity = self._extras.photographer, settings.layer.quantity
+        if settings.shows_truth and photographer is not None:
+            look = replace(look, truth=photographer(look.T_world_camera))
+        term = quantity if quantity in look.glance.images else "renderability"
+        content = pictures_html(preview_pictures(look, term), panorama_image(look))
+        return functools.partial(self._controls.show_pictures, content)
+
+    def _show_legend(self) -> None:
+        if self._place.caption is not None:
+            has_candidates = self._candidates is not None
+            self._controls.show_legend(legend_html(self._place.caption, has_candidates))
+
     def _show_candidates(self, step: int, is_wanted: bool) -> Show:
-        """The candidates of a view, colored by score; has them decided on again if need be."""
+        """The candidates of a view, colored by score, and the legend; all is shown then."""
         segments, colors = np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
-        offer, note = None, ""
         if is_wanted:
             offer = self._story.offer(step) or self._offers.get(step)
             if offer is None:
                 self._decide_again()
             else:
                 segments, colors = offer_segments(self._story.camera, offer)
-                reachable = int(np.isfinite(offer.utilities["path"]).sum())
-                note = f"{len(offer.poses)} candidates, {reachable} within reach: yellow is best"
         key = (step, len(segments)) if len(segments) else None
+        note = "; ".join(part for part in (self._asking, self._extras.remark()) if part)
 
         def show() -> None:
             if self._candidates != key:
                 self._canvas.show_lines("/candidates", segments, colors, 0.006)
                 self._candidates = key
-                if note:
-                    self._controls.show_note(note)
+            self._show_legend()
+            self._controls.show_note(note)
 
         return show
+
+    def forget_view(self) -> None:
+        """What is shown of the view on the slider belongs to another one."""
+        self._view = None  # shown anew even if the slider comes back
+        self._canvas.show_lines("/candidates", np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), 0.0)
+        self._candidates = None
 
     def _decide_again(self) -> None:
         """Starts the thread that decides the run again, once."""
@@ -243,11 +309,28 @@ class QueryHandler:
                     return
                 if offer is not None:
                     self._offers[step] = offer
-                self._controls.show_note(f"asking the policy again: view {step + 1} of {total}")
+                is_last = step == total - 1
+                self._asking = (
+                    "" if is_last else f"asking the planner again: view {step + 1} of {total} …"
+                )
+                self._controls.show_note(self._asking)
                 if step == self._controls.settings.step:
                     self._ask_again()
         except (RunError, ValueError) as error:
-            self._controls.show_note(f"no candidates: {error}")
+            self._asking = f"no candidates to draw: {error}"
+            self._controls.show_note(self._asking)
+
+
+def floor_height(heights: np.ndarray, voxel_size: float) -> float:
+    """The height of the floor [m]: the lower side of the lowest layer that is well filled.
+
+    Args:
+        heights: centers of voxels, [n] [m].
+        voxel_size: their edge [m].
+    """
+    layers, counts = np.unique(np.round(heights / voxel_size - 0.5), return_counts=True)
+    lowest = layers[counts >= 0.2 * counts.max()][0]
+    return float(lowest * voxel_size)
 
 
 def _color_of(glance: QuickPreview) -> Color:

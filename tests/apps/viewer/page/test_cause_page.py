@@ -10,6 +10,7 @@ pytest.importorskip("viser", reason="the viewer needs viser, which is not instal
 
 from r3jax.apps.viewer.blocks import CAUSE
 from r3jax.apps.viewer.color_maps import CAUSE_COLORS, UNSEEN
+from r3jax.apps.viewer.page.layers import LAYERS
 from r3jax.apps.viewer.recorded import open_run_page
 from r3jax.exploration.explain_run import explain_run
 from tests.apps.viewer.conftest import VIEWS
@@ -18,6 +19,7 @@ pytestmark = pytest.mark.full
 
 PATIENCE = 240.0  # seconds; of a machine with other work, that compiles
 STEP = VIEWS - 1
+CAUSES_SHOWN = next(layer.name for layer in LAYERS if layer.quantity == CAUSE)
 
 
 @pytest.fixture(scope="module")
@@ -40,24 +42,29 @@ def wait_until(is_true) -> None:
         time.sleep(0.05)
 
 
-def note_of(viewer) -> str:
-    return viewer.app.controls._note.content
+def is_gray(colors: np.ndarray) -> np.ndarray:
+    """Which of the colors [n, 3] have as little color as the gray of what is unseen."""
+    return np.ptp(colors.astype(int), axis=1) <= np.ptp(UNSEEN)
+
+
+def legend_of(viewer) -> str:
+    return viewer.app.controls._legend.content
 
 
 def test_the_panel_tells_the_shares_once_they_are_known(viewer, reason):
-    facts = lambda: viewer.app.controls._facts.content.partition("its utility when")[2]
+    facts = lambda: viewer.app.controls._facts.content.partition("what it promised")[2]
     wait_until(lambda: " %<" in facts())  # the page asks again by itself
     shown = [float(share) for share in re.findall(r">([\d.]+) %<", facts())]
     np.testing.assert_allclose(shown, 100.0 * reason.totals / reason.utility, atol=0.0501)
-    assert f">{reason.utility:.0f}</b>" in facts()
+    assert f"<b>{reason.utility:,.0f}</b>" in facts()
 
 
 def test_the_map_before_the_view_is_colored_by_cause(viewer, reason):
     """Below the cut every voxel in view has the color of its largest share; the rest is gray."""
     app, cut = viewer.app, viewer.app.controls.settings.cut
     assert app.controls.settings.step == STEP
-    app.controls._quantity.value = CAUSE
-    wait_until(lambda: f"before view {STEP}" in note_of(viewer))
+    app.controls._layer.value = CAUSES_SHOWN
+    wait_until(lambda: f"just before view {STEP + 1}" in legend_of(viewer))
     scene = app.controls._server.scene
     shown = scene.get_handle_by_name("/map").colors
     state = app.story.moment(STEP - 1).map_state
@@ -68,17 +75,17 @@ def test_the_map_before_the_view_is_colored_by_cause(viewer, reason):
     for number, color in enumerate(CAUSE_COLORS[1:]):
         assert (shown == color).all(axis=1).sum() == (largest == number).sum()
     assert len(np.unique(largest)) > 1
-    assert (shown == UNSEEN).all(axis=1).sum() == len(shown) - lacks.sum()
+    assert is_gray(shown).sum() == len(shown) - lacks.sum()
     cells = scene.get_handle_by_name("/unexplored").points
     assert len(cells) == (reason.cells[:, 2] <= cut).sum() > 0
-    app.controls._quantity.value = "color"
-    wait_until(lambda: "before view" not in note_of(viewer))
+    app.controls._layer.value = "colors"
+    wait_until(lambda: "before view" not in legend_of(viewer))
     assert scene.get_handle_by_name("/unexplored") is None
 
 
 def test_the_start_was_chosen_by_nobody(viewer):
-    viewer.app.controls._quantity.value = CAUSE
+    viewer.app.controls._layer.value = CAUSES_SHOWN
     viewer.app.controls.set_step(0, VIEWS)
-    wait_until(lambda: "nothing was chosen" in note_of(viewer))
+    wait_until(lambda: "nothing was chosen" in legend_of(viewer))
     shown = viewer.app.controls._server.scene.get_handle_by_name("/map").colors
-    assert (shown == UNSEEN).all()
+    assert is_gray(shown).all()

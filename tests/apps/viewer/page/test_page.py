@@ -1,6 +1,7 @@
 """The page in real Chromium: it loads, the slider moves the camera, a drag is answered."""
 
 import contextlib
+import dataclasses
 import shutil
 import time
 from pathlib import Path
@@ -18,6 +19,7 @@ pytest.importorskip(
 from playwright import sync_api
 from viser import transforms
 
+from r3jax.apps.viewer.page.queries import Query
 from r3jax.apps.viewer.recorded import open_run_page
 from tests.apps.viewer.conftest import VIEWS
 
@@ -97,23 +99,30 @@ def test_the_page_loads_and_says_what_the_map_says(page, viewer):
     assert page.locator("canvas").count() >= 1
     number = settle(page, viewer)
     assert 0.0 < number < 1.0
-    assert page.inner_text("#r3jax-view") == str(VIEWS - 1)
-    assert "voxels" in page.inner_text("#r3jax-note")
+    assert page.inner_text("#r3jax-view") == str(VIEWS)
+    assert page.inner_text("#r3jax-moment") == f"after view {VIEWS} of {VIEWS}"
+    assert page.locator("#r3jax-busy").count() == 0
+
+
+def test_the_scene_is_beside_the_panel(page):
+    canvas, panel = (page.locator(what).first.bounding_box() for what in ("canvas", NUMBER))
+    assert canvas["x"] + canvas["width"] <= panel["x"] + 1.0
 
 
 def test_the_slider_moves_the_camera(page, viewer, run):
-    thumb = page.locator('[role="slider"]').first
+    thumb = page.locator('[role="slider"]').nth(1)  # below that of the cut
     before = viewer.app.canvas.view_position()
     thumb.focus()
     thumb.press("ArrowLeft")
     thumb.press("ArrowLeft")
-    wait_until(page, lambda: page.inner_text("#r3jax-view") == str(VIEWS - 3))
+    wait_until(page, lambda: page.inner_text("#r3jax-view") == str(VIEWS - 2))
     assert viewer.app.controls.settings.step == VIEWS - 3
     assert viewer.app.worker.wait(PATIENCE)
     after = viewer.app.canvas.view_position()
     np.testing.assert_allclose(after, run.rows[VIEWS - 3].pose[:3, 3], atol=1e-5)
     assert np.abs(after - before).max() > 0.01
     settle(page, viewer)  # the number is that of the earlier map
+    assert page.inner_text("#r3jax-moment") == f"after view {VIEWS - 2} of {VIEWS}"
 
 
 def pixel_of(client, point: np.ndarray) -> tuple[float, float]:
@@ -169,11 +178,31 @@ def test_a_dragged_camera_is_answered(page, viewer):
     assert after != before
 
 
+def test_what_belongs_to_another_view_says_so(page, viewer):
+    settle(page, viewer)
+    app, shown = viewer.app, page.inner_text("#r3jax-moment")
+    settings = dataclasses.replace(app.controls.settings, step=0)
+    app._mark_stale(Query(settings, app.canvas.pose), camera=True, view=True, scene=True)
+    wait_until(page, lambda: page.locator("#r3jax-busy").count() == 1)
+    assert page.inner_text("#r3jax-busy") == "View 1: being computed …"
+    assert page.inner_text("#r3jax-moment") == shown  # what is drawn until then
+    wait_until(page, lambda: page.get_by_text("opening view 1 …").count() == 1)
+    assert page.locator(NUMBER).get_attribute("data-state") == "computing"
+    assert app.canvas._server.scene.get_handle_by_name("/suggestion") is None
+    assert app.look is None
+    app._asked = None  # as it is when there is a new view
+    app.ask()
+    settle(page, viewer)
+    wait_until(page, lambda: page.locator("#r3jax-busy").count() == 0)
+    assert page.get_by_text("opening view").count() == 0
+    assert app.look is not None
+
+
 def test_the_button_turns_the_camera_along_the_suggestion(page, viewer):
     settle(page, viewer)
     look = viewer.app.look
     assert look is not None
-    page.get_by_text("look along the suggested direction").click()
+    page.get_by_text("Look along the suggested direction").click()
     wait_until(
         page, lambda: np.allclose(viewer.app.canvas.pose[:3, 2], look.best_direction, atol=1e-4)
     )
