@@ -41,6 +41,7 @@ MODULES = (
     "sequences:REPLICA_SLAM",
     "sequences:TUM",
     "sequences:SEVEN_SCENES",
+    "phones:POLYCAM",
 )
 """Of this folder, with the name of the reader where it is not READER."""
 

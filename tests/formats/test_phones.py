@@ -1,0 +1,218 @@
+"""Exports of phone apps: what they show lies where the room has its walls."""
+
+import json
+
+import numpy as np
+import pytest
+
+from r3jax.apps.audit.source import source_of
+from r3jax.formats.captures import open_capture
+from r3jax.formats.errors import FormatError
+from r3jax.formats.phones.polycam import is_polycam, read_polycam
+from r3jax.formats.posed_images import PosedImages
+from tests.apps.audit.room import SIZE, color_of
+from tests.formats import phones
+from tests.formats.phones import FACTOR, NUM, Y_UP_FROM_Z_UP, rays_of
+from tests.fuzz.containers import zipped
+from tests.fuzz.tree import lay_out
+
+JPEG = 12.0
+"""Mean error of colors that a JPEG of so small an image may have [of 255]."""
+
+
+def assert_shows_the_room(images: PosedImages, T_capture_room: np.ndarray, colors: float = JPEG):
+    """Pixels whose center is that of a depth pixel are points on the walls, of the wall's color."""
+    measured = 0
+    for index in range(len(images)):
+        frame, middle = images.frame(index), slice(FACTOR // 2, None, FACTOR)
+        rays, depth = rays_of(images.lenses[index])[middle, middle], np.asarray(frame.depth)
+        z = depth[middle, middle].astype(np.float64)
+        local = (z[..., None] * rays)[z > 0]
+        pose = np.linalg.inv(T_capture_room) @ images.poses[index]
+        points = local @ pose[:3, :3].T + pose[:3, 3]
+        to_wall = np.minimum(np.abs(points), np.abs(SIZE - points)).min(axis=1)
+        assert to_wall.max() < 2e-3  # depth comes in millimeters
+        assert (points > -2e-3).all()
+        assert (points < SIZE + 2e-3).all()
+        shown = np.asarray(frame.rgb)[middle, middle][z > 0]
+        assert 255 * np.abs(shown - color_of(points)).mean() < colors
+        measured += (z > 0).sum()
+    assert measured > 0.5 * len(images) * z.size
+
+
+def write_zip(path, files):
+    path.write_bytes(zipped(files))
+    return path
+
+
+@pytest.fixture(params=["folder", "zip", "zip with a top folder"])
+def polycam(request, tmp_path):
+    if request.param == "folder":
+        lay_out(tmp_path / "scan", phones.polycam())
+        return tmp_path / "scan"
+    top = "MyScan/" if "top" in request.param else ""
+    files = {"__MACOSX/keyframes/._x": b"", **phones.polycam(top=top)}
+    return write_zip(tmp_path / "scan.zip", files)
+
+
+def test_polycam_shows_the_room_by_its_corrected_cameras(polycam):
+    images = read_polycam(polycam)
+    assert len(images) == NUM
+    assert images.remark is None
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+    assert [lens.params[0] for lens in images.lenses] == [33.0, 34.0, 35.0, 36.0]
+
+
+def test_a_polycam_archive_is_opened_by_its_looks_and_named_after_itself(polycam):
+    capture = open_capture(polycam)
+    assert capture.name == "scan"
+    assert len(capture) == NUM
+    source = source_of(capture.source, capture.name)
+    np.testing.assert_array_equal(source.up, [0, 1, 0])  # one camera lies on its side
+    assert source.labels[0] == "1600000.jpg"
+
+
+def test_polycam_without_corrected_cameras_has_its_own(tmp_path):
+    lay_out(tmp_path, phones.polycam(corrected=False))
+    assert_shows_the_room(read_polycam(tmp_path), Y_UP_FROM_Z_UP)
+
+
+def test_unsure_and_far_depth_of_polycam_is_no_measurement(tmp_path):
+    files = phones.polycam()
+    name = "keyframes/depth/1600000.png"
+    far = phones.depth_steps(phones.room_poses()[0], phones.smaller(phones.lens_of(0)))
+    far[5, 5] = 5001
+    lay_out(tmp_path, files | {name: phones.encoded(far)})
+    depth = read_polycam(tmp_path).depth(0)
+    assert depth is not None
+    blocks = depth.reshape(12, FACTOR, 16, FACTOR)
+    assert (blocks[:, :, -2:] == 0).all()
+    assert (blocks[0, :, 0] == 0).all()
+    assert (blocks[5, :, 5] == 0).all()
+    assert (blocks[1:5, :, :-2] > 0).all()
+    without = {n: data for n, data in files.items() if "confidence" not in n}
+    lay_out(tmp_path, without)
+    assert (read_polycam(tmp_path).depth(0).reshape(12, FACTOR, 16, FACTOR)[:, :, -2:] > 0).all()
+
+
+def test_frames_without_depth_are_left_out_and_counted(tmp_path):
+    files = phones.polycam()
+    del files["keyframes/depth/2300000.png"]
+    lay_out(tmp_path, files)
+    images = read_polycam(tmp_path)
+    assert len(images) == NUM - 1
+    assert images.remark == (
+        "1 of 4 frames lack an image or a depth image and are left out."
+    )  # fmt: skip
+
+
+def test_other_folders_are_no_polycam(tmp_path):
+    lay_out(tmp_path / "scan", {"images/0.jpg": b""})
+    write_zip(tmp_path / "scan.zip", {"images/0.jpg": b""})
+    for name in ("scan", "scan.zip", "nowhere", "nowhere.zip"):
+        assert not is_polycam(tmp_path / name)
+
+
+def damaged(name, change):
+    """Files with one changed by a function of its JSON or bytes; None takes it away."""
+
+    def changed(files):
+        files = dict(files)
+        if change is None:
+            files = {other: data for other, data in files.items() if name not in other}
+        else:
+            names = [other for other in files if name in other]
+            assert names
+            files[names[0]] = change(files[names[0]])
+        return files
+
+    return changed
+
+
+def with_fields(**fields):
+    return lambda data: json.dumps({**json.loads(data), **fields}).encode()
+
+
+def without_field(name):
+    return lambda data: json.dumps(
+        {k: v for k, v in json.loads(data).items() if k != name}
+    ).encode()
+
+
+POLYCAM = {
+    "depth": (
+        damaged("keyframes/depth", None),
+        "looks like a Polycam export without keyframes/depth: .* ns-process-data images",
+    ),
+    "cameras": (damaged("cameras/", None), "without keyframes/cameras: export raw data"),
+    "field": (
+        damaged("corrected_cameras", without_field("fx")), r"1600000\.json: `camera` lacks fx",
+    ),
+    "pose": (damaged("corrected_cameras", with_fields(t_00=7.0)), r"1600000\.json: the pose"),
+    "size": (damaged("corrected_cameras", with_fields(width=-1)), r"image is -1 x 36 pixels"),
+    "word": (damaged("corrected_cameras", with_fields(fx="x")), r"`camera.fx` must be float"),
+    "not json": (damaged("corrected_cameras", lambda data: data[:40]), "this is not JSON"),
+}  # fmt: skip
+PIXELS = {
+    "image": (
+        damaged("corrected_images", lambda data: data[:50]),
+        r"1600000\.jpg: the image cannot",
+    ),
+    "other size": (
+        damaged("corrected_cameras", with_fields(width=50)),
+        r"1600000\.jpg: the size is \(48, 36\), others are \(50, 36\)",
+    ),
+    "colored depth": (
+        damaged("keyframes/depth", lambda data: phones.encoded(np.zeros((12, 16, 3), np.uint8))),
+        r"depth/1600000\.png: depth must be a 16-bit PNG",
+    ),
+    "confidence": (
+        damaged("keyframes/confidence", lambda data: phones.encoded(np.zeros((3, 4), np.uint8))),
+        r"confidence/1600000\.png: the confidence has 4 x 3 pixels, its depth image 16 x 12",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", POLYCAM)
+@pytest.mark.parametrize("is_zip", [False, True])
+def test_damaged_polycam_is_named(tmp_path, damage, is_zip):
+    break_it, message = POLYCAM[damage]
+    files = break_it(phones.polycam())
+    lay_out(tmp_path / "scan", files)
+    path = write_zip(tmp_path / "scan.zip", files) if is_zip else tmp_path / "scan"
+    with pytest.raises(FormatError, match=message) as found:
+        open_capture(path)
+    assert str(path) in str(found.value)
+
+
+@pytest.mark.parametrize("damage", PIXELS)
+def test_damaged_pixels_of_polycam_are_named(tmp_path, damage):
+    break_it, message = PIXELS[damage]
+    lay_out(tmp_path / "scan", break_it(phones.polycam()))
+    images = read_polycam(tmp_path / "scan")
+    with pytest.raises(FormatError, match=message):
+        images.frame(0)
+
+
+def test_an_archive_that_was_cut_off_says_so(tmp_path):
+    path = tmp_path / "scan.zip"
+    path.write_bytes(zipped(phones.polycam())[:-100])
+    with pytest.raises(FormatError, match=r"scan\.zip: this is no whole zip archive .*again"):
+        open_capture(path)
+
+
+def test_a_member_that_was_damaged_says_so(tmp_path):
+    data = bytearray(zipped(phones.polycam()))
+    at = data.find(b"keyframes/depth/1600000.png") + 60
+    data[at : at + 20] = bytes(20)
+    (tmp_path / "scan.zip").write_bytes(data)
+    images = read_polycam(tmp_path / "scan.zip")
+    with pytest.raises(FormatError, match=r"depth/1600000\.png: it cannot be unpacked"):
+        images.frame(0)
+
+
+def test_a_member_that_unpacks_to_far_too_much_is_not_unpacked(tmp_path):
+    files = phones.polycam() | {"keyframes/corrected_cameras/1600000.json": bytes(65 << 20)}
+    path = write_zip(tmp_path / "scan.zip", files)
+    with pytest.raises(FormatError, match=r"1600000\.json: it claims to unpack to 65 MiB"):
+        read_polycam(path)

@@ -1,0 +1,68 @@
+"""Exports of phone apps with damaged poses, cameras, images, archives and videos.
+
+All 2,000 cases of each: `pytest -m slow tests/fuzz/test_phones.py`.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r3jax.formats.errors import FormatError
+from r3jax.formats.phones.polycam import read_polycam
+from r3jax.formats.posed_images import PosedImages
+from tests.formats import phones
+from tests.fuzz import mutate
+from tests.fuzz.containers import zipped
+from tests.fuzz.harness import CASES_SLOW
+from tests.fuzz.test_sequences import checked
+from tests.fuzz.tree import Entry, Files
+from tests.fuzz.worker import Reader
+
+pytestmark = pytest.mark.full
+
+CASES = 100
+"""Of each, in the normal suite."""
+
+
+def of_folder(make: Callable[[], dict[str, bytes]], read: Callable[[Path], PosedImages]) -> Reader:
+    """The reader of a folder, as the app writes it."""
+    return Reader(lambda: [make()], checked(read), (FormatError,))
+
+
+def of_archive(
+    make: Callable[[], dict[str, bytes]], read: Callable[[Path], PosedImages], name: str
+) -> Reader:
+    """The same in an archive: half of the cases damage a member, the others the archive."""
+
+    def damaged(rng: np.random.Generator, files: Files) -> tuple[dict[str, Entry], str]:
+        if rng.random() < 0.5:
+            return mutate.mutate(rng, files)
+        members, what = mutate.mutate(rng, make())
+        plain = {key: data for key, data in members.items() if isinstance(data, bytes)}
+        return {name: zipped(plain)}, what
+
+    return Reader(
+        lambda: [{name: zipped(make())}],
+        checked(lambda folder: read(folder / name)),
+        (FormatError,),
+        make=damaged,
+    )
+
+
+POLYCAM = of_folder(phones.polycam, read_polycam)
+POLYCAM_ZIP = of_archive(phones.polycam, read_polycam, "scan.zip")
+NAMES = ("POLYCAM", "POLYCAM_ZIP")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_exports_are_refused_or_read(harness, name):
+    harness.check(f"{__name__}:{name}", CASES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_many_damaged_exports(harness, name):
+    """`pytest -m slow tests/fuzz/test_phones.py`."""
+    harness.check(f"{__name__}:{name}", CASES_SLOW)
