@@ -10,6 +10,8 @@ from r3jax.formats.errors import FormatError, check_capture
 from r3jax.formats.guesses import nearest_guess
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
+from r3jax.formats.phones.record3d import is_record3d, read_record3d
+from r3jax.formats.phones.stray_scanner import is_stray_scanner, read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.recordings import Recording, is_recording, read_recording
 from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
@@ -24,6 +26,8 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_seven_scenes, read_seven_scenes),
     (lambda path: (path / "transforms.json").exists(), read_transforms),
     (is_polycam, read_polycam),
+    (is_record3d, read_record3d),
+    (is_stray_scanner, read_stray_scanner),
     (lambda path: find_model(path) is not None, read_colmap),
 )
 """Folders and archives of posed images: what each looks like, and its reader."""
@@ -32,7 +36,8 @@ _KNOWN = (
     "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json, a COLMAP "
     "model (cameras.bin or cameras.txt, here or in sparse/0), a scene of Replica-SLAM (traj.txt, "
     "results/), TUM (rgb.txt, depth.txt, groundtruth.txt), 7-Scenes (frame-*.color.png or .jpg), "
-    "raw data of Polycam (keyframes/)"
+    "raw data of Polycam (keyframes/), a recording of Record3D (.r3d) or Stray "
+    "Scanner (rgb.mp4, odometry.csv)"
 )
 
 _MOST_BELOW = 100

@@ -1,6 +1,5 @@
 """Poses written as a position and a quaternion, as trackers and phones write them."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,7 @@ from r3jax.formats.poses import MAX_DISTANCE
 from r3jax.formats.validation.errors import ForeignFileError
 
 
-def quaternion_pose(
-    source: Path,
-    which: str,
-    position: Sequence[float] | np.ndarray,
-    xyzw: Sequence[float] | np.ndarray,
-) -> np.ndarray:
+def quaternion_pose(source: Path, which: str, position: np.ndarray, xyzw: np.ndarray) -> np.ndarray:
     """Makes the matrix [4, 4] float64 of a position [3] and a unit quaternion x y z w [4].
 
     Args:

@@ -1,9 +1,11 @@
 """The room of the audit's tests, filmed by phones: in memory, in the layout of each app."""
 
+import io
 import json
 
 import numpy as np
 
+from r3jax.formats.colmap.model import quaternion_of
 from r3jax.formats.lenses import Lens
 from tests.apps.audit.room import SIZE, color_of, round_poses
 from tests.formats.sequences import encoded
@@ -102,3 +104,71 @@ def polycam(corrected: bool = True, top: str = "") -> dict[str, bytes]:
             files[f"keyframes/corrected_images/{name}.jpg"] = encoded(rgb, "jpeg")
             files[f"keyframes/corrected_cameras/{name}.json"] = json.dumps(camera).encode()
     return {top + name: data for name, data in files.items()}
+
+
+def record3d(size: bool = True, first: np.ndarray | None = None) -> dict[str, bytes]:
+    """What an .r3d archive holds; `first` takes the world to another one."""
+    import lzfse
+
+    files: dict[str, bytes] = {}
+    T_world_room = Y_UP_FROM_Z_UP if first is None else first
+    poses, coeffs = [], []
+    for i, room_pose in enumerate(room_poses()):
+        lens = lens_of(i)
+        arkit = T_world_room @ room_pose @ OPENGL
+        w, x, y, z = quaternion_of(arkit[:3, :3])
+        poses.append([x, y, z, w, *arkit[:3, 3].tolist()])
+        coeffs.append(list(lens.params))
+        depth = view(room_pose, smaller(lens))[1].astype("<f4")
+        depth[0, 0] = np.nan
+        files[f"rgbd/{i}.jpg"] = encoded(view(room_pose, lens)[0], "jpeg")
+        files[f"rgbd/{i}.depth"] = lzfse.compress(depth.tobytes())
+        files[f"rgbd/{i}.conf"] = lzfse.compress(levels(2).tobytes())
+    fx, fy, cx, cy = LENS.params
+    metadata = {"w": LENS.width, "h": LENS.height, "fps": 60, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
+    metadata |= {"poses": poses, "initPose": [0, 0, 0, 1, 0, 0, 0]}
+    metadata |= {"perFrameIntrinsicCoeffs": coeffs, "frameTimestamps": [0.0, 0.1, 0.2, 0.3]}
+    if size:
+        metadata |= {"dw": LENS.width // FACTOR, "dh": LENS.height // FACTOR}
+    return {"metadata": json.dumps(metadata).encode(), **files, "sound.m4a": b"", "icon": b""}
+
+
+VIDEO = Lens("PINHOLE", 192, 144, (132.0, 132.0, 102.0, 66.0))
+"""Of a video: larger, as encoders want it; depth has a twelfth of its sides."""
+
+
+def video(images: list[np.ndarray]) -> bytes:
+    """An MP4 with two key frames, so that jumping is tried; nearly without loss."""
+    import av
+
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        options = {"crf": "4", "preset": "ultrafast"}
+        stream = container.add_stream("libx264", rate=60, options=options)
+        stream.width, stream.height, stream.pix_fmt = VIDEO.width, VIDEO.height, "yuv420p"
+        stream.codec_context.gop_size = max(2, len(images) // 2)
+        for image in images:
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            container.mux(stream.encode(frame.reformat(format="yuv420p")))
+        container.mux(stream.encode(None))
+    return file.getvalue()
+
+
+def stray_scanner(intrinsics: bool = True) -> dict[str, bytes]:
+    """A recording; with intrinsics of every frame as newer versions write it."""
+    fx, fy, cx, cy = VIDEO.params
+    names = ["timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw"]
+    rows = [", ".join(names + (["fx", "fy", "cx", "cy"] if intrinsics else []))]
+    images, files = [], {}
+    for i, room_pose in enumerate(room_poses()):
+        lens = Lens("PINHOLE", 192, 144, (fx + 4 * i * intrinsics, fy + 4 * i * intrinsics, cx, cy))
+        arkit = Y_UP_FROM_Z_UP @ room_pose  # the app has turned the camera's axes
+        w, x, y, z = quaternion_of(arkit[:3, :3])
+        numbers = [100 + i / 60, f"{i:06d}", *arkit[:3, 3], x, y, z, w]
+        rows.append(", ".join(str(v) for v in numbers + list(lens.params) * intrinsics))
+        images.append(view(room_pose, lens)[0])
+        files[f"depth/{i:06d}.png"] = encoded(depth_steps(room_pose, smaller(lens)))
+        files[f"confidence/{i:06d}.png"] = encoded(levels(2, smaller(lens)))
+    files["odometry.csv"] = ("\n".join(rows) + "\n").encode()
+    files["camera_matrix.csv"] = f"{fx},0.0,{cx}\n0.0,{fy},{cy}\n0.0,0.0,1.0\n".encode()
+    return files | {"rgb.mp4": video(images), "imu.csv": b"timestamp, a_x\n"}

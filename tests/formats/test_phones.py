@@ -1,6 +1,7 @@
 """Exports of phone apps: what they show lies where the room has its walls."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -9,6 +10,9 @@ from r3jax.apps.audit.source import source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
+from r3jax.formats.phones.record3d import read_record3d
+from r3jax.formats.phones.stray_scanner import read_stray_scanner
+from r3jax.formats.phones.videos import Video
 from r3jax.formats.posed_images import PosedImages
 from tests.apps.audit.room import SIZE, color_of
 from tests.formats import phones
@@ -216,3 +220,186 @@ def test_a_member_that_unpacks_to_far_too_much_is_not_unpacked(tmp_path):
     path = write_zip(tmp_path / "scan.zip", files)
     with pytest.raises(FormatError, match=r"1600000\.json: it claims to unpack to 65 MiB"):
         read_polycam(path)
+
+
+@pytest.fixture(params=["folder", "archive"])
+def record3d(request, tmp_path):
+    if request.param == "archive":
+        return write_zip(tmp_path / "scan.r3d", phones.record3d())
+    lay_out(tmp_path / "scan", phones.record3d())
+    return tmp_path / "scan"
+
+
+def test_record3d_shows_the_room(record3d):
+    capture = open_capture(record3d)
+    assert capture.name == "scan"
+    images = capture.source
+    assert isinstance(images, PosedImages)
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+    np.testing.assert_array_equal(images.up, [0, 1, 0])
+    assert [lens.params[0] for lens in images.lenses] == [33.0, 34.0, 35.0, 36.0]
+    depth = images.depth(0).reshape(12, FACTOR, 16, FACTOR)
+    assert (depth[:, :, -2:] == 0).all()  # not sure
+    assert (depth[0, :, 0] == 0).all()  # NaN
+    assert (depth[1:, :, :-2] > 0).all()
+
+
+def test_record3d_from_its_first_camera_on_does_not_know_what_is_up(tmp_path):
+    first = np.linalg.inv(phones.room_poses()[0] @ phones.OPENGL)
+    lay_out(tmp_path, phones.record3d(first=first))
+    images = read_record3d(tmp_path)
+    assert images.up is None
+    assert_shows_the_room(images, first)
+
+
+def test_record3d_of_earlier_versions_has_one_camera_and_no_size_of_depth(tmp_path):
+    import lzfse
+
+    files = phones.record3d(size=False)
+    metadata = json.loads(files["metadata"])
+    del metadata["perFrameIntrinsicCoeffs"]
+    metadata |= {"w": 480, "h": 640, "K": [400.0, 0, 0, 0, 401.0, 0, 240.0, 321.0, 1]}
+    lidar = np.full((256, 192), 2.0, "<f4")
+    lidar[0] = 1.0
+    files |= {
+        "metadata": json.dumps(metadata).encode(),
+        "rgbd/0.depth": lzfse.compress(lidar.tobytes()),
+    }
+    files = {name: data for name, data in files.items() if not name.endswith("conf")}
+    lay_out(
+        tmp_path, files | {"rgbd/0.jpg": phones.encoded(np.zeros((640, 480, 3), np.uint8), "jpeg")}
+    )
+    images = read_record3d(tmp_path)
+    assert images.lenses[0].params == (400.0, 401.0, 240.0, 321.0)
+    depth = images.frame(0).depth
+    assert depth.shape == (640, 480)
+    assert (np.asarray(depth[:2]) == 1.0).all()
+    assert (np.asarray(depth[3:]) == 2.0).all()
+
+
+def with_lzfse(array):
+    import lzfse
+
+    return lambda data: lzfse.compress(array.tobytes())
+
+
+RECORD3D = {
+    "depth": (damaged(".depth", None), "looks like a recording of Record3D without depth"),
+    "poses": (damaged("metadata", with_fields(poses=[[0, 0, 0, 1, 0, 0]])), "1 poses must have 7"),
+    "fewer": (damaged("metadata", with_fields(poses=[[0, 0, 0, 1, 0, 0, 0]])), "intrinsics, 4"),
+    "no pose": (damaged("metadata", with_fields(poses=[])), "the 0 poses"),
+    "quaternion": (
+        damaged("metadata", with_fields(poses=[[0, 0, 0, 2, 0, 0, 0]] * 4)),
+        "metadata: pose 0: the rotation is no unit quaternion",
+    ),
+    "K": (damaged("metadata", with_fields(K=[1.0])), "`K` must have 9 numbers"),
+    "size": (damaged("metadata", with_fields(dw=1 << 20)), "cannot have 1048576 x 12 pixels"),
+    "field": (damaged("metadata", without_field("w")), "`metadata` lacks w"),
+}
+
+
+@pytest.mark.parametrize("damage", RECORD3D)
+def test_damaged_record3d_is_named(tmp_path, damage):
+    break_it, message = RECORD3D[damage]
+    path = write_zip(tmp_path / "scan.r3d", break_it(phones.record3d()))
+    with pytest.raises(FormatError, match=message) as found:
+        open_capture(path)
+    assert str(path) in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data[:30], r"0\.depth: it unpacks to .* bytes, not 768: is it damaged"),
+        (lambda data: b"bvx1" + data[4:], r"0\.depth: it unpacks to 0 bytes, not 768"),
+        (with_lzfse(np.ones((12, 15), np.float32)), "it unpacks to 720 bytes, not 768"),
+        (with_lzfse(np.zeros(1 << 20, np.uint8)), "it unpacks to more than 768 bytes, not 768"),
+    ],
+)
+def test_damaged_depth_of_record3d_is_named(tmp_path, change, message):
+    lay_out(tmp_path, damaged("0.depth", change)(phones.record3d()))
+    images = read_record3d(tmp_path)
+    with pytest.raises(FormatError, match=message):
+        images.frame(0)
+
+
+def test_record3d_without_lzfse_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lzfse", None)
+    path = write_zip(tmp_path / "scan.r3d", {"metadata": b"{}", "rgbd/0.jpg": b""})
+    with pytest.raises(FormatError, match=r"scan\.r3d: .*pip install 'r3jax\[phones\]'"):
+        open_capture(path)
+
+
+@pytest.fixture(params=["folder", "archive"])
+def stray(request, tmp_path):
+    if request.param == "archive":
+        return write_zip(tmp_path / "scan.zip", phones.stray_scanner())
+    lay_out(tmp_path / "scan", phones.stray_scanner())
+    return tmp_path / "scan"
+
+
+def test_stray_scanner_shows_the_room(stray):
+    images = open_capture(stray).source
+    assert isinstance(images, PosedImages)
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+    np.testing.assert_array_equal(images.up, [0, 1, 0])
+    assert [lens.params[0] for lens in images.lenses] == [132.0, 136.0, 140.0, 144.0]
+    assert images.image_paths[1].name == "000001"
+
+
+def test_stray_scanner_of_earlier_versions_has_one_camera(tmp_path):
+    lay_out(tmp_path, phones.stray_scanner(intrinsics=False))
+    images = read_stray_scanner(tmp_path)
+    assert set(images.lenses) == {phones.VIDEO}
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+
+
+def test_frames_of_a_video_come_by_number_in_any_order(tmp_path):
+    gray = [np.full((144, 192, 3), 20 * i, np.uint8) for i in range(12)]
+    video = Video(tmp_path, phones.video(gray))
+    assert len(video) == 12
+    for number in (0, 1, 2, 11, 5, 4, 4, 10, 0, 7):
+        assert abs(video.frame(number).mean() - 20 * number) < 4
+    for number in (-1, 12):
+        with pytest.raises(FormatError, match=f"12 frames, none of number {number}"):
+            video.frame(number)
+
+
+def lines(change):
+    return lambda data: "\n".join(change(data.decode().splitlines())).encode()
+
+
+STRAY = {
+    "depth": (damaged("depth/", None), "looks like a recording of Stray Scanner without depth/"),
+    "odometry": (damaged("odometry", None), "Stray Scanner without odometry.csv: copy the whole"),
+    "columns": (
+        damaged("odometry", lambda data: data.replace(b"qw", b"q")), r"odometry\.csv: .*columns qw",
+    ),
+    "no rows": (damaged("odometry", lines(lambda rows: rows[:1])), "it lists no frames"),
+    "row": (damaged("odometry", lines(lambda rows: [*rows, "1, 2"])), "not every row is a row of"),
+    "word": (damaged("odometry", lambda d: d.replace(b"000001", b"x")), "not every row is a row"),
+    "frame": (damaged("odometry", lambda d: d.replace(b"000003", b"9")), "none of number 9"),
+    "video": (damaged("rgb.mp4", lambda data: data[:100]), r"rgb\.mp4: the video cannot be read"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", STRAY)
+def test_damaged_stray_scanner_is_named(tmp_path, damage):
+    break_it, message = STRAY[damage]
+    lay_out(tmp_path, break_it(phones.stray_scanner()))
+    with pytest.raises(FormatError, match=message) as found:
+        open_capture(tmp_path)
+    assert str(tmp_path) in str(found.value)
+
+
+def test_stray_scanner_without_a_matrix_says_so(tmp_path):
+    files = phones.stray_scanner(intrinsics=False) | {"camera_matrix.csv": b"1,2\n3,4\n"}
+    lay_out(tmp_path, files)
+    with pytest.raises(FormatError, match=r"camera_matrix\.csv: expected a 3x3 matrix"):
+        read_stray_scanner(tmp_path)
+
+
+def test_a_video_without_pyav_names_the_extra(stray, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(FormatError, match=r"rgb\.mp4: .*pip install 'r3jax\[phones\]'"):
+        open_capture(stray)

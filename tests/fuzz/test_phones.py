@@ -11,6 +11,8 @@ import pytest
 
 from r3jax.formats.errors import FormatError
 from r3jax.formats.phones.polycam import read_polycam
+from r3jax.formats.phones.record3d import read_record3d
+from r3jax.formats.phones.stray_scanner import read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
 from tests.formats import phones
 from tests.fuzz import mutate
@@ -53,7 +55,10 @@ def of_archive(
 
 POLYCAM = of_folder(phones.polycam, read_polycam)
 POLYCAM_ZIP = of_archive(phones.polycam, read_polycam, "scan.zip")
-NAMES = ("POLYCAM", "POLYCAM_ZIP")
+RECORD3D = of_folder(phones.record3d, read_record3d)
+RECORD3D_ARCHIVE = of_archive(phones.record3d, read_record3d, "scan.r3d")
+STRAY_SCANNER = of_folder(phones.stray_scanner, read_stray_scanner)
+NAMES = ("POLYCAM", "POLYCAM_ZIP", "RECORD3D", "RECORD3D_ARCHIVE", "STRAY_SCANNER")
 
 
 @pytest.mark.parametrize("name", NAMES)
