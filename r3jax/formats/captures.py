@@ -9,12 +9,15 @@ from r3jax.formats.colmap.reader import find_model, read_colmap
 from r3jax.formats.errors import FormatError, check_capture
 from r3jax.formats.guesses import nearest_guess
 from r3jax.formats.nerfstudio import read_transforms
+from r3jax.formats.phones.arkit_scenes import is_arkit_scenes, read_arkit_scenes
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
 from r3jax.formats.phones.record3d import is_record3d, read_record3d
 from r3jax.formats.phones.stray_scanner import is_stray_scanner, read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.recordings import Recording, is_recording, read_recording
 from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
+from r3jax.formats.sequences.scannet import is_scannet, read_scannet
+from r3jax.formats.sequences.scannet_sens import is_sens, read_sens
 from r3jax.formats.sequences.seven_scenes import is_seven_scenes, read_seven_scenes
 from r3jax.formats.sequences.tum import is_tum, read_tum
 from r3jax.frame import Frame
@@ -28,16 +31,20 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_polycam, read_polycam),
     (is_record3d, read_record3d),
     (is_stray_scanner, read_stray_scanner),
+    (is_arkit_scenes, read_arkit_scenes),
+    (is_scannet, read_scannet),
+    (is_sens, read_sens),
     (lambda path: find_model(path) is not None, read_colmap),
 )
 """Folders and archives of posed images: what each looks like, and its reader."""
 
 _KNOWN = (
     "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json, a COLMAP "
-    "model (cameras.bin or cameras.txt, here or in sparse/0), a scene of Replica-SLAM (traj.txt, "
-    "results/), TUM (rgb.txt, depth.txt, groundtruth.txt), 7-Scenes (frame-*.color.png or .jpg), "
-    "raw data of Polycam (keyframes/), a recording of Record3D (.r3d) or Stray "
-    "Scanner (rgb.mp4, odometry.csv)"
+    "model (cameras.bin or cameras.txt, here or in sparse/0), raw data of Polycam (keyframes/), a "
+    "recording of Record3D (.r3d) or Stray Scanner (rgb.mp4, odometry.csv), a scene of ARKitScenes "
+    "(lowres_wide.traj), ScanNet (.sens, or color/, depth/, pose/, intrinsic/), Replica-SLAM "
+    "(traj.txt, results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes "
+    "(frame-*.color.png)"
 )
 
 _MOST_BELOW = 100

@@ -33,7 +33,7 @@ def naming(path: Path) -> Generator[None]:
         raise FormatError(path, str(error)) from None
 
 
-CAPTURE_FILES = (".json", ".zip", ".r3d")
+CAPTURE_FILES = (".json", ".zip", ".r3d", ".sens")
 """Suffixes of the files that may be a capture; all others are folders."""
 
 _ADVICE = {
@@ -78,7 +78,7 @@ def check_capture(path: Path) -> None:
         raise FormatError(path, "there is no such folder")
     if path.is_file() and path.suffix.lower() not in CAPTURE_FILES:
         default = (
-            "this is a file; a capture is a folder, nerfstudio's transforms.json, or an archive "
+            "this is a file; a capture is a folder, nerfstudio's transforms.json, or an app's file "
             f"({', '.join(CAPTURE_FILES[1:])})"
         )
         raise FormatError(path, _ADVICE.get(path.suffix.lower(), default).format(path))

@@ -54,7 +54,7 @@ def _of_archive(path: Path) -> str | None:
 
 
 def _exr(path: Path, names: list[str]) -> str | None:
-    if not any(name.endswith(".exr") for name in names):
+    if not any(name.endswith(".exr") or name.startswith("EXR_RGBD/") for name in names):
         return None
     return (
         "this looks like Record3D's export EXR + RGB, whose depth is not read: share the same "

@@ -2,8 +2,11 @@
 
 import io
 import json
+import struct
+import zlib
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from r3jax.formats.colmap.model import quaternion_of
 from r3jax.formats.lenses import Lens
@@ -172,3 +175,90 @@ def stray_scanner(intrinsics: bool = True) -> dict[str, bytes]:
     files["odometry.csv"] = ("\n".join(rows) + "\n").encode()
     files["camera_matrix.csv"] = f"{fx},0.0,{cx}\n0.0,{fy},{cy}\n0.0,0.0,1.0\n".encode()
     return files | {"rgb.mp4": video(images), "imu.csv": b"timestamp, a_x\n"}
+
+
+Z_UP_FROM_ROOM = np.array(
+    [[0.0, -1.0, 0.0, 3.0], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]]
+)
+"""Takes the room to a world that is z up as well, somewhere else."""
+
+
+def arkit_scenes() -> dict[str, bytes]:
+    """A video; poses have a clock of their own, the first image comes before them."""
+    files: dict[str, bytes] = {}
+    lines = []
+    for i, room_pose in enumerate([room_poses()[0], *room_poses()]):
+        lens, time = lens_of(i), 6791.528 + 0.1 * i
+        name = f"40753679_{time:.3f}"
+        T_camera_world = np.linalg.inv(Z_UP_FROM_ROOM @ room_pose)
+        numbers = [time + 0.003, *axis_angle(T_camera_world[:3, :3]), *T_camera_world[:3, 3]]
+        if i:
+            lines.append(" ".join(f"{value:.9f}" for value in numbers))
+        fx, fy, cx, cy = lens.params
+        camera = f"{lens.width} {lens.height} {fx} {fy} {cx} {cy}".encode()
+        files[f"lowres_wide/{name}.png"] = encoded(view(room_pose, lens)[0])
+        files[f"lowres_depth/{name}.png"] = encoded(depth_steps(room_pose, smaller(lens)))
+        files[f"confidence/{name}.png"] = encoded(levels(2))
+        off = 0.001 * (i % 3 - 1)
+        files[f"lowres_wide_intrinsics/40753679_{time + off:.3f}.pincam"] = camera
+    return files | {"lowres_wide.traj": "\n".join(lines).encode()}
+
+
+def axis_angle(R: np.ndarray) -> np.ndarray:
+    """Axis times angle [3] of a rotation."""
+    return Rotation.from_matrix(R).as_rotvec()
+
+
+DEPTH_LENS = Lens("PINHOLE", 20, 14, (11.0, 11.0, 10.5, 6.5))
+"""Of a depth camera that sees more than the colors, at the same place: their pixels coincide."""
+
+ONLY_DEPTH = DEPTH_LENS.params[2] - LENS.params[2] / FACTOR
+"""Columns of depth to the left of the colors."""
+
+
+def matrix(lens: Lens) -> np.ndarray:
+    """ScanNet's 4x4 intrinsics; pixel centers lie at whole numbers."""
+    fx, fy, cx, cy = lens.params
+    K = np.eye(4)
+    K[:2, :3] = [[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5]]
+    return K
+
+
+def scannet_poses() -> list[np.ndarray]:
+    """The second one was lost."""
+    poses = [Z_UP_FROM_ROOM @ pose for pose in room_poses()]
+    return [poses[0], np.full((4, 4), -np.inf), *poses[1:]]
+
+
+def scannet() -> dict[str, bytes]:
+    """An exported scene."""
+    files: dict[str, bytes] = {}
+    text = lambda M: "\n".join(" ".join(f"{x:.9f}" for x in row) for row in M).encode()
+    for i, pose in enumerate(scannet_poses()):
+        room_pose = room_poses()[max(0, i - 1)]
+        files[f"color/{9 + i}.jpg"] = encoded(view(room_pose, LENS)[0], "jpeg")
+        files[f"depth/{9 + i}.png"] = encoded(depth_steps(room_pose, DEPTH_LENS))
+        files[f"pose/{9 + i}.txt"] = text(pose)
+    for name, lens in (("color", LENS), ("depth", DEPTH_LENS)):
+        files[f"intrinsic/intrinsic_{name}.txt"] = text(matrix(lens))
+        files[f"intrinsic/extrinsic_{name}.txt"] = text(np.eye(4))
+    return files
+
+
+def sens(packed: bool = True) -> bytes:
+    """The same scene as a .sens file."""
+    name = b"StructureSensor"
+    matrices = [matrix(LENS), np.eye(4), matrix(DEPTH_LENS), np.eye(4)]
+    poses = scannet_poses()
+    data = struct.pack("<IQ", 4, len(name)) + name
+    data += np.stack(matrices).astype("<f4").tobytes()
+    sizes = (LENS.width, LENS.height, DEPTH_LENS.width, DEPTH_LENS.height)
+    data += struct.pack("<2i4IfQ", 2, int(packed), *sizes, 1000.0, len(poses))
+    for i, pose in enumerate(poses):
+        room_pose = room_poses()[max(0, i - 1)]
+        color = encoded(view(room_pose, LENS)[0], "jpeg")
+        depth = depth_steps(room_pose, DEPTH_LENS).astype("<u2").tobytes()
+        depth = zlib.compress(depth) if packed else depth
+        data += pose.astype("<f4").tobytes()
+        data += struct.pack("<4Q", i, i, len(color), len(depth)) + color + depth
+    return data + struct.pack("<Q", 0)  # no readings of the inertial sensor

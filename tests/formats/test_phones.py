@@ -9,6 +9,7 @@ import pytest
 from r3jax.apps.audit.source import source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
+from r3jax.formats.phones.arkit_scenes import read_arkit_scenes
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
 from r3jax.formats.phones.record3d import read_record3d
 from r3jax.formats.phones.stray_scanner import read_stray_scanner
@@ -403,3 +404,36 @@ def test_a_video_without_pyav_names_the_extra(stray, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(FormatError, match=r"rgb\.mp4: .*pip install 'r3jax\[phones\]'"):
         open_capture(stray)
+
+
+def test_arkit_scenes_shows_the_room(tmp_path):
+    lay_out(tmp_path / "40753679", phones.arkit_scenes())
+    images = open_capture(tmp_path / "40753679").source
+    assert isinstance(images, PosedImages)
+    assert len(images) == NUM
+    assert images.remark == "1 of 5 images lack a pose, a camera or depth and are left out."
+    assert_shows_the_room(images, phones.Z_UP_FROM_ROOM, colors=1.5)
+    np.testing.assert_array_equal(images.up, [0, 0, 1])
+    assert [lens.params[0] for lens in images.lenses] == [34.0, 35.0, 36.0, 37.0]
+    assert (images.depth(0).reshape(12, FACTOR, 16, FACTOR)[:, :, -2:] == 0).all()
+
+
+ARKIT_SCENES = {
+    "depth": (damaged("lowres_depth", None), "looks like a video of ARKitScenes without images"),
+    "cameras": (damaged("pincam", None), "download its assets lowres_wide, lowres_depth"),
+    "camera": (damaged("1.628.pincam", lambda data: b"256 192 1"), r"pincam: every line must have"),
+    "huge": (damaged("1.628.pincam", lambda data: b"1e300 1 1 1 1 1"), "image is 0 x 1 pixels"),
+    "columns": (damaged("traj", lambda data: data[:-20]), r"wide\.traj: every line must have 7"),
+    "word": (damaged("traj", lambda data: b"a b c d e f g"), "a word that is no number"),
+    "lost": (damaged("traj", lambda data: b"6791 nan 0 0 0 0 0"), "not finite"),
+    "other time": (damaged("traj", lambda data: b"7 0 0 0 0 0 0"), "without images that have"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", ARKIT_SCENES)
+def test_damaged_arkit_scenes_is_named(tmp_path, damage):
+    break_it, message = ARKIT_SCENES[damage]
+    lay_out(tmp_path, break_it(phones.arkit_scenes()))
+    with pytest.raises(FormatError, match=message) as found:
+        read_arkit_scenes(tmp_path)
+    assert str(tmp_path) in str(found.value)

@@ -42,6 +42,9 @@ MODULES = (
     "sequences:TUM",
     "sequences:SEVEN_SCENES",
     "phones:POLYCAM",
+    "phones:RECORD3D",
+    "phones:ARKIT_SCENES",
+    "phones:SCANNET",
 )
 """Of this folder, with the name of the reader where it is not READER."""
 

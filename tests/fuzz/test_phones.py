@@ -1,4 +1,4 @@
-"""Exports of phone apps with damaged poses, cameras, images, archives and videos.
+"""Exports of phone apps and ScanNet's scenes with damaged poses, cameras, images and archives.
 
 All 2,000 cases of each: `pytest -m slow tests/fuzz/test_phones.py`.
 """
@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from r3jax.formats.errors import FormatError
+from r3jax.formats.phones.arkit_scenes import read_arkit_scenes
 from r3jax.formats.phones.polycam import read_polycam
 from r3jax.formats.phones.record3d import read_record3d
 from r3jax.formats.phones.stray_scanner import read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.sequences.scannet import read_scannet
+from r3jax.formats.sequences.scannet_sens import read_sens
 from tests.formats import phones
 from tests.fuzz import mutate
 from tests.fuzz.containers import zipped
@@ -58,7 +61,19 @@ POLYCAM_ZIP = of_archive(phones.polycam, read_polycam, "scan.zip")
 RECORD3D = of_folder(phones.record3d, read_record3d)
 RECORD3D_ARCHIVE = of_archive(phones.record3d, read_record3d, "scan.r3d")
 STRAY_SCANNER = of_folder(phones.stray_scanner, read_stray_scanner)
-NAMES = ("POLYCAM", "POLYCAM_ZIP", "RECORD3D", "RECORD3D_ARCHIVE", "STRAY_SCANNER")
+ARKIT_SCENES = of_folder(phones.arkit_scenes, read_arkit_scenes)
+SCANNET = of_folder(phones.scannet, read_scannet)
+SENS = of_folder(lambda: {"scene.sens": phones.sens()}, read_sens)
+NAMES = (
+    "POLYCAM",
+    "POLYCAM_ZIP",
+    "RECORD3D",
+    "RECORD3D_ARCHIVE",
+    "STRAY_SCANNER",
+    "ARKIT_SCENES",
+    "SCANNET",
+    "SENS",
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
