@@ -11,6 +11,9 @@ _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff")
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi")
 _MODELS = (".ply", ".glb", ".obj", ".usdz", ".las", ".laz", ".e57")
 
+_MARKS = ("keyframes/", "rgbd/", "odometry.csv", "lowres_wide.traj")
+"""Beginnings of names by which phones' captures are known."""
+
 _MOST = 2000
 """Names that are looked at in each folder."""
 
@@ -49,8 +52,15 @@ def _of_archive(path: Path) -> str | None:
         names = list(open_zip(path).NameToInfo)[:_MOST]
     except FormatError as error:
         return error.reason
-    sentence = next((found for guess in _GUESSES if (found := guess(path, names))), None)
-    return sentence or "this archive holds no capture that is known: unpack it and give the folder"
+    tops = {top for top, _, rest in (n.partition("/") for n in names) if rest.startswith(_MARKS)}
+    if len(tops) > 1:
+        return "this archive holds several captures: unpack it and give one of its folders"
+    unpacked = path.with_suffix("")
+    for guess in _GUESSES:
+        sentence = guess(unpacked, names)
+        if sentence is not None:
+            return f"unpack this archive first; {sentence}"
+    return "this archive holds no capture that is known: unpack it and give the folder"
 
 
 def _exr(path: Path, names: list[str]) -> str | None:

@@ -41,6 +41,10 @@ FOLDERS = {
         {f"seq-0{k}/{n}": d for k in (1, 2, 3) for n, d in sequences.seven_scenes().items()},
         r"but \S+scan/seq-01 is one \(and 2 more\): give that folder",
     ),
+    "several phones": (
+        phones.polycam(top="monday/") | phones.polycam(top="friday/"),
+        r"but \S+scan/friday is one \(and 1 more\): give that folder",
+    ),
 }
 
 
@@ -56,7 +60,11 @@ def test_a_folder_that_is_not_understood_gets_a_guess(tmp_path, name):
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({"a/1.jpg": b""}, "look like images without poses"),
+        ({"a/1.jpg": b""}, r"unpack this archive first; .* images --data \S+scan/a --output-dir"),
+        (
+            phones.polycam(top="monday/") | phones.polycam(top="friday/"),
+            "holds several captures: unpack it and give one of its folders",
+        ),
         ({"notes.txt": b""}, "holds no capture that is known: unpack it"),
     ],
 )
@@ -72,6 +80,7 @@ def test_an_archive_of_something_else_gets_a_guess(tmp_path, files, message):
         ("clip.mp4", r"ns-process-data video --data \S+clip\.mp4 --output-dir OUT"),
         ("mesh.GLB", "a folder of the images that a model was made of"),
         ("map.db", "databases of RTAB-Map and COLMAP are not read: export"),
+        ("drive.mcap", r"ROS bags are not read: export .* in TUM's layout"),
         ("notes.txt", r"transforms\.json, or an app's file \(\.zip, \.r3d, \.sens\)"),
     ],
 )

@@ -164,7 +164,8 @@ def find_archive(path: Path, *marks: str) -> Archive | None:
     """Opens the folder or archive in which all these names are found, at its top or one below.
 
     Returns:
-        None where they are not, or where there is no such folder or archive.
+        None where they are not, or below more than one folder, or where there is no such folder
+        or archive.
 
     Raises:
         FormatError: an archive that is damaged.
@@ -182,7 +183,9 @@ def find_archive(path: Path, *marks: str) -> Archive | None:
         ]
     else:
         return None
-    return next((one for one in candidates if all(one.holds(mark) for mark in marks)), None)
+    found = [one for one in candidates if all(one.holds(mark) for mark in marks)]
+    is_one = len(found) == 1 or any(not one.top for one in found)
+    return found[0] if is_one else None  # of several, the user has to choose
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:

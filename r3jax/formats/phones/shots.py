@@ -15,7 +15,7 @@ from r3jax.formats.posed_images import DepthUnit, Pixels, PosedImages
 UP_Y, UP_Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 """ARKit's worlds have y up; some data sets turned them."""
 
-MILLIMETRES = DepthUnit(0.001)
+MILLIMETERS = DepthUnit(0.001)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def confident_depth(archive: Archive, shot: Shot, best: int) -> np.ndarray:
     Raises:
         FormatError: a file is missing or damaged, or the sizes differ.
     """
-    depth = MILLIMETRES.depth(archive.depth_steps(shot.depth))
+    depth = MILLIMETERS.depth(archive.depth_steps(shot.depth))
     if not archive.has(shot.confidence):
         return depth
     levels = archive.confidence(shot.confidence)
