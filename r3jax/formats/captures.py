@@ -28,13 +28,13 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_tum, read_tum),
     (is_seven_scenes, read_seven_scenes),
     (lambda path: (path / "transforms.json").exists(), read_transforms),
+    (lambda path: find_model(path) is not None, read_colmap),
     (is_polycam, read_polycam),
     (is_record3d, read_record3d),
     (is_stray_scanner, read_stray_scanner),
     (is_arkit_scenes, read_arkit_scenes),
     (is_scannet, read_scannet),
     (is_sens, read_sens),
-    (lambda path: find_model(path) is not None, read_colmap),
 )
 """Folders and archives of posed images: what each looks like, and its reader."""
 

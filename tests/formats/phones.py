@@ -137,7 +137,7 @@ def record3d(size: bool = True, first: np.ndarray | None = None) -> dict[str, by
 
 
 VIDEO = Lens("PINHOLE", 192, 144, (132.0, 132.0, 102.0, 66.0))
-"""Of a video: larger, as encoders want it; depth has a twelfth of its sides."""
+"""Of a video: larger, as encoders want it."""
 
 
 def video(images: list[np.ndarray]) -> bytes:
@@ -211,9 +211,6 @@ def axis_angle(R: np.ndarray) -> np.ndarray:
 
 DEPTH_LENS = Lens("PINHOLE", 20, 14, (11.0, 11.0, 10.5, 6.5))
 """Of a depth camera that sees more than the colors, at the same place: their pixels coincide."""
-
-ONLY_DEPTH = DEPTH_LENS.params[2] - LENS.params[2] / FACTOR
-"""Columns of depth to the left of the colors."""
 
 
 def matrix(lens: Lens) -> np.ndarray:

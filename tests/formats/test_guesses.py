@@ -96,3 +96,10 @@ def test_files_of_apps_pass_the_first_check(tmp_path):
         check_capture(tmp_path / name)
     (tmp_path / "scan.r3d").write_bytes(zipped(phones.record3d()))
     assert len(open_capture(tmp_path / "scan.r3d")) == phones.NUM
+
+
+def test_a_model_of_colmap_beside_raw_data_goes_first(tmp_path):
+    files = {f"raw/{name}": data for name, data in phones.polycam().items()}
+    lay_out(tmp_path, files | {"sparse/0/cameras.bin": b"", "sparse/0/images.bin": b""})
+    with pytest.raises(FormatError, match=r"sparse/0/\w+\.bin"):
+        open_capture(tmp_path)

@@ -107,7 +107,7 @@ def test_frames_without_depth_are_left_out_and_counted(tmp_path):
     images = read_polycam(tmp_path)
     assert len(images) == NUM - 1
     assert images.remark == (
-        "1 of 4 frames lack an image or a depth image and are left out."
+        "1 of 4 frames lack an image, depth or a pose and are left out."
     )  # fmt: skip
 
 
@@ -379,7 +379,7 @@ STRAY = {
     "no rows": (damaged("odometry", lines(lambda rows: rows[:1])), "it lists no frames"),
     "row": (damaged("odometry", lines(lambda rows: [*rows, "1, 2"])), "not every row is a row of"),
     "word": (damaged("odometry", lambda d: d.replace(b"000001", b"x")), "not every row is a row"),
-    "frame": (damaged("odometry", lambda d: d.replace(b"000003", b"9")), "none of number 9"),
+    "frame": (damaged("odometry", lambda d: d.replace(b"000003", b"-3")), "-3 is no number"),
     "video": (damaged("rgb.mp4", lambda data: data[:100]), r"rgb\.mp4: the video cannot be read"),
 }  # fmt: skip
 
@@ -391,6 +391,15 @@ def test_damaged_stray_scanner_is_named(tmp_path, damage):
     with pytest.raises(FormatError, match=message) as found:
         open_capture(tmp_path)
     assert str(tmp_path) in str(found.value)
+
+
+def test_poses_after_the_end_of_a_video_are_left_out(tmp_path):
+    files = phones.stray_scanner()
+    shorter = [phones.view(pose, phones.VIDEO)[0] for pose in phones.room_poses()[:3]]
+    lay_out(tmp_path, files | {"rgb.mp4": phones.video(shorter)})
+    images = read_stray_scanner(tmp_path)
+    assert len(images) == 3
+    assert images.remark == "1 of 4 frames lack an image, depth or a pose and are left out."
 
 
 def test_stray_scanner_without_a_matrix_says_so(tmp_path):
@@ -411,7 +420,7 @@ def test_arkit_scenes_shows_the_room(tmp_path):
     images = open_capture(tmp_path / "40753679").source
     assert isinstance(images, PosedImages)
     assert len(images) == NUM
-    assert images.remark == "1 of 5 images lack a pose, a camera or depth and are left out."
+    assert images.remark == "1 of 5 frames lack an image, depth or a pose and are left out."
     assert_shows_the_room(images, phones.Z_UP_FROM_ROOM, colors=1.5)
     np.testing.assert_array_equal(images.up, [0, 0, 1])
     assert [lens.params[0] for lens in images.lenses] == [34.0, 35.0, 36.0, 37.0]

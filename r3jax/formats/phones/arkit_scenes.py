@@ -70,10 +70,7 @@ def read_arkit_scenes(path: Path | str) -> PosedImages:
         "and a camera: download its assets lowres_wide, lowres_depth, confidence, "
         "lowres_wide_intrinsics and lowres_wide.traj"
     )
-    kept, remark = complete_shots(archive, shots, advice)
-    gone = len(names) - len(kept)
-    if gone:
-        remark = f"{gone} of {len(names)} images lack a pose, a camera or depth and are left out."
+    kept, remark = complete_shots(archive, shots, len(names), advice)
     read = partial(confident_depth, archive, best=_BEST)
     return posed_images(archive, kept, depth=read, up=UP_Z, remark=remark)
 

@@ -67,7 +67,7 @@ def read_polycam(path: Path | str) -> PosedImages:
             "Developer mode on",
         )
     shots, remark = complete_shots(
-        archive, [_shot(archive, kind, name) for name in names], _NO_DEPTH.format(path)
+        archive, [_shot(archive, kind, name) for name in names], len(names), _NO_DEPTH.format(path)
     )
     return posed_images(
         archive, shots, depth=lambda shot: _depth(archive, shot), up=UP_Y, remark=remark

@@ -85,7 +85,7 @@ def read_record3d(path: Path | str) -> PosedImages:
     advice = (
         "this looks like a recording of Record3D without depth (rgbd/<n>.depth): share it as .r3d"
     )
-    kept, remark = complete_shots(archive, shots, advice)
+    kept, remark = complete_shots(archive, shots, len(rows), advice)
     is_relative = abs(abs(rows[0][3]) - 1.0) < 1e-6
     up = None if is_relative else UP_Y
     return posed_images(

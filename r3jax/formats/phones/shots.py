@@ -35,13 +35,14 @@ class Shot:
 
 
 def complete_shots(
-    archive: Archive, shots: Sequence[Shot], advice: str, *, images: bool = True
+    archive: Archive, shots: Sequence[Shot], total: int, advice: str, *, images: bool = True
 ) -> tuple[list[Shot], str | None]:
     """Leaves out the frames that lack their depth image or image.
 
     Args:
         archive: that holds them.
-        shots: all of them.
+        shots: those that have a pose and a camera.
+        total: how many frames the app lists.
         advice: what to do where no frame is left, a part of a sentence.
         images: False where the images are no files of the archive.
 
@@ -58,10 +59,10 @@ def complete_shots(
     ]
     if not kept:
         raise FormatError(archive.path, advice)
-    gone = len(shots) - len(kept)
+    gone = total - len(kept)
     if not gone:
         return kept, None
-    return kept, f"{gone} of {len(shots)} frames lack an image or a depth image and are left out."
+    return kept, f"{gone} of {total} frames lack an image, depth or a pose and are left out."
 
 
 def confident_depth(archive: Archive, shot: Shot, best: int) -> np.ndarray:

@@ -56,13 +56,17 @@ def read_stray_scanner(path: Path | str) -> PosedImages:
         poses, intrinsics = _table(archive)
         if intrinsics is None:
             intrinsics = np.tile(_camera_matrix(archive), (len(poses), 1))
-        shots = [_shot(archive, video, *row) for row in zip(poses, intrinsics, strict=True)]
+        shots = [
+            _shot(archive, video, *row)
+            for row in zip(poses, intrinsics, strict=True)
+            if row[0][0] < len(video)  # some videos end before the poses do
+        ]
     advice = (
         "this looks like a recording of Stray Scanner without depth/: the phone has no LiDAR "
         f"sensor, or the folder was not copied; ns-process-data video --data {path / _VIDEO} "
         "--output-dir OUT finds poses by COLMAP"
     )
-    kept, remark = complete_shots(archive, shots, advice, images=False)
+    kept, remark = complete_shots(archive, shots, len(poses), advice, images=False)
     return posed_images(
         archive,
         kept,
@@ -75,9 +79,9 @@ def read_stray_scanner(path: Path | str) -> PosedImages:
 
 def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -> Shot:
     """One frame of a row [8] of the table and its intrinsics [4]."""
-    number = int(np.clip(row[0], -1, 1 << 40))
-    if number != row[0] or not 0 <= number < len(video):
-        raise ForeignFileError(f"the video has {len(video)} frames, none of number {row[0]:g}")
+    number = int(row[0])
+    if number != row[0] or number < 0:
+        raise ForeignFileError(f"{row[0]:g} is no number of a frame")
     source = archive.where("odometry.csv")
     return Shot(
         image=f"{_VIDEO}/{number:06d}",
