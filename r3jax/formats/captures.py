@@ -7,10 +7,17 @@ from typing import Literal
 
 from r3jax.formats.colmap.reader import find_model, read_colmap
 from r3jax.formats.errors import FormatError, check_capture
+from r3jax.formats.guesses import nearest_guess
 from r3jax.formats.nerfstudio import read_transforms
+from r3jax.formats.phones.arkit_scenes import is_arkit_scenes, read_arkit_scenes
+from r3jax.formats.phones.polycam import is_polycam, read_polycam
+from r3jax.formats.phones.record3d import is_record3d, read_record3d
+from r3jax.formats.phones.stray_scanner import is_stray_scanner, read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.recordings import Recording, is_recording, read_recording
 from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
+from r3jax.formats.sequences.scannet import is_scannet, read_scannet
+from r3jax.formats.sequences.scannet_sens import is_sens, read_sens
 from r3jax.formats.sequences.seven_scenes import is_seven_scenes, read_seven_scenes
 from r3jax.formats.sequences.tum import is_tum, read_tum
 from r3jax.frame import Frame
@@ -22,14 +29,26 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_seven_scenes, read_seven_scenes),
     (lambda path: (path / "transforms.json").exists(), read_transforms),
     (lambda path: find_model(path) is not None, read_colmap),
+    (is_polycam, read_polycam),
+    (is_record3d, read_record3d),
+    (is_stray_scanner, read_stray_scanner),
+    (is_arkit_scenes, read_arkit_scenes),
+    (is_scannet, read_scannet),
+    (is_sens, read_sens),
 )
-"""Folders of posed images: what each looks like, and its reader."""
+"""Folders and archives of posed images: what each looks like, and its reader."""
 
 _KNOWN = (
     "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json, a COLMAP "
-    "model (cameras.bin or cameras.txt, here or in sparse/0), a scene of Replica-SLAM (traj.txt, "
-    "results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes (frame-*.color.png or .jpg)"
+    "model (cameras.bin or cameras.txt, here or in sparse/0), raw data of Polycam (keyframes/), a "
+    "recording of Record3D (.r3d) or Stray Scanner (rgb.mp4, odometry.csv), a scene of ARKitScenes "
+    "(lowres_wide.traj), ScanNet (.sens, or color/, depth/, pose/, intrinsic/), Replica-SLAM "
+    "(traj.txt, results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes "
+    "(frame-*.color.png)"
 )
+
+_MOST_BELOW = 100
+"""Folders that are looked into, where the one given is no capture."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +65,11 @@ class Capture:
 
     @property
     def name(self) -> str:
-        """The folder's name."""
+        """The folder's name, or that of an archive without its suffix."""
         path = self.path.resolve()
-        return path.parent.name if path.is_file() else path.name
+        if not path.is_file():
+            return path.name
+        return path.parent.name if path.suffix == ".json" else path.stem
 
     def __len__(self) -> int:
         return len(self.source.rows if isinstance(self.source, Run) else self.source)
@@ -69,7 +90,7 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y") -> Capture:
     """Opens a run, a recording, or posed images of any format.
 
     Args:
-        path: the folder; of nerfstudio also the file.
+        path: the folder, or the archive as an app shares it; of nerfstudio also the file.
         up: axis of a recording's world that points up; the others stay as they are.
 
     Raises:
@@ -86,4 +107,23 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y") -> Capture:
         if fits(path):
             return Capture(path, read(path))
     check_capture(path)
-    raise FormatError(path, f"this is neither {_KNOWN}")
+    guess = _below(path) or nearest_guess(path)
+    raise FormatError(path, guess or f"this is neither {_KNOWN}")
+
+
+def _below(path: Path) -> str | None:
+    """Says which folder in it is a capture, where the folder itself is none."""
+    if not path.is_dir():
+        return None
+    folders = sorted(entry for entry in path.iterdir() if entry.is_dir())[:_MOST_BELOW]
+    found = [folder for folder in folders if _is_known(folder)]
+    if not found:
+        return None
+    many = f" (and {len(found) - 1} more)" if found[1:] else ""
+    return f"this is no capture itself, but {found[0]} is one{many}: give that folder"
+
+
+def _is_known(path: Path) -> bool:
+    """True if a folder looks like something that can be opened, whether or not it is whole."""
+    is_ours = (path / "run.json").exists() or is_recording(path)
+    return is_ours or any(fits(path) for fits, _ in _FORMATS)

@@ -33,22 +33,57 @@ def naming(path: Path) -> Generator[None]:
         raise FormatError(path, str(error)) from None
 
 
+CAPTURE_FILES = (".json", ".zip", ".r3d", ".sens")
+"""Suffixes of the files that may be a capture; all others are folders."""
+
+_ADVICE = {
+    **dict.fromkeys(
+        (".mp4", ".mov", ".m4v", ".avi"),
+        "this is a video without poses: ns-process-data video --data {} --output-dir OUT finds "
+        "them by COLMAP, then audit OUT",
+    ),
+    **dict.fromkeys(
+        (
+            ".ply",
+            ".glb",
+            ".gltf",
+            ".obj",
+            ".usdz",
+            ".usd",
+            ".las",
+            ".laz",
+            ".e57",
+            ".fbx",
+            ".splat",
+        ),
+        "this is a file; a capture is a folder of the images that a model was made of, which no "
+        "model holds: export raw data of the scan",
+    ),
+    **dict.fromkeys(
+        (".bag", ".db3", ".mcap"),
+        "ROS bags are not read: export images, depth and poses in TUM's layout (rgb.txt, "
+        "depth.txt, groundtruth.txt), or hand the topics to r3jax.observe (docs/howto/slam.md)",
+    ),
+    ".db": (
+        "the databases of RTAB-Map and COLMAP are not read: export a folder with images, depth and "
+        "poses (RTAB-Map: File, Export poses in the format of RGB-D SLAM, as TUM's "
+        "groundtruth.txt)"
+    ),
+}
+"""What to do with other files; {} is the path."""
+
+
 def check_capture(path: Path) -> None:
-    """Refuses what is neither a folder nor nerfstudio's file, before anything heavy is imported.
+    """Refuses what is neither a folder nor a capture's file, before anything heavy is imported.
 
     Raises:
         FormatError: says what a capture is.
     """
     if not path.exists():
         raise FormatError(path, "there is no such folder")
-    if path.is_file() and path.suffix != ".json":
-        raise FormatError(path, f"this is a file; {_advice(path)}")
-
-
-def _advice(path: Path) -> str:
-    if path.suffix.lower() == ".r3d":
-        return (
-            "the archives of Record3D are not read: make nerfstudio's transforms.json of it, with "
-            "a depth_file_path for every frame"
+    if path.is_file() and path.suffix.lower() not in CAPTURE_FILES:
+        default = (
+            "this is a file; a capture is a folder, nerfstudio's transforms.json, or an app's file "
+            f"({', '.join(CAPTURE_FILES[1:])})"
         )
-    return "a capture is a folder, or nerfstudio's transforms.json"
+        raise FormatError(path, _ADVICE.get(path.suffix.lower(), default).format(path))

@@ -7,13 +7,14 @@ Shape symbols: n images; m points; t observations.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.formats.depth_images import resample_depth
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.validation.images import image_pixels, image_size
@@ -22,7 +23,8 @@ from r3jax.frame import Frame
 IMAGE_FORMATS = ("PNG", "JPEG")
 """What Pillow may try."""
 
-_DEPTH_MODES = ("I;16", "I;16B", "I")
+DEPTH_MODES = ("I;16", "I;16B", "I")
+"""Pillow's modes of a depth image."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,26 @@ class DepthUnit:
     invalid: int | None = None
     """Stored, beside 0, where there is no measurement; None: there is no such number."""
 
+    def depth(self, steps: np.ndarray) -> np.ndarray:
+        """z-depth [h, w] float32 of whole numbers; 0 no measurement, inf beyond the range."""
+        depth = (steps.astype(np.float64) * self.metres_per_step).astype(np.float32)
+        if self.invalid is not None:
+            depth = np.where(steps == self.invalid, np.float32(0.0), depth)
+        if self.beyond_range is None:
+            return depth
+        return np.where(steps == self.beyond_range, np.float32(np.inf), depth)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Reads the pixels of a capture that is no folder of plain images: an archive, a video."""
+
+    rgb: Callable[[int], np.ndarray]
+    """Colors of an image, [H, W, 3] uint8, of its lens' size; raises FormatError."""
+
+    depth: Callable[[int], np.ndarray]
+    """z-depth of an image, [h, w] float32 of any size, 0 no measurement; raises FormatError."""
+
 
 @dataclass(frozen=True)
 class PosedImages:
@@ -95,6 +117,16 @@ class PosedImages:
     T_capture_original: np.ndarray | None = None
     """Where the program that wrote the capture moved it: takes points [4, 4] from the coordinates
     it was given to those of the poses; None: it does not say."""
+
+    pixels: Pixels | None = None
+    """Reads the pixels in place of the paths, which are names then; None: the paths are files."""
+
+    depth_lenses: tuple[Lens, ...] | None = None
+    """One per image, where depth has a camera of its own at the same place; None: a depth image
+    covers what its image covers."""
+
+    up: np.ndarray | None = None
+    """The vertical, [3] in the capture's coordinates; None: the format does not say."""
 
     remark: str | None = None
     """What else is there but not among the images, a sentence; None: nothing is left out."""
@@ -146,6 +178,8 @@ class PosedImages:
         Raises:
             FormatError: the file is missing, broken or of another size.
         """
+        if self.pixels is not None:
+            return self.pixels.rgb(index)
         path, lens = self.image_paths[index], self.lenses[index]
         with naming(path):
             image_size(path, IMAGE_FORMATS)  # refuses what would not fit into memory
@@ -159,30 +193,21 @@ class PosedImages:
         Raises:
             FormatError: the file is missing, broken, or no 16-bit image.
         """
-        path, lens = self.depth_paths[index], self.lenses[index]
+        path = self.depth_paths[index]
         if path is None:
             return None
-        return _read_depth(path, (lens.width, lens.height), self.depth_unit)
+        stored = self.pixels.depth(index) if self.pixels else _read_depth(path, self.depth_unit)
+        own = None if self.depth_lenses is None else self.depth_lenses[index]
+        return resample_depth(stored, self.lenses[index], own)
 
     def frames(self) -> Iterator[Frame]:
         """Every frame in order, read one by one."""
         return (self.frame(index) for index in range(len(self)))
 
 
-def _read_depth(path: Path, size: tuple[int, int], unit: DepthUnit) -> np.ndarray:
-    """z-depth [H, W] float32; 0 no measurement, inf beyond the range."""
+def _read_depth(path: Path, unit: DepthUnit) -> np.ndarray:
+    """z-depth [h, w] float32; 0 no measurement, inf beyond the range."""
     with naming(path):
         stored = image_size(path, IMAGE_FORMATS)
         wanted = "depth must be a 16-bit PNG"
-        steps = image_pixels(path, IMAGE_FORMATS, stored, _DEPTH_MODES, wanted)
-    rows, columns = (
-        ((np.arange(now) + 0.5) * there / now).astype(np.int64)
-        for now, there in zip(size[::-1], stored[::-1], strict=True)
-    )
-    steps = steps[rows[:, None], columns[None, :]]
-    depth = (steps.astype(np.float64) * unit.metres_per_step).astype(np.float32)
-    if unit.invalid is not None:
-        depth = np.where(steps == unit.invalid, np.float32(0.0), depth)
-    if unit.beyond_range is None:
-        return depth
-    return np.where(steps == unit.beyond_range, np.float32(np.inf), depth)
+        return unit.depth(image_pixels(path, IMAGE_FORMATS, stored, DEPTH_MODES, wanted))

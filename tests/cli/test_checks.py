@@ -37,7 +37,7 @@ REFUSED = {
     "train nowhere": "nowhere: there is no such folder",
     "train runs --resolution 3": "--resolution must be at least 16",
     "evaluate runs --name ../x": "--name is the name of one folder",
-    "audit scan.r3d": "scan.r3d: this is a file; the archives of Record3D are not read",
+    "audit scan.mp4": "scan.mp4: this is a video without poses: ns-process-data video",
     "audit scan.ply": "scan.ply: this is a file; a capture is a folder",
     "replay runs": "runs: this folder is not a run",
     "merge runs/run nowhere": "nowhere: there is no such folder",
@@ -49,7 +49,7 @@ REFUSED = {
 def test_names_budgets_and_paths_are_refused_before_jax_is_imported(tmp_path):
     with RunWriter(tmp_path / "runs" / "run", make_header()):
         pass
-    for name in ("scan.r3d", "scan.ply"):
+    for name in ("scan.mp4", "scan.ply"):
         (tmp_path / name).touch()
     program = (
         "import json, sys\n"

@@ -100,6 +100,17 @@ def test_seven_scenes_may_have_its_colors_as_jpeg(tmp_path):
     np.testing.assert_allclose(images.poses, poses(2), atol=2e-7)
 
 
+def test_seven_scenes_may_shout_its_suffixes(tmp_path):
+    files = sequences.seven_scenes()
+    shouted = {n.replace("color.png", "color.PNG"): data for n, data in files.items()}
+    lay_out(tmp_path, shouted)
+    images = open_capture(tmp_path).source
+    assert [path.name for path in images.image_paths] == [
+        "frame-000000.color.PNG", "frame-000001.color.PNG",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(images.rgb(0)[30::60, 32::64], pixels(0)[0])
+
+
 def test_seven_scenes_has_two_numbers_for_no_measurement(tmp_path):
     lay_out(tmp_path, sequences.seven_scenes())
     images = read_seven_scenes(tmp_path)

@@ -41,6 +41,10 @@ MODULES = (
     "sequences:REPLICA_SLAM",
     "sequences:TUM",
     "sequences:SEVEN_SCENES",
+    "phones:POLYCAM",
+    "phones:RECORD3D",
+    "phones:ARKIT_SCENES",
+    "phones:SCANNET",
 )
 """Of this folder, with the name of the reader where it is not READER."""
 

@@ -296,7 +296,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
     labels = tuple(path.name for path in images.image_paths)
     if any(path is not None for path in images.depth_paths):
         return Source(
-            name, images.poses, images.lenses, labels, "depth", True, None, stride,
+            name, images.poses, images.lenses, labels, "depth", True, images.up, stride,
             lambda index: _read_dense(images, index, stride),
         )  # fmt: skip
     has_images = any(path.is_file() for path in images.image_paths)
@@ -322,7 +322,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
         return colors, depth
 
     return Source(
-        name, images.poses, images.lenses, labels, kind, False, None, stride, read, has_images
+        name, images.poses, images.lenses, labels, kind, False, images.up, stride, read, has_images
     )
 
 

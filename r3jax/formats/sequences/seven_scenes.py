@@ -1,6 +1,6 @@
 """Reads a sequence of the 7-Scenes data set (Shotton et al. 2013).
 
-    frame-000000.color.png    8-bit RGB, 640x480; or .color.jpg, as some hand it on
+    frame-000000.color.png    8-bit RGB, 640x480; or .jpg, .JPEG, ..., as some hand it on
     frame-000000.depth.png    uint16, millimeters; 0 and 65535 are no measurement
     frame-000000.pose.txt     a 4x4 camera-to-world matrix, OpenCV axes
 
@@ -20,12 +20,20 @@ from r3jax.formats.poses import mend_pose, read_numbers
 
 _LENS = Lens("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0))
 _UNIT = DepthUnit(0.001, invalid=65535)
-_COLORS = (".color.png", ".color.jpg", ".color.jpeg")
+_SUFFIXES = (".jpeg", ".jpg", ".png")
+"""Of images, in any case; where a frame has several, the last is the original."""
 
 
 def is_seven_scenes(path: Path) -> bool:
     """True if the folder looks like a sequence of the data set."""
-    return path.is_dir() and any(any(path.glob(f"frame-*{color}")) for color in _COLORS)
+    return path.is_dir() and bool(_colors(path))
+
+
+def _colors(path: Path) -> dict[str, Path]:
+    """Color images by the names of their frames."""
+    found = [p for p in path.glob("frame-*.color.*") if p.suffix.lower() in _SUFFIXES]
+    found.sort(key=lambda image: _SUFFIXES.index(image.suffix.lower()))
+    return {image.name.removesuffix(f".color{image.suffix}"): image for image in found}
 
 
 def read_seven_scenes(path: Path | str) -> PosedImages:
@@ -39,13 +47,9 @@ def read_seven_scenes(path: Path | str) -> PosedImages:
             that are missing are noticed when they are read.
     """
     path = Path(path)
-    found = {
-        image.name.removesuffix(color): image
-        for color in reversed(_COLORS)  # where a frame has both, the PNG is the original
-        for image in path.glob(f"frame-*{color}")
-    }
+    found = _colors(path)
     if not found:
-        raise FormatError(path, f"the folder holds no frame-*{_COLORS[0]} or .jpg")
+        raise FormatError(path, "the folder holds no frame-*.color.png or .jpg")
     bases = sorted(found)
     return PosedImages(
         path=path,

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.formats.colmap.model import rotation_of
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
-from r3jax.formats.poses import MAX_DISTANCE, read_lines, read_numbers, to_floats
+from r3jax.formats.poses import read_lines, read_numbers, to_floats
+from r3jax.formats.quaternion_poses import quaternion_pose
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.images import image_size
 from r3jax.formats.validation.names import below
@@ -113,16 +113,7 @@ def _pictures(folder: Path, name: str) -> tuple[np.ndarray, list[Path]]:
 
 def _pose(source: Path, row: np.ndarray) -> np.ndarray:
     """`T_world_camera` of a line: time, translation, quaternion x y z w."""
-    which = f"the pose at {row[0]:.4f} s"
-    if np.abs(row[1:4]).max() > MAX_DISTANCE:
-        raise FormatError(source, f"{which}: the position is {row[1:4].tolist()}")
-    pose = np.eye(4)
-    pose[:3, 3] = row[1:4]
-    try:
-        pose[:3, :3] = rotation_of(row[[7, 4, 5, 6]])
-    except ForeignFileError as error:
-        raise FormatError(source, f"{which}: {error}") from None
-    return pose
+    return quaternion_pose(source, f"the pose at {row[0]:.4f} s", row[1:4], row[4:])
 
 
 def _lens(path: Path, first_image: Path) -> Lens:

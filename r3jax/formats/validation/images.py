@@ -1,8 +1,9 @@
-"""Images from a path: their size is known before a pixel is unpacked.
+"""Images from a path or from bytes: their size is known before a pixel is unpacked.
 
 Shape symbols: H, W image size.
 """
 
+import io
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ MAX_PIXELS = 1 << 24
 """Images with more pixels (4096 x 4096) come from no depth camera; as floats one takes 200 MB."""
 
 
-def image_size(path: Path, formats: Sequence[str]) -> tuple[int, int]:
+def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
     """Width and height of an image [px].
 
     Raises:
@@ -35,7 +36,7 @@ def image_size(path: Path, formats: Sequence[str]) -> tuple[int, int]:
 
 
 def image_pixels(
-    path: Path,
+    path: Path | bytes,
     formats: Sequence[str],
     size: tuple[int, int],
     modes: Sequence[str] = (),
@@ -44,7 +45,7 @@ def image_pixels(
     """The pixels of an image.
 
     Args:
-        path: the file.
+        path: the file, or what it holds.
         formats: those that Pillow may try, such as "PNG".
         size: width and height that it must have [px].
         modes: Pillow's modes that it may have; none: any, and it becomes RGB.
@@ -68,19 +69,21 @@ def image_pixels(
 
 
 @contextmanager
-def _opened(path: Path, formats: Sequence[str]) -> Generator[Any]:
+def _opened(path: Path | bytes, formats: Sequence[str]) -> Generator[Any]:
     """An open image; whatever Pillow says of a broken one becomes one kind of error."""
     from PIL import Image
 
-    check_regular(path)
+    if isinstance(path, Path):
+        check_regular(path)
+    source = io.BytesIO(path) if isinstance(path, bytes) else path
     try:
         # The size is compared by the caller: Pillow's own warning of bombs says nothing new.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path, formats=tuple(formats)) as image:
+            with Image.open(source, formats=tuple(formats)) as image:
                 yield image
     except (FileNotFoundError, ForeignFileError):
         raise
     except Exception as error:  # struct, zlib, syntax, overflow: every decoder has its own
-        reason = str(error).replace(str(path), "the file") or type(error).__name__
+        reason = str(error).replace(str(source), "the file") or type(error).__name__
         raise ForeignFileError(f"the image cannot be read ({reason[:200]})") from None

@@ -1,0 +1,1 @@
+"""Captures as phone and tablet apps export them, folders and archives: one module for each."""

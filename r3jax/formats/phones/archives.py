@@ -1,0 +1,212 @@
+"""A folder, or a zip archive of one: phone apps hand on both, and both are read alike.
+
+Nothing is unpacked onto the disk. An archive may hold its files under one folder at its top.
+"""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.posed_images import DEPTH_MODES, IMAGE_FORMATS
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular, read_bytes
+from r3jax.formats.validation.images import image_pixels, image_size
+from r3jax.formats.validation.json_text import parse_json
+
+SUFFIXES = (".zip", ".r3d")
+"""Names of files that are zip archives."""
+
+_MAX_IMAGE = 64 << 20
+"""A phone's image takes a few megabytes."""
+
+_MAX_TEXT = 64 << 20
+"""A pose takes some hundred bytes."""
+
+_CONFIDENCE_MODES = ("L", *DEPTH_MODES)
+
+_NOT_THE_USERS = "__MACOSX"
+"""Folder that macOS adds to its archives."""
+
+
+@dataclass(frozen=True)
+class Archive:
+    """Files by their names below the top of a capture; slashes separate folders."""
+
+    path: Path
+    """The folder or the archive."""
+
+    top: str = ""
+    """Folder in it where the capture begins, with a slash at its end; empty: it is all of it."""
+
+    zipped: zipfile.ZipFile | None = None
+    """The opened archive; None: a folder."""
+
+    def where(self, name: str) -> Path:
+        """Path of a file, for messages; that of a member of an archive is no file."""
+        return self.path / f"{self.top}{name}"
+
+    def has(self, name: str) -> bool:
+        """True if there is a file of this name."""
+        if self.zipped is None:
+            return self.where(name).is_file()
+        return self.top + name in self.zipped.NameToInfo
+
+    def holds(self, name: str) -> bool:
+        """True if there is a file or a folder of this name."""
+        if self.zipped is None:
+            return self.where(name).exists()
+        start = f"{self.top}{name}/"
+        return self.has(name) or any(one.startswith(start) for one in self.zipped.NameToInfo)
+
+    def names(self, folder: str, suffix: str) -> list[str]:
+        """Names of the files in a folder that end like this, sorted, without their suffix."""
+        if self.zipped is None:
+            place = self.where(folder)
+            found = [p.name for p in place.iterdir()] if place.is_dir() else []
+        else:
+            start, members = f"{self.top}{folder}/", self.zipped.NameToInfo
+            found = [name.removeprefix(start) for name in members if name.startswith(start)]
+        return sorted(
+            name.removesuffix(suffix)
+            for name in found
+            if name.endswith(suffix) and "/" not in name and not name.startswith(".")
+        )
+
+    def read(self, name: str, limit: int = _MAX_TEXT) -> bytes:
+        """Reads a file of at most `limit` bytes.
+
+        Raises:
+            FormatError: missing, too large, or damaged.
+        """
+        with naming(self.where(name)):
+            if self.zipped is None:
+                return read_bytes(self.where(name), limit)
+            return _unpack(self.zipped, self.top + name, limit)
+
+    def json(self, name: str) -> Any:
+        """Reads a JSON file.
+
+        Raises:
+            FormatError: missing, or not JSON.
+        """
+        data = self.read(name)
+        with naming(self.where(name)):
+            return parse_json(data)
+
+    def rgb(self, name: str, size: tuple[int, int]) -> np.ndarray:
+        """Reads an image of this width and height, [H, W, 3] uint8.
+
+        Raises:
+            FormatError: missing, damaged, or of another size.
+        """
+        data = self.read(name, _MAX_IMAGE)
+        with naming(self.where(name)):
+            image_size(data, IMAGE_FORMATS)  # refuses what would not fit into memory
+            return image_pixels(data, IMAGE_FORMATS, size)
+
+    def size(self, name: str) -> tuple[int, int]:
+        """Width and height of an image [px].
+
+        Raises:
+            FormatError: missing, or damaged.
+        """
+        data = self.read(name, _MAX_IMAGE)
+        with naming(self.where(name)):
+            return image_size(data, IMAGE_FORMATS)
+
+    def depth_steps(self, name: str) -> np.ndarray:
+        """Reads a depth image as it is stored, [h, w] of whole numbers.
+
+        Raises:
+            FormatError: missing, damaged, or not of 16 bits.
+        """
+        return self._gray(name, DEPTH_MODES, "depth must be a 16-bit PNG")
+
+    def confidence(self, name: str) -> np.ndarray:
+        """Reads an image of levels of confidence, [h, w] of whole numbers.
+
+        Raises:
+            FormatError: missing, damaged, or colored.
+        """
+        return self._gray(name, _CONFIDENCE_MODES, "confidence must be a gray image")
+
+    def _gray(self, name: str, modes: tuple[str, ...], wanted: str) -> np.ndarray:
+        data = self.read(name, _MAX_IMAGE)
+        with naming(self.where(name)):
+            size = image_size(data, IMAGE_FORMATS)
+            return image_pixels(data, IMAGE_FORMATS, size, modes, wanted)
+
+
+def _unpack(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+    """One member, that must be as long as it says."""
+    info = archive.NameToInfo.get(name)
+    if info is None:
+        raise ForeignFileError("the file is missing in the archive")
+    if info.file_size > limit:
+        raise ForeignFileError(
+            f"it claims to unpack to {info.file_size >> 20} MiB, more than {limit >> 20} MiB: it "
+            "is something else"
+        )
+    try:
+        with archive.open(info) as file:
+            return file.read(limit)
+    except Exception as error:  # zlib, struct, passwords, methods that are not known, ...
+        raise ForeignFileError(
+            f"it cannot be unpacked ({error!s:.200}): copy the archive again"
+        ) from None
+
+
+def find_archive(path: Path, *marks: str) -> Archive | None:
+    """Opens the folder or archive in which all these names are found, at its top or one below.
+
+    Returns:
+        None where they are not, or below more than one folder, or where there is no such folder
+        or archive.
+
+    Raises:
+        FormatError: an archive that is damaged.
+    """
+    if path.is_dir():
+        below = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
+        tops = [f"{name}/" for name in below if (path / name / marks[0]).exists()]
+        candidates = [Archive(path, top) for top in ("", *tops)]
+    elif path.is_file() and path.suffix.lower() in SUFFIXES:
+        zipped = open_zip(path)
+        names = [name for name in zipped.NameToInfo if "/" in name]
+        tops = sorted({f"{name.partition('/')[0]}/" for name in names})
+        candidates = [
+            Archive(path, top, zipped) for top in ("", *tops) if not top.startswith(_NOT_THE_USERS)
+        ]
+    else:
+        return None
+    found = [one for one in candidates if all(one.holds(mark) for mark in marks)]
+    is_one = len(found) == 1 or any(not one.top for one in found)
+    return found[0] if is_one else None  # of several, the user has to choose
+
+
+def open_zip(path: Path) -> zipfile.ZipFile:
+    """Opens a zip archive.
+
+    Raises:
+        FormatError: missing, or damaged.
+    """
+    with naming(path):
+        check_regular(path)
+        try:
+            return zipfile.ZipFile(path)
+        except Exception as error:  # cut off, no archive, seeks before the beginning, ...
+            raise ForeignFileError(
+                f"this is no whole zip archive ({error!s:.200}): copy or export it again"
+            ) from None
+
+
+def is_there(path: Path, *marks: str) -> bool:
+    """True if a folder or a whole archive holds these names, at its top or one below."""
+    try:
+        return find_archive(path, *marks) is not None
+    except FormatError:
+        return False

@@ -1,0 +1,139 @@
+"""Reads recordings of Record3D: the .r3d archive that the app shares, or what it unpacks to.
+
+    metadata         JSON: w, h, dw, dh; K, 9 numbers column by column; poses [qx, qy, qz, qw, x, y,
+                     z], camera to world, OpenGL axes [m]; perFrameIntrinsicCoeffs [fx, fy, cx, cy]
+    rgbd/<n>.jpg     8-bit RGB
+    rgbd/<n>.depth   LZFSE of float32 [dh, dw] [m], NaN where there is no measurement
+    rgbd/<n>.conf    LZFSE of uint8 [dh, dw], 2 is the best; the front camera has none
+
+Where the first pose is no rotation, the app has made the first camera the world: which way is up
+is not known then. Else the world is ARKit's, y up.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.formats.depth_images import keep_confident
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.lenses import Lens
+from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
+from r3jax.formats.phones.archives import Archive, find_archive, is_there
+from r3jax.formats.phones.lzfse_streams import load_decoder, unpack_lzfse
+from r3jax.formats.phones.shots import UP_Y, Shot, complete_shots, posed_images
+from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.quaternion_poses import quaternion_pose
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_fields, check_type
+
+_BEST = 2
+_DEPTH_SIZES = ((256, 192), (640, 480))
+"""Longer and shorter side of the LiDAR's and the front camera's depth [px], for files that do not
+say it."""
+
+_MAX_BYTES = 16 << 20
+"""A packed depth image takes a megabyte at most."""
+
+_FIELDS = {"w": int, "h": int, "K": list[float], "poses": list[list[float]]}
+
+
+def is_record3d(path: Path) -> bool:
+    """True if the folder or archive looks like a recording of Record3D."""
+    return is_there(path, "metadata", "rgbd")
+
+
+def read_record3d(path: Path | str) -> PosedImages:
+    """Opens a recording and checks everything but the pixels.
+
+    Args:
+        path: the .r3d file, or the folder that it was unpacked to.
+
+    Raises:
+        FormatError: lzfse is not installed; metadata that are missing or damaged; numbers of
+            poses and intrinsics that differ; no depth images.
+    """
+    path = Path(path)
+    archive = find_archive(path, "metadata", "rgbd")
+    if archive is None:
+        raise FormatError(path, "there are no metadata and no folder rgbd in it")
+    decoder = load_decoder(path)
+    metadata = archive.json("metadata")
+    source = archive.where("metadata")
+    with naming(source):
+        check_fields("metadata", metadata, _FIELDS)
+        lenses = _lenses(metadata)
+        size = _depth_size(metadata)
+    rows = metadata["poses"]
+    if not rows or len(rows) != len(lenses) or {len(row) for row in rows} != {7}:
+        raise FormatError(
+            source,
+            f"the {len(rows)} poses must have 7 numbers each and be as many as there are "
+            f"intrinsics, {len(lenses)}",
+        )
+    shots = [
+        Shot(
+            image=f"rgbd/{i}.jpg",
+            depth=f"rgbd/{i}.depth",
+            confidence=f"rgbd/{i}.conf",
+            lens=lens,
+            pose=quaternion_pose(source, f"pose {i}", row[4:], row[:4]) @ OPENGL_FROM_OPENCV,
+        )
+        for i, (row, lens) in enumerate(zip(np.asarray(rows, np.float64), lenses, strict=True))
+    ]
+    advice = (
+        "this looks like a recording of Record3D without depth (rgbd/<n>.depth): share it as .r3d"
+    )
+    kept, remark = complete_shots(archive, shots, len(rows), advice)
+    is_relative = abs(abs(rows[0][3]) - 1.0) < 1e-6
+    up = None if is_relative else UP_Y
+    return posed_images(
+        archive, kept, depth=partial(_depth, archive, decoder, size), up=up, remark=remark
+    )
+
+
+def _lenses(metadata: dict[str, Any]) -> list[Lens]:
+    """One for each pose."""
+    width, height, K = metadata["w"], metadata["h"], metadata["K"]
+    if len(K) != 9:
+        raise ForeignFileError(f"`K` must have 9 numbers, got {len(K)}")
+    rows = metadata.get("perFrameIntrinsicCoeffs") or [[K[0], K[4], K[6], K[7]]] * len(
+        metadata["poses"]
+    )
+    check_type("perFrameIntrinsicCoeffs", rows, list[list[float]])
+    return [Lens("PINHOLE", width, height, tuple(float(value) for value in row)) for row in rows]
+
+
+def _depth_size(metadata: dict[str, Any]) -> tuple[int, int] | None:
+    """Rows and columns of the depth images, where the file says them."""
+    if "dw" not in metadata or "dh" not in metadata:
+        return None
+    check_fields("metadata", metadata, {"dw": int, "dh": int})
+    rows, columns = metadata["dh"], metadata["dw"]
+    if not (0 < rows <= 4096 and 0 < columns <= 4096):
+        raise ForeignFileError(f"the depth images cannot have {columns} x {rows} pixels")
+    return rows, columns
+
+
+def _depth(archive: Archive, decoder: Any, size: tuple[int, int] | None, shot: Shot) -> np.ndarray:
+    """z-depth [h, w] float32 where the sensor was sure."""
+    data = archive.read(shot.depth, _MAX_BYTES)
+    with naming(archive.where(shot.depth)):
+        sizes = _DEPTH_SIZES if size is None else (size,)
+        values = unpack_lzfse(decoder, data, [4 * rows * columns for rows, columns in sizes])
+        rows, columns = size or _turned(len(values) // 4, shot.lens)
+        depth = np.frombuffer(values, "<f4").reshape(rows, columns)
+        depth = np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))
+    if not archive.has(shot.confidence):
+        return depth
+    data = archive.read(shot.confidence, _MAX_BYTES)
+    with naming(archive.where(shot.confidence)):
+        values = unpack_lzfse(decoder, data, [rows * columns])
+        return keep_confident(depth, np.frombuffer(values, np.uint8).reshape(rows, columns), _BEST)
+
+
+def _turned(count: int, lens: Lens) -> tuple[int, int]:
+    """Rows and columns of so many values, turned as the image is."""
+    longer, shorter = next(size for size in _DEPTH_SIZES if count == size[0] * size[1])
+    return (longer, shorter) if lens.height > lens.width else (shorter, longer)

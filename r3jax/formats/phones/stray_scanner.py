@@ -1,0 +1,142 @@
+"""Reads recordings of Stray Scanner.
+
+    rgb.mp4                  the video
+    depth/000000.png         uint16, millimeters
+    confidence/000000.png    2 is the best
+    odometry.csv             "timestamp, frame, x, y, z, qx, qy, qz, qw", camera to world, OpenCV
+                             axes, world y up [m]; newer versions: and fx, fy, cx, cy
+    camera_matrix.csv        3x3 intrinsics of the video, of the last frame
+
+(https://github.com/StrayRobots/scanner)
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.lenses import Lens
+from r3jax.formats.phones.archives import Archive, find_archive, is_there
+from r3jax.formats.phones.shots import UP_Y, Shot, complete_shots, confident_depth, posed_images
+from r3jax.formats.phones.videos import Video
+from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.quaternion_poses import quaternion_pose
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular
+
+_BEST = 2
+_POSE = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+_VIDEO = "rgb.mp4"
+_MAX_VIDEO = 4 << 30
+"""Of a video in an archive, which is read as a whole [bytes]."""
+
+
+def is_stray_scanner(path: Path) -> bool:
+    """True if the folder or archive looks like a recording of Stray Scanner."""
+    return is_there(path, "odometry.csv", _VIDEO)
+
+
+def read_stray_scanner(path: Path | str) -> PosedImages:
+    """Opens a recording and checks everything but the pixels.
+
+    Args:
+        path: the folder that the app wrote, or a zip archive of it.
+
+    Raises:
+        FormatError: PyAV is not installed; files that are missing or damaged; frames that the
+            video does not have; poses that are not finite; no depth images.
+    """
+    path = Path(path)
+    archive = find_archive(path, "odometry.csv", _VIDEO)
+    if archive is None:
+        raise FormatError(path, "there are no odometry.csv and rgb.mp4 in it")
+    video = _video(archive)
+    with naming(archive.where("odometry.csv")):
+        poses, intrinsics = _table(archive)
+        if intrinsics is None:
+            intrinsics = np.tile(_camera_matrix(archive), (len(poses), 1))
+        shots = [
+            _shot(archive, video, *row)
+            for row in zip(poses, intrinsics, strict=True)
+            if row[0][0] < len(video)  # some videos end before the poses do
+        ]
+    advice = (
+        "this looks like a recording of Stray Scanner without depth/: the phone has no LiDAR "
+        f"sensor, or the folder was not copied; ns-process-data video --data {path / _VIDEO} "
+        "--output-dir OUT finds poses by COLMAP"
+    )
+    kept, remark = complete_shots(archive, shots, len(poses), advice, images=False)
+    return posed_images(
+        archive,
+        kept,
+        depth=lambda shot: confident_depth(archive, shot, _BEST),
+        rgb=lambda shot: video.frame(int(shot.image[-6:])),
+        up=UP_Y,
+        remark=remark,
+    )
+
+
+def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -> Shot:
+    """One frame of a row [8] of the table and its intrinsics [4]."""
+    number = int(row[0])
+    if number != row[0] or number < 0:
+        raise ForeignFileError(f"{row[0]:g} is no number of a frame")
+    source = archive.where("odometry.csv")
+    return Shot(
+        image=f"{_VIDEO}/{number:06d}",
+        depth=f"depth/{number:06d}.png",
+        confidence=f"confidence/{number:06d}.png",
+        lens=Lens("PINHOLE", *video.size, tuple(float(value) for value in params)),
+        pose=quaternion_pose(source, f"the pose of frame {number}", row[1:4], row[4:8]),
+    )
+
+
+def _video(archive: Archive) -> Video:
+    """The video, from the disk where it lies there."""
+    name = archive.where(_VIDEO)
+    if archive.zipped is not None:
+        return Video(name, archive.read(_VIDEO, _MAX_VIDEO))
+    with naming(name):
+        check_regular(name)
+    return Video(name, name)
+
+
+def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray | None]:
+    """The columns of odometry.csv: frame and pose [n, 8], and intrinsics [n, 4] if it has them.
+
+    Raises:
+        ForeignFileError: no such columns, no rows, or a row that is not all numbers.
+    """
+    lines = archive.read("odometry.csv").decode("utf-8", errors="replace").splitlines()
+    rows = [[word.strip() for word in line.split(",")] for line in lines if line.strip()]
+    names = rows[0] if rows else []
+    missing = [name for name in _POSE if name not in names]
+    if missing:
+        raise ForeignFileError(f"there are no columns {', '.join(missing)}")
+    if not rows[1:]:
+        raise ForeignFileError("it lists no frames")
+    try:
+        values = np.array([[float(word) for word in row] for row in rows[1:]])
+    except ValueError as error:  # a word that is no number, or rows of different lengths
+        raise ForeignFileError(f"not every row is a row of numbers ({error!s:.200})") from None
+    if values.shape[1] != len(names) or not np.all(np.isfinite(values)):
+        raise ForeignFileError(f"every row must hold {len(names)} finite numbers")
+    columns = {name: values[:, at] for at, name in enumerate(names)}
+    pose = np.stack([columns[name] for name in _POSE], axis=1)
+    has_intrinsics = all(name in columns for name in _INTRINSICS)
+    return pose, np.stack([columns[n] for n in _INTRINSICS], axis=1) if has_intrinsics else None
+
+
+def _camera_matrix(archive: Archive) -> np.ndarray:
+    """fx, fy, cx, cy of all frames, [4]."""
+    source = archive.where("camera_matrix.csv")
+    text = archive.read("camera_matrix.csv").decode("utf-8", errors="replace")
+    with naming(source):
+        try:
+            K = np.array([[float(word) for word in line.split(",")] for line in text.split()])
+        except ValueError as error:
+            raise ForeignFileError(f"this is no matrix ({error!s:.200})") from None
+        if K.shape != (3, 3):
+            raise ForeignFileError("expected a 3x3 matrix")
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])

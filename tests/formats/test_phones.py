@@ -1,0 +1,448 @@
+"""Exports of phone apps: what they show lies where the room has its walls."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from r3jax.apps.audit.source import source_of
+from r3jax.formats.captures import open_capture
+from r3jax.formats.errors import FormatError
+from r3jax.formats.phones.arkit_scenes import read_arkit_scenes
+from r3jax.formats.phones.polycam import is_polycam, read_polycam
+from r3jax.formats.phones.record3d import read_record3d
+from r3jax.formats.phones.stray_scanner import read_stray_scanner
+from r3jax.formats.phones.videos import Video
+from r3jax.formats.posed_images import PosedImages
+from tests.apps.audit.room import SIZE, color_of
+from tests.formats import phones
+from tests.formats.phones import FACTOR, NUM, Y_UP_FROM_Z_UP, rays_of
+from tests.fuzz.containers import zipped
+from tests.fuzz.tree import lay_out
+
+JPEG = 12.0
+"""Mean error of colors that a JPEG of so small an image may have [of 255]."""
+
+
+def assert_shows_the_room(images: PosedImages, T_capture_room: np.ndarray, colors: float = JPEG):
+    """Pixels whose center is that of a depth pixel are points on the walls, of the wall's color."""
+    measured = 0
+    for index in range(len(images)):
+        frame, middle = images.frame(index), slice(FACTOR // 2, None, FACTOR)
+        rays, depth = rays_of(images.lenses[index])[middle, middle], np.asarray(frame.depth)
+        z = depth[middle, middle].astype(np.float64)
+        local = (z[..., None] * rays)[z > 0]
+        pose = np.linalg.inv(T_capture_room) @ images.poses[index]
+        points = local @ pose[:3, :3].T + pose[:3, 3]
+        to_wall = np.minimum(np.abs(points), np.abs(SIZE - points)).min(axis=1)
+        assert to_wall.max() < 2e-3  # depth comes in millimeters
+        assert (points > -2e-3).all()
+        assert (points < SIZE + 2e-3).all()
+        shown = np.asarray(frame.rgb)[middle, middle][z > 0]
+        assert 255 * np.abs(shown - color_of(points)).mean() < colors
+        measured += (z > 0).sum()
+    assert measured > 0.5 * len(images) * z.size
+
+
+def write_zip(path, files):
+    path.write_bytes(zipped(files))
+    return path
+
+
+@pytest.fixture(params=["folder", "zip", "zip with a top folder"])
+def polycam(request, tmp_path):
+    if request.param == "folder":
+        lay_out(tmp_path / "scan", phones.polycam())
+        return tmp_path / "scan"
+    top = "MyScan/" if "top" in request.param else ""
+    files = {"__MACOSX/keyframes/._x": b"", **phones.polycam(top=top)}
+    return write_zip(tmp_path / "scan.zip", files)
+
+
+def test_polycam_shows_the_room_by_its_corrected_cameras(polycam):
+    images = read_polycam(polycam)
+    assert len(images) == NUM
+    assert images.remark is None
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+    assert [lens.params[0] for lens in images.lenses] == [33.0, 34.0, 35.0, 36.0]
+
+
+def test_a_polycam_archive_is_opened_by_its_looks_and_named_after_itself(polycam):
+    capture = open_capture(polycam)
+    assert capture.name == "scan"
+    assert len(capture) == NUM
+    source = source_of(capture.source, capture.name)
+    np.testing.assert_array_equal(source.up, [0, 1, 0])  # one camera lies on its side
+    assert source.labels[0] == "1600000.jpg"
+
+
+def test_polycam_without_corrected_cameras_has_its_own(tmp_path):
+    lay_out(tmp_path, phones.polycam(corrected=False))
+    assert_shows_the_room(read_polycam(tmp_path), Y_UP_FROM_Z_UP)
+
+
+def test_unsure_and_far_depth_of_polycam_is_no_measurement(tmp_path):
+    files = phones.polycam()
+    name = "keyframes/depth/1600000.png"
+    far = phones.depth_steps(phones.room_poses()[0], phones.smaller(phones.lens_of(0)))
+    far[5, 5] = 5001
+    lay_out(tmp_path, files | {name: phones.encoded(far)})
+    depth = read_polycam(tmp_path).depth(0)
+    assert depth is not None
+    blocks = depth.reshape(12, FACTOR, 16, FACTOR)
+    assert (blocks[:, :, -2:] == 0).all()
+    assert (blocks[0, :, 0] == 0).all()
+    assert (blocks[5, :, 5] == 0).all()
+    assert (blocks[1:5, :, :-2] > 0).all()
+    without = {n: data for n, data in files.items() if "confidence" not in n}
+    lay_out(tmp_path, without)
+    assert (read_polycam(tmp_path).depth(0).reshape(12, FACTOR, 16, FACTOR)[:, :, -2:] > 0).all()
+
+
+def test_frames_without_depth_are_left_out_and_counted(tmp_path):
+    files = phones.polycam()
+    del files["keyframes/depth/2300000.png"]
+    lay_out(tmp_path, files)
+    images = read_polycam(tmp_path)
+    assert len(images) == NUM - 1
+    assert images.remark == (
+        "1 of 4 frames lack an image, depth or a pose and are left out."
+    )  # fmt: skip
+
+
+def test_other_folders_are_no_polycam(tmp_path):
+    lay_out(tmp_path / "scan", {"images/0.jpg": b""})
+    write_zip(tmp_path / "scan.zip", {"images/0.jpg": b""})
+    for name in ("scan", "scan.zip", "nowhere", "nowhere.zip"):
+        assert not is_polycam(tmp_path / name)
+
+
+def damaged(name, change):
+    """Files with one changed by a function of its JSON or bytes; None takes it away."""
+
+    def changed(files):
+        files = dict(files)
+        if change is None:
+            files = {other: data for other, data in files.items() if name not in other}
+        else:
+            names = [other for other in files if name in other]
+            assert names
+            files[names[0]] = change(files[names[0]])
+        return files
+
+    return changed
+
+
+def with_fields(**fields):
+    return lambda data: json.dumps({**json.loads(data), **fields}).encode()
+
+
+def without_field(name):
+    return lambda data: json.dumps(
+        {k: v for k, v in json.loads(data).items() if k != name}
+    ).encode()
+
+
+POLYCAM = {
+    "depth": (
+        damaged("keyframes/depth", None),
+        "looks like a Polycam export without keyframes/depth: .* ns-process-data images",
+    ),
+    "cameras": (damaged("cameras/", None), "without keyframes/cameras: export raw data"),
+    "field": (
+        damaged("corrected_cameras", without_field("fx")), r"1600000\.json: `camera` lacks fx",
+    ),
+    "pose": (damaged("corrected_cameras", with_fields(t_00=7.0)), r"1600000\.json: the pose"),
+    "size": (damaged("corrected_cameras", with_fields(width=-1)), r"image is -1 x 36 pixels"),
+    "word": (damaged("corrected_cameras", with_fields(fx="x")), r"`camera.fx` must be float"),
+    "not json": (damaged("corrected_cameras", lambda data: data[:40]), "this is not JSON"),
+}  # fmt: skip
+PIXELS = {
+    "image": (
+        damaged("corrected_images", lambda data: data[:50]),
+        r"1600000\.jpg: the image cannot",
+    ),
+    "other size": (
+        damaged("corrected_cameras", with_fields(width=50)),
+        r"1600000\.jpg: the size is \(48, 36\), others are \(50, 36\)",
+    ),
+    "colored depth": (
+        damaged("keyframes/depth", lambda data: phones.encoded(np.zeros((12, 16, 3), np.uint8))),
+        r"depth/1600000\.png: depth must be a 16-bit PNG",
+    ),
+    "confidence": (
+        damaged("keyframes/confidence", lambda data: phones.encoded(np.zeros((3, 4), np.uint8))),
+        r"confidence/1600000\.png: the confidence has 4 x 3 pixels, its depth image 16 x 12",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", POLYCAM)
+@pytest.mark.parametrize("is_zip", [False, True])
+def test_damaged_polycam_is_named(tmp_path, damage, is_zip):
+    break_it, message = POLYCAM[damage]
+    files = break_it(phones.polycam())
+    lay_out(tmp_path / "scan", files)
+    path = write_zip(tmp_path / "scan.zip", files) if is_zip else tmp_path / "scan"
+    with pytest.raises(FormatError, match=message) as found:
+        open_capture(path)
+    assert str(path) in str(found.value)
+
+
+@pytest.mark.parametrize("damage", PIXELS)
+def test_damaged_pixels_of_polycam_are_named(tmp_path, damage):
+    break_it, message = PIXELS[damage]
+    lay_out(tmp_path / "scan", break_it(phones.polycam()))
+    images = read_polycam(tmp_path / "scan")
+    with pytest.raises(FormatError, match=message):
+        images.frame(0)
+
+
+def test_an_archive_that_was_cut_off_says_so(tmp_path):
+    path = tmp_path / "scan.zip"
+    path.write_bytes(zipped(phones.polycam())[:-100])
+    with pytest.raises(FormatError, match=r"scan\.zip: this is no whole zip archive .*again"):
+        open_capture(path)
+
+
+def test_a_member_that_was_damaged_says_so(tmp_path):
+    data = bytearray(zipped(phones.polycam()))
+    at = data.find(b"keyframes/depth/1600000.png") + 60
+    data[at : at + 20] = bytes(20)
+    (tmp_path / "scan.zip").write_bytes(data)
+    images = read_polycam(tmp_path / "scan.zip")
+    with pytest.raises(FormatError, match=r"depth/1600000\.png: it cannot be unpacked"):
+        images.frame(0)
+
+
+def test_a_member_that_unpacks_to_far_too_much_is_not_unpacked(tmp_path):
+    files = phones.polycam() | {"keyframes/corrected_cameras/1600000.json": bytes(65 << 20)}
+    path = write_zip(tmp_path / "scan.zip", files)
+    with pytest.raises(FormatError, match=r"1600000\.json: it claims to unpack to 65 MiB"):
+        read_polycam(path)
+
+
+@pytest.fixture(params=["folder", "archive"])
+def record3d(request, tmp_path):
+    if request.param == "archive":
+        return write_zip(tmp_path / "scan.r3d", phones.record3d())
+    lay_out(tmp_path / "scan", phones.record3d())
+    return tmp_path / "scan"
+
+
+def test_record3d_shows_the_room(record3d):
+    capture = open_capture(record3d)
+    assert capture.name == "scan"
+    images = capture.source
+    assert isinstance(images, PosedImages)
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+    np.testing.assert_array_equal(images.up, [0, 1, 0])
+    assert [lens.params[0] for lens in images.lenses] == [33.0, 34.0, 35.0, 36.0]
+    depth = images.depth(0).reshape(12, FACTOR, 16, FACTOR)
+    assert (depth[:, :, -2:] == 0).all()  # not sure
+    assert (depth[0, :, 0] == 0).all()  # NaN
+    assert (depth[1:, :, :-2] > 0).all()
+
+
+def test_record3d_from_its_first_camera_on_does_not_know_what_is_up(tmp_path):
+    first = np.linalg.inv(phones.room_poses()[0] @ phones.OPENGL)
+    lay_out(tmp_path, phones.record3d(first=first))
+    images = read_record3d(tmp_path)
+    assert images.up is None
+    assert_shows_the_room(images, first)
+
+
+def test_record3d_of_earlier_versions_has_one_camera_and_no_size_of_depth(tmp_path):
+    import lzfse
+
+    files = phones.record3d(size=False)
+    metadata = json.loads(files["metadata"])
+    del metadata["perFrameIntrinsicCoeffs"]
+    metadata |= {"w": 480, "h": 640, "K": [400.0, 0, 0, 0, 401.0, 0, 240.0, 321.0, 1]}
+    lidar = np.full((256, 192), 2.0, "<f4")
+    lidar[0] = 1.0
+    files |= {
+        "metadata": json.dumps(metadata).encode(),
+        "rgbd/0.depth": lzfse.compress(lidar.tobytes()),
+    }
+    files = {name: data for name, data in files.items() if not name.endswith("conf")}
+    lay_out(
+        tmp_path, files | {"rgbd/0.jpg": phones.encoded(np.zeros((640, 480, 3), np.uint8), "jpeg")}
+    )
+    images = read_record3d(tmp_path)
+    assert images.lenses[0].params == (400.0, 401.0, 240.0, 321.0)
+    depth = images.frame(0).depth
+    assert depth.shape == (640, 480)
+    assert (np.asarray(depth[:2]) == 1.0).all()
+    assert (np.asarray(depth[3:]) == 2.0).all()
+
+
+def with_lzfse(array):
+    import lzfse
+
+    return lambda data: lzfse.compress(array.tobytes())
+
+
+RECORD3D = {
+    "depth": (damaged(".depth", None), "looks like a recording of Record3D without depth"),
+    "poses": (damaged("metadata", with_fields(poses=[[0, 0, 0, 1, 0, 0]])), "1 poses must have 7"),
+    "fewer": (damaged("metadata", with_fields(poses=[[0, 0, 0, 1, 0, 0, 0]])), "intrinsics, 4"),
+    "no pose": (damaged("metadata", with_fields(poses=[])), "the 0 poses"),
+    "quaternion": (
+        damaged("metadata", with_fields(poses=[[0, 0, 0, 2, 0, 0, 0]] * 4)),
+        "metadata: pose 0: the rotation is no unit quaternion",
+    ),
+    "K": (damaged("metadata", with_fields(K=[1.0])), "`K` must have 9 numbers"),
+    "size": (damaged("metadata", with_fields(dw=1 << 20)), "cannot have 1048576 x 12 pixels"),
+    "field": (damaged("metadata", without_field("w")), "`metadata` lacks w"),
+}
+
+
+@pytest.mark.parametrize("damage", RECORD3D)
+def test_damaged_record3d_is_named(tmp_path, damage):
+    break_it, message = RECORD3D[damage]
+    path = write_zip(tmp_path / "scan.r3d", break_it(phones.record3d()))
+    with pytest.raises(FormatError, match=message) as found:
+        open_capture(path)
+    assert str(path) in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data[:30], r"0\.depth: it unpacks to .* bytes, not 768: is it damaged"),
+        (lambda data: b"bvx1" + data[4:], r"0\.depth: it unpacks to 0 bytes, not 768"),
+        (with_lzfse(np.ones((12, 15), np.float32)), "it unpacks to 720 bytes, not 768"),
+        (with_lzfse(np.zeros(1 << 20, np.uint8)), "it unpacks to more than 768 bytes, not 768"),
+    ],
+)
+def test_damaged_depth_of_record3d_is_named(tmp_path, change, message):
+    lay_out(tmp_path, damaged("0.depth", change)(phones.record3d()))
+    images = read_record3d(tmp_path)
+    with pytest.raises(FormatError, match=message):
+        images.frame(0)
+
+
+def test_record3d_without_lzfse_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lzfse", None)
+    path = write_zip(tmp_path / "scan.r3d", {"metadata": b"{}", "rgbd/0.jpg": b""})
+    with pytest.raises(FormatError, match=r"scan\.r3d: .*pip install 'r3jax\[phones\]'"):
+        open_capture(path)
+
+
+@pytest.fixture(params=["folder", "archive"])
+def stray(request, tmp_path):
+    if request.param == "archive":
+        return write_zip(tmp_path / "scan.zip", phones.stray_scanner())
+    lay_out(tmp_path / "scan", phones.stray_scanner())
+    return tmp_path / "scan"
+
+
+def test_stray_scanner_shows_the_room(stray):
+    images = open_capture(stray).source
+    assert isinstance(images, PosedImages)
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+    np.testing.assert_array_equal(images.up, [0, 1, 0])
+    assert [lens.params[0] for lens in images.lenses] == [132.0, 136.0, 140.0, 144.0]
+    assert images.image_paths[1].name == "000001"
+
+
+def test_stray_scanner_of_earlier_versions_has_one_camera(tmp_path):
+    lay_out(tmp_path, phones.stray_scanner(intrinsics=False))
+    images = read_stray_scanner(tmp_path)
+    assert set(images.lenses) == {phones.VIDEO}
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+
+
+def test_frames_of_a_video_come_by_number_in_any_order(tmp_path):
+    gray = [np.full((144, 192, 3), 20 * i, np.uint8) for i in range(12)]
+    video = Video(tmp_path, phones.video(gray))
+    assert len(video) == 12
+    for number in (0, 1, 2, 11, 5, 4, 4, 10, 0, 7):
+        assert abs(video.frame(number).mean() - 20 * number) < 4
+    for number in (-1, 12):
+        with pytest.raises(FormatError, match=f"12 frames, none of number {number}"):
+            video.frame(number)
+
+
+def lines(change):
+    return lambda data: "\n".join(change(data.decode().splitlines())).encode()
+
+
+STRAY = {
+    "depth": (damaged("depth/", None), "looks like a recording of Stray Scanner without depth/"),
+    "odometry": (damaged("odometry", None), "Stray Scanner without odometry.csv: copy the whole"),
+    "columns": (
+        damaged("odometry", lambda data: data.replace(b"qw", b"q")), r"odometry\.csv: .*columns qw",
+    ),
+    "no rows": (damaged("odometry", lines(lambda rows: rows[:1])), "it lists no frames"),
+    "row": (damaged("odometry", lines(lambda rows: [*rows, "1, 2"])), "not every row is a row of"),
+    "word": (damaged("odometry", lambda d: d.replace(b"000001", b"x")), "not every row is a row"),
+    "frame": (damaged("odometry", lambda d: d.replace(b"000003", b"-3")), "-3 is no number"),
+    "video": (damaged("rgb.mp4", lambda data: data[:100]), r"rgb\.mp4: the video cannot be read"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", STRAY)
+def test_damaged_stray_scanner_is_named(tmp_path, damage):
+    break_it, message = STRAY[damage]
+    lay_out(tmp_path, break_it(phones.stray_scanner()))
+    with pytest.raises(FormatError, match=message) as found:
+        open_capture(tmp_path)
+    assert str(tmp_path) in str(found.value)
+
+
+def test_poses_after_the_end_of_a_video_are_left_out(tmp_path):
+    files = phones.stray_scanner()
+    shorter = [phones.view(pose, phones.VIDEO)[0] for pose in phones.room_poses()[:3]]
+    lay_out(tmp_path, files | {"rgb.mp4": phones.video(shorter)})
+    images = read_stray_scanner(tmp_path)
+    assert len(images) == 3
+    assert images.remark == "1 of 4 frames lack an image, depth or a pose and are left out."
+
+
+def test_stray_scanner_without_a_matrix_says_so(tmp_path):
+    files = phones.stray_scanner(intrinsics=False) | {"camera_matrix.csv": b"1,2\n3,4\n"}
+    lay_out(tmp_path, files)
+    with pytest.raises(FormatError, match=r"camera_matrix\.csv: expected a 3x3 matrix"):
+        read_stray_scanner(tmp_path)
+
+
+def test_a_video_without_pyav_names_the_extra(stray, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(FormatError, match=r"rgb\.mp4: .*pip install 'r3jax\[phones\]'"):
+        open_capture(stray)
+
+
+def test_arkit_scenes_shows_the_room(tmp_path):
+    lay_out(tmp_path / "40753679", phones.arkit_scenes())
+    images = open_capture(tmp_path / "40753679").source
+    assert isinstance(images, PosedImages)
+    assert len(images) == NUM
+    assert images.remark == "1 of 5 frames lack an image, depth or a pose and are left out."
+    assert_shows_the_room(images, phones.Z_UP_FROM_ROOM, colors=1.5)
+    np.testing.assert_array_equal(images.up, [0, 0, 1])
+    assert [lens.params[0] for lens in images.lenses] == [34.0, 35.0, 36.0, 37.0]
+    assert (images.depth(0).reshape(12, FACTOR, 16, FACTOR)[:, :, -2:] == 0).all()
+
+
+ARKIT_SCENES = {
+    "depth": (damaged("lowres_depth", None), "looks like a video of ARKitScenes without images"),
+    "cameras": (damaged("pincam", None), "download its assets lowres_wide, lowres_depth"),
+    "camera": (damaged("1.628.pincam", lambda data: b"256 192 1"), r"pincam: every line must have"),
+    "huge": (damaged("1.628.pincam", lambda data: b"1e300 1 1 1 1 1"), "image is 0 x 1 pixels"),
+    "columns": (damaged("traj", lambda data: data[:-20]), r"wide\.traj: every line must have 7"),
+    "word": (damaged("traj", lambda data: b"a b c d e f g"), "a word that is no number"),
+    "lost": (damaged("traj", lambda data: b"6791 nan 0 0 0 0 0"), "not finite"),
+    "other time": (damaged("traj", lambda data: b"7 0 0 0 0 0 0"), "without images that have"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", ARKIT_SCENES)
+def test_damaged_arkit_scenes_is_named(tmp_path, damage):
+    break_it, message = ARKIT_SCENES[damage]
+    lay_out(tmp_path, break_it(phones.arkit_scenes()))
+    with pytest.raises(FormatError, match=message) as found:
+        read_arkit_scenes(tmp_path)
+    assert str(tmp_path) in str(found.value)
