@@ -34,7 +34,7 @@ COUNT, SIZE, BUDGET = 70, (40, 24), 1024
 
 def python_compiler() -> ModuleType:
     """Stands for `compiled.py`: kernels stay Python, the counter needs no atomics."""
-    module = ModuleType(f"{PACKAGE}.compiled")
+    module = ModuleType("r3jax.native.compiled")
     for name in ("kernel", "inlined", "inlined_fast", "parallel_kernel"):
         setattr(module, name, lambda function: function)
 
@@ -75,7 +75,7 @@ def numpy_lanes() -> ModuleType:
 
 def no_advice() -> ModuleType:
     """Stands for `memory.py`."""
-    module = ModuleType(f"{PACKAGE}.memory")
+    module = ModuleType("r3jax.native.memory")
     module.__dict__["expect_writes"] = lambda array: None
     return module
 

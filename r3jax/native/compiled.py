@@ -14,22 +14,28 @@ _Function = Callable[..., Any]
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 
-def _forget_outdated_code() -> None:
-    """Deletes machine code on the disk that is older than any source of this package.
+_HERE = Path(__file__).parent
+
+
+def forget_outdated_code(folder: Path = _HERE) -> None:
+    """Deletes machine code on the disk that is older than any source that it may come from.
 
     Numba compares a kernel with its own file only, not with the files of what it inlines.
+
+    Args:
+        folder: with sources of kernels; they may inline what stands in each other's files and
+            in this package.
     """
-    here = Path(__file__).parent
-    sources = {source.stem: source.stat().st_mtime for source in here.glob("*.py")}
-    newest = max(sources.values())
-    for index in here.glob("__pycache__/*.nbi"):
+    sources = {source.stem for source in folder.glob("*.py")}
+    newest = max(s.stat().st_mtime for at in (folder, _HERE) for s in at.glob("*.py"))
+    for index in folder.glob("__pycache__/*.nbi"):
         is_ours = index.name.partition(".")[0] in sources  # of a kernel in one of these files
         with contextlib.suppress(OSError):
             if is_ours and index.stat().st_mtime < newest:
                 index.unlink()
 
 
-_forget_outdated_code()
+forget_outdated_code()
 
 
 def intrinsic(function: _Function) -> _Function:
