@@ -17,7 +17,7 @@ _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
 _HERE = Path(__file__).parent
 
 
-def forget_outdated_code(folder: Path = _HERE) -> None:
+def forget_outdated_code(folder: Path = _HERE, *others: Path) -> None:
     """Deletes machine code on the disk that is older than any source that it may come from.
 
     Numba compares a kernel with its own file only, not with the files of what it inlines.
@@ -25,9 +25,10 @@ def forget_outdated_code(folder: Path = _HERE) -> None:
     Args:
         folder: with sources of kernels; they may inline what stands in each other's files and
             in this package.
+        others: folders with kernels that they inline as well.
     """
     sources = {source.stem for source in folder.glob("*.py")}
-    newest = max(s.stat().st_mtime for at in (folder, _HERE) for s in at.glob("*.py"))
+    newest = max(s.stat().st_mtime for at in (folder, *others, _HERE) for s in at.glob("*.py"))
     for index in folder.glob("__pycache__/*.nbi"):
         is_ours = index.name.partition(".")[0] in sources  # of a kernel in one of these files
         with contextlib.suppress(OSError):
@@ -64,6 +65,12 @@ def inlined_fast(function: _Function) -> _Function:
     NaN and infinity keep their meaning.
     """
     compiler = njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FAST)
+    return compiler(inspect.unwrap(function))
+
+
+def inlined_fused(function: _Function) -> _Function:
+    """The same where LLVM may do no more than fuse a product with a sum."""
+    compiler = njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
     return compiler(inspect.unwrap(function))
 
 

@@ -58,6 +58,7 @@ def _caster(numba_type):
 
 _int64_at, _int32_at = _reader(types.int64, ir.IntType(64)), _reader(types.int32, ir.IntType(32))
 _floats, _ints, _bytes = _caster(types.float32), _caster(types.int32), _caster(types.uint8)
+_words = _caster(types.uint32)
 
 
 @intrinsic
@@ -124,6 +125,30 @@ def ints1(frame, kind, index):
     """Views the index-th argument or result as int32 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_ints(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
+
+
+@inlined
+def bytes2(frame, kind, index):
+    """Views the index-th argument or result as uint8 with two axes."""
+    buffer = _buffer(frame, kind, index)
+    shape = _length(buffer, 0), _length(buffer, 1)
+    return carray(_bytes(_int64_at(buffer + _DATA)), shape)
+
+
+@inlined
+def ints2(frame, kind, index):
+    """Views the index-th argument or result as int32 with two axes."""
+    buffer = _buffer(frame, kind, index)
+    shape = _length(buffer, 0), _length(buffer, 1)
+    return carray(_ints(_int64_at(buffer + _DATA)), shape)
+
+
+@inlined
+def words2(frame, kind, index):
+    """Views the index-th argument or result as uint32 with two axes."""
+    buffer = _buffer(frame, kind, index)
+    shape = _length(buffer, 0), _length(buffer, 1)
+    return carray(_words(_int64_at(buffer + _DATA)), shape)
 
 
 @inlined

@@ -1,0 +1,111 @@
+"""Which backend answers where: machine code on a CPU, dense batches on a GPU.
+
+The choice is made where a program is lowered, so that `jit`, `vmap`, `lax.map` and `grad` of the
+public verbs all get it. Derivatives are those of the reference.
+
+Shape symbols: B bins of the panorama; p q bytes that hold a bit for every voxel and every cell.
+"""
+
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float, UInt8
+
+from r3jax.mapping.state import MapState
+from r3jax.native.version import WRITTEN_FOR, ffi_version
+from r3jax.scoring.backends import dense, reference
+from r3jax.scoring.backends.views import frame_of, over_views, row_of
+from r3jax.scoring.cells import Cells
+from r3jax.scoring.config import ScoringConfig
+from r3jax.visibility.views import View
+
+LARGEST_BUFFER = 2048
+"""Edge [px] up to which the kernels' places in a buffer are exact in float32."""
+
+
+def speaks_our_interface() -> bool:
+    """Whether XLA can call the kernels; warns if its interface is another."""
+    if (version := ffi_version()) != WRITTEN_FOR:
+        _warn(version)
+        return False
+    return True
+
+
+@functools.cache
+def _warn(version: tuple[int, int]) -> None:
+    warnings.warn(
+        f"scoring's kernels read XLA's structs as they are in version "
+        f"{'.'.join(map(str, WRITTEN_FOR))} of its foreign function interface; this jaxlib has "
+        f"{'.'.join(map(str, version))}: scoring in plain JAX, which is slower",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+
+
+def _by_platform(view: View, cpu: Callable[..., Any], default: Callable[..., Any]) -> Any:
+    """A function that runs `cpu` on CPUs, where kernels serve the view, and `default` elsewhere."""
+    if max(view.shape) > LARGEST_BUFFER or not speaks_our_interface():
+        return default
+    return functools.partial(jax.lax.platform_dependent, cpu=cpu, default=default)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(6,))
+def sums_in_view(
+    voxels: MapState,
+    cells: Cells,
+    view: View,
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    num_bins: int,
+) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
+    """`reference.sums_in_view`, by the fastest backend of the platform."""
+    del position  # that of the view; it only carries the derivative
+    deficits, unexplored = _sums(voxels, cells, view, focal, config, num_bins, keep=False)
+    return deficits, unexplored
+
+
+@sums_in_view.defjvp
+def _sums_in_view_jvp(num_bins: int, primals: Any, tangents: Any) -> Any:
+    score = functools.partial(reference.sums_in_view, num_bins=num_bins)
+    return jax.jvp(score, primals, tangents)
+
+
+def sums_and_seen(
+    voxels: MapState,
+    cells: Cells,
+    view: View,
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    num_bins: int,
+) -> tuple[Float[Array, " B"], Float[Array, " B"], UInt8[Array, " p"], UInt8[Array, " q"]]:
+    """`sums_in_view`, and which voxels and unexplored cells are seen: bits, packed in bytes."""
+    return _sums(voxels, cells, view, focal, config, num_bins, keep=True)
+
+
+def _sums(
+    voxels: MapState,
+    cells: Cells,
+    view: View,
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    num_bins: int,
+    *,
+    keep: bool,
+) -> Any:
+    from r3jax.scoring.backends import numba
+
+    frame, forms = frame_of(view), config.forms
+
+    def score_by(backend: Any) -> Callable[..., Any]:
+        def score(shared: tuple[MapState, Cells], views: Array) -> Any:
+            return backend.sums_in_views(*shared, views, frame, forms, num_bins, keep=keep)
+
+        return lambda shared, views: over_views(score, shared, views)
+
+    chosen = _by_platform(view, score_by(numba), score_by(dense))
+    results = chosen((voxels, cells), row_of(view, focal, config)[None])
+    return jax.tree.map(lambda of_all: of_all[0], results)
