@@ -36,7 +36,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
 from r3jax.planning.policies.cover import SeenBins, coverage_of_pixels
 from r3jax.scoring.config import Forms, ScoringConfig
-from r3jax.scoring.renderability import Renderability, score_voxels
+from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.trace.reader import read_run

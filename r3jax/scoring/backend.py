@@ -3,7 +3,8 @@
 The choice is made where a program is lowered, so that `jit`, `vmap`, `lax.map` and `grad` of the
 public verbs all get it. Derivatives are those of the reference.
 
-Shape symbols: B bins of the panorama; p q bytes that hold a bit for every voxel and every cell.
+Shape symbols: B bins of the panorama; p q bytes that hold a bit for every voxel and every cell;
+h w pixels of a depth buffer.
 """
 
 import functools
@@ -12,14 +13,16 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jaxtyping import Array, Float, UInt8
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
 
 from r3jax.mapping.state import MapState
 from r3jax.native.version import WRITTEN_FOR, ffi_version
 from r3jax.scoring.backends import dense, reference
 from r3jax.scoring.backends.views import frame_of, over_views, row_of
 from r3jax.scoring.cells import Cells
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import PAPER, Forms, ScoringConfig
 from r3jax.visibility.views import View
 
 LARGEST_BUFFER = 2048
@@ -109,3 +112,58 @@ def _sums(
     chosen = _by_platform(view, score_by(numba), score_by(dense))
     results = chosen((voxels, cells), row_of(view, focal, config)[None])
     return jax.tree.map(lambda of_all: of_all[0], results)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
+def mean_in_pixels(
+    voxels: MapState,
+    view: View,
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    forms: Forms,
+) -> Float[Array, ""]:
+    """`reference.mean_in_pixels`, by the fastest backend of the platform."""
+    del position  # that of the view; it only carries the derivative
+    frame = frame_of(view)
+    from r3jax.scoring.backends import numba
+
+    def score_by(backend: Any) -> Callable[..., Any]:
+        score = lambda voxels, views: backend.means_in_pixels(voxels, views, frame, forms)
+        return lambda voxels, views: over_views(score, voxels, views)
+
+    chosen = _by_platform(view, score_by(numba), score_by(dense))
+    return chosen(voxels, row_of(view, focal, config)[None])[0]
+
+
+@mean_in_pixels.defjvp
+def _mean_in_pixels_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
+    voxels, view, position, focal, config = primals
+    rows = rows_in_pixels(voxels, view, config)
+
+    def score(voxels: MapState, position: Array, focal: Array) -> Array:
+        return reference.mean_of_rows(voxels, rows, position, focal, forms)
+
+    moved = tangents[0], tangents[2], tangents[3]
+    return jax.jvp(score, (voxels, position, focal), moved)
+
+
+@jax.custom_jvp
+def rows_in_pixels(voxels: MapState, view: View, config: ScoringConfig) -> Int[Array, "h w"]:
+    """`reference.rows_in_pixels`, by the fastest backend of the platform."""
+    frame = frame_of(view)
+    from r3jax.scoring.backends import numba
+
+    def look_by(backend: Any) -> Callable[..., Any]:
+        look = lambda voxels, views: backend.rows_in_pixels(voxels, views, frame, PAPER)
+        return lambda voxels, views: over_views(look, voxels, views)
+
+    chosen = _by_platform(view, look_by(numba), look_by(dense))
+    return chosen(voxels, row_of(view, jnp.ones(()), config)[None])[0]
+
+
+@rows_in_pixels.defjvp
+def _rows_in_pixels_jvp(primals: Any, tangents: Any) -> Any:
+    del tangents  # a choice has no derivative
+    rows = rows_in_pixels(*primals)
+    return rows, np.zeros(rows.shape, dtype=jax.dtypes.float0)

@@ -21,7 +21,7 @@ from r3jax.mapping.occupancy import OccupancyGrid, a_grid
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.cells import cells_of, visible_cells
 from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
-from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.depth_buffer import seen_in
 from r3jax.visibility.selection import Selection, for_selected
 from r3jax.visibility.views import pinhole_view

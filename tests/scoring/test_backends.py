@@ -152,6 +152,38 @@ def test_views_that_are_none_see_nothing_and_disturb_no_other(kind):
         np.testing.assert_array_equal(sums[4:], sound[4:])
 
 
+@functools.cache
+def renderabilities():
+    """The reference, one by one; the public verb mapped, and its image in a loop."""
+
+    def exact(m: MapState, pose: jax.Array):
+        view, position = pinhole_view(CAMERA, pose, CONFIG), pose[:3, 3]
+        return reference.mean_in_pixels(m, view, position, CAMERA.focal, CONFIG.forms)
+
+    mean = lambda m, pose: r3jax.renderability(m, CAMERA, pose, CONFIG)
+    image = lambda m, pose: r3jax.renderability_image(m, CAMERA, pose, CONFIG)
+    return (
+        jax.jit(lambda m, poses: jax.lax.map(lambda pose: exact(m, pose), poses)),
+        jax.jit(lambda m, poses: jax.vmap(lambda pose: mean(m, pose))(poses)),
+        jax.jit(lambda m, poses: jax.lax.map(lambda pose: image(m, pose), poses)),
+        jax.jit(jax.vmap(jax.grad(exact, argnums=1), (None, 0))),
+        jax.jit(jax.vmap(jax.grad(mean, argnums=1), (None, 0))),
+    )
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 1000))
+def test_renderability_is_that_of_the_reference(seed):
+    state, poses = world(seed)[0], poses_of(seed)
+    exact, mapped, images, by_pose, mapped_by_pose = renderabilities()
+    expected = exact(state, poses)
+    assert float(expected.max()) > 0.01
+    np.testing.assert_allclose(mapped(state, poses), expected, atol=1e-4)
+    np.testing.assert_allclose(images(state, poses).mean(axis=(1, 2)), expected, atol=1e-4)
+    slope, found = by_pose(state, poses), mapped_by_pose(state, poses)
+    np.testing.assert_allclose(found[:, :3, 3], slope[:, :3, 3], atol=1e-3)
+
+
 def test_another_interface_of_xla_is_served_by_plain_jax(monkeypatch):
     monkeypatch.setattr(backend, "ffi_version", lambda: (0, 2))
     backend._warn.cache_clear()

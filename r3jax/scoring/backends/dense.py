@@ -7,7 +7,7 @@ Shape symbols: P views; B bins of the panorama.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from r3jax.mapping.state import MapState
 from r3jax.scoring.backends import reference
@@ -49,4 +49,25 @@ def sums_in_views(
         seen = reference.seen_in_view(voxels, cells, view, config)
         return *sums, *(jnp.packbits(mask) for mask in seen)
 
+    return jax.lax.map(one, views, batch_size=batch_size(voxels.capacity))
+
+
+def means_in_pixels(
+    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms
+) -> Float[Array, " P"]:
+    """`reference.mean_in_pixels` of many views."""
+
+    def one(row: Float[Array, " 20"]) -> Float[Array, ""]:
+        view = view_of(row, frame)
+        return reference.mean_in_pixels(voxels, view, row[:3], row[18], forms)
+
+    return jax.lax.map(one, views, batch_size=batch_size(voxels.capacity))
+
+
+def rows_in_pixels(
+    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms
+) -> Int[Array, "P h w"]:
+    """`reference.rows_in_pixels` of many views."""
+    del forms
+    one = lambda row: reference.rows_in_pixels(voxels, view_of(row, frame))
     return jax.lax.map(one, views, batch_size=batch_size(voxels.capacity))

@@ -6,15 +6,14 @@ what is visible is held fixed. What other backends answer is held to this.
 Shape symbols: n voxels; c cells; B bins of the panorama; h w pixels of the depth buffer.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import Forms, ScoringConfig
 from r3jax.scoring.deficit import sum_by_direction
-from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.reference import nearest_voxels, visible
 from r3jax.visibility.views import View
 
@@ -68,10 +67,26 @@ def mean_in_pixels(
     view: View,
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    config: ScoringConfig,
+    forms: Forms,
 ) -> Float[Array, ""]:
     """Averages R of the voxel that each pixel shows; 0 where it shows none."""
-    row = jax.lax.stop_gradient(rows_in_pixels(voxels, view)).reshape(-1)
-    is_hit = row < voxels.capacity
-    shown = voxels.take(jnp.where(is_hit, row, 0), is_hit)
-    return jnp.mean(score_voxels(shown, position, focal, config.forms).value)
+    return mean_of_rows(voxels, rows_in_pixels(voxels, view), position, focal, forms)
+
+
+def mean_of_rows(
+    voxels: MapState,
+    rows: Int[Array, "h w"],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    forms: Forms,
+) -> Float[Array, ""]:
+    """Averages R of the voxels in the pixels of an image; 0 where there is none."""
+    shown = voxels_of_rows(voxels, rows)
+    return jnp.mean(score_voxels(shown, position, focal, forms).value)
+
+
+def voxels_of_rows(voxels: MapState, rows: Int[Array, "h w"]) -> MapState:
+    """Gathers the voxel in each pixel, row by row; absent where a pixel shows none."""
+    flat = rows.reshape(-1)
+    is_hit = flat < voxels.capacity
+    return voxels.take(jnp.where(is_hit, flat, 0), is_hit)

@@ -9,14 +9,14 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 import r3jax.visibility.backends.numba as visibility_kernels
 from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
 from r3jax.mapping.state import MapState
 from r3jax.native.compiled import forget_outdated_code
 from r3jax.native.ffi import num_workers
-from r3jax.scoring.backends.numba.bridge import SUMS, register
+from r3jax.scoring.backends.numba.bridge import PIXELS, SUMS, register
 from r3jax.scoring.backends.views import Frame
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms
@@ -71,3 +71,34 @@ def sums_in_views(
         *_shared(voxels), views, _options(frame, forms), directions, *_tables(num_bins), *space
     )
     return tuple(results) if keep else tuple(results[:2])
+
+
+def means_in_pixels(
+    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms
+) -> Float[Array, " P"]:
+    """`reference.mean_in_pixels` of many views, on as many cores as the process may use."""
+    return _look(voxels, views, frame, forms, 0)[0]
+
+
+def rows_in_pixels(
+    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms
+) -> Int[Array, "P h w"]:
+    """`reference.rows_in_pixels` of many views."""
+    rows = _look(voxels, views, frame, forms, frame.height * frame.width)[1]
+    return rows.reshape(-1, frame.height, frame.width)
+
+
+def _look(
+    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms, room: int
+) -> tuple[Array, Array]:
+    register()
+    num = views.shape[0]
+    shapes = [
+        jax.ShapeDtypeStruct((num,), jnp.float32),
+        jax.ShapeDtypeStruct((num, room), jnp.int32),
+    ]
+    directions = fibonacci_lattice(voxels.num_bins).astype(np.float32)
+    means, rows = jax.ffi.ffi_call(PIXELS, shapes)(
+        *_shared(voxels), views, _options(frame, forms), directions
+    )
+    return means, rows

@@ -23,9 +23,10 @@ from r3jax.native.ffi import (
     register_handlers,
     words2,
 )
+from r3jax.scoring.backends.numba.pixels import pixels_pass
 from r3jax.scoring.backends.numba.sums import sums_pass
 
-SUMS = "r3jax_scoring_sums"
+SUMS, PIXELS = "r3jax_scoring_sums", "r3jax_scoring_pixels"
 
 
 @inlined
@@ -66,6 +67,26 @@ def _sums(frame):
     return 0
 
 
+def _pixels(frame):
+    """Arguments: state (6), views, options as in `_sums`, directions.
+
+    Results: means of R, rows of the map in the pixels.
+    """
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 7)
+    pixels_pass(
+        _state(frame),
+        floats2(frame, ARGUMENTS, 6),
+        (options[0] != 0, (np.int64(options[1]), np.int64(options[2]))),
+        (options[3] != 0, options[4] != 0),
+        floats2(frame, ARGUMENTS, 8),
+        np.int64(options[5]),
+        (floats1(frame, RESULTS, 0), ints2(frame, RESULTS, 1)),
+    )  # fmt: skip
+    return 0
+
+
 _lock = threading.Lock()
 
 
@@ -77,4 +98,4 @@ def register() -> None:
 
 @functools.cache
 def _register() -> tuple[Any, ...]:
-    return register_handlers({SUMS: _sums})
+    return register_handlers({SUMS: _sums, PIXELS: _pixels})
