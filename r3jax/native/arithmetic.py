@@ -134,14 +134,14 @@ def distance_of(typingctx, key):
 
 _ROUND = np.float32(12582912.0)  # 1.5 * 2^23: adding it leaves the rounded integer in the low bits
 _LOWEST = np.float32(-126.0)
-_E0, _E1 = np.float32(1.0000001192092896), np.float32(6.931469440460205e-1)
+_E0, _E1 = np.float32(1.0), np.float32(6.931469440460205e-1)  # 2^0 is exactly 1
 _E2, _E3 = np.float32(2.4022120237350464e-1), np.float32(5.550713092088699e-2)
 _E4, _E5 = np.float32(9.675541892647743e-3), np.float32(1.3276472454890609e-3)
 
 
 @inlined_fused
 def exp2(power):
-    """2^power to 1e-7, and 2^-126 for all powers below.
+    """2^power to 2e-7, and 2^-126 for all powers below.
 
     2^n p(f) with n the nearest integer and p of degree 5 (as in `splatting.backends.numba.lanes`).
     """

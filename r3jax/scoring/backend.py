@@ -3,8 +3,8 @@
 The choice is made where a program is lowered, so that `jit`, `vmap`, `lax.map` and `grad` of the
 public verbs all get it. Derivatives are those of the reference.
 
-Shape symbols: B bins of the panorama; p q bytes that hold a bit for every voxel and every cell;
-h w pixels of a depth buffer.
+Shape symbols: n voxels; c cells; B bins of the panorama; p q bytes that hold a bit for every voxel
+and every cell; h w pixels of a depth buffer.
 """
 
 import functools
@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.mapping.state import MapState
 from r3jax.native.version import WRITTEN_FOR, ffi_version
@@ -87,6 +87,17 @@ def sums_and_seen(
 ) -> tuple[Float[Array, " B"], Float[Array, " B"], UInt8[Array, " p"], UInt8[Array, " q"]]:
     """`sums_in_view`, and which voxels and unexplored cells are seen: bits, packed in bytes."""
     return _sums(voxels, cells, view, focal, config, num_bins, keep=True)
+
+
+def seen_in_view(
+    voxels: MapState, cells: Cells, view: View, config: ScoringConfig
+) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:
+    """`reference.seen_in_view`: the voxels and the unexplored cells that sums are taken over."""
+    *_, seen, empty = sums_and_seen(voxels, cells, view, jnp.ones(()), config, 1)
+    return (
+        jnp.unpackbits(seen, count=voxels.capacity).astype(bool),
+        jnp.unpackbits(empty, count=cells.x.shape[0]).astype(bool),
+    )
 
 
 def _sums(

@@ -8,10 +8,9 @@ from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.backend import sums_in_view
-from r3jax.scoring.cells import Cells, cells_of, visible_cells
+from r3jax.scoring.backend import seen_in_view, sums_in_view
+from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig, scoring_settings
-from r3jax.visibility.depth_buffer import candidates_of, depth_buffer
 from r3jax.visibility.views import pinhole_view
 
 
@@ -73,5 +72,5 @@ def visible_unexplored(
 ) -> Bool[Array, "X Y Z"]:
     """The cells that U_G of a view counts."""
     view = pinhole_view(camera, T_world_camera, config)
-    buffer = depth_buffer(state, candidates_of(state, view), view, config)
-    return visible_cells(cells_of(grid), view, buffer).mask.reshape(grid.log_odds.shape)
+    _, unexplored = seen_in_view(state, cells_of(grid), view, config)
+    return unexplored.reshape(grid.log_odds.shape)

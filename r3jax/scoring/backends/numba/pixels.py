@@ -8,12 +8,12 @@ import math
 import numpy as np
 from numba import prange
 
-from r3jax.native.arithmetic import key_of, log2
+from r3jax.native.arithmetic import key_of
 from r3jax.native.compiled import claim, inlined, inlined_fused, kernel, parallel_kernel
 from r3jax.scoring.backends.numba.sums import FEW, sound_views
 from r3jax.scoring.backends.numba.terms import look_from, product_of_terms
-from r3jax.scoring.backends.numba.voxels import consistency, log2_or_never
-from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_rows, voxel_of
+from r3jax.scoring.backends.numba.voxels import bins_of, consistency, log2_or_never
+from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots, voxel_of
 from r3jax.visibility.backends.numba.splat import (
     SPARE,
     TARGETS,
@@ -49,13 +49,16 @@ def _center_of(key, row, voxel_size):
 
 
 @parallel_kernel
-def centers_of(key, rows, voxel_size, workers, centers):
-    """Writes the centers of the voxels in some rows, [3, n] [m]."""
-    num = rows.shape[0]
+def gather_centers(slots, key, voxel_size, workers, centers, rows):
+    """Gathers centers [3, n] [m] and rows [n] of voxels in the order of the bricks."""
+    capacity = slots.shape[0]
     for share in prange(workers):
-        for i in range(num * share // workers, num * (share + 1) // workers):
-            x, y, z = _center_of(key, np.int64(rows[i]), voxel_size)
-            centers[0, i], centers[1, i], centers[2, i] = x, y, z
+        for row in range(capacity * share // workers, capacity * (share + 1) // workers):
+            slot = slots[row]
+            if slot >= 0:
+                x, y, z = _center_of(key, row, voxel_size)
+                centers[0, slot], centers[1, slot], centers[2, slot] = x, y, z
+                rows[slot] = row
 
 
 @inlined
@@ -84,7 +87,7 @@ def nearest_rows(view, wraps, shape, voxel_size, runs, centers, rows, chunk, key
 
 
 @inlined_fused
-def _value_of(row, view, log_focal, state, forms, directions, bits):
+def _value_of(row, view, state, forms, directions, bits):
     """R of the voxel in a row of the map, as a view sees it."""
     key, words, count, m2, resolution, voxel_size = state
     x, y, z = _center_of(key, row, voxel_size)
@@ -92,23 +95,19 @@ def _value_of(row, view, log_focal, state, forms, directions, bits):
     distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), _LEAST)
     inverse = _ONE / distance
     for word in range(0, words.shape[0], 2):
-        low = np.uint64(words[word, row])
-        if word + 1 < words.shape[0]:
-            low |= np.uint64(words[word + 1, row]) << np.uint64(32)
-        bits[word >> 1, 0] = low
+        bits[word >> 1, 0] = bins_of(words, word, row)
     to = dx * inverse, dy * inverse, dz * inverse
     cosine, is_inside = look_from(bits, 0, directions, to)
     delta = consistency(count[row], m2[row], forms[1])
     return product_of_terms(
         cosine, is_inside | forms[0], distance, delta, log2_or_never(delta),
-        log2_or_never(resolution[row]), log_focal,
+        resolution[row], view[FOCAL],
     )  # fmt: skip
 
 
 @kernel
 def _mean_of(keys, side, shape, view, state, forms, directions, bits):
     """Mean of R over the pixels; 0 where a pixel shows nothing. Neighbors often show the same."""
-    log_focal = log2(view[FOCAL])
     total, last, value = 0.0, np.int64(-1), np.float32(0.0)
     for r in range(shape[0]):
         for c in range(shape[1]):
@@ -116,7 +115,7 @@ def _mean_of(keys, side, shape, view, state, forms, directions, bits):
             if key < _INFINITE_KEY:
                 row = key & _ROW
                 if row != last:
-                    value = _value_of(row, view, log_focal, state, forms, directions, bits)
+                    value = _value_of(row, view, state, forms, directions, bits)
                     last = row
                 total += value
     return np.float32(total / (shape[0] * shape[1]))
@@ -196,11 +195,12 @@ def pixels_pass(state, views, frame, forms, directions, workers, results):
     voxel_size = state[5]
     is_sound = sound_views(views, voxel_size)
     most = 1 if views.shape[0] <= FEW else MOST
-    rows, starts, spheres = sorted_rows(
+    slots, starts, spheres = sorted_slots(
         state[0], state[2], views, is_sound, voxel_size, most, workers
     )
-    centers = np.empty((3, rows.shape[0]), np.float32)
-    centers_of(state[0], rows, voxel_size, workers, centers)
+    num = starts[starts.shape[0] - 1]
+    centers, rows = np.empty((3, num), np.float32), np.empty(num, np.int32)
+    gather_centers(slots, state[0], voxel_size, workers, centers, rows)
     look_all(
         views, is_sound, frame[0], frame[1][0], frame[1][1], state[0], state[1], state[2],
         state[3], state[4], voxel_size, starts, spheres, rows, centers, forms[0], forms[1],

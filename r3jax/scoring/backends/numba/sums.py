@@ -8,12 +8,15 @@ import math
 import numpy as np
 from numba import prange
 
-from r3jax.native.arithmetic import floor, log2, whole
+from r3jax.native.arithmetic import floor, whole
 from r3jax.native.compiled import claim, inlined, inlined_fused, kernel, parallel_kernel
 from r3jax.scoring.backends.numba.terms import (
     ANGLES,
+    DELTAS,
     INSIDE,
+    LOG_DELTAS,
     RANGE,
+    SHARPNESS,
     TO_X,
     TO_Y,
     TO_Z,
@@ -23,14 +26,14 @@ from r3jax.scoring.backends.numba.terms import (
 from r3jax.scoring.backends.numba.voxels import (
     DELTA,
     LOG_DELTA,
-    LOG_RESOLUTION,
+    RESOLUTION,
     SIZE,
     X,
     Y,
     Z,
     gather_voxels,
 )
-from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_rows
+from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots
 from r3jax.visibility.backends.numba.limit import padded_size, surface_limit
 from r3jax.visibility.backends.numba.seen import test_corners, test_points
 from r3jax.visibility.backends.numba.splat import (
@@ -147,9 +150,13 @@ def _compact(is_seen, count, chosen):
 def _find_directions(position, points, first, chosen, num, size, angles, cells):
     """Finds unit vectors from a position to chosen points, distances, and octahedral cells."""
     x, y, z = position
+    # Gathered by themselves, so that LLVM vectorizes the arithmetic.
     for j in range(num):
         at = first + np.int64(chosen[j])
-        dx, dy, dz = points[X, at] - x, points[Y, at] - y, points[Z, at] - z
+        angles[TO_X + j], angles[TO_Y + j] = points[X, at], points[Y, at]
+        angles[TO_Z + j] = points[Z, at]
+    for j in range(num):
+        dx, dy, dz = angles[TO_X + j] - x, angles[TO_Y + j] - y, angles[TO_Z + j] - z
         distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), _LEAST)
         inverse = _ONE / distance
         dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
@@ -174,17 +181,18 @@ def _add_by_direction(angles, cells, weights, num, table, lattice, sums):
 def _find_deficits(known, first, chosen, num, settings, directions, angles, weights):
     """Finds 1 - R of chosen voxels."""
     voxels, visited = known
-    is_always_one, log_focal = settings
+    is_always_one, focal = settings
     for j in range(num):
         at = first + np.int64(chosen[j])
         from_voxel = -angles[TO_X + j], -angles[TO_Y + j], -angles[TO_Z + j]
         cosine, is_inside = look_from(visited, at, directions, from_voxel)
         weights[j], angles[INSIDE + j] = cosine, np.float32(is_inside | is_always_one)
+        angles[DELTAS + j], angles[LOG_DELTAS + j] = voxels[DELTA, at], voxels[LOG_DELTA, at]
+        angles[SHARPNESS + j] = voxels[RESOLUTION, at]
     for j in range(num):
-        at = first + np.int64(chosen[j])
         weights[j] = _ONE - product_of_terms(
-            weights[j], angles[INSIDE + j] > _ZERO, angles[RANGE + j],
-            voxels[DELTA, at], voxels[LOG_DELTA, at], voxels[LOG_RESOLUTION, at], log_focal,
+            weights[j], angles[INSIDE + j] > _ZERO, angles[RANGE + j], angles[DELTAS + j],
+            angles[LOG_DELTAS + j], angles[SHARPNESS + j], focal,
         )  # fmt: skip
 
 
@@ -218,7 +226,7 @@ def add_seen_voxels(view, wraps, shape, voxel_size, runs, known, limit, chunk, o
     placed, pixels, is_seen, chosen, angles, bins, weights = chunk
     directions, table, lattice = options[1]
     side, size = side_of(shape), np.float32(math.sqrt(table.shape[0]))
-    settings = options[0], log2(view[FOCAL])
+    settings = options[0], view[FOCAL]
     position = view[POSITION], view[POSITION + 1], view[POSITION + 2]
     for begin, end in runs:
         for first in range(begin, end, CHUNK):
@@ -344,19 +352,20 @@ def sums_pass(state, cells, views, frame, forms, tables, workers, results):
         results: written; sums of 1 - R [P, B], numbers of unexplored cells [P, B], and a bit for
             each row of the map and each cell that a view sees [P, N / 8], [P, c / 8], or [P, 0].
     """
-    key, visited, count, _, _, voxel_size = state
+    key, words, count, m2, resolution, voxel_size = state
     is_sound = sound_views(views, voxel_size)
     most = 1 if views.shape[0] <= FEW else MOST
-    rows, starts, spheres = sorted_rows(key, count, views, is_sound, voxel_size, most, workers)
-    num = rows.shape[0]
-    voxels, words = (
-        np.empty((SIZE, num), np.float32),
-        np.empty(((visited.shape[0] + 1) // 2, num), np.uint64),
-    )
-    gather_voxels(rows, state, forms[1], workers, voxels, words)
+    slots, starts, spheres = sorted_slots(key, count, views, is_sound, voxel_size, most, workers)
+    num = starts[starts.shape[0] - 1]
+    voxels, rows = np.empty((SIZE, num), np.float32), np.empty(num, np.int32)
+    visited = np.empty(((words.shape[0] + 1) // 2, num), np.uint64)
+    gather_voxels(
+        slots, key, words, count, m2, resolution, voxel_size, forms[1], workers,
+        voxels, visited, rows,
+    )  # fmt: skip
     empty, numbers = unexplored_of(cells[:3], cells[3])
     score_all(
         views, is_sound, frame[0], frame[1][0], frame[1][1], voxel_size, starts, spheres,
-        voxels, words, rows, empty, numbers, forms[0], tables[0], tables[1], tables[2], workers,
+        voxels, visited, rows, empty, numbers, forms[0], tables[0], tables[1], tables[2], workers,
         results[0], results[1], results[2], results[3],
     )  # fmt: skip

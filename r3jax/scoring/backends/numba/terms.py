@@ -12,9 +12,10 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
-from r3jax.native.arithmetic import exp2, log2
+from r3jax.native.arithmetic import exp2
 from r3jax.native.compiled import inlined_fused, intrinsic
 from r3jax.scoring import directions
+from r3jax.scoring.backends.numba.voxels import log2_or_never
 from r3jax.visibility.backends.numba.views import CHUNK
 
 TO_X, TO_Y, TO_Z = 0 * CHUNK, 1 * CHUNK, 2 * CHUNK
@@ -24,8 +25,11 @@ RANGE, INSIDE = 3 * CHUNK, 4 * CHUNK
 """distance [m], and 1 where the camera lies in the box of the directions from which a voxel was
 seen."""
 
-ANGLES = 5 * CHUNK
-"""Floats that a chunk's angles take."""
+DELTAS, LOG_DELTAS, SHARPNESS = 5 * CHUNK, 6 * CHUNK, 7 * CHUNK
+"""What is known of the voxels, see `voxels`: the last is the best resolution."""
+
+ANGLES = 8 * CHUNK
+"""Floats that all this of a chunk takes."""
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 _INFINITE, _POLE, _LEAST = np.float32(np.inf), np.float32(1e-12), np.float32(1e-6)
@@ -83,9 +87,9 @@ def look_from(visited, at, lattice, direction):
 
 
 @inlined_fused
-def product_of_terms(cosine, is_one, distance, delta, log_delta, log_resolution, log_focal):
+def product_of_terms(cosine, is_one, distance, delta, log_delta, resolution, focal):
     """R of one voxel from its angle and what is known of it."""
     kappa = _ONE if is_one else _TWO
     bias = cosine if is_one else cosine * cosine
-    ratio = min(log_resolution + log2(distance) - log_focal, _ZERO)
+    ratio = log2_or_never(min(resolution * distance / focal, _ONE))
     return bias * exp2(kappa * (_ONE - bias) * log_delta + (_ONE - delta * bias) * ratio)

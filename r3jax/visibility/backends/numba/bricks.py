@@ -114,21 +114,25 @@ def begin_bricks(counts, starts, bricks):
 
 
 @parallel_kernel
-def sort_rows(key, count, box, shift, dims, counts, rows):
-    """Writes the rows brick by brick, within a brick in the order of the map."""
+def sort_rows(key, count, box, shift, dims, counts, slots):
+    """Finds the slot of every row, brick by brick and within one in the order of the map; -1: none.
+
+    Slots by row, not rows by slot: what is gathered is then read in the order in which it lies.
+    """
     shares, num = counts.shape[0], count.shape[0]
     for share in prange(shares):
         own = counts[share]
         for row in range(num * share // shares, num * (share + 1) // shares):
+            slots[row] = -1
             if count[row] > 0.0:
                 brick = _brick_of(key, row, box, shift, dims)
                 if brick >= 0:
-                    rows[own[brick]] = row
+                    slots[row] = own[brick]
                     own[brick] += 1
 
 
 @kernel
-def sorted_rows(key, count, views, is_sound, voxel_size, most, workers):
+def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
     """Sorts the rows that some view may see into bricks.
 
     Args:
@@ -141,8 +145,8 @@ def sorted_rows(key, count, views, is_sound, voxel_size, most, workers):
         workers: threads.
 
     Returns:
-        The rows [n]; where each brick begins among them [b + 1]; and the middle and half the
-        diagonal of each brick [b, 4] [m].
+        The slot of every row [N], -1 for those out of range; where each brick begins among the
+        slots [b + 1]; and the middle and half the diagonal of each brick [b, 4] [m].
     """
     box = box_of(views, is_sound, voxel_size)
     shift, dims = divide(box, most)
@@ -151,8 +155,8 @@ def sorted_rows(key, count, views, is_sound, voxel_size, most, workers):
     count_rows(key, count, box, shift, dims, counts)
     starts, bricks = np.empty(num_bricks + 1, np.int64), np.empty(num_bricks, np.int64)
     used = begin_bricks(counts, starts, bricks)
-    rows = np.empty(starts[used], np.int32)
-    sort_rows(key, count, box, shift, dims, counts, rows)
+    slots = np.empty(count.shape[0], np.int32)
+    sort_rows(key, count, box, shift, dims, counts, slots)
     spheres = np.empty((used, 4), np.float32)
     for b in range(used):
         i, rest = bricks[b] // (dims[1] * dims[2]), bricks[b] % (dims[1] * dims[2])
@@ -161,7 +165,7 @@ def sorted_rows(key, count, views, is_sound, voxel_size, most, workers):
             low = box[0, axis] + (corner[axis] << shift)
             spheres[b, axis] = (np.float32(low) + _HALF * np.float32(1 << shift)) * voxel_size
         spheres[b, 3] = np.float32(math.sqrt(3.0)) * _HALF * np.float32(1 << shift) * voxel_size
-    return rows, starts[: used + 1], spheres
+    return slots, starts[: used + 1], spheres
 
 
 @inlined
