@@ -73,16 +73,9 @@ def numpy_lanes() -> ModuleType:
     return module
 
 
-def no_advice() -> ModuleType:
-    """Stands for `memory.py`."""
-    module = ModuleType("r3jax.native.memory")
-    module.__dict__["expect_writes"] = lambda array: None
-    return module
-
-
 @pytest.fixture(autouse=True, scope="module")
 def plain_python():
-    doubles = python_compiler(), numpy_lanes(), no_advice()
+    doubles = python_compiler(), numpy_lanes()
     with mock.patch.dict(sys.modules, {double.__name__: double for double in doubles}):
         yield
 
