@@ -97,6 +97,32 @@ def whole(typingctx, value):
 
 
 @intrinsic
+def count_bits(typingctx, word):
+    """How many bits of a word of 32 are set."""
+
+    def codegen(context, builder, sig, args):
+        return builder.zext(builder.ctpop(args[0]), ir.IntType(64))
+
+    return types.int64(types.uint32), codegen
+
+
+@intrinsic
+def bits_of(typingctx, value):
+    """The bits of a float, as a word of 32."""
+    return types.uint32(types.float32), lambda context, builder, sig, args: _bits(builder, args[0])
+
+
+@intrinsic
+def float_of(typingctx, word):
+    """The float of which a word of 32 holds the bits."""
+
+    def codegen(context, builder, sig, args):
+        return builder.bitcast(args[0], _FLOAT)
+
+    return types.float32(types.uint32), codegen
+
+
+@intrinsic
 def _add_bits(typingctx, value, other):
     """The float whose bits are the sum of two floats' bits."""
 

@@ -9,20 +9,25 @@ import numpy as np
 from numba import prange
 
 from r3jax.native.arithmetic import key_of
-from r3jax.native.compiled import claim, inlined, inlined_fused, kernel, parallel_kernel
+from r3jax.native.compiled import (
+    claim,
+    inlined,
+    inlined_fused,
+    kernel,
+    parallel_kernel,
+)
 from r3jax.scoring.backends.numba.sums import FEW, sound_views
 from r3jax.scoring.backends.numba.terms import look_from, product_of_terms
-from r3jax.scoring.backends.numba.voxels import bins_of, consistency, log2_or_never
-from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots, voxel_of
-from r3jax.visibility.backends.numba.splat import (
-    SPARE,
-    TARGETS,
-    find_targets,
-    finest,
+from r3jax.scoring.backends.numba.voxels import bins_of, center_of, consistency, log2_or_never
+from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots
+from r3jax.visibility.backends.numba.picture import (
+    begin_of,
     push_down,
     pyramid_size,
     side_of,
+    stride_of,
 )
+from r3jax.visibility.backends.numba.splat import SPARE, TARGETS, find_targets
 from r3jax.visibility.backends.numba.views import (
     CHUNK,
     DISTANCE,
@@ -34,18 +39,7 @@ from r3jax.visibility.backends.numba.views import (
 
 _NOTHING = np.int64(2**63 - 1)
 _ROW = np.int64(2**32 - 1)
-_HALF, _ONE, _LEAST = np.float32(0.5), np.float32(1.0), np.float32(1e-6)
-
-
-@inlined
-def _center_of(key, row, voxel_size):
-    """Center of the voxel in a row of the map [m]."""
-    x, y, z = voxel_of(key, row)
-    return (
-        (np.float32(x) + _HALF) * voxel_size,
-        (np.float32(y) + _HALF) * voxel_size,
-        (np.float32(z) + _HALF) * voxel_size,
-    )
+_ONE, _LEAST = np.float32(1.0), np.float32(1e-6)
 
 
 @parallel_kernel
@@ -56,7 +50,7 @@ def gather_centers(slots, key, voxel_size, workers, centers, rows):
         for row in range(capacity * share // workers, capacity * (share + 1) // workers):
             slot = slots[row]
             if slot >= 0:
-                x, y, z = _center_of(key, row, voxel_size)
+                x, y, z = center_of(key, row, voxel_size)
                 centers[0, slot], centers[1, slot], centers[2, slot] = x, y, z
                 rows[slot] = row
 
@@ -67,7 +61,7 @@ def _keep_nearest(placed, targets, first, count, rows, keys):
     for i in range(count):
         key = key_of(placed[DISTANCE + i], rows[first + i])
         for corner in range(4):
-            at = targets[corner * CHUNK + i]
+            at = np.uint32(targets[corner * CHUNK + i])
             keys[at] = min(keys[at], key)
 
 
@@ -81,16 +75,16 @@ def nearest_rows(view, wraps, shape, voxel_size, runs, centers, rows, chunk, key
         for first in range(begin, end, CHUNK):
             count = min(CHUNK, end - first)
             place(view, shape, wraps, centers[0], centers[1], centers[2], first, count, placed)
-            find_targets(placed, count, voxel_size, shape, side, wraps, targets)
+            find_targets(placed, count, voxel_size, side, targets)
             _keep_nearest(placed, targets, first, count, rows, keys)
-    push_down(keys, side, shape)
+    push_down(keys, side, shape, wraps)
 
 
 @inlined_fused
 def _value_of(row, view, state, forms, directions, bits):
     """R of the voxel in a row of the map, as a view sees it."""
     key, words, count, m2, resolution, voxel_size = state
-    x, y, z = _center_of(key, row, voxel_size)
+    x, y, z = center_of(key, row, voxel_size)
     dx, dy, dz = view[POSITION] - x, view[POSITION + 1] - y, view[POSITION + 2] - z
     distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), _LEAST)
     inverse = _ONE / distance
@@ -111,7 +105,7 @@ def _mean_of(keys, side, shape, view, state, forms, directions, bits):
     total, last, value = 0.0, np.int64(-1), np.float32(0.0)
     for r in range(shape[0]):
         for c in range(shape[1]):
-            key = keys[r * side + c]
+            key = keys[begin_of(0, side) + r * stride_of(side) + c]
             if key < _INFINITE_KEY:
                 row = key & _ROW
                 if row != last:
@@ -131,7 +125,7 @@ def _write_rows(keys, side, shape, num, image):
     if image.shape[0] > 0:
         for r in range(shape[0]):
             for c in range(shape[1]):
-                key = keys[r * side + c]
+                key = keys[begin_of(0, side) + r * stride_of(side) + c]
                 image[r * shape[1] + c] = key & _ROW if key < _INFINITE_KEY else num
 
 
@@ -155,11 +149,10 @@ def _look_share(next_view, views, is_sound, frame, state, index, forms, directio
             nearest_rows(
                 view, wraps, shape, voxel_size, runs[:num], centers, rows, (placed, targets), keys
             )
-            shown = finest(keys, side)
             if images.shape[1] > 0:
-                _write_rows(shown, side, shape, state[2].shape[0], images[i])
+                _write_rows(keys, side, shape, state[2].shape[0], images[i])
             else:
-                means[i] = _mean_of(shown, side, shape, view, state, forms, directions, bits)
+                means[i] = _mean_of(keys, side, shape, view, state, forms, directions, bits)
         i = claim(next_view)
 
 

@@ -9,7 +9,14 @@ import numpy as np
 from numba import prange
 
 from r3jax.native.arithmetic import floor, whole
-from r3jax.native.compiled import claim, inlined, inlined_fused, kernel, parallel_kernel
+from r3jax.native.compiled import (
+    claim,
+    in_wide_vectors,
+    inlined,
+    inlined_fused,
+    kernel,
+    parallel_kernel,
+)
 from r3jax.scoring.backends.numba.terms import (
     ANGLES,
     DELTAS,
@@ -35,16 +42,17 @@ from r3jax.scoring.backends.numba.voxels import (
 )
 from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots
 from r3jax.visibility.backends.numba.limit import padded_size, surface_limit
-from r3jax.visibility.backends.numba.seen import test_corners, test_points
-from r3jax.visibility.backends.numba.splat import (
-    SPARE,
-    TARGETS,
-    find_targets,
-    finest,
+from r3jax.visibility.backends.numba.picture import (
+    begin_of,
+    fill_ring,
+    picture_size,
     push_down,
     pyramid_size,
     side_of,
+    stride_of,
 )
+from r3jax.visibility.backends.numba.seen import test_corners, test_points
+from r3jax.visibility.backends.numba.splat import SPARE, TARGETS, find_targets
 from r3jax.visibility.backends.numba.views import (
     CHUNK,
     DISTANCE,
@@ -79,7 +87,7 @@ def splat_chunk(placed, targets, count, pixels):
     for i in range(count):
         distance = placed[DISTANCE + i]
         for corner in range(4):
-            at = targets[corner * CHUNK + i]
+            at = np.uint32(targets[corner * CHUNK + i])
             pixels[at] = min(pixels[at], distance)
 
 
@@ -95,7 +103,7 @@ def nearest_distance(view, wraps, shape, voxel_size, runs, voxels, chunk, pixels
         runs: of voxels that may be seen, see `find_runs`.
         voxels: see `gather_voxels`.
         chunk: scratch: placement and targets.
-        pixels: written; a pyramid, whose finest level is the answer.
+        pixels: written; a pyramid (`picture`), whose finest level is the answer.
     """
     placed, targets = chunk
     side = side_of(shape)
@@ -104,9 +112,9 @@ def nearest_distance(view, wraps, shape, voxel_size, runs, voxels, chunk, pixels
         for first in range(begin, end, CHUNK):
             count = min(CHUNK, end - first)
             place(view, shape, wraps, voxels[X], voxels[Y], voxels[Z], first, count, placed)
-            find_targets(placed, count, voxel_size, shape, side, wraps, targets)
+            find_targets(placed, count, voxel_size, side, targets)
             splat_chunk(placed, targets, count, pixels)
-    push_down(pixels, side, shape)
+    push_down(pixels, side, shape, wraps)
 
 
 @inlined_fused
@@ -149,6 +157,7 @@ def _compact(is_seen, count, chosen):
 @inlined_fused
 def _find_directions(position, points, first, chosen, num, size, angles, cells):
     """Finds unit vectors from a position to chosen points, distances, and octahedral cells."""
+    in_wide_vectors()
     x, y, z = position
     # Gathered by themselves, so that LLVM vectorizes the arithmetic.
     for j in range(num):
@@ -180,6 +189,7 @@ def _add_by_direction(angles, cells, weights, num, table, lattice, sums):
 @inlined_fused
 def _find_deficits(known, first, chosen, num, settings, directions, angles, weights):
     """Finds 1 - R of chosen voxels."""
+    in_wide_vectors()
     voxels, visited = known
     is_always_one, focal = settings
     for j in range(num):
@@ -232,7 +242,7 @@ def add_seen_voxels(view, wraps, shape, voxel_size, runs, known, limit, chunk, o
         for first in range(begin, end, CHUNK):
             count = min(CHUNK, end - first)
             place(view, shape, wraps, voxels[X], voxels[Y], voxels[Z], first, count, placed)
-            test_corners(placed, count, voxel_size, limit, side, shape, wraps, pixels, is_seen)
+            test_corners(placed, count, voxel_size, limit, side, shape, pixels, is_seen)
             num = _compact(is_seen, count, chosen)
             _find_directions(position, voxels, first, chosen, num, size, angles, bins)
             _mark(rows, first, chosen, num, bits)
@@ -254,7 +264,7 @@ def count_seen_cells(view, wraps, shape, empty, nearest, chunk, tables, counts, 
     for first in range(0, cells.shape[1], CHUNK):
         count = min(CHUNK, cells.shape[1] - first)
         place(view, shape, wraps, cells[X], cells[Y], cells[Z], first, count, placed)
-        test_points(placed, count, nearest, side, shape, wraps, is_seen)
+        test_points(placed, count, nearest, side, shape, is_seen)
         num = _compact(is_seen, count, chosen)
         _mark(numbers, first, chosen, num, bits)
         _find_directions(position, cells, first, chosen, num, size, angles, bins)
@@ -291,9 +301,10 @@ def _score_share(
     is_seen, chosen = np.empty(CHUNK, np.int32), np.empty(CHUNK + 1, np.int32)
     angles, bins = np.empty(ANGLES, np.float32), np.zeros(CHUNK, np.int32)
     weights = np.empty(CHUNK, np.float32)
-    pixels = np.empty(pyramid_size(side) + SPARE, np.float32)
-    nearest = finest(pixels, side)
-    limit, padded = np.empty(side * side, np.float32), np.empty(padded_size(shape), np.float32)
+    nearest, limit = (
+        np.empty(pyramid_size(side) + SPARE, np.float32), np.empty(picture_size(side), np.float32),
+    )  # fmt: skip
+    padded, slopes = np.empty(padded_size(shape), np.float32), np.empty(shape[1], np.float32)
     sums, runs = np.empty(lacks.shape[1], np.float64), np.empty((spheres.shape[0], 2), np.int64)
     i = claim(next_view)
     while i < views.shape[0]:
@@ -302,10 +313,11 @@ def _score_share(
         if is_sound[i]:
             num = find_runs(view, wraps, shape, voxel_size, starts, spheres, runs)
             nearest_distance(
-                view, wraps, shape, voxel_size, runs[:num], known[0], (placed, targets), pixels
+                view, wraps, shape, voxel_size, runs[:num], known[0], (placed, targets), nearest
             )
             allowance = view[TOLERANCE] * voxel_size
-            surface_limit(nearest, side, shape, view[PIXEL_ANGLE], allowance, padded, limit)
+            surface_limit(nearest, side, shape, view[PIXEL_ANGLE], allowance, padded, slopes, limit)
+            fill_ring(limit, begin_of(0, side), stride_of(side), shape, wraps)
             add_seen_voxels(
                 view, wraps, shape, voxel_size, runs[:num], known, limit,
                 (placed, targets, is_seen, chosen, angles, bins, weights), options, sums,
@@ -360,7 +372,7 @@ def sums_pass(state, cells, views, frame, forms, tables, workers, results):
     voxels, rows = np.empty((SIZE, num), np.float32), np.empty(num, np.int32)
     visited = np.empty(((words.shape[0] + 1) // 2, num), np.uint64)
     gather_voxels(
-        slots, key, words, count, m2, resolution, voxel_size, forms[1], workers,
+        slots, starts, key, words, count, m2, resolution, voxel_size, forms[1], workers,
         voxels, visited, rows,
     )  # fmt: skip
     empty, numbers = unexplored_of(cells[:3], cells[3])

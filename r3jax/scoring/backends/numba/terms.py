@@ -66,7 +66,7 @@ def look_from(visited, at, lattice, direction):
     a_x, a_y = (_ONE if is_pole else -y), (_ZERO if is_pole else x)
     b_x, b_y, b_z = -z * a_y, z * a_x, x * a_y - y * a_x
     best = _ZERO
-    a_low, b_low, a_high, b_high = _INFINITE, _INFINITE, -_INFINITE, -_INFINITE
+    a_low, b_low, minus_a_high, minus_b_high = _INFINITE, _INFINITE, _INFINITE, _INFINITE
     for w in range(visited.shape[0]):
         word = visited[w, at]
         while word != _NO_BITS:
@@ -75,21 +75,39 @@ def look_from(visited, at, lattice, direction):
             q_x, q_y, q_z = lattice[k, 0], lattice[k, 1], lattice[k, 2]
             cosine = q_x * x + q_y * y + q_z * z
             best = max(best, cosine)
-            is_ahead = cosine > _ZERO
+            # Added, not chosen between: what is not ahead is no bound of the box.
+            apart = _ZERO if cosine > _ZERO else _INFINITE
             a = q_x * a_x + q_y * a_y
             b = q_x * b_x + q_y * b_y + q_z * b_z
-            a_low = min(a_low, a if is_ahead else _INFINITE)
-            b_low = min(b_low, b if is_ahead else _INFINITE)
-            a_high = max(a_high, a if is_ahead else -_INFINITE)
-            b_high = max(b_high, b if is_ahead else -_INFINITE)
-    is_inside = (a_low <= _EDGE) & (a_high >= -_EDGE) & (b_low <= _EDGE) & (b_high >= -_EDGE)
+            a_low, minus_a_high = min(a_low, apart + a), min(minus_a_high, apart - a)
+            b_low, minus_b_high = min(b_low, apart + b), min(minus_b_high, apart - b)
+    low, minus_high = max(a_low, b_low), max(minus_a_high, minus_b_high)
+    is_inside = (low <= _EDGE) & (minus_high <= _EDGE)
     return min(best, _ONE), is_inside
 
 
 @inlined_fused
-def product_of_terms(cosine, is_one, distance, delta, log_delta, resolution, focal):
-    """R of one voxel from its angle and what is known of it."""
+def bias_of(cosine, is_one):
+    """B = cos^kappa, with kappa 1 or 2."""
+    return cosine if is_one else cosine * cosine
+
+
+@inlined_fused
+def log_noise(bias, is_one, log_delta):
+    """log2 of delta^(kappa (1 - b))."""
     kappa = _ONE if is_one else _TWO
-    bias = cosine if is_one else cosine * cosine
-    ratio = log2_or_never(min(resolution * distance / focal, _ONE))
-    return bias * exp2(kappa * (_ONE - bias) * log_delta + (_ONE - delta * bias) * ratio)
+    return kappa * (_ONE - bias) * log_delta
+
+
+@inlined_fused
+def log_resolution(bias, delta, best, distance, focal):
+    """log2 of min(1, rho_max / rho)^(1 - delta b), with rho = focal / distance."""
+    return (_ONE - delta * bias) * log2_or_never(min(best * distance / focal, _ONE))
+
+
+@inlined_fused
+def product_of_terms(cosine, is_one, distance, delta, log_delta, best, focal):
+    """R of one voxel from its angle and what is known of it; one power instead of two."""
+    bias = bias_of(cosine, is_one)
+    power = log_noise(bias, is_one, log_delta) + log_resolution(bias, delta, best, distance, focal)
+    return bias * exp2(power)

@@ -8,9 +8,10 @@ import math
 import numpy as np
 from numba import prange
 
-from r3jax.native.arithmetic import log2
-from r3jax.native.compiled import inlined, parallel_kernel
+from r3jax.native.arithmetic import bits_of, count_bits, float_of, log2
+from r3jax.native.compiled import inlined, kernel, parallel_kernel
 from r3jax.visibility.backends.numba.bricks import voxel_of
+from r3jax.visibility.backends.numba.views import CHUNK
 
 X, Y, Z, DELTA, LOG_DELTA, RESOLUTION = 0, 1, 2, 3, 4, 5
 """Rows of the array that `gather_voxels` writes: center [m], color consistency and log2 of it,
@@ -18,11 +19,28 @@ best resolution [px/m]."""
 
 SIZE = 6
 
+_ROW, _WORDS = 6, 7
+"""Parts of a record beside those: the row of the map, and where the words of bins begin."""
+
+_CLASSES = 8
+"""Numbers of directions that are told apart: 0 to 6, and more."""
+
 NEVER = np.float32(-1e30)
 """Stands for log2 of 0: any power of it but the zeroth is 0, and the zeroth is 1."""
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 _TWO_THIRDS_OF_TWO = np.float32(2.0 / 1.5)
+
+
+@inlined
+def center_of(key, row, voxel_size):
+    """Center of the voxel in a row of the map [m]."""
+    x, y, z = voxel_of(key, row)
+    return (
+        (np.float32(x) + _HALF) * voxel_size,
+        (np.float32(y) + _HALF) * voxel_size,
+        (np.float32(z) + _HALF) * voxel_size,
+    )
 
 
 @inlined
@@ -48,13 +66,49 @@ def bins_of(words, word, row):
     return bits
 
 
+@inlined
+def _num_directions(record, words):
+    """How many bins a voxel was seen from."""
+    num = np.int64(0)
+    for word in range(words):
+        num += count_bits(record[_WORDS + word])
+    return num
+
+
+@kernel
+def _unpack_sorted(records, begin, end, words, counts, voxels, visited, rows):
+    """Unpacks records, those that were seen from few directions first.
+
+    A counting sort. Loops over the directions of one voxel after the other then end after as many
+    turns as the ones before, which the processor foresees.
+    """
+    counts[:] = 0
+    for i in range(begin, end):
+        counts[min(_num_directions(records[i], words), _CLASSES - 1)] += 1
+    place = begin
+    for i in range(_CLASSES):
+        counts[i], place = place, place + counts[i]
+    for i in range(begin, end):
+        record = records[i]
+        group = min(_num_directions(record, words), _CLASSES - 1)
+        place = counts[group]
+        counts[group] += 1
+        rows[place] = record[_ROW]
+        for part in range(SIZE):
+            voxels[part, place] = float_of(record[part])
+        for word in range(0, words, 2):
+            high = np.uint64(record[_WORDS + word + 1]) if word + 1 < words else np.uint64(0)
+            visited[word >> 1, place] = np.uint64(record[_WORDS + word]) | (high << np.uint64(32))
+
+
 @parallel_kernel
-def gather_voxels(slots, key, words, count, m2, resolution, voxel_size, is_pairwise, workers,
-                  voxels, visited, rows):  # fmt: skip
+def gather_voxels(slots, starts, key, words, count, m2, resolution, voxel_size, is_pairwise,
+                  workers, voxels, visited, rows):  # fmt: skip
     """Gathers what is known of voxels in the order of the bricks.
 
     Args:
         slots: of every row of the map, -1: none [N].
+        starts: of the bricks among the slots [b + 1].
         key: of the map, like the next five.
         words: its visited bins, 32 in a word.
         count: observations.
@@ -67,25 +121,25 @@ def gather_voxels(slots, key, words, count, m2, resolution, voxel_size, is_pairw
         visited: written, the visited bins, 64 in a word [ceil(W / 2), n].
         rows: written, the rows of the map [n].
     """
-    num, capacity = rows.shape[0], slots.shape[0]
-    records = np.empty((num, SIZE), np.float32)
+    num, capacity, num_words = rows.shape[0], slots.shape[0], words.shape[0]
+    # Records, so that a voxel out of its order costs one miss of the cache and not one for each.
+    records = np.empty((num, _WORDS + num_words), np.uint32)
     for share in prange(workers):
         for row in range(capacity * share // workers, capacity * (share + 1) // workers):
-            slot = slots[row]
-            if slot >= 0:
-                # One record, so that a voxel costs one miss of the cache and not six.
-                record = records[slot]
-                x, y, z = voxel_of(key, row)
-                record[X] = (np.float32(x) + _HALF) * voxel_size
-                record[Y] = (np.float32(y) + _HALF) * voxel_size
-                record[Z] = (np.float32(z) + _HALF) * voxel_size
+            if slots[row] >= 0:
+                record = records[slots[row]]
                 delta = consistency(count[row], m2[row], is_pairwise)
-                record[DELTA], record[LOG_DELTA] = delta, log2_or_never(delta)
-                record[RESOLUTION] = resolution[row]
-                rows[slot] = row
-                for word in range(0, words.shape[0], 2):
-                    visited[word >> 1, slot] = bins_of(words, word, row)
+                x, y, z = center_of(key, row, voxel_size)
+                record[X], record[Y], record[Z] = bits_of(x), bits_of(y), bits_of(z)
+                record[DELTA], record[LOG_DELTA] = bits_of(delta), bits_of(log2_or_never(delta))
+                record[RESOLUTION], record[_ROW] = bits_of(resolution[row]), row
+                for word in range(num_words):
+                    record[_WORDS + word] = words[word, row]
     for share in prange(workers):
-        for i in range(num * share // workers, num * (share + 1) // workers):
-            for part in range(SIZE):
-                voxels[part, i] = records[i, part]
+        first, last = num * share // workers, num * (share + 1) // workers
+        counts = np.empty(_CLASSES, np.int64)
+        for brick in range(starts.shape[0] - 1):
+            for begin in range(starts[brick], starts[brick + 1], CHUNK):
+                if first <= begin < last:
+                    end = min(begin + CHUNK, starts[brick + 1])
+                    _unpack_sorted(records, begin, end, num_words, counts, voxels, visited, rows)

@@ -58,11 +58,10 @@ def box_of(views, is_sound, voxel_size):
 def _brick_of(key, row, box, shift, dims):
     """Number of a row's brick; -1 outside the box."""
     x, y, z = voxel_of(key, row)
-    inside = (x >= box[0, 0]) & (x <= box[1, 0]) & (y >= box[0, 1]) & (y <= box[1, 1])
-    if not (inside & (z >= box[0, 2]) & (z <= box[1, 2])):
-        return np.int64(-1)
+    is_in = (x >= box[0, 0]) & (x <= box[1, 0]) & (y >= box[0, 1]) & (y <= box[1, 1])
+    is_in = is_in & (z >= box[0, 2]) & (z <= box[1, 2])
     i, j, k = (x - box[0, 0]) >> shift, (y - box[0, 1]) >> shift, (z - box[0, 2]) >> shift
-    return (i * dims[1] + j) * dims[2] + k
+    return (i * dims[1] + j) * dims[2] + k if is_in else np.int64(-1)
 
 
 @kernel
@@ -79,17 +78,17 @@ def divide(box, most):
 
 
 @parallel_kernel
-def count_rows(key, count, box, shift, dims, counts):
-    """Counts the rows in every brick, for each share of the rows apart."""
+def count_rows(key, count, box, shift, dims, bricks, counts):
+    """Finds the brick of every row, -1: none, and counts them, for each share of the rows apart."""
     shares, num = counts.shape[0], count.shape[0]
     for share in prange(shares):
         own = counts[share]
         own[:] = 0
         for row in range(num * share // shares, num * (share + 1) // shares):
-            if count[row] > 0.0:
-                brick = _brick_of(key, row, box, shift, dims)
-                if brick >= 0:
-                    own[brick] += 1
+            brick = _brick_of(key, row, box, shift, dims) if count[row] > 0.0 else np.int64(-1)
+            bricks[row] = brick
+            if brick >= 0:
+                own[brick] += 1
 
 
 @kernel
@@ -114,21 +113,19 @@ def begin_bricks(counts, starts, bricks):
 
 
 @parallel_kernel
-def sort_rows(key, count, box, shift, dims, counts, slots):
-    """Finds the slot of every row, brick by brick and within one in the order of the map; -1: none.
+def number_slots(counts, slots):
+    """Replaces the brick of every row by its slot, in the order of the map within a brick.
 
     Slots by row, not rows by slot: what is gathered is then read in the order in which it lies.
     """
-    shares, num = counts.shape[0], count.shape[0]
+    shares, num = counts.shape[0], slots.shape[0]
     for share in prange(shares):
         own = counts[share]
         for row in range(num * share // shares, num * (share + 1) // shares):
-            slots[row] = -1
-            if count[row] > 0.0:
-                brick = _brick_of(key, row, box, shift, dims)
-                if brick >= 0:
-                    slots[row] = own[brick]
-                    own[brick] += 1
+            brick = slots[row]
+            if brick >= 0:
+                slots[row] = own[brick]
+                own[brick] += 1
 
 
 @kernel
@@ -152,11 +149,11 @@ def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
     shift, dims = divide(box, most)
     num_bricks = dims[0] * dims[1] * dims[2]
     counts = np.empty((workers, num_bricks), np.int32)
-    count_rows(key, count, box, shift, dims, counts)
+    slots = np.empty(count.shape[0], np.int32)
+    count_rows(key, count, box, shift, dims, slots, counts)
     starts, bricks = np.empty(num_bricks + 1, np.int64), np.empty(num_bricks, np.int64)
     used = begin_bricks(counts, starts, bricks)
-    slots = np.empty(count.shape[0], np.int32)
-    sort_rows(key, count, box, shift, dims, counts, slots)
+    number_slots(counts, slots)
     spheres = np.empty((used, 4), np.float32)
     for b in range(used):
         i, rest = bricks[b] // (dims[1] * dims[2]), bricks[b] % (dims[1] * dims[2])

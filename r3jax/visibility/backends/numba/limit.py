@@ -7,8 +7,9 @@ import math
 
 import numpy as np
 
-from r3jax.native.compiled import inlined_fused, kernel
+from r3jax.native.compiled import in_wide_vectors, inlined_fused, kernel
 from r3jax.visibility import slope
+from r3jax.visibility.backends.numba.picture import begin_of, stride_of
 
 MARGIN = max(slope.STRIDES)
 """Pixels by which a buffer is continued beyond its border."""
@@ -50,46 +51,71 @@ def _flatter(before, after, step):
 
 
 @inlined_fused
-def _steepest(padded, at, stride):
-    here = padded[at]
-    found = _ZERO
+def _steepest_down(lines, stride, slopes):
+    """Writes the slope along columns: lines of the buffer from `MARGIN` above to as many below."""
+    here = MARGIN * stride + MARGIN
+    middle = lines[here : here + slopes.shape[0]]
     for step in slope.STRIDES:
-        before = here - padded[at - step * stride]
-        after = padded[at + step * stride] - here
+        above, below = lines[here - step * stride :], lines[here + step * stride :]
+        for c in range(slopes.shape[0]):
+            flat = _flatter(middle[c] - above[c], below[c] - middle[c], np.float32(step))
+            slopes[c] = max(slopes[c], flat)
+
+
+@inlined_fused
+def _steepest_right(line, c):
+    """Slope along the row at one column; the line begins `MARGIN` before the first."""
+    here, found = line[MARGIN + c], _ZERO
+    for step in slope.STRIDES:
+        before, after = here - line[MARGIN + c - step], line[MARGIN + c + step] - here
         found = max(found, _flatter(before, after, np.float32(step)))
     return found
 
 
 @inlined_fused
-def surface_limit(distance, side, shape, pixel_angle, allowance, padded, limit):
+def _limit_line(distance, line, slopes, pixel_angle, allowance, limit):
+    """Writes the limits of one row, see `visibility.slope`."""
+    for c in range(slopes.shape[0]):
+        right, down = _steepest_right(line, c), slopes[c]
+        span = pixel_angle * max(line[MARGIN + c], _LEAST)
+        tangent = math.sqrt(down * down + right * right) / span
+        stretch = min(math.sqrt(_ONE + tangent * tangent), _MAX_STRETCH)
+        limit[c] = distance[c] + allowance * stretch
+
+
+@kernel
+def surface_limit(distance, side, shape, pixel_angle, allowance, padded, slopes, limit):
     """Finds the distance up to which voxels count as the surface in the buffer [m].
 
     Args:
-        distance: the buffer, rows `side` apart [m].
-        side: columns of a row as it is stored.
+        distance: the buffer, see `picture` [m].
+        side: of the picture.
         shape: height and width of the image [px].
         pixel_angle: angle that a pixel covers [rad].
         allowance: depth of the surface across itself [m].
         padded: scratch, `padded_size(shape)`.
-        limit: written, rows `side` apart.
+        slopes: scratch, one for each column.
+        limit: written, in places as those of `distance`.
     """
+    in_wide_vectors()
     height, width = shape
     stride = width + 2 * MARGIN
     first = MARGIN * stride + MARGIN
     for r in range(height):
+        at, to = begin_of(0, side) + r * stride_of(side), first + r * stride
+        line, source = padded[to : to + width], distance[at : at + width]
         for c in range(width):
-            padded[first + r * stride + c] = min(distance[r * side + c], _FAR)
+            line[c] = min(source[c], _FAR)
     _extend(padded, first, stride, height, 1, width)
     _extend(padded, first, 1, width, stride, height)
     for r in range(height):
-        for c in range(width):
-            at = first + r * stride + c
-            down, right = _steepest(padded, at, stride), _steepest(padded, at, 1)
-            tangent = math.sqrt(down * down + right * right) / (
-                pixel_angle * max(padded[at], _LEAST)
-            )
-            stretch = min(math.sqrt(_ONE + tangent * tangent), _MAX_STRETCH)
-            limit[r * side + c] = distance[r * side + c] + allowance * stretch
+        at = begin_of(0, side) + r * stride_of(side)
+        slopes[:] = _ZERO
+        _steepest_down(padded[r * stride :], stride, slopes)
+        _limit_line(
+            distance[at : at + width], padded[(r + MARGIN) * stride :], slopes, pixel_angle,
+            allowance, limit[at : at + width],
+        )  # fmt: skip
 
 
 @inlined_fused

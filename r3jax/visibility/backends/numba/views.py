@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from r3jax.native.compiled import inlined_fused
+from r3jax.native.compiled import in_wide_vectors, inlined_fused
 
 CHUNK = 512
 """Voxels at a time."""
@@ -23,7 +23,10 @@ DISTANCE = 6 * CHUNK
 """Infinite where a voxel lies behind the camera or out of range: so it hides nothing and is never
 seen, without a test."""
 
-PLACED = 7 * CHUNK
+REACH = 7 * CHUNK
+"""How far the view reaches at a voxel [m]; written by `seen.test_corners`."""
+
+PLACED = 8 * CHUNK
 """Floats that a chunk's placement takes."""
 
 POSITION, ROTATION, LENS, RANGE, TOLERANCE, FOCAL, PIXEL_ANGLE = 0, 3, 12, 16, 17, 18, 19
@@ -44,12 +47,13 @@ def _sign(x):
 
 
 @inlined_fused
-def place_all_round(view, size, x, y, z, first, count, placed):
+def place_all_round(view, size, x, y, z, placed):
     """Places voxels on the octahedral map round a position (`PanoramaView.place`)."""
+    in_wide_vectors()
     center_x, center_y, center_z = view[POSITION], view[POSITION + 1], view[POSITION + 2]
     far, half = view[RANGE], _HALF * np.float32(size)
-    for i in range(count):
-        dx, dy, dz = x[first + i] - center_x, y[first + i] - center_y, z[first + i] - center_z
+    for i in range(x.shape[0]):
+        dx, dy, dz = x[i] - center_x, y[i] - center_y, z[i] - center_z
         distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), _LEAST)
         inverse = _ONE / max(abs(dx) + abs(dy) + abs(dz), _LEAST)
         u, v = dx * inverse, dy * inverse
@@ -75,8 +79,9 @@ def place_all_round(view, size, x, y, z, first, count, placed):
 
 
 @inlined_fused
-def place_in_image(view, x, y, z, first, count, placed):
+def place_in_image(view, x, y, z, placed):
     """Places voxels in the image of a camera (`PinholeView.place`)."""
+    in_wide_vectors()
     center_x, center_y, center_z = view[POSITION], view[POSITION + 1], view[POSITION + 2]
     r = ROTATION
     xx, xy, xz = view[r], view[r + 1], view[r + 2]
@@ -84,8 +89,8 @@ def place_in_image(view, x, y, z, first, count, placed):
     zx, zy, zz = view[r + 6], view[r + 7], view[r + 8]
     fx, fy, cx, cy = view[LENS], view[LENS + 1], view[LENS + 2], view[LENS + 3]
     far = view[RANGE]
-    for i in range(count):
-        dx, dy, dz = x[first + i] - center_x, y[first + i] - center_y, z[first + i] - center_z
+    for i in range(x.shape[0]):
+        dx, dy, dz = x[i] - center_x, y[i] - center_y, z[i] - center_z
         right = xx * dx + yx * dy + zx * dz
         down = xy * dx + yy * dy + zy * dz
         ahead = xz * dx + yz * dy + zz * dz
@@ -110,7 +115,10 @@ def place_in_image(view, x, y, z, first, count, placed):
 @inlined_fused
 def place(view, shape, wraps, x, y, z, first, count, placed):
     """Places `count` voxels from `first` on."""
+    # Slices, not offsets: Numba allows for negative indices, and LLVM would gather one by one.
+    end = first + count
+    x, y, z = x[first:end], y[first:end], z[first:end]
     if wraps:
-        place_all_round(view, shape[0], x, y, z, first, count, placed)
+        place_all_round(view, shape[0], x, y, z, placed)
     else:
-        place_in_image(view, x, y, z, first, count, placed)
+        place_in_image(view, x, y, z, placed)
