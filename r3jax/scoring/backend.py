@@ -23,6 +23,7 @@ from r3jax.scoring.backends import dense, reference
 from r3jax.scoring.backends.views import frame_of, over_views, row_of
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import PAPER, Forms, ScoringConfig
+from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.visibility.views import View
 
 LARGEST_BUFFER = 2048
@@ -48,11 +49,20 @@ def _warn(version: tuple[int, int]) -> None:
     )
 
 
-def _by_platform(view: View, cpu: Callable[..., Any], default: Callable[..., Any]) -> Any:
-    """A function that runs `cpu` on CPUs, where kernels serve the view, and `default` elsewhere."""
-    if max(view.shape) > LARGEST_BUFFER or not speaks_our_interface():
-        return default
-    return functools.partial(jax.lax.platform_dependent, cpu=cpu, default=default)
+def _by_platform(answer_by: Callable[[Any], Callable[..., Any]], edge: int = 1) -> Any:
+    """A function that answers by `numba` on CPUs, where kernels serve, and by `dense` elsewhere.
+
+    Args:
+        answer_by: from a backend's module to the function that asks it.
+        edge: of the depth buffer [px].
+    """
+    if edge > LARGEST_BUFFER or not speaks_our_interface():
+        return answer_by(dense)
+    from r3jax.scoring.backends import numba
+
+    return functools.partial(
+        jax.lax.platform_dependent, cpu=answer_by(numba), default=answer_by(dense)
+    )
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(6,))
@@ -110,8 +120,6 @@ def _sums(
     *,
     keep: bool,
 ) -> Any:
-    from r3jax.scoring.backends import numba
-
     frame, forms = frame_of(view), config.forms
 
     def score_by(backend: Any) -> Callable[..., Any]:
@@ -120,7 +128,7 @@ def _sums(
 
         return lambda shared, views: over_views(score, shared, views)
 
-    chosen = _by_platform(view, score_by(numba), score_by(dense))
+    chosen = _by_platform(score_by, max(view.shape))
     results = chosen((voxels, cells), row_of(view, focal, config)[None])
     return jax.tree.map(lambda of_all: of_all[0], results)
 
@@ -137,13 +145,12 @@ def mean_in_pixels(
     """`reference.mean_in_pixels`, by the fastest backend of the platform."""
     del position  # that of the view; it only carries the derivative
     frame = frame_of(view)
-    from r3jax.scoring.backends import numba
 
     def score_by(backend: Any) -> Callable[..., Any]:
         score = lambda voxels, views: backend.means_in_pixels(voxels, views, frame, forms)
         return lambda voxels, views: over_views(score, voxels, views)
 
-    chosen = _by_platform(view, score_by(numba), score_by(dense))
+    chosen = _by_platform(score_by, max(view.shape))
     return chosen(voxels, row_of(view, focal, config)[None])[0]
 
 
@@ -163,13 +170,12 @@ def _mean_in_pixels_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
 def rows_in_pixels(voxels: MapState, view: View, config: ScoringConfig) -> Int[Array, "h w"]:
     """`reference.rows_in_pixels`, by the fastest backend of the platform."""
     frame = frame_of(view)
-    from r3jax.scoring.backends import numba
 
     def look_by(backend: Any) -> Callable[..., Any]:
         look = lambda voxels, views: backend.rows_in_pixels(voxels, views, frame, PAPER)
         return lambda voxels, views: over_views(look, voxels, views)
 
-    chosen = _by_platform(view, look_by(numba), look_by(dense))
+    chosen = _by_platform(look_by, max(view.shape))
     return chosen(voxels, row_of(view, jnp.ones(()), config)[None])[0]
 
 
@@ -178,3 +184,22 @@ def _rows_in_pixels_jvp(primals: Any, tangents: Any) -> Any:
     del tangents  # a choice has no derivative
     rows = rows_in_pixels(*primals)
     return rows, np.zeros(rows.shape, dtype=jax.dtypes.float0)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def terms_of_rows(
+    voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
+) -> Renderability:
+    """`score_voxels`, by the fastest backend of the platform."""
+
+    def score_by(backend: Any) -> Callable[..., Any]:
+        score = lambda voxels, points: backend.terms_of_rows(voxels, points, forms)
+        return lambda voxels, points: over_views(score, voxels, points)
+
+    point = jnp.concatenate([position, focal[None]])
+    return Renderability(*_by_platform(score_by)(voxels, point[None])[0])
+
+
+@terms_of_rows.defjvp
+def _terms_of_rows_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
+    return jax.jvp(functools.partial(score_voxels, forms=forms), primals, tangents)

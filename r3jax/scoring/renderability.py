@@ -7,62 +7,29 @@ Shape symbols: n voxels; N capacity of the map; h w size of the depth buffer.
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked
 from r3jax.geometry.cameras import Camera, is_traced, sound
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.backend import mean_in_pixels, rows_in_pixels
+from r3jax.scoring.backend import mean_in_pixels, rows_in_pixels, terms_of_rows
 from r3jax.scoring.backends.reference import voxels_of_rows
 from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
 from r3jax.scoring.terms import Renderability, score_voxels
-from r3jax.visibility.selection import for_selected, select
 from r3jax.visibility.views import pinhole_view
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def _score_present(
-    voxels: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
-) -> Renderability:
-    """`score_voxels`, at a cost that follows the voxels present and not the capacity."""
-    num = voxels.present.shape[0]
-
-    def score(
-        index: Int[Array, " K"], valid: Bool[Array, " K"], terms: Renderability
-    ) -> Renderability:
-        part = score_voxels(voxels.take(index, valid), camera_position, focal, forms)
-        target = jnp.where(valid, index, num)
-        return jax.tree.map(lambda all, new: all.at[target].set(new, mode="drop"), terms, part)
-
-    # What absent rows keep: kappa 2, delta 1, and 0 for R and its factors.
-    zeros, ones = jnp.zeros(num), jnp.ones(num)
-    return for_selected(
-        select(voxels.present), score, Renderability(2.0 * ones, zeros, ones, zeros, zeros, zeros)
-    )
-
-
-@_score_present.defjvp
-def _score_present_jvp(
-    forms: Forms,
-    primals: tuple[MapState, Float[Array, " 3"], Float[Array, ""]],
-    tangents: tuple[Any, ...],
-) -> tuple[Renderability, Renderability]:
-    # A loop of unknown length has no reverse mode; the dense form has.
-    return jax.jvp(functools.partial(score_voxels, forms=forms), primals, tangents)
 
 
 @functools.partial(jax.jit, static_argnames="forms")
 def _voxel_renderability(
     state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
-    terms = _score_present(state, camera_position, focal, forms)
+    terms = terms_of_rows(state, camera_position, focal, forms)
     positive = jnp.stack([focal, state.voxel_size])
     is_sound = jnp.all(jnp.isfinite(camera_position)) & jnp.all(jnp.isfinite(positive))
     factor = jnp.where(is_sound & jnp.all(positive > 0.0), 1.0, jnp.nan)

@@ -14,6 +14,7 @@ from r3jax.scoring.backends import reference
 from r3jax.scoring.backends.views import Frame, view_of
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms, ScoringConfig
+from r3jax.scoring.terms import score_voxels
 
 _ELEMENTS = 1 << 26
 """Voxels times views at a time on a GPU; each takes some 60 bytes."""
@@ -71,3 +72,14 @@ def rows_in_pixels(
     del forms
     one = lambda row: reference.rows_in_pixels(voxels, view_of(row, frame))
     return jax.lax.map(one, views, batch_size=batch_size(voxels.capacity))
+
+
+def terms_of_rows(
+    voxels: MapState, points: Float[Array, "P 4"], forms: Forms
+) -> Float[Array, "P 6 n"]:
+    """`score_voxels` from many points (position, focal length), field by field."""
+
+    def one(point: Float[Array, " 4"]) -> Float[Array, "6 n"]:
+        return jnp.stack(jax.tree.leaves(score_voxels(voxels, point[:3], point[3], forms)))
+
+    return jax.lax.map(one, points, batch_size=batch_size(voxels.capacity))

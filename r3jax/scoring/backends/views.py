@@ -63,7 +63,7 @@ def view_of(row: Float[Array, " 20"], frame: Frame) -> View:
 
 
 def over_views(
-    score: Callable[[Any, Float[Array, "P 20"]], Any], shared: Any, views: Float[Array, "P 20"]
+    score: Callable[[Any, Float[Array, "P k"]], Any], shared: Any, views: Float[Array, "P k"]
 ) -> Any:
     """`score(shared, views)`, so that `vmap` over views is one call of all of them.
 

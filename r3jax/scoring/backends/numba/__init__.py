@@ -16,7 +16,8 @@ from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
 from r3jax.mapping.state import MapState
 from r3jax.native.compiled import forget_outdated_code
 from r3jax.native.ffi import num_workers
-from r3jax.scoring.backends.numba.bridge import PIXELS, SUMS, register
+from r3jax.scoring.backends.numba.bridge import PIXELS, ROWS, SUMS, register
+from r3jax.scoring.backends.numba.rows import NUM_TERMS
 from r3jax.scoring.backends.views import Frame
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms
@@ -33,8 +34,12 @@ def _shared(voxels: MapState) -> tuple[Array, ...]:
 
 
 def _options(frame: Frame, forms: Forms) -> np.ndarray:
-    is_one, is_pairwise = forms.kappa == "one", forms.delta == "pairwise"
-    return np.array([*frame, is_one, is_pairwise, num_workers()], dtype=np.int32)
+    return np.array([*frame, *_choices(forms), num_workers()], dtype=np.int32)
+
+
+def _choices(forms: Forms) -> tuple[bool, bool]:
+    """Whether kappa is always 1, and whether delta is that of pairs."""
+    return forms.kappa == "one", forms.delta == "pairwise"
 
 
 @functools.cache
@@ -60,7 +65,7 @@ def sums_in_views(
         Sums of 1 - R [P, B] and numbers of unexplored cells [P, B]. If `keep`: also which rows
         of the map and which cells each view sees, as bits in bytes [P, p] and [P, q].
     """
-    register()
+    register(SUMS)
     num = views.shape[0]
     sums = jax.ShapeDtypeStruct((num, num_bins), jnp.float32)
     sizes = [-(-size // 8) if keep else 0 for size in (voxels.capacity, cells.x.shape[0])]
@@ -91,7 +96,7 @@ def rows_in_pixels(
 def _look(
     voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms, room: int
 ) -> tuple[Array, Array]:
-    register()
+    register(PIXELS)
     num = views.shape[0]
     shapes = [
         jax.ShapeDtypeStruct((num,), jnp.float32),
@@ -102,3 +107,17 @@ def _look(
         *_shared(voxels), views, _options(frame, forms), directions
     )
     return means, rows
+
+
+def terms_of_rows(
+    voxels: MapState, points: Float[Array, "P 4"], forms: Forms
+) -> Float[Array, "P 6 n"]:
+    """`terms.score_voxels` from many points (position, focal length), field by field."""
+    register(ROWS)
+    shape = (points.shape[0], NUM_TERMS, voxels.capacity)
+    options = np.array([*_choices(forms), num_workers()], dtype=np.int32)
+    directions = fibonacci_lattice(voxels.num_bins).astype(np.float32)
+    (terms,) = jax.ffi.ffi_call(ROWS, [jax.ShapeDtypeStruct(shape, jnp.float32)])(
+        *_shared(voxels), points, options, directions
+    )
+    return terms

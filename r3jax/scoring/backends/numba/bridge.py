@@ -18,15 +18,18 @@ from r3jax.native.ffi import (
     bytes2,
     floats1,
     floats2,
+    floats3,
     ints1,
     ints2,
     register_handlers,
     words2,
 )
 from r3jax.scoring.backends.numba.pixels import pixels_pass
+from r3jax.scoring.backends.numba.rows import rows_pass
 from r3jax.scoring.backends.numba.sums import sums_pass
 
 SUMS, PIXELS = "r3jax_scoring_sums", "r3jax_scoring_pixels"
+ROWS = "r3jax_scoring_rows"
 
 
 @inlined
@@ -87,15 +90,35 @@ def _pixels(frame):
     return 0
 
 
+def _rows(frame):
+    """Arguments: state (6), points, options, directions.
+
+    Options: whether kappa is 1, whether delta is that of pairs, workers. Results: terms of rows.
+    """
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 7)
+    rows_pass(
+        _state(frame),
+        floats2(frame, ARGUMENTS, 6),
+        (options[0] != 0, options[1] != 0),
+        floats2(frame, ARGUMENTS, 8),
+        np.int64(options[2]),
+        floats3(frame, RESULTS, 0),
+    )
+    return 0
+
+
+_HANDLERS = {SUMS: _sums, PIXELS: _pixels, ROWS: _rows}
 _lock = threading.Lock()
 
 
-def register() -> None:
-    """Compiles the handlers (or takes them from the disk) and tells XLA of them, once."""
+def register(name: str) -> None:
+    """Compiles a handler (or takes it from the disk) and tells XLA of it, once."""
     with _lock:
-        _register()
+        _register(name)
 
 
 @functools.cache
-def _register() -> tuple[Any, ...]:
-    return register_handlers({SUMS: _sums, PIXELS: _pixels})
+def _register(name: str) -> tuple[Any, ...]:
+    return register_handlers({name: _HANDLERS[name]})
