@@ -104,20 +104,6 @@ def seen_in(
     return buffer, visible_voxels(voxels, candidates, view, buffer)
 
 
-def voxels_in_pixels(
-    voxels: MapState, view: View, config: VisibilityConfig
-) -> tuple[MapState, Int[Array, "h w"]]:
-    """The voxel that each pixel of a view shows, row by row, and its index.
-
-    Where a pixel shows none, the index is that of `DepthBuffer.item` and the voxel is absent.
-    """
-    item = depth_buffer(voxels, candidates_of(voxels, view), view, config).item
-    flat = item.reshape(-1)
-    is_hit = flat < voxels.present.shape[0]
-    # Row 0 stands in where nothing is shown, marked absent, so that the gather stays in bounds.
-    return voxels.take(jnp.where(is_hit, flat, 0), is_hit), item
-
-
 def is_visible(view: View, place: Placement, limit: Float[Array, "h w"]) -> Bool[Array, " n"]:
     """True for points in the image and within range, no farther than `limit` at their pixel.
 
