@@ -19,6 +19,7 @@ from r3jax.scoring.backends import numba, reference
 from r3jax.scoring.backends.views import row_of
 from r3jax.scoring.cells import cells_of
 from r3jax.scoring.terms import score_voxels
+from r3jax.visibility.views import wrap
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.scoring.test_backends import CAMERA, CONFIG, NUM_BINS, poses_of, view_at, world
 
@@ -141,6 +142,23 @@ def images_agree(modules: Modules, kind: str = "pinhole") -> None:
     np.testing.assert_allclose(results[0], expected(kind)[2], atol=1e-4)
 
 
+def images_all_round(modules: Modules) -> None:
+    images_agree(modules, "panorama")
+
+
+def borders_agree(modules: Modules) -> None:
+    """Each pixel of the border stands for the one that `wrap` glues it to."""
+    picture, size = modules["picture"], 8
+    ring = [picture._ring_pixel(i, (size, size)) for i in range(4 * size + 4)]
+    row, column = np.array(ring).T
+    is_outside = (row == -1) | (row == size) | (column == -1) | (column == size)
+    assert len(set(ring)) == len(ring)
+    assert is_outside.all()
+    expected = np.stack(wrap(*jnp.asarray([row, column]), jnp.full(len(ring), size)), axis=1)
+    found = [picture.stands_for(*pixel, (size, size), True) for pixel in ring]
+    np.testing.assert_array_equal(found, expected)
+
+
 def in_images(modules: Modules) -> None:
     sums_agree(modules, "pinhole")
 
@@ -165,11 +183,12 @@ MUTANTS = [
     Mutant("views", "c0, r0 = along_x * (xx - slope_x * xz), along_y",
            "c0, r0 = along_x * xx, along_y", in_images),
     Mutant("views", "abs(c0 - r0) + abs(c1 - r1)", "abs(c0 - r0) + abs(c1 + r1)", in_images),
-    Mutant("picture", "height - 1 - row if crosses_column", "row if crosses_column", sums_agree),
+    Mutant("picture", "height - 1 - row if crosses_column", "row if crosses_column",
+           borders_agree),
+    Mutant("picture", "i -= 2 * (width + 2)", "i -= 2 * width", borders_agree),
     Mutant("picture", "        if wraps:\n            fold", "        if False:\n            fold",
-           sums_agree),
+           images_all_round),
     Mutant("picture", "above + (r >> 1) * stride", "above + r * stride", sums_agree),
-    Mutant("picture", "if width & 1:", "if False:", images_agree),
     Mutant("splat", "spread = _QUARTER if begins_level else _ZERO", "spread = _ZERO", sums_agree),
     Mutant("splat", "(in_slants | is_own)", "is_own", sums_agree),
     Mutant("splat", "+ _TWO * _RING * level + _RING", "+ _RING", sums_agree),
@@ -203,7 +222,10 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("law", [sums_agree, in_images, images_agree, terms_agree])
+LAWS = borders_agree, sums_agree, in_images, images_agree, images_all_round, terms_agree
+
+
+@pytest.mark.parametrize("law", LAWS)
 def test_the_laws_hold(law):
     law(load(CHAIN))
 
