@@ -35,12 +35,13 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
 from r3jax.planning.policies.cover import SeenBins, coverage_of_pixels
+from r3jax.scoring.backend import rows_in_pixels
+from r3jax.scoring.backends.reference import voxels_of_rows
 from r3jax.scoring.config import Forms, ScoringConfig
-from r3jax.scoring.renderability import Renderability, score_voxels
+from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.trace.reader import read_run
-from r3jax.visibility.depth_buffer import voxels_in_pixels
 from r3jax.visibility.views import pinhole_view
 
 VERSION = 1
@@ -97,7 +98,8 @@ def expect(
 ) -> Expected:
     """Every prediction of one view, pixel by pixel as `renderability_image` has it."""
     view = pinhole_view(camera, T_world_camera, config)
-    seen, row = voxels_in_pixels(state, view, config)
+    row = rows_in_pixels(state, view, config)
+    seen = voxels_of_rows(state, row)
     shape, position = row.shape, T_world_camera[:3, 3]
     hit = seen.present.astype(jnp.float32)
     bins = SeenBins(seen.visited.reshape(-1, *shape), seen.num_bins)

@@ -89,7 +89,7 @@ _MAP_SIZE = 128
 
 
 @functools.cache
-def _nearest_candidates(num: int) -> np.ndarray:
+def nearest_bin_table(num: int) -> np.ndarray:
     """Per octahedral cell the bins that can be nearest somewhere in it, [K, S * S] int32.
 
     Exact, not sampled: if c is the cell's center, r the angle to its farthest corner and d the
@@ -123,7 +123,7 @@ def nearest_bin(directions: Float[Array, "3 n"], num: int) -> Int[Array, " n"]:
     not grow with `num`.
     """
     # A few candidates per cell are compared exactly, so that no bin is off by rounding of the map.
-    table = jnp.asarray(_nearest_candidates(num))
+    table = jnp.asarray(nearest_bin_table(num))
     lattice = jnp.asarray(fibonacci_lattice(num).T, dtype=jnp.float32)
     cell = octahedral_cell(directions, _MAP_SIZE)
     # Below every cosine, rounded or not: the first candidate always wins.

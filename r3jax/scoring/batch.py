@@ -1,7 +1,7 @@
 """Scores of many candidates against one map: the inner loop of planning.
 
-XLA runs the loops of one score on one core; on a CPU the candidates are therefore dealt out to as
-many threads as the process may use. Where there are several devices, they share the candidates.
+One call scores all candidates. Where there are several devices, they share the candidates; what has
+no kernel for CPUs, and so runs on one core, is dealt out to as many threads as the process may use.
 
 Shape symbols: C candidates; n voxels; c cells; B bins of the panorama.
 """
@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r3jax.geometry.cameras import Camera
+from r3jax.geometry.cameras import Camera, is_traced
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells
+from r3jax.scoring.backend import speaks_our_interface
+from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama import Panorama, panorama_of
@@ -47,7 +48,7 @@ def score_views(
 ) -> ViewUtility:
     """`view_utility` of every pose; fields of shape [C]. Not to be called under jit."""
     poses = jnp.asarray(poses, dtype=jnp.float32)
-    voxels, cells, _ = gather_in_range(state, grid, poses[:, :3, 3], config)
+    voxels, cells = _at_hand(state, grid, poses[:, :3, 3], config)
     return score_views_near(voxels, cells, camera, poses, config)
 
 
@@ -71,8 +72,23 @@ def score_positions(
             the B of the panorama; None: all.
     """
     positions = jnp.asarray(positions, dtype=jnp.float32)
-    voxels, cells, _ = gather_in_range(state, grid, positions, config)
+    voxels, cells = _at_hand(state, grid, positions, config)
     return score_positions_near(voxels, cells, camera, positions, config, allowed)
+
+
+def _at_hand(
+    state: MapState, grid: OccupancyGrid, positions: Float[Array, "C 3"], config: ScoringConfig
+) -> tuple[MapState, Cells]:
+    """The whole map and grid; where no kernel finds its way in them, what is within range."""
+    if is_traced(state.key, positions):
+        raise TypeError("score_views and score_positions deal out work: call them outside jit")
+    if jax.default_backend() == "cpu" and speaks_our_interface():
+        return state, _cells_of(grid)
+    voxels, cells, _ = gather_in_range(state, grid, positions, config)
+    return voxels, cells
+
+
+_cells_of = jax.jit(cells_of)
 
 
 def score_views_near(
@@ -83,7 +99,9 @@ def score_views_near(
     config: ScoringConfig,
 ) -> ViewUtility:
     """`score_views` of voxels and cells that `near` gathered."""
-    return map_over_devices(functools.partial(_score_views, voxels, cells, camera, config), poses)
+    return map_over_devices(
+        functools.partial(_score_views, voxels, cells, camera, config), poses, threads=1
+    )
 
 
 def score_positions_near(
@@ -96,7 +114,7 @@ def score_positions_near(
 ) -> Panorama:
     """`score_positions` of voxels and cells that `near` gathered."""
     score = functools.partial(_score_positions, voxels, cells, camera, config)
-    return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)))
+    return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)), threads=1)
 
 
 def cache_positions_near(
@@ -109,7 +127,7 @@ def cache_positions_near(
 ) -> tuple[Panorama, PanoramaCache]:
     """`score_positions_near`, and what `score_cached_near` needs to do it again."""
     score = functools.partial(_cache_positions, voxels, cells, camera, config)
-    return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)))
+    return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)), threads=1)
 
 
 def score_cached_near(
@@ -147,10 +165,7 @@ def _score_views(
     config: ScoringConfig,
     poses: Float[Array, "C 4 4"],
 ) -> ViewUtility:
-    score = functools.partial(utility_of_view, voxels, cells, camera, config=config)
-    # One by one: `vmap` would hold all depth buffers at once, and run the loops of unknown length
-    # for every candidate until the longest has ended.
-    return jax.lax.map(score, poses)
+    return jax.vmap(lambda pose: utility_of_view(voxels, cells, camera, pose, config))(poses)
 
 
 @jax.jit
@@ -164,7 +179,7 @@ def _score_positions(
     def score(place: tuple[Float[Array, " 3"], Bool[Array, " B"]]) -> Panorama:
         return panorama_of(voxels, cells, camera, place[0], config, place[1])
 
-    return jax.lax.map(score, places)
+    return jax.vmap(score)(places)
 
 
 _changes_between = jax.jit(changes_between)
@@ -178,9 +193,7 @@ def _cache_positions(
     config: ScoringConfig,
     places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
 ) -> tuple[Panorama, PanoramaCache]:
-    return jax.lax.map(
-        lambda at: cached_panorama(voxels, cells, camera, at[0], config, at[1]), places
-    )
+    return jax.vmap(lambda at: cached_panorama(voxels, cells, camera, at[0], config, at[1]))(places)
 
 
 @jax.jit
@@ -199,6 +212,7 @@ def map_over_devices(
     score: "functools.partial[Scores]",
     candidates: Candidates,
     devices: Sequence[Any] | None = None,
+    threads: int | None = None,
 ) -> Scores:
     """Scores candidates in equal shares on all devices; a CPU alone: on all of its cores.
 
@@ -206,6 +220,7 @@ def map_over_devices(
         score: of any number of candidates; a jitted function with all but the last argument.
         candidates: what to score.
         devices: of JAX, where to; by default all of this process.
+        threads: at most, on a CPU alone; 1 for a `score` that shares its work out by itself.
     """
     num = jax.tree.leaves(candidates)[0].shape[0]
     devices = (jax.local_devices() if devices is None else devices)[:num]
@@ -213,7 +228,8 @@ def map_over_devices(
         scores = score_on_devices(score.func, score.args, candidates, devices)
         return jax.tree.map(lambda x: x[:num], jax.device_put(scores, devices[0]))
     # The cores this process may use, which a scheduler may keep below those of the machine.
-    workers = min(len(os.sched_getaffinity(0)), num) if jax.default_backend() == "cpu" else 1
+    is_cpu = jax.default_backend() == "cpu"
+    workers = min(len(os.sched_getaffinity(0)), num, threads or num) if is_cpu else 1
     if workers < 2:
         return score(candidates)
     # Shares of one size: one compiled program serves all threads.

@@ -17,7 +17,7 @@ from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import Forms
-from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.selection import Selection, for_selected
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, UInt32
 
 from r3jax.geometry.sphere import fibonacci_lattice
 
-_ON_EDGE = 1e-6
+ON_EDGE = 1e-6
 """Tangent coordinates within this of 0 lie on the edge of the box, which belongs to it."""
 
 
@@ -128,6 +128,6 @@ def _scan(
         a_high = jnp.maximum(a_high, jnp.where(is_ahead, a, -jnp.inf))
         b_low = jnp.minimum(b_low, jnp.where(is_ahead, b, jnp.inf))
         b_high = jnp.maximum(b_high, jnp.where(is_ahead, b, -jnp.inf))
-    is_inside = (a_low <= _ON_EDGE) & (a_high >= -_ON_EDGE)
-    is_inside &= (b_low <= _ON_EDGE) & (b_high >= -_ON_EDGE)
+    is_inside = (a_low <= ON_EDGE) & (a_high >= -ON_EDGE)
+    is_inside &= (b_low <= ON_EDGE) & (b_high >= -ON_EDGE)
     return jnp.clip(best, 0.0, 1.0), is_inside.astype(x.dtype), nearest

@@ -19,11 +19,11 @@ from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.cells import cells_of, visible_cells
+from r3jax.scoring.backend import seen_in_view
+from r3jax.scoring.cells import cells_of
 from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
-from r3jax.scoring.renderability import score_voxels
-from r3jax.visibility.depth_buffer import seen_in
-from r3jax.visibility.selection import Selection, for_selected
+from r3jax.scoring.terms import score_voxels
+from r3jax.visibility.selection import Selection, for_selected, select
 from r3jax.visibility.views import pinhole_view
 
 CAUSES = ("never seen", "too oblique", "inconsistent", "too far")
@@ -77,8 +77,8 @@ def explain_view(
     config = ScoringConfig() if config is None else config
     view = pinhole_view(camera, T_world_camera, config)
     # The steps of `view_utility`, one by one: the parts must sum to its total.
-    buffer, visible = seen_in(state, view, config)
-    unseen = visible_cells(cells_of(grid), view, buffer).mask
+    shown, unseen = seen_in_view(state, cells_of(grid), view, config)
+    visible = select(shown)
     position = T_world_camera[:3, 3]
     shares, rendering = _divide_visible(state, visible, position, camera.focal, config.forms)
     exploration = config.lambda1 * jnp.sum(unseen, dtype=jnp.float32)
@@ -86,7 +86,7 @@ def explain_view(
     return Explanation(
         totals=factor * jnp.concatenate([exploration[None], rendering]),
         shares=factor * shares,
-        visible=visible.mask,
+        visible=shown,
         cells=unseen.reshape(grid.log_odds.shape),
     )
 

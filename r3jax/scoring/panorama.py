@@ -13,11 +13,9 @@ from r3jax.geometry.cameras import Camera, pose_along, sound
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_cells
+from r3jax.scoring.backend import sums_in_view
+from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig, scoring_settings
-from r3jax.scoring.deficit import deficit_per_bin
-from r3jax.visibility.depth_buffer import seen_in
-from r3jax.visibility.selection import Selection
 from r3jax.visibility.views import panorama_view
 
 
@@ -84,26 +82,12 @@ def panorama_of(
         config: settings.
         allowed: axes q_k that the best direction is taken from, at least one; None: all.
     """
-    view = panorama_view(position, config)
-    buffer, visible = seen_in(voxels, view, config)
-    seen = visible_cells(cells, view, buffer)
-    bins = bins_of_seen(voxels, visible, cells, seen, position, camera.focal, config)
+    view, num_bins = panorama_view(position, config), config.panorama_bins
+    deficits, unexplored = sums_in_view(
+        voxels, cells, view, position, camera.focal, config, num_bins
+    )
+    bins = deficits + config.lambda1 * unexplored
     return panorama_of_bins(bins, camera, position, config, allowed)
-
-
-def bins_of_seen(
-    voxels: MapState,
-    visible: Selection,
-    cells: Cells,
-    seen: Selection,
-    position: Float[Array, " 3"],
-    focal: Float[Array, ""],
-    config: ScoringConfig,
-) -> Float[Array, " B"]:
-    """`Panorama.bin_scores` of the `visible` voxels and the cells that are `seen`."""
-    num_bins = config.panorama_bins
-    bins = deficit_per_bin(voxels, visible, position, focal, config.forms, num_bins)
-    return bins + config.lambda1 * unexplored_by_direction(cells, seen, position, num_bins)
 
 
 def panorama_of_bins(

@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, unexplored_by_direction, visible_cells
+from r3jax.scoring.backend import sums_and_seen
+from r3jax.scoring.cells import Cells, unexplored_by_direction
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.deficit import deficit_per_bin
-from r3jax.scoring.panorama import Panorama, bins_of_seen, panorama_of_bins
-from r3jax.visibility.depth_buffer import seen_in
+from r3jax.scoring.panorama import Panorama, panorama_of_bins
 from r3jax.visibility.selection import Selection, narrow, select
 from r3jax.visibility.views import panorama_view
 
@@ -77,12 +77,10 @@ def cached_panorama(
     allowed: Bool[Array, " B"] | None = None,
 ) -> tuple[Panorama, PanoramaCache]:
     """`panorama_of`, and what is needed to score it again."""
-    view = panorama_view(position, config)
-    buffer, visible = seen_in(voxels, view, config)
-    seen = visible_cells(cells, view, buffer)
-    bins = bins_of_seen(voxels, visible, cells, seen, position, camera.focal, config)
-    # Bits, not bytes: a search keeps these of many positions.
-    kept = PanoramaCache(bins, jnp.packbits(visible.mask), jnp.packbits(seen.mask))
+    view, num_bins = panorama_view(position, config), config.panorama_bins
+    deficits, unexplored, *seen = sums_and_seen(voxels, cells, view, camera.focal, config, num_bins)
+    bins = deficits + config.lambda1 * unexplored
+    kept = PanoramaCache(bins, *seen)
     return panorama_of_bins(bins, camera, position, config, allowed), kept
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera
+from r3jax.geometry.numerics import safe_norm
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.batch import map_over_devices
@@ -127,6 +128,9 @@ def pixel_view(
     center = voxels.center_of(item.reshape(-1)).reshape(3, *item.shape)
     offset = T_world_camera[:3, 3][:, None, None] - center
     axis = T_world_camera[:3, 2][:, None, None]
+    # Of the voxel itself: in the buffer it is rounded down, and would hide a cell just before it.
+    nearest = jnp.where(hit, safe_norm(offset, axis=0), jnp.inf)
+    buffer = eqx.tree_at(lambda b: b.distance, buffer, nearest)
     # In the view of the sensor's range: what it cannot measure stays unexplored.
     count, distance = _unexplored(cells, view, buffer)
     return PixelView(

@@ -38,7 +38,7 @@ from r3jax.geometry.numerics import safe_norm
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells, visible_cells
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.depth_buffer import (
     corner_margin,
     depth_buffer,

@@ -8,10 +8,9 @@ from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.cells import Cells, cells_of, unexplored_by_direction, visible_cells
+from r3jax.scoring.backend import seen_in_view, sums_in_view
+from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig, scoring_settings
-from r3jax.scoring.deficit import deficit_per_bin
-from r3jax.visibility.depth_buffer import candidates_of, depth_buffer, seen_in
 from r3jax.visibility.views import pinhole_view
 
 
@@ -57,12 +56,9 @@ def utility_of_view(
 ) -> ViewUtility:
     """`view_utility` of voxels and cells that are already at hand."""
     view = pinhole_view(camera, T_world_camera, config)
-    buffer, visible = seen_in(voxels, view, config)
     position = T_world_camera[:3, 3]
-    focal = camera.focal
-    rendering = deficit_per_bin(voxels, visible, position, focal, config.forms, 1)[0]
-    seen = visible_cells(cells, view, buffer)
-    exploration = unexplored_by_direction(cells, seen, position, 1)[0]
+    deficit, unexplored = sums_in_view(voxels, cells, view, position, camera.focal, config, 1)
+    exploration, rendering = unexplored[0], deficit[0]
     return ViewUtility(exploration, rendering, config.lambda1 * exploration + rendering)
 
 
@@ -76,5 +72,5 @@ def visible_unexplored(
 ) -> Bool[Array, "X Y Z"]:
     """The cells that U_G of a view counts."""
     view = pinhole_view(camera, T_world_camera, config)
-    buffer = depth_buffer(state, candidates_of(state, view), view, config)
-    return visible_cells(cells_of(grid), view, buffer).mask.reshape(grid.log_odds.shape)
+    _, unexplored = seen_in_view(state, cells_of(grid), view, config)
+    return unexplored.reshape(grid.log_odds.shape)

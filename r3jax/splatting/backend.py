@@ -1,10 +1,7 @@
 """What a rasterizer backend takes and gives, and which one serves where."""
 
-import functools
 import importlib.util
-import re
 import warnings
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -12,6 +9,7 @@ import jax
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera
+from r3jax.native.version import WRITTEN_FOR, ffi_version
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 
@@ -49,27 +47,6 @@ class Rasterize(Protocol):
     ) -> Composite:
         """Composites the scene on black; one view, to be vmapped over poses."""
         ...
-
-
-WRITTEN_FOR = (0, 3)
-"""Version of XLA's foreign function interface whose structs the numba bridge reads by offset."""
-
-
-@functools.cache
-def ffi_version() -> tuple[int, int]:
-    """Reads major and minor version of the interface from the header that jaxlib ships.
-
-    Returns:
-        The version; (-1, -1) if the header does not say.
-    """
-    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
-    text = header.read_text(encoding="utf-8") if header.is_file() else ""
-    found = [
-        re.search(rf"^#define XLA_FFI_API_{part} (\d+)$", text, re.MULTILINE)
-        for part in ("MAJOR", "MINOR")
-    ]
-    major, minor = (-1 if match is None else int(match[1]) for match in found)
-    return major, minor
 
 
 def find_backend(name: str) -> Rasterize:

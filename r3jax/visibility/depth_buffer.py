@@ -20,7 +20,7 @@ from r3jax.visibility.selection import Selection, for_selected, narrow, select
 from r3jax.visibility.slope import surface_limit
 from r3jax.visibility.views import Placement, View, wrap
 
-_CORNER = 0.6
+CORNER = 0.6
 """Where visibility is tested, in edges from a voxel's center along columns and rows."""
 
 # The largest word: every voxel wins the minimum against it.
@@ -90,7 +90,7 @@ def visible_voxels(
     def test(index: Int[Array, " K"]) -> Bool[Array, " K"]:
         place = view.place(voxels.center_of(index))
         margin = corner_margin(view, place, voxels.voxel_size, buffer.limit)
-        return _is_in_view(view, place) & (margin >= 0.0)
+        return is_in_view(view, place) & (margin >= 0.0)
 
     return narrow(candidates, test)
 
@@ -104,20 +104,6 @@ def seen_in(
     return buffer, visible_voxels(voxels, candidates, view, buffer)
 
 
-def voxels_in_pixels(
-    voxels: MapState, view: View, config: VisibilityConfig
-) -> tuple[MapState, Int[Array, "h w"]]:
-    """The voxel that each pixel of a view shows, row by row, and its index.
-
-    Where a pixel shows none, the index is that of `DepthBuffer.item` and the voxel is absent.
-    """
-    item = depth_buffer(voxels, candidates_of(voxels, view), view, config).item
-    flat = item.reshape(-1)
-    is_hit = flat < voxels.present.shape[0]
-    # Row 0 stands in where nothing is shown, marked absent, so that the gather stays in bounds.
-    return voxels.take(jnp.where(is_hit, flat, 0), is_hit), item
-
-
 def is_visible(view: View, place: Placement, limit: Float[Array, "h w"]) -> Bool[Array, " n"]:
     """True for points in the image and within range, no farther than `limit` at their pixel.
 
@@ -126,7 +112,7 @@ def is_visible(view: View, place: Placement, limit: Float[Array, "h w"]) -> Bool
         place: where the points fall in it.
         limit: `DepthBuffer.distance` for points in empty space, which nothing may hide.
     """
-    return _is_in_view(view, place) & (depth_margin(view, place, limit) >= 0.0)
+    return is_in_view(view, place) & (depth_margin(view, place, limit) >= 0.0)
 
 
 def depth_margin(view: View, place: Placement, limit: Float[Array, "h w"]) -> Float[Array, " n"]:
@@ -142,8 +128,8 @@ def corner_margin(
     Half of the voxels that a cluttered room hides in part show something beside the edge that
     hides their middle.
     """
-    right = _CORNER * voxel_size * place.column_scale
-    down = _CORNER * voxel_size * place.row_scale
+    right = CORNER * voxel_size * place.column_scale
+    down = CORNER * voxel_size * place.row_scale
     farthest = [
         _at_pixel(limit, place.column + i * right, place.row + j * down, wraps=view.wraps)
         for i in (-1.0, 1.0)
@@ -164,7 +150,8 @@ def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
     return is_in & (place.row >= 0.0) & (place.row < height)
 
 
-def _is_in_view(view: View, place: Placement) -> Bool[Array, " n"]:
+def is_in_view(view: View, place: Placement) -> Bool[Array, " n"]:
+    """True for points in the image and within range."""
     return is_in_image(view, place) & (place.distance <= view.max_range)
 
 

@@ -15,13 +15,13 @@ from jaxtyping import Array, Bool, Float, Int
 from r3jax.geometry.compaction import spare_places
 from r3jax.visibility.views import Placement, wrap
 
-_HALF_WIDTH = 0.51
+HALF_WIDTH = 0.51
 """Half an edge, and a little for rounding."""
 
-_NEAR = 0.25
+NEAR = 0.25
 """The projection is linear in the position only nearly: added edges per edge / distance."""
 
-_SEAM = 0.6
+SEAM = 0.6
 """Where a wall passes from one level to the next, pixel centers of the two do not interlock. Voxels
 on the first fifth of a level therefore reach a quarter of a pixel farther: to the centers of the
 finer pixels that theirs consist of."""
@@ -59,7 +59,7 @@ def footprint(
         offsets: where each level begins; one more for the end, behind which lie spare places.
         wraps: True for an octahedral map.
     """
-    half = voxel_size * (_HALF_WIDTH + _NEAR * voxel_size / place.distance)
+    half = voxel_size * (HALF_WIDTH + NEAR * voxel_size / place.distance)
     widths = [2.0 * half * x for x in (place.column_scale, place.row_scale)]
     widest = jnp.maximum(jnp.maximum(widths[0], widths[1]), 1e-6)
     # Half the width before the logarithm: on its level a footprint is at most two pixels wide.
@@ -70,7 +70,7 @@ def footprint(
     # Voxels side by side may lie on different levels, so sizes and offsets are gathered for each.
     height, width = table([s[0] for s in shapes]), table([s[1] for s in shapes])
     offset = table(offsets[:-1])
-    begins_level = (level > 0) & (0.5 * widest * scale < _SEAM)
+    begins_level = (level > 0) & (0.5 * widest * scale < SEAM)
     spread = jnp.where(begins_level, 0.25, 0.0)
     columns = _covered(place.column * scale, 0.5 * widths[0] * scale + spread)
     rows = _covered(place.row * scale, 0.5 * widths[1] * scale + spread)

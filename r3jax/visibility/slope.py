@@ -6,14 +6,14 @@ Shape symbols: h w size of the buffer.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_STRIDES = (1, 2, 4)
+STRIDES = (1, 2, 4)
 """Steps over which the slope is taken [px]. A voxel near by covers several pixels at one
 distance, so that the slope from pixel to pixel is 0 on most of a tilted wall."""
 
-_MAX_STRETCH = 6.0
+MAX_STRETCH = 6.0
 """The allowance grows at most by this factor: surfaces seen at 80 degrees from their normal."""
 
-_FAR = 1e4
+FAR = 1e4
 """Stands for "nothing there", so that differences stay finite [m]."""
 
 
@@ -34,19 +34,19 @@ def surface_limit(
         pixel_angle: angle that a pixel covers [rad].
         allowance: depth of the surface across itself [m].
     """
-    capped = jnp.minimum(distance, _FAR)
+    capped = jnp.minimum(distance, FAR)
     # Beyond the border the buffer is continued in a straight line.
-    padded = jnp.pad(capped, max(_STRIDES), mode="reflect", reflect_type="odd")
+    padded = jnp.pad(capped, max(STRIDES), mode="reflect", reflect_type="odd")
     squared = jnp.zeros_like(distance)
     for axis in (0, 1):
         steepest = jnp.zeros_like(distance)
-        for step in _STRIDES:
+        for step in STRIDES:
             steepest = jnp.maximum(steepest, _slope(capped, padded, step, axis))
         squared = squared + steepest * steepest
     # Meters of depth per pixel, over the meters that a pixel spans there.
     tangent = jnp.sqrt(squared) / (pixel_angle * jnp.maximum(capped, 1e-6))
     # 1 / cos a = sqrt(1 + tan^2 a); uncapped, a wall seen edge on would hide nothing.
-    stretch = jnp.minimum(jnp.sqrt(1.0 + tangent * tangent), _MAX_STRETCH)
+    stretch = jnp.minimum(jnp.sqrt(1.0 + tangent * tangent), MAX_STRETCH)
     # On the uncapped distance: where there is nothing, the limit stays infinite.
     return distance + allowance * stretch
 
@@ -58,7 +58,7 @@ def _slope(
 
     So neither a silhouette nor a ragged edge counts as a slope.
     """
-    margin = max(_STRIDES)
+    margin = max(STRIDES)
     height, width = distance.shape
 
     def moved(shift: int) -> Float[Array, "h w"]:

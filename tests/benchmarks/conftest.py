@@ -9,6 +9,7 @@ import pytest
 
 import r3jax
 from r3jax.mapping.occupancy import mark_free_ball
+from r3jax.mapping.update import integrate_growing
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.scenes import procedural
 from r3jax.simulators.scenes.registry import open_scene
@@ -27,9 +28,9 @@ def pytest_collection_modifyitems(config, items):
 
 
 class Explored:
-    """An apartment whose map holds so many voxels, and the last frame that joined it."""
+    """An apartment of whose map so many voxels are known, or more, after so many views."""
 
-    def __init__(self, voxels, edge):
+    def __init__(self, voxels, edge, views=1):
         self.simulator = open_scene("apartment", camera=r3jax.Camera.from_fov(edge, edge, 60.0))
         self.camera = self.simulator.camera
         self.map = r3jax.empty_map()
@@ -37,7 +38,7 @@ class Explored:
         self.frames = []
         rooms = list(procedural.rooms("apartment").values())
         rng = np.random.default_rng(0)
-        while int(self.map.num_occupied) < voxels:
+        while len(self.frames) < views or int(self.map.num_occupied) < voxels:
             x0, y0, x1, y1 = rooms[len(self.frames) % len(rooms)]
             position = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 1.4], dtype=np.float32)
             direction = (rng.standard_normal(3) * [1.0, 1.0, 0.3]).astype(np.float32)
@@ -45,7 +46,7 @@ class Explored:
             self.add(self.simulator.render(np.asarray(pose, dtype=np.float64)))
 
     def add(self, frame: r3jax.Frame) -> None:
-        self.map = r3jax.integrate(self.map, frame)
+        self.map = integrate_growing(self.map, frame)
         grid = r3jax.integrate_depth(self.grid, frame)
         self.grid = mark_free_ball(grid, frame.position, 0.3)
         self.frames.append(frame)

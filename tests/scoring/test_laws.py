@@ -76,15 +76,14 @@ def expected_terms(voxels, forms: Forms = PAPER) -> dict[str, np.ndarray]:
 def law_formulas(modules: Modules, kappa: str = "box", delta: str = "trace") -> None:
     voxels, forms = make_voxels(), Forms(kappa, delta)
     position = jnp.asarray(POSITION, jnp.float32)
-    found = modules["renderability"].score_voxels(voxels, position, jnp.float32(FOCAL), forms)
+    found = modules["terms"].score_voxels(voxels, position, jnp.float32(FOCAL), forms)
     for name, expected in expected_terms(voxels, forms).items():
         np.testing.assert_allclose(getattr(found, name), expected, atol=2e-5, err_msg=name)
 
 
 CHAIN = (
     "r3jax.scoring.directions",
-    "r3jax.visibility.depth_buffer",
-    "r3jax.scoring.renderability",
+    "r3jax.scoring.terms",
 )
 _IN_KAPPA = """(visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
         cosine = jnp.where"""
@@ -95,17 +94,17 @@ MUTANTS = [
     Mutant("directions", "is_inside &= (b_low", "is_inside |= (b_low", law_formulas),
     Mutant("directions", _IN_KAPPA, _IN_KAPPA.replace("k // 32", "0"), law_formulas),
     Mutant("directions", "-z * a_y, z * a_x", "-z * a_x, z * a_y", law_formulas),
-    Mutant("renderability", "cosine, cosine * cosine)", "cosine, cosine)", law_formulas),
-    Mutant("renderability", "kappa_value * (1.0 - bias)", "1.0 - bias", law_formulas),
-    Mutant("renderability", "1.0 - delta * bias", "1.0 - bias", law_formulas),
-    Mutant("renderability", "* distance / focal, 1.0)", "* distance / focal, 2.0)", law_formulas),
-    Mutant("renderability", "value=blank(bias * noise * resolution)",
+    Mutant("terms", "cosine, cosine * cosine)", "cosine, cosine)", law_formulas),
+    Mutant("terms", "kappa_value * (1.0 - bias)", "1.0 - bias", law_formulas),
+    Mutant("terms", "1.0 - delta * bias", "1.0 - bias", law_formulas),
+    Mutant("terms", "* distance / focal, 1.0)", "* distance / focal, 2.0)", law_formulas),
+    Mutant("terms", "value=blank(bias * noise * resolution)",
            "value=blank(bias * noise)", law_formulas),
-    Mutant("renderability", "jnp.where(voxels.present, term, 0.0)", "term", law_formulas),
-    Mutant("renderability", "2.0 / 1.5 * variance", "2.0 * variance", law_formulas),
-    Mutant("renderability", "jnp.maximum(count - 1.0, 1.0)", "jnp.maximum(count, 1.0)",
+    Mutant("terms", "jnp.where(voxels.present, term, 0.0)", "term", law_formulas),
+    Mutant("terms", "2.0 / 1.5 * variance", "2.0 * variance", law_formulas),
+    Mutant("terms", "jnp.maximum(count - 1.0, 1.0)", "jnp.maximum(count, 1.0)",
            law_formulas),
-    Mutant("renderability", "count > 1.0, jnp.clip", "count > 3.0, jnp.clip", law_formulas),
+    Mutant("terms", "count > 1.0, jnp.clip", "count > 3.0, jnp.clip", law_formulas),
 ]  # fmt: skip
 
 

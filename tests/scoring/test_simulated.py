@@ -14,7 +14,8 @@ from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_points
 from r3jax.scoring import simulated as real
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.renderability import consistency, voxel_renderability
+from r3jax.scoring.renderability import voxel_renderability
+from r3jax.scoring.terms import consistency
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 CAPACITY, VOXEL = 1024, 0.1  # one shape: one compile

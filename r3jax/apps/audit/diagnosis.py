@@ -28,7 +28,8 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.batch import map_over_devices
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.renderability import score_voxels, term_images
+from r3jax.scoring.renderability import term_images
+from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.depth_buffer import seen_in
 from r3jax.visibility.selection import for_selected, select
 from r3jax.visibility.views import panorama_view

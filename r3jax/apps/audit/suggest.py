@@ -53,8 +53,8 @@ from r3jax.planning.planner import Planner, decide
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 from r3jax.scoring.batch import map_over_devices, score_positions
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.renderability import score_voxels
 from r3jax.scoring.simulated import simulate_view
+from r3jax.scoring.terms import score_voxels
 from r3jax.scoring.utility import visible_unexplored
 from r3jax.visibility.depth_buffer import candidates_of, depth_buffer
 from r3jax.visibility.selection import for_selected, select

@@ -31,7 +31,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.explain import CAUSES
-from r3jax.scoring.renderability import score_voxels
+from r3jax.scoring.terms import score_voxels
 from r3jax.trace.header import RunHeader
 from r3jax.trace.rows import StepRow
 from r3jax.visibility.depth_buffer import seen_in

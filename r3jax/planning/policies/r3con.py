@@ -31,12 +31,11 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decision import net_utility
 from r3jax.planning.greedy import Drawn, GreedyPolicy
 from r3jax.planning.policy import Situation
+from r3jax.scoring.backend import sums_and_seen
 from r3jax.scoring.batch import map_over_devices
-from r3jax.scoring.cells import Cells, unexplored_by_direction, visible_cells
+from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.deficit import deficit_per_bin
 from r3jax.scoring.gather import gather_in_range
-from r3jax.visibility.depth_buffer import seen_in
 from r3jax.visibility.views import panorama_view
 
 
@@ -96,7 +95,9 @@ class R3con(GreedyPolicy):
         allowed = situation.limits.allowed_axes(positions, scoring.panorama_bins)
         weight = jnp.asarray(self.config.cell_weight, dtype=jnp.float32)
         look = functools.partial(_look_round, *at_hand[:2], situation.camera, scoring, weight)
-        axis, cells, lack, voxels = map_over_devices(look, (places, jnp.asarray(allowed)))
+        axis, cells, lack, voxels = map_over_devices(
+            look, (places, jnp.asarray(allowed)), threads=1
+        )
         turned = candidates_along(positions, np.asarray(axis, dtype=np.float64))
         turned = eqx.tree_at(lambda c: c.valid, turned, candidates.valid)
         cells, lack, voxels = (np.asarray(x, dtype=np.float64) for x in (cells, lack, voxels))
@@ -134,16 +135,13 @@ def _look_round(
     ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         position, allowed = place
         view = panorama_view(position, config)
-        buffer, visible = seen_in(voxels, view, config)
-        seen = visible_cells(cells, view, buffer)
-        lack = deficit_per_bin(voxels, visible, position, camera.focal, config.forms, num_bins)
-        empty = unexplored_by_direction(cells, seen, position, num_bins)
+        lack, empty, seen, _ = sums_and_seen(voxels, cells, view, camera.focal, config, num_bins)
         sums = cone @ (lack + cell_weight * empty)
         best = jnp.argmax(jnp.where(allowed, sums, -jnp.inf))
-        num_voxels = jnp.sum(visible.mask & voxels.present, dtype=jnp.float32)
+        num_voxels = jnp.sum(jax.lax.population_count(seen), dtype=jnp.float32)
         return lattice[best], empty.sum(), lack.sum(), num_voxels
 
-    return jax.lax.map(look, places)
+    return jax.vmap(look)(places)
 
 
 def _cone_angle(camera: Camera) -> Float[Array, ""]:

@@ -34,7 +34,7 @@ COUNT, SIZE, BUDGET = 70, (40, 24), 1024
 
 def python_compiler() -> ModuleType:
     """Stands for `compiled.py`: kernels stay Python, the counter needs no atomics."""
-    module = ModuleType(f"{PACKAGE}.compiled")
+    module = ModuleType("r3jax.native.compiled")
     for name in ("kernel", "inlined", "inlined_fast", "parallel_kernel"):
         setattr(module, name, lambda function: function)
 
@@ -73,16 +73,9 @@ def numpy_lanes() -> ModuleType:
     return module
 
 
-def no_advice() -> ModuleType:
-    """Stands for `memory.py`."""
-    module = ModuleType(f"{PACKAGE}.memory")
-    module.__dict__["expect_writes"] = lambda array: None
-    return module
-
-
 @pytest.fixture(autouse=True, scope="module")
 def plain_python():
-    doubles = python_compiler(), numpy_lanes(), no_advice()
+    doubles = python_compiler(), numpy_lanes()
     with mock.patch.dict(sys.modules, {double.__name__: double for double in doubles}):
         yield
 

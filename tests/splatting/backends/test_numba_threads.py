@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r3jax.native import ffi
 from r3jax.splatting import backend
 from r3jax.splatting.backends import numba
-from r3jax.splatting.backends.numba import bridge
 from r3jax.splatting.backends.xla import rasterize as xla_rasterize
 from r3jax.splatting.config import RasterConfig
 from tests.splatting.clouds import random_cloud, view
@@ -134,14 +134,14 @@ def test_training_on_one_core_does_not_hang(when):
 
 
 def test_a_threading_layer_for_one_rendering_only_is_refused(monkeypatch):
-    monkeypatch.setattr(bridge, "threading_layer", lambda: "workqueue")
+    monkeypatch.setattr(ffi, "threading_layer", lambda: "workqueue")
     with pytest.raises(RuntimeError, match="omp"):
-        bridge.require_threads()
+        ffi.require_threads()
 
 
 def test_workers_follow_the_cores_of_the_process(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3}, raising=False)
-    assert bridge.num_workers() == 1
+    assert ffi.num_workers() == 1
 
 
 @pytest.mark.parametrize("version", [(0, 2), (0, 4), (1, 3), (-1, -1)])

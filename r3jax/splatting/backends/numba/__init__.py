@@ -1,5 +1,6 @@
 """Rasterizer for CPUs: projection, binning, sort, compositing and all gradients in Numba."""
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -8,11 +9,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera, invert_pose
+from r3jax.native.compiled import forget_outdated_code
+from r3jax.native.ffi import num_workers
 from r3jax.splatting.backend import Composite
 from r3jax.splatting.backends.numba import records
-from r3jax.splatting.backends.numba.bridge import BACKWARD, FORWARD, num_workers, register
+from r3jax.splatting.backends.numba.bridge import BACKWARD, FORWARD, register
 from r3jax.splatting.config import TILE, RasterConfig
 from r3jax.splatting.scene import GaussianScene
+
+forget_outdated_code(Path(__file__).parent)
 
 _Size = tuple[int, int, int]
 """Width and height of the image [px], and the budget of intersections."""

@@ -9,8 +9,8 @@ A Gaussian is listed in the tiles that its ellipse touches: its exact rows in ea
 import numpy as np
 from numba import prange
 
+from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel
 from r3jax.splatting.backends.numba import records as at
-from r3jax.splatting.backends.numba.compiled import claim, inlined, kernel, parallel_kernel
 from r3jax.splatting.backends.numba.project import color_one, project_one
 from r3jax.splatting.backends.numba.records import (
     CENTER_X,

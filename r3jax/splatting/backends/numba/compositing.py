@@ -16,9 +16,9 @@ forward pass's own.
 import numpy as np
 from numba import prange
 
+from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel
 from r3jax.splatting import config
 from r3jax.splatting.backends.numba import records as at
-from r3jax.splatting.backends.numba.compiled import claim, inlined, kernel, parallel_kernel
 from r3jax.splatting.backends.numba.lanes import (
     any_above,
     exp2,

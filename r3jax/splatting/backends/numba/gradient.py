@@ -9,8 +9,8 @@ Names: `g_x` is dL/dx. The order is that of `project.py`, backwards.
 import numpy as np
 from numba import prange
 
+from r3jax.native.compiled import claim, inlined_fast, kernel, parallel_kernel
 from r3jax.splatting.backends.numba import records as at
-from r3jax.splatting.backends.numba.compiled import claim, inlined_fast, kernel, parallel_kernel
 from r3jax.splatting.backends.numba.harmonics import basis_at, gradient_by_direction
 from r3jax.splatting.backends.numba.project import (
     ONE,

@@ -8,8 +8,8 @@ The same functions in the same order as `r3jax.splatting.harmonics`.
 
 import numpy as np
 
+from r3jax.native.compiled import inlined_fast
 from r3jax.splatting import harmonics as shared
-from r3jax.splatting.backends.numba.compiled import inlined_fast
 
 _C0, _C1 = np.float32(shared.C0), np.float32(shared.C1)
 _P, _Q, _R = (np.float32(c) for c in shared.C2)

@@ -15,7 +15,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import models, overload, register_model
 
-from r3jax.splatting.backends.numba.compiled import inlined, intrinsic
+from r3jax.native.compiled import inlined, intrinsic
 
 WIDTH = 16
 _FLOAT = ir.FloatType()

@@ -11,6 +11,7 @@ import sys
 import numpy as np
 from numba import types
 
+from r3jax.native.compiled import inlined, kernel
 from r3jax.splatting.backends.numba import records as at
 from r3jax.splatting.backends.numba.bins import (
     emit_all,
@@ -19,7 +20,6 @@ from r3jax.splatting.backends.numba.bins import (
     project_all,
     sums_before,
 )
-from r3jax.splatting.backends.numba.compiled import inlined, kernel
 from r3jax.splatting.backends.numba.compositing import composite_all, gradient_of_all
 from r3jax.splatting.backends.numba.gradient import gradient_of_cloud
 

@@ -5,9 +5,9 @@
 
 import numpy as np
 
+from r3jax.native.compiled import inlined_fast
 from r3jax.splatting import config
 from r3jax.splatting.backends.numba import records as at
-from r3jax.splatting.backends.numba.compiled import inlined_fast
 from r3jax.splatting.backends.numba.harmonics import basis_at
 
 NEAR = np.float32(config.NEAR)

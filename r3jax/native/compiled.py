@@ -14,22 +14,29 @@ _Function = Callable[..., Any]
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 
-def _forget_outdated_code() -> None:
-    """Deletes machine code on the disk that is older than any source of this package.
+_HERE = Path(__file__).parent
+
+
+def forget_outdated_code(folder: Path = _HERE, *others: Path) -> None:
+    """Deletes machine code on the disk that is older than any source that it may come from.
 
     Numba compares a kernel with its own file only, not with the files of what it inlines.
+
+    Args:
+        folder: with sources of kernels; they may inline what stands in each other's files and
+            in this package.
+        others: folders with kernels that they inline as well.
     """
-    here = Path(__file__).parent
-    sources = {source.stem: source.stat().st_mtime for source in here.glob("*.py")}
-    newest = max(sources.values())
-    for index in here.glob("__pycache__/*.nbi"):
+    sources = {source.stem for source in folder.glob("*.py")}
+    newest = max(s.stat().st_mtime for at in (folder, *others, _HERE) for s in at.glob("*.py"))
+    for index in folder.glob("__pycache__/*.nbi"):
         is_ours = index.name.partition(".")[0] in sources  # of a kernel in one of these files
         with contextlib.suppress(OSError):
             if is_ours and index.stat().st_mtime < newest:
                 index.unlink()
 
 
-_forget_outdated_code()
+forget_outdated_code()
 
 
 def intrinsic(function: _Function) -> _Function:
@@ -61,6 +68,12 @@ def inlined_fast(function: _Function) -> _Function:
     return compiler(inspect.unwrap(function))
 
 
+def inlined_fused(function: _Function) -> _Function:
+    """The same where LLVM may do no more than fuse a product with a sum."""
+    compiler = njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
+    return compiler(inspect.unwrap(function))
+
+
 def parallel_kernel(function: _Function) -> _Function:
     """Compiles a kernel whose `prange` loops share the cores that the process may use."""
     return njit(cache=True, error_model="numpy", parallel=True)(inspect.unwrap(function))
@@ -77,3 +90,18 @@ def claim(typingctx: Any, counter: Any) -> Any:
         return builder.atomic_rmw("add", array.data, one, "monotonic")
 
     return signature, codegen
+
+
+@intrinsic
+def in_wide_vectors(typingctx: Any) -> Any:
+    """Asks LLVM for the widest vectors of the processor in the kernel that calls this.
+
+    Left to itself it halves them on Intel's, whose early models with AVX-512 slowed down on them.
+    """
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        # llvmlite knows no attributes but LLVM's own keywords, and refuses to add this one.
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        return context.get_dummy_value()
+
+    return types.void(), codegen

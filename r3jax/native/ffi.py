@@ -1,0 +1,202 @@
+"""Machine code that XLA calls with its own buffers: custom calls whose handlers Numba compiles.
+
+A handler speaks XLA's foreign function interface (`xla/ffi/api/c_api.h`, which jaxlib ships): it
+is a C function of one pointer, the call frame, from which it reads the addresses and shapes of the
+arrays. Compared with `jax.pure_callback` nothing is copied, no Python runs inside a computation,
+and nothing can wait for a thread of XLA's pool while it occupies the only one.
+"""
+
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# Code generators get what llvmlite makes, which has no types.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
+import inspect
+import os
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from llvmlite import ir
+from numba import cfunc, get_num_threads, prange, types
+from numba.np.numpy_support import carray
+from numba.np.ufunc.parallel import threading_layer
+
+from r3jax.native.compiled import inlined, intrinsic, parallel_kernel
+
+# Offsets in bytes in the structs of XLA's FFI, API version `version.WRITTEN_FOR`.
+_EXTENSION, _API = 8, 16
+_API_MINOR = 36  # in XLA_FFI_Api
+ARGUMENTS, RESULTS = 72, 112  # in XLA_FFI_CallFrame: arrays of pointers to buffers
+_DATA, _DIMENSIONS = 24, 40  # in XLA_FFI_Buffer
+_EXTENSION_TYPE, _EXTENSION_METADATA = 8, 24
+_METADATA_MAJOR, _METADATA_MINOR = 24, 28  # in XLA_FFI_Metadata
+_IS_METADATA = 1
+
+
+def _reader(numba_type, llvm_type):
+    @intrinsic
+    def read(typingctx, address):
+        def codegen(context, builder, sig, args):
+            return builder.load(builder.inttoptr(args[0], llvm_type.as_pointer()))
+
+        return numba_type(types.int64), codegen
+
+    return read
+
+
+def _caster(numba_type):
+    @intrinsic
+    def cast(typingctx, address):
+        def codegen(context, builder, sig, args):
+            return builder.inttoptr(args[0], context.get_value_type(sig.return_type))
+
+        return types.CPointer(numba_type)(types.int64), codegen
+
+    return cast
+
+
+_int64_at, _int32_at = _reader(types.int64, ir.IntType(64)), _reader(types.int32, ir.IntType(32))
+_floats, _ints, _bytes = _caster(types.float32), _caster(types.int32), _caster(types.uint8)
+_words = _caster(types.uint32)
+
+
+@intrinsic
+def _write_int32(typingctx, address, value):
+    def codegen(context, builder, sig, args):
+        builder.store(args[1], builder.inttoptr(args[0], ir.IntType(32).as_pointer()))
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int32), codegen
+
+
+@inlined
+def answers_metadata(frame):
+    """XLA asks first which version of the interface a handler speaks; True if this is that call.
+
+    The major version is ours; within it the structs only grow at their ends, so any minor one,
+    that is, the caller's, will do.
+    """
+    extension = _int64_at(frame + _EXTENSION)
+    if extension == 0 or _int32_at(extension + _EXTENSION_TYPE) != _IS_METADATA:
+        return False
+    metadata = _int64_at(extension + _EXTENSION_METADATA)
+    _write_int32(metadata + _METADATA_MAJOR, np.int32(0))
+    _write_int32(metadata + _METADATA_MINOR, _int32_at(_int64_at(frame + _API) + _API_MINOR))
+    return True
+
+
+@inlined
+def _buffer(frame, kind, index):
+    """Address of the index-th argument or result of a call."""
+    return _int64_at(_int64_at(frame + kind) + 8 * index)
+
+
+@inlined
+def _length(buffer, axis):
+    return _int64_at(_int64_at(buffer + _DIMENSIONS) + 8 * axis)
+
+
+@inlined
+def floats1(frame, kind, index):
+    """Views the index-th argument or result as float32 with one axis."""
+    buffer = _buffer(frame, kind, index)
+    return carray(_floats(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
+
+
+@inlined
+def floats2(frame, kind, index):
+    """Views the index-th argument or result as float32 with two axes."""
+    buffer = _buffer(frame, kind, index)
+    shape = _length(buffer, 0), _length(buffer, 1)
+    return carray(_floats(_int64_at(buffer + _DATA)), shape)
+
+
+@inlined
+def floats3(frame, kind, index):
+    """Views the index-th argument or result as float32 with three axes."""
+    buffer = _buffer(frame, kind, index)
+    shape = _length(buffer, 0), _length(buffer, 1), _length(buffer, 2)
+    return carray(_floats(_int64_at(buffer + _DATA)), shape)
+
+
+@inlined
+def ints1(frame, kind, index):
+    """Views the index-th argument or result as int32 with one axis."""
+    buffer = _buffer(frame, kind, index)
+    return carray(_ints(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
+
+
+@inlined
+def bytes2(frame, kind, index):
+    """Views the index-th argument or result as uint8 with two axes."""
+    buffer = _buffer(frame, kind, index)
+    shape = _length(buffer, 0), _length(buffer, 1)
+    return carray(_bytes(_int64_at(buffer + _DATA)), shape)
+
+
+@inlined
+def ints2(frame, kind, index):
+    """Views the index-th argument or result as int32 with two axes."""
+    buffer = _buffer(frame, kind, index)
+    shape = _length(buffer, 0), _length(buffer, 1)
+    return carray(_ints(_int64_at(buffer + _DATA)), shape)
+
+
+@inlined
+def words2(frame, kind, index):
+    """Views the index-th argument or result as uint32 with two axes."""
+    buffer = _buffer(frame, kind, index)
+    shape = _length(buffer, 0), _length(buffer, 1)
+    return carray(_words(_int64_at(buffer + _DATA)), shape)
+
+
+@inlined
+def bytes1(frame, kind, index):
+    """Views the index-th argument or result as uint8 with one axis."""
+    buffer = _buffer(frame, kind, index)
+    return carray(_bytes(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
+
+
+@parallel_kernel
+def _wake_up(x):
+    for i in prange(x.shape[0]):
+        x[i] = i
+
+
+def require_threads() -> None:
+    """Starts Numba's threads.
+
+    Raises:
+        RuntimeError: its threading layer cannot serve two callers at once.
+    """
+    _wake_up(np.zeros(8))
+    layer = threading_layer()
+    if layer == "workqueue":
+        raise RuntimeError(
+            "machine code for CPUs needs Numba's threading layer `omp` or `tbb`, but only "
+            "`workqueue` is there, which aborts the process when two calls run at once. "
+            "Install OpenMP (libgomp) or `pip install tbb`, or render with backend='xla'."
+        )
+
+
+def num_workers() -> int:
+    """Threads that share the work: one for each core that the process may use."""
+    return min(get_num_threads(), len(os.sched_getaffinity(0)))
+
+
+def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> tuple[Any, ...]:
+    """Compiles handlers (or takes them from the disk) and tells XLA of them by their names.
+
+    Returns:
+        What the caller must keep alive: XLA holds the addresses.
+
+    Raises:
+        RuntimeError: Numba has no threading layer that serves two callers at once.
+    """
+    require_threads()
+    compiler = cfunc(types.int64(types.int64), cache=True)
+    compiled = tuple(compiler(inspect.unwrap(handler)) for handler in handlers.values())
+    for name, handler in zip(handlers, compiled, strict=True):
+        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler.address), platform="cpu")
+    return compiled

@@ -1,0 +1,124 @@
+"""The passes as XLA custom calls."""
+
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
+import functools
+import threading
+from typing import Any
+
+import numpy as np
+
+from r3jax.native.compiled import inlined
+from r3jax.native.ffi import (
+    ARGUMENTS,
+    RESULTS,
+    answers_metadata,
+    bytes1,
+    bytes2,
+    floats1,
+    floats2,
+    floats3,
+    ints1,
+    ints2,
+    register_handlers,
+    words2,
+)
+from r3jax.scoring.backends.numba.pixels import pixels_pass
+from r3jax.scoring.backends.numba.rows import rows_pass
+from r3jax.scoring.backends.numba.sums import sums_pass
+
+SUMS, PIXELS = "r3jax_scoring_sums", "r3jax_scoring_pixels"
+ROWS = "r3jax_scoring_rows"
+
+
+@inlined
+def _state(frame):
+    """Key, visited, count, m2, resolution and voxel size of the map: the first six arguments."""
+    return (
+        words2(frame, ARGUMENTS, 0), words2(frame, ARGUMENTS, 1), floats1(frame, ARGUMENTS, 2),
+        floats1(frame, ARGUMENTS, 3), floats1(frame, ARGUMENTS, 4),
+        floats1(frame, ARGUMENTS, 5)[0],
+    )  # fmt: skip
+
+
+def _sums(frame):
+    """Arguments: state (6), views, options, directions, table, lattice, cells (4).
+
+    Options: wraps, height, width, whether kappa is 1, whether delta is that of pairs, workers.
+    Results: sums of 1 - R, numbers of unexplored cells, bits of rows and of cells seen.
+    """
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 7)
+    sums_pass(
+        _state(frame),
+        (
+            floats1(frame, ARGUMENTS, 11), floats1(frame, ARGUMENTS, 12),
+            floats1(frame, ARGUMENTS, 13), bytes1(frame, ARGUMENTS, 14),
+        ),
+        floats2(frame, ARGUMENTS, 6),
+        (options[0] != 0, (np.int64(options[1]), np.int64(options[2]))),
+        (options[3] != 0, options[4] != 0),
+        (floats2(frame, ARGUMENTS, 8), ints2(frame, ARGUMENTS, 9), floats2(frame, ARGUMENTS, 10)),
+        np.int64(options[5]),
+        (
+            floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1),
+            bytes2(frame, RESULTS, 2), bytes2(frame, RESULTS, 3),
+        ),
+    )  # fmt: skip
+    return 0
+
+
+def _pixels(frame):
+    """Arguments: state (6), views, options as in `_sums`, directions.
+
+    Results: means of R, rows of the map in the pixels.
+    """
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 7)
+    pixels_pass(
+        _state(frame),
+        floats2(frame, ARGUMENTS, 6),
+        (options[0] != 0, (np.int64(options[1]), np.int64(options[2]))),
+        (options[3] != 0, options[4] != 0),
+        floats2(frame, ARGUMENTS, 8),
+        np.int64(options[5]),
+        (floats1(frame, RESULTS, 0), ints2(frame, RESULTS, 1)),
+    )  # fmt: skip
+    return 0
+
+
+def _rows(frame):
+    """Arguments: state (6), points, options, directions.
+
+    Options: whether kappa is 1, whether delta is that of pairs, workers. Results: terms of rows.
+    """
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 7)
+    rows_pass(
+        _state(frame),
+        floats2(frame, ARGUMENTS, 6),
+        (options[0] != 0, options[1] != 0),
+        floats2(frame, ARGUMENTS, 8),
+        np.int64(options[2]),
+        floats3(frame, RESULTS, 0),
+    )
+    return 0
+
+
+_HANDLERS = {SUMS: _sums, PIXELS: _pixels, ROWS: _rows}
+_lock = threading.Lock()
+
+
+def register(name: str) -> None:
+    """Compiles a handler (or takes it from the disk) and tells XLA of it, once."""
+    with _lock:
+        _register(name)
+
+
+@functools.cache
+def _register(name: str) -> tuple[Any, ...]:
+    return register_handlers({name: _HANDLERS[name]})

@@ -1,0 +1,225 @@
+"""The voxels near some views, sorted into bricks: what a view cannot see is skipped by the brick.
+
+The index is built anew in every call, by counting: a share of the time of one panorama.
+"""
+
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
+import math
+
+import numpy as np
+from numba import prange
+
+from r3jax.geometry.voxels import INDEX_LIMIT
+from r3jax.native.compiled import inlined, kernel, parallel_kernel
+from r3jax.visibility.backends.numba.views import LENS, POSITION, RANGE, ROTATION
+
+EDGE = 3
+"""log2 of the voxels along a brick, unless that makes too many bricks."""
+
+MOST = 1 << 19
+"""Bricks at most."""
+
+_LIMIT = np.int64(INDEX_LIMIT)
+_LOW = np.int64((1 << 21) - 1)
+_HALF = np.float32(0.5)
+
+
+@inlined
+def voxel_of(key, row):
+    """Index of the voxel in a row of the map along x, y and z (`geometry.voxels.unpack`)."""
+    low, high = np.int64(key[0, row]), np.int64(key[1, row])
+    y = (low >> 21) | ((high & 1023) << 11)
+    return (low & _LOW) - _LIMIT, y - _LIMIT, ((high >> 10) & _LOW) - _LIMIT
+
+
+@inlined
+def _clipped(value):
+    return np.int64(min(max(value, -np.float64(INDEX_LIMIT)), np.float64(INDEX_LIMIT)))
+
+
+@kernel
+def box_of(views, is_sound, voxel_size):
+    """Indices of the voxels that bound what the views may see: [2, 3], the upper ones included."""
+    box = np.empty((2, 3), np.int64)
+    box[0], box[1] = _LIMIT, -_LIMIT
+    for view in range(views.shape[0]):
+        if is_sound[view]:
+            for axis in range(3):
+                middle, far = np.float64(views[view, POSITION + axis]), views[view, RANGE]
+                low = _clipped(math.floor((middle - far) / voxel_size) - 1.0)
+                high = _clipped(math.floor((middle + far) / voxel_size) + 1.0)
+                box[0, axis], box[1, axis] = min(box[0, axis], low), max(box[1, axis], high)
+    return box
+
+
+@inlined
+def _brick_of(key, row, box, shift, dims):
+    """Number of a row's brick; -1 outside the box."""
+    x, y, z = voxel_of(key, row)
+    is_in = (x >= box[0, 0]) & (x <= box[1, 0]) & (y >= box[0, 1]) & (y <= box[1, 1])
+    is_in = is_in & (z >= box[0, 2]) & (z <= box[1, 2])
+    i, j, k = (x - box[0, 0]) >> shift, (y - box[0, 1]) >> shift, (z - box[0, 2]) >> shift
+    return (i * dims[1] + j) * dims[2] + k if is_in else np.int64(-1)
+
+
+@kernel
+def divide(box, most):
+    """Chooses the edge of the bricks (its log2); their number along each axis follows."""
+    shift = EDGE
+    dims = np.zeros(3, np.int64)
+    while True:
+        for axis in range(3):
+            dims[axis] = max((box[1, axis] - box[0, axis] + (1 << shift)) >> shift, 0)
+        if np.float64(dims[0]) * dims[1] * dims[2] <= most:
+            return shift, dims
+        shift += 1
+
+
+@parallel_kernel
+def count_rows(key, count, box, shift, dims, bricks, counts):
+    """Finds the brick of every row, -1: none, and counts them, for each share of the rows apart."""
+    shares, num = counts.shape[0], count.shape[0]
+    for share in prange(shares):
+        own = counts[share]
+        own[:] = 0
+        for row in range(num * share // shares, num * (share + 1) // shares):
+            brick = _brick_of(key, row, box, shift, dims) if count[row] > 0.0 else np.int64(-1)
+            bricks[row] = brick
+            if brick >= 0:
+                own[brick] += 1
+
+
+@kernel
+def begin_bricks(counts, starts, bricks):
+    """Where bricks begin, and where each share of the rows writes; empty bricks are left out.
+
+    Returns:
+        The number of bricks that hold something; `bricks` has their numbers.
+    """
+    total, used = 0, 0
+    for brick in range(counts.shape[1]):
+        begin = total
+        for share in range(counts.shape[0]):
+            own = counts[share, brick]
+            counts[share, brick] = total
+            total += own
+        if total > begin:
+            starts[used], bricks[used] = begin, brick
+            used += 1
+    starts[used] = total
+    return used
+
+
+@parallel_kernel
+def number_slots(counts, slots):
+    """Replaces the brick of every row by its slot, in the order of the map within a brick.
+
+    Slots by row, not rows by slot: what is gathered is then read in the order in which it lies.
+    """
+    shares, num = counts.shape[0], slots.shape[0]
+    for share in prange(shares):
+        own = counts[share]
+        for row in range(num * share // shares, num * (share + 1) // shares):
+            brick = slots[row]
+            if brick >= 0:
+                slots[row] = own[brick]
+                own[brick] += 1
+
+
+@kernel
+def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
+    """Sorts the rows that some view may see into bricks.
+
+    Args:
+        key: of the map.
+        count: observations; 0 where there is no voxel.
+        views: one a row.
+        is_sound: False for views that see nothing.
+        voxel_size: edge [m].
+        most: bricks at most; 1 keeps the order of the map.
+        workers: threads.
+
+    Returns:
+        The slot of every row [N], -1 for those out of range; where each brick begins among the
+        slots [b + 1]; and the middle and half the diagonal of each brick [b, 4] [m].
+    """
+    box = box_of(views, is_sound, voxel_size)
+    shift, dims = divide(box, most)
+    num_bricks = dims[0] * dims[1] * dims[2]
+    counts = np.empty((workers, num_bricks), np.int32)
+    slots = np.empty(count.shape[0], np.int32)
+    count_rows(key, count, box, shift, dims, slots, counts)
+    starts, bricks = np.empty(num_bricks + 1, np.int64), np.empty(num_bricks, np.int64)
+    used = begin_bricks(counts, starts, bricks)
+    number_slots(counts, slots)
+    spheres = np.empty((used, 4), np.float32)
+    for b in range(used):
+        i, rest = bricks[b] // (dims[1] * dims[2]), bricks[b] % (dims[1] * dims[2])
+        corner = (i, rest // dims[2], rest % dims[2])
+        for axis in range(3):
+            low = box[0, axis] + (corner[axis] << shift)
+            spheres[b, axis] = (np.float32(low) + _HALF * np.float32(1 << shift)) * voxel_size
+        spheres[b, 3] = np.float32(math.sqrt(3.0)) * _HALF * np.float32(1 << shift) * voxel_size
+    return slots, starts[: used + 1], spheres
+
+
+@inlined
+def may_see(view, wraps, shape, sphere, voxel_size):
+    """False only if no voxel whose center lies in a sphere can appear in the view."""
+    dx, dy, dz = (
+        sphere[0] - view[POSITION],
+        sphere[1] - view[POSITION + 1],
+        sphere[2] - view[POSITION + 2],
+    )
+    reach = view[RANGE] + sphere[3]
+    if dx * dx + dy * dy + dz * dz > reach * reach:
+        return False
+    if wraps:
+        return True
+    r, margin = ROTATION, sphere[3] + voxel_size
+    x = view[r] * dx + view[r + 3] * dy + view[r + 6] * dz
+    y = view[r + 1] * dx + view[r + 4] * dy + view[r + 7] * dz
+    z = view[r + 2] * dx + view[r + 5] * dy + view[r + 8] * dz
+    fx, fy, cx, cy = view[LENS], view[LENS + 1], view[LENS + 2], view[LENS + 3]
+    return (
+        (z > -margin)
+        & _is_inside(x, z, -cx / fx, margin, 1.0)
+        & _is_inside(x, z, (shape[1] - cx) / fx, margin, -1.0)
+        & _is_inside(y, z, -cy / fy, margin, 1.0)
+        & _is_inside(y, z, (shape[0] - cy) / fy, margin, -1.0)
+    )
+
+
+@inlined
+def _is_inside(along, z, slope, margin, side):
+    """Whether a point lies within `margin` of the inner side of the plane `along = slope z`."""
+    return side * (along - slope * z) >= -margin * math.sqrt(1.0 + slope * slope)
+
+
+@kernel
+def find_runs(view, wraps, shape, voxel_size, starts, spheres, runs):
+    """Finds the runs of sorted voxels that may appear in a view; neighbors in memory join.
+
+    Args:
+        view: one row.
+        wraps: True for an octahedral map.
+        shape: height and width [px].
+        voxel_size: edge [m].
+        starts: of the bricks among the voxels [b + 1].
+        spheres: round the bricks [b, 4] [m].
+        runs: written; the first voxel and the one after the last of each run [b, 2].
+
+    Returns:
+        How many runs there are.
+    """
+    num = 0
+    for brick in range(spheres.shape[0]):
+        if may_see(view, wraps, shape, spheres[brick], voxel_size):
+            if num > 0 and runs[num - 1, 1] == starts[brick]:
+                runs[num - 1, 1] = starts[brick + 1]
+            else:
+                runs[num, 0], runs[num, 1] = starts[brick], starts[brick + 1]
+                num += 1
+    return num

@@ -1,0 +1,235 @@
+"""Small faults in the kernels for CPUs, each of which the reference must tell from the truth.
+
+The kernels run as plain Python here: what they compile to is compared in `test_backends`.
+"""
+
+import dataclasses
+import functools
+import sys
+from types import ModuleType
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
+from r3jax.scoring.backends import numba, reference
+from r3jax.scoring.backends.views import row_of
+from r3jax.scoring.cells import cells_of
+from r3jax.scoring.terms import score_voxels
+from r3jax.visibility.views import wrap
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.scoring.test_backends import CAMERA, CONFIG, NUM_BINS, poses_of, view_at, world
+
+SIGHT, SCORES = numba.visibility_kernels.__name__, numba.__name__
+CHAIN = (
+    *(f"{SIGHT}.{name}" for name in ("views", "picture", "splat", "limit", "seen", "bricks")),
+    *(f"{SCORES}.{name}" for name in ("voxels", "terms", "sums", "pixels", "rows")),
+)
+VIEWS = 5  # one more than `sums.FEW`, so that bricks are made
+
+
+def python_compiler() -> ModuleType:
+    """Stands for `compiled.py`: kernels stay Python, the counter needs no atomics."""
+    module = ModuleType("r3jax.native.compiled")
+    for name in ("kernel", "inlined", "inlined_fused", "parallel_kernel"):
+        setattr(module, name, lambda function: function)
+
+    def claim(counter):
+        counter[0] += 1
+        return int(counter[0]) - 1
+
+    module.__dict__.update(
+        claim=claim, in_wide_vectors=lambda: None, intrinsic=lambda function: plain_lowest_bit
+    )
+    return module
+
+
+def plain_lowest_bit(word) -> int:
+    return (int(word) & -int(word)).bit_length() - 1
+
+
+def numpy_arithmetic() -> ModuleType:
+    """Stands for `arithmetic.py`."""
+    single, module = np.float32, ModuleType("r3jax.native.arithmetic")
+    bits_of = lambda value: single(value).view(np.uint32)
+    module.__dict__.update(
+        floor=lambda x: single(np.floor(x)),
+        ceil_log2=lambda x: single(np.ceil(np.log2(x))),
+        power_of_two=np.exp2,
+        whole=np.int32,
+        count_bits=lambda word: int(word).bit_count(),
+        bits_of=bits_of,
+        float_of=lambda word: np.uint32(word).view(single),
+        key_of=lambda distance, row: np.int64(int(bits_of(distance)) << 32 | int(row)),
+        exp2=lambda power: np.exp2(max(power, single(-126.0))),
+        log2=np.log2,
+    )
+    return module
+
+
+@pytest.fixture(autouse=True, scope="module")
+def plain_python():
+    doubles = python_compiler(), numpy_arithmetic()
+    with (
+        mock.patch.dict(sys.modules, {double.__name__: double for double in doubles}),
+        np.errstate(all="ignore"),
+    ):
+        yield
+
+
+@functools.cache
+def asked():
+    """The map, cells, and the arguments that all passes share."""
+    state, grid = world(2)
+    # Some rows hold what is left of a voxel that was taken out (`MapState.take`).
+    is_left = jnp.arange(state.capacity) % 7 == 0
+    state = dataclasses.replace(state, count=jnp.where(is_left, 0.0, state.count))
+    cells = cells_of(grid)
+    arrays = state.key, state.visited, state.count, state.m2, state.resolution
+    space = cells.x, cells.y, cells.z, cells.unexplored.astype(jnp.uint8)
+    known = (*(np.array(x) for x in arrays), np.float32(state.voxel_size))
+    return state, cells, known, tuple(np.array(x) for x in space)
+
+
+def frame_and_rows(kind: str):
+    views = [view_at(kind, pose) for pose in poses_of(2)[:VIEWS]]
+    rows = [np.array(row_of(view, CAMERA.focal, CONFIG)) for view in views]
+    return views, (views[0].wraps, views[0].shape), np.stack(rows)
+
+
+@functools.cache
+def expected(kind: str):
+    """Sums, cells, and means in pixels of every view, by the reference."""
+    state, cells, *_ = asked()
+    views, *_ = frame_and_rows(kind)
+
+    @jax.jit
+    def look(view, position):
+        at = position, CAMERA.focal, CONFIG
+        sums = reference.sums_in_view(state, cells, view, *at, NUM_BINS[kind])
+        return *sums, reference.mean_in_pixels(state, view, *at[:2], CONFIG.forms)
+
+    answers = [look(v, p[:3, 3]) for v, p in zip(views, poses_of(2), strict=False)]
+    return [np.stack([np.array(x) for x in part]) for part in zip(*answers, strict=True)]
+
+
+def bins_of(state) -> np.ndarray:
+    return fibonacci_lattice(state.num_bins).astype(np.float32)
+
+
+def sums_agree(modules: Modules, kind: str = "panorama") -> None:
+    state, _, known, space = asked()
+    _, frame, rows = frame_and_rows(kind)
+    bins = NUM_BINS[kind]
+    table = np.ascontiguousarray(nearest_bin_table(bins).T)
+    tables = bins_of(state), table, fibonacci_lattice(bins).astype(np.float32)
+    none = np.empty((VIEWS, 0), np.uint8)
+    results = (*np.empty((2, VIEWS, bins), np.float32), none, none)
+    modules["sums"].sums_pass(known, space, rows, frame, (False, False), tables, 2, results)
+    deficits, unexplored, _ = expected(kind)
+    np.testing.assert_allclose(results[0], deficits, atol=1e-4 * deficits.max())
+    np.testing.assert_array_equal(results[1], unexplored)
+
+
+def images_agree(modules: Modules, kind: str = "pinhole") -> None:
+    state, _, known, _ = asked()
+    _, frame, rows = frame_and_rows(kind)
+    results = np.empty(VIEWS, np.float32), np.empty((VIEWS, 0), np.int32)
+    modules["pixels"].pixels_pass(known, rows, frame, (False, False), bins_of(state), 2, results)
+    np.testing.assert_allclose(results[0], expected(kind)[2], atol=1e-4)
+
+
+def images_all_round(modules: Modules) -> None:
+    images_agree(modules, "panorama")
+
+
+def borders_agree(modules: Modules) -> None:
+    """Each pixel of the border stands for the one that `wrap` glues it to."""
+    picture, size = modules["picture"], 8
+    ring = [picture._ring_pixel(i, (size, size)) for i in range(4 * size + 4)]
+    row, column = np.array(ring).T
+    is_outside = (row == -1) | (row == size) | (column == -1) | (column == size)
+    assert len(set(ring)) == len(ring)
+    assert is_outside.all()
+    expected = np.stack(wrap(*jnp.asarray([row, column]), jnp.full(len(ring), size)), axis=1)
+    found = [picture.stands_for(*pixel, (size, size), True) for pixel in ring]
+    np.testing.assert_array_equal(found, expected)
+
+
+def in_images(modules: Modules) -> None:
+    sums_agree(modules, "pinhole")
+
+
+def terms_agree(modules: Modules) -> None:
+    state, _, known, _ = asked()
+    position = poses_of(2)[0, :3, 3]
+    points = np.append(np.array(position), CAMERA.focal).astype(np.float32)[None]
+    results = np.empty((1, modules["rows"].NUM_TERMS, state.capacity), np.float32)
+    modules["rows"].rows_pass(known, points, (False, False), bins_of(state), 2, results)
+    terms = jax.jit(score_voxels)(state, position, CAMERA.focal)
+    for found, (name, term) in zip(results[0], vars(terms).items(), strict=True):
+        np.testing.assert_allclose(found, term, atol=1e-4, err_msg=name)
+
+
+MUTANTS = [
+    Mutant("views", "placed[COLUMN + i] = column * half + half",
+           "placed[COLUMN + i] = column * half", sums_agree),
+    Mutant("views", "q = a if is_lower else b", "q = b", sums_agree),
+    Mutant("views", "abs(-_ONE - apart * sign_y)", "abs(_ONE - apart * sign_y)", sums_agree),
+    Mutant("views", "distance if distance <= far else _INFINITE", "distance", sums_agree),
+    Mutant("views", "c0, r0 = along_x * (xx - slope_x * xz), along_y",
+           "c0, r0 = along_x * xx, along_y", in_images),
+    Mutant("views", "abs(c0 - r0) + abs(c1 - r1)", "abs(c0 - r0) + abs(c1 + r1)", in_images),
+    Mutant("picture", "height - 1 - row if crosses_column", "row if crosses_column",
+           borders_agree),
+    Mutant("picture", "i -= 2 * (width + 2)", "i -= 2 * width", borders_agree),
+    Mutant("picture", "        if wraps:\n            fold", "        if False:\n            fold",
+           images_all_round),
+    Mutant("picture", "above + (r >> 1) * stride", "above + r * stride", sums_agree),
+    Mutant("splat", "spread = _QUARTER if begins_level else _ZERO", "spread = _ZERO", sums_agree),
+    Mutant("splat", "(in_slants | is_own)", "is_own", sums_agree),
+    Mutant("splat", "+ _TWO * _RING * level + _RING", "+ _RING", sums_agree),
+    Mutant("limit", "_flatter(before, after, np.float32(step))", "_ZERO", sums_agree),
+    Mutant("limit", "return least if before * after > _ZERO else _ZERO", "return least",
+           sums_agree),
+    Mutant("limit", ", _MAX_STRETCH)", ", _ONE)", sums_agree),
+    Mutant("seen", "first = max(limit", "first = min(limit", sums_agree),
+    Mutant("seen", "(distance <= nearest[pixel])", "(distance <= 2 * nearest[pixel])", sums_agree),
+    Mutant("bricks", "reach = view[RANGE] + sphere[3]", "reach = view[RANGE]", sums_agree),
+    Mutant("bricks", "_is_inside(y, z, -cy / fy, margin, 1.0)",
+           "_is_inside(y, z, -cy / fy, -margin, 1.0)", in_images),
+    Mutant("voxels", "math.sqrt(_TWO_THIRDS_OF_TWO * variance)", "math.sqrt(variance)",
+           sums_agree),
+    Mutant("voxels", "max(count - _ONE, _ONE)", "count", terms_agree),
+    Mutant("voxels", "counts[group] += 1\n        rows", "rows", sums_agree),
+    Mutant("terms", "best = max(best, cosine)", "best = cosine", images_agree),
+    Mutant("terms", "apart = _ZERO if cosine > _ZERO else _INFINITE", "apart = _ZERO",
+           terms_agree),
+    Mutant("terms", "-z * a_y, z * a_x", "-z * a_x, z * a_y", terms_agree),
+    Mutant("terms", "cosine if is_one else cosine * cosine", "cosine", sums_agree),
+    Mutant("terms", "_ONE - delta * bias", "_ONE - bias", sums_agree),
+    Mutant("terms", "kappa * (_ONE - bias)", "(_ONE - bias)", terms_agree),
+    Mutant("sums", "is_better = cosine > best", "is_better = k == 0", sums_agree),
+    Mutant("sums", "num += is_seen[i]", "num += 1", sums_agree),
+    Mutant("pixels", "key_of(placed[DISTANCE + i], rows[first + i])",
+           "key_of(placed[DISTANCE + i], first + i)", images_agree),
+    Mutant("pixels", "if row != last:", "if last < 0:", images_agree),
+    Mutant("rows", "is_there * bias * noise * resolution", "bias * noise * resolution",
+           terms_agree),
+]  # fmt: skip
+
+
+LAWS = borders_agree, sums_agree, in_images, images_agree, images_all_round, terms_agree
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_laws_hold(law):
+    law(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_faults_are_noticed(mutant):
+    assert_caught(CHAIN, mutant)
