@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from r3jax.mapping.state import MapState
 from r3jax.native.version import WRITTEN_FOR, ffi_version
 from r3jax.scoring.backends import dense, reference
-from r3jax.scoring.backends.views import frame_of, over_views, row_of
+from r3jax.scoring.backends.views import layout_of, over_views, row_of
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import PAPER, Forms, ScoringConfig
 from r3jax.scoring.terms import Renderability, score_voxels
@@ -120,11 +120,11 @@ def _sums(
     *,
     keep: bool,
 ) -> Any:
-    frame, forms = frame_of(view), config.forms
+    layout, forms = layout_of(view), config.forms
 
     def score_by(backend: Any) -> Callable[..., Any]:
         def score(shared: tuple[MapState, Cells], views: Array) -> Any:
-            return backend.sums_in_views(*shared, views, frame, forms, num_bins, keep=keep)
+            return backend.sums_in_views(*shared, views, layout, forms, num_bins, keep=keep)
 
         return lambda shared, views: over_views(score, shared, views)
 
@@ -144,10 +144,10 @@ def mean_in_pixels(
 ) -> Float[Array, ""]:
     """`reference.mean_in_pixels`, by the fastest backend of the platform."""
     del position  # that of the view; it only carries the derivative
-    frame = frame_of(view)
+    layout = layout_of(view)
 
     def score_by(backend: Any) -> Callable[..., Any]:
-        score = lambda voxels, views: backend.means_in_pixels(voxels, views, frame, forms)
+        score = lambda voxels, views: backend.means_in_pixels(voxels, views, layout, forms)
         return lambda voxels, views: over_views(score, voxels, views)
 
     chosen = _by_platform(score_by, max(view.shape))
@@ -169,10 +169,10 @@ def _mean_in_pixels_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
 @jax.custom_jvp
 def rows_in_pixels(voxels: MapState, view: View, config: ScoringConfig) -> Int[Array, "h w"]:
     """`reference.rows_in_pixels`, by the fastest backend of the platform."""
-    frame = frame_of(view)
+    layout = layout_of(view)
 
     def look_by(backend: Any) -> Callable[..., Any]:
-        look = lambda voxels, views: backend.rows_in_pixels(voxels, views, frame, PAPER)
+        look = lambda voxels, views: backend.rows_in_pixels(voxels, views, layout, PAPER)
         return lambda voxels, views: over_views(look, voxels, views)
 
     chosen = _by_platform(look_by, max(view.shape))

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.scoring.deficit import sum_by_direction
 from r3jax.visibility.depth_buffer import DepthBuffer, is_visible
-from r3jax.visibility.selection import Carry, Selection, for_selected, narrow, select
-from r3jax.visibility.views import Placement, View
+from r3jax.visibility.selection import Selection, for_selected, narrow, select
+from r3jax.visibility.views import View
 
 
 class Cells(eqx.Module):
@@ -90,30 +90,3 @@ def visible_cells(
         in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
         among = select(cells.unexplored & in_view)
     return narrow(among, test)
-
-
-def over_visible(
-    cells: Cells,
-    view: View,
-    buffer: DepthBuffer,
-    add: Callable[[Float[Array, "3 n"], Placement, Bool[Array, " n"], Carry], Carry],
-    start: Carry,
-) -> Carry:
-    """Adds something up over the unexplored cells whose center the view sees.
-
-    Args:
-        cells: of the coarse grid.
-        view: where from.
-        buffer: what hides.
-        add: from centers [3, n] [m], where they fall (`View.place`), which of them are seen [n]
-            and the total so far to the total with them.
-        start: the total of nothing.
-    """
-
-    def of_chunk(index: Int[Array, " n"], valid: Bool[Array, " n"], total: Carry) -> Carry:
-        points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
-        place = view.place(points)
-        return add(points, place, valid & is_visible(view, place, buffer.distance), total)
-
-    in_view = view.may_see((cells.x, cells.y, cells.z), jnp.zeros(()))
-    return for_selected(select(cells.unexplored & in_view), of_chunk, start)

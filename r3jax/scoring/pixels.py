@@ -1,9 +1,11 @@
 """What each pixel of a view would show of the map: the form in which other planners score views.
 
 Active-GS, ActiveGAMER and COVER render their map from every candidate and average over pixels.
-Here the rendering is the voxel depth buffer of `visibility`, at most `config.zbuffer_size` wide.
+Here the rendering is the nearest voxel of each pixel (`scoring.backend`), at most
+`config.zbuffer_size` wide.
 
-Shape symbols: C candidates; h w pixels of the buffer; n voxels at hand; N rows of the map.
+Shape symbols: C candidates; h w pixels of the buffer; n voxels and c cells at hand; N rows of the
+map.
 """
 
 import functools
@@ -14,18 +16,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.numerics import safe_norm
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.scoring.backend import rows_in_pixels, seen_in_view
 from r3jax.scoring.batch import map_over_devices
-from r3jax.scoring.cells import Cells, over_visible
+from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
-from r3jax.visibility.depth_buffer import DepthBuffer, candidates_of, depth_buffer
-from r3jax.visibility.views import PinholeView, Placement, pinhole_view
+from r3jax.visibility.views import pinhole_view
 
 
 class PixelView(eqx.Module):
@@ -103,61 +105,54 @@ def _score(
     reach: Float[Array, ""],
     poses: Float[Array, "C 4 4"],
 ) -> Any:
-    def look(pose: Array) -> Any:
-        return value(pixel_view(voxels, cells, camera, pose, config, rows, reach))
+    def shown(pose: Array) -> tuple[Int[Array, "h w"], Bool[Array, " c"]]:
+        view = pinhole_view(camera, pose, config)
+        far = eqx.tree_at(lambda v: v.max_range, view, reach)
+        # In the view of the sensor's range: what it cannot measure stays unexplored.
+        return rows_in_pixels(voxels, far, config), seen_in_view(voxels, cells, view, config)[1]
 
-    return jax.lax.map(look, poses)
+    def look(one: tuple[Array, tuple[Array, Array]]) -> Any:
+        pose, (item, unexplored) = one
+        return value(pixel_view(voxels, cells, pose, config, item, unexplored, rows))
+
+    # All views in one call of the backend; what is made of their pixels, one after the other.
+    return jax.lax.map(look, (poses, jax.vmap(shown)(poses)))
 
 
 def pixel_view(
     voxels: MapState,
     cells: Cells,
-    camera: Camera,
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
+    item: Int[Array, "h w"],
+    unexplored: Bool[Array, " c"],
     rows: Any = (),
-    reach: Float[Array, ""] | None = None,
 ) -> PixelView:
-    """One view of voxels and cells that are at hand; `rows` holds arrays `[..., n]`."""
-    view = pinhole_view(camera, T_world_camera, config)
-    far = view if reach is None else eqx.tree_at(lambda v: v.max_range, view, reach)
-    buffer = depth_buffer(voxels, candidates_of(voxels, far), far, config)
-    num = voxels.count.shape[0]
-    hit = buffer.item < num
-    item = jnp.minimum(buffer.item, num - 1)
+    """One view of voxels and cells that are at hand.
+
+    Args:
+        voxels: n voxels.
+        cells: c cells of the coarse grid.
+        T_world_camera: pose of the view.
+        config: the sensor's range.
+        item: the voxel that each pixel shows; n where there is none.
+        unexplored: the unexplored cells that the view shows.
+        rows: arrays `[..., n]` with something about each voxel.
+    """
+    num, position = voxels.count.shape[0], T_world_camera[:3, 3]
+    hit = item < num
+    item = jnp.minimum(item, num - 1)
     center = voxels.center_of(item.reshape(-1)).reshape(3, *item.shape)
-    offset = T_world_camera[:3, 3][:, None, None] - center
+    offset = position[:, None, None] - center
     axis = T_world_camera[:3, 2][:, None, None]
-    # Of the voxel itself: in the buffer it is rounded down, and would hide a cell just before it.
-    nearest = jnp.where(hit, safe_norm(offset, axis=0), jnp.inf)
-    buffer = eqx.tree_at(lambda b: b.distance, buffer, nearest)
-    # In the view of the sensor's range: what it cannot measure stays unexplored.
-    count, distance = _unexplored(cells, view, buffer)
+    distance = safe_norm(jnp.stack([cells.x, cells.y, cells.z]) - position[:, None], axis=0)
     return PixelView(
         hit=hit,
         # The offset points towards the camera, the axis away from it: hence the sign.
         depth=jnp.where(hit, -jnp.sum(offset * axis, axis=0), jnp.inf),
         offset=offset,
         rows=jax.tree.map(lambda x: x[..., item], rows),
-        cells=count,
-        cell_distance=distance,
+        cells=jnp.sum(unexplored, dtype=jnp.float32),
+        cell_distance=jnp.sum(jnp.where(unexplored, distance, 0.0)),
         max_range=config.max_range,
     )
-
-
-def _unexplored(
-    cells: Cells, view: PinholeView, buffer: DepthBuffer
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Number of unexplored cells whose center the view sees, and the sum of their distances."""
-
-    def add(
-        points: Float[Array, "3 n"],
-        place: Placement,
-        is_seen: Bool[Array, " n"],
-        totals: tuple[Float[Array, ""], Float[Array, ""]],
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        del points
-        count = jnp.sum(is_seen, dtype=jnp.float32)
-        return totals[0] + count, totals[1] + jnp.sum(jnp.where(is_seen, place.distance, 0.0))
-
-    return over_visible(cells, view, buffer, add, (jnp.zeros(()), jnp.zeros(())))

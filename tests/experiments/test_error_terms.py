@@ -16,9 +16,9 @@ from r3jax.apps.benchmark.run_cell import run_cell
 from r3jax.evaluation.maps import map_of
 from r3jax.geometry.cameras import pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.scoring.backend import rows_in_pixels
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.scenes.registry import open_scene
-from r3jax.visibility.depth_buffer import candidates_of, depth_buffer
 from r3jax.visibility.views import pinhole_view
 from tests.apps.benchmark.tiny import CONDITIONS, make_cells
 from tests.box_room import write_room
@@ -107,7 +107,7 @@ def _shown(state, T):
     """The map's row that each pixel shows, and the rows' centers."""
     voxels = state
     view = pinhole_view(CONDITIONS.camera, T, CONFIG)
-    return depth_buffer(voxels, candidates_of(voxels, view), view, CONFIG).item, voxels.center
+    return rows_in_pixels(voxels, view, CONFIG), voxels.center
 
 
 def _oracle(state, T):

@@ -15,7 +15,7 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
 from r3jax.scoring import backend
 from r3jax.scoring.backends import dense, reference
-from r3jax.scoring.backends.views import frame_of, row_of
+from r3jax.scoring.backends.views import layout_of, row_of
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import View, panorama_view, pinhole_view
@@ -108,7 +108,7 @@ def test_dense_batches_are_those_of_the_reference(kind):
     cells, poses = cells_of(grid), poses_of(0)
     view = view_at(kind, poses[0])
     rows = jax.vmap(lambda pose: row_of(view_at(kind, pose), CAMERA.focal, CONFIG))(poses)
-    frame, forms = frame_of(view), CONFIG.forms
+    frame, forms = layout_of(view), CONFIG.forms
     found = jax.jit(
         lambda v, c, rows: dense.sums_in_views(v, c, rows, frame, forms, NUM_BINS[kind])
     )(state, cells, rows)

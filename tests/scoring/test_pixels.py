@@ -210,21 +210,20 @@ def law_reach(modules: Modules) -> None:
 
 
 LAWS = [law_rows, law_rays, law_cells_as_in_utility, law_single_cells, law_reach]
-CHAIN = ("r3jax.scoring.cells", "r3jax.scoring.pixels")
+CHAIN = ("r3jax.scoring.pixels",)
 MUTANTS = [
     Mutant("pixels", "jnp.minimum(index, last)]", "jnp.arange(index.shape[0])]", law_rows),
     Mutant("pixels", "x[..., item], rows", "x[..., item + 1], rows", law_rows),
     Mutant("pixels", "[:, None, None] - center", "[:, None, None] + center", law_rows),
     Mutant("pixels", "-jnp.sum(offset * axis", "jnp.sum(offset * axis", law_rows),
-    Mutant("pixels", "jnp.minimum(buffer.item, num - 1)", "jnp.minimum(buffer.item, 40)", law_rays),
-    Mutant("pixels", "buffer.item < num", "buffer.item <= num", law_rays),
-    Mutant("cells", "valid & is_visible", "is_visible", law_single_cells),
-    Mutant("cells", "for_selected(select(cells.unexplored & in_view)",
-           "for_selected(select(in_view)", law_single_cells),
-    Mutant("cells", "place, buffer.distance)", "place, buffer.limit)", law_cells_as_in_utility),
-    Mutant("pixels", "far = view if reach is None", "far = view if True", law_reach),
-    Mutant("pixels", "_unexplored(cells, view", "_unexplored(cells, far", law_reach),
-    Mutant("pixels", "is_seen, place.distance, 0.0", "is_seen, 1.0, 0.0", law_single_cells),
+    Mutant("pixels", "jnp.minimum(item, num - 1)", "jnp.minimum(item, 40)", law_rays),
+    Mutant("pixels", "hit = item < num", "hit = item <= num", law_rays),
+    Mutant("pixels", "rows_in_pixels(voxels, far, config)",
+           "rows_in_pixels(voxels, pinhole_view(camera, pose, config), config)", law_reach),
+    Mutant("pixels", "unexplored, distance, 0.0", "unexplored, 1.0, 0.0", law_single_cells),
+    Mutant("pixels", "jnp.sum(unexplored, dtype", "jnp.sum(~unexplored, dtype", law_single_cells),
+    Mutant("pixels", "seen_in_view(voxels, cells, view, config)[1]",
+           "seen_in_view(voxels, cells, far, config)[1]", law_reach),
 ]  # fmt: skip
 
 

@@ -28,7 +28,7 @@ class Shot:
     """Need not exist: then all depth counts."""
 
     lens: Lens
-    """Of the color image."""
+    """Lens of the color image."""
 
     pose: np.ndarray
     """`T_world_camera`, [4, 4]: OpenCV axes."""

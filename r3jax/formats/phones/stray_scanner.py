@@ -29,7 +29,7 @@ _POSE = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _VIDEO = "rgb.mp4"
 _MAX_VIDEO = 4 << 30
-"""Of a video in an archive, which is read as a whole [bytes]."""
+"""Size of a video in an archive, which is read as a whole [bytes]."""
 
 
 def is_stray_scanner(path: Path) -> bool:

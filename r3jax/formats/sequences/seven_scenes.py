@@ -21,7 +21,7 @@ from r3jax.formats.poses import mend_pose, read_numbers
 _LENS = Lens("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0))
 _UNIT = DepthUnit(0.001, invalid=65535)
 _SUFFIXES = (".jpeg", ".jpg", ".png")
-"""Of images, in any case; where a frame has several, the last is the original."""
+"""Endings of images, in any case; where a frame has several, the last is the original."""
 
 
 def is_seven_scenes(path: Path) -> bool:

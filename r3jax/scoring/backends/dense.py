@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from r3jax.mapping.state import MapState
 from r3jax.scoring.backends import reference
-from r3jax.scoring.backends.views import Frame, view_of
+from r3jax.scoring.backends.views import BufferLayout, view_of
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms, ScoringConfig
 from r3jax.scoring.terms import score_voxels
@@ -33,7 +33,7 @@ def sums_in_views(
     voxels: MapState,
     cells: Cells,
     views: Float[Array, "P 20"],
-    frame: Frame,
+    layout: BufferLayout,
     forms: Forms,
     num_bins: int,
     *,
@@ -42,7 +42,7 @@ def sums_in_views(
     """`reference.sums_in_view` of many views; `keep` as in `numba.sums_in_views`."""
 
     def one(row: Float[Array, " 20"]) -> tuple[Array, ...]:
-        config, view = _config(row, forms), view_of(row, frame)
+        config, view = _config(row, forms), view_of(row, layout)
         position, focal = row[:3], row[18]
         sums = reference.sums_in_view(voxels, cells, view, position, focal, config, num_bins)
         if not keep:
@@ -54,23 +54,23 @@ def sums_in_views(
 
 
 def means_in_pixels(
-    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms
+    voxels: MapState, views: Float[Array, "P 20"], layout: BufferLayout, forms: Forms
 ) -> Float[Array, " P"]:
     """`reference.mean_in_pixels` of many views."""
 
     def one(row: Float[Array, " 20"]) -> Float[Array, ""]:
-        view = view_of(row, frame)
+        view = view_of(row, layout)
         return reference.mean_in_pixels(voxels, view, row[:3], row[18], forms)
 
     return jax.lax.map(one, views, batch_size=batch_size(voxels.capacity))
 
 
 def rows_in_pixels(
-    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms
+    voxels: MapState, views: Float[Array, "P 20"], layout: BufferLayout, forms: Forms
 ) -> Int[Array, "P h w"]:
     """`reference.rows_in_pixels` of many views."""
     del forms
-    one = lambda row: reference.rows_in_pixels(voxels, view_of(row, frame))
+    one = lambda row: reference.rows_in_pixels(voxels, view_of(row, layout))
     return jax.lax.map(one, views, batch_size=batch_size(voxels.capacity))
 
 

@@ -20,7 +20,7 @@ VIEW_SIZE = 20
 range [m], tolerance [voxels], focal length of R [px], angle of a pixel [rad]."""
 
 
-class Frame(NamedTuple):
+class BufferLayout(NamedTuple):
     """What all views of a batch have in common."""
 
     wraps: bool
@@ -33,9 +33,9 @@ class Frame(NamedTuple):
     """Columns of the depth buffer [px]."""
 
 
-def frame_of(view: View) -> Frame:
+def layout_of(view: View) -> BufferLayout:
     """Finds the part of a view that is static."""
-    return Frame(view.wraps, *view.shape)
+    return BufferLayout(view.wraps, *view.shape)
 
 
 def row_of(view: View, focal: Float[Array, ""], config: ScoringConfig) -> Float[Array, " 20"]:
@@ -51,14 +51,14 @@ def row_of(view: View, focal: Float[Array, ""], config: ScoringConfig) -> Float[
     return jnp.concatenate([position, rotation, lens, rest])
 
 
-def view_of(row: Float[Array, " 20"], frame: Frame) -> View:
+def view_of(row: Float[Array, " 20"], layout: BufferLayout) -> View:
     """Unpacks a row: the inverse of `row_of`."""
     position, far = row[:3], row[16]
-    if frame.wraps:
-        return PanoramaView(position, far, frame.width)
+    if layout.wraps:
+        return PanoramaView(position, far, layout.width)
     top = jnp.concatenate([row[3:12].reshape(3, 3), position[:, None]], axis=1)
     T_world_camera = jnp.concatenate([top, jnp.array([[0.0, 0.0, 0.0, 1.0]])], axis=0)
-    camera = Camera(frame.width, frame.height, row[12], row[13], row[14], row[15])
+    camera = Camera(layout.width, layout.height, row[12], row[13], row[14], row[15])
     return PinholeView(camera, T_world_camera, far)
 
 

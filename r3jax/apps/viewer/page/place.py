@@ -49,7 +49,7 @@ class _Drawing:
 
     draw: Show
     moment: str
-    """Of which moment it is."""
+    """Moment that it shows."""
 
     detail: str
     """Such as how many voxels there are."""

@@ -38,7 +38,7 @@ from r3jax.splatting.views import fitted_size
 from r3jax.trace.errors import RunError
 
 _PATH_WIDTH = 0.03
-"""Of the line along the path [m]."""
+"""Width of the line along the path [m]."""
 
 _REPLAYED = 0.9
 """Share of the work that replaying frames is said to be; the rest is drawing."""

@@ -18,7 +18,7 @@ from r3jax.native.compiled import forget_outdated_code
 from r3jax.native.ffi import num_workers
 from r3jax.scoring.backends.numba.bridge import PIXELS, ROWS, SUMS, register
 from r3jax.scoring.backends.numba.rows import NUM_TERMS
-from r3jax.scoring.backends.views import Frame
+from r3jax.scoring.backends.views import BufferLayout
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms
 
@@ -33,8 +33,8 @@ def _shared(voxels: MapState) -> tuple[Array, ...]:
     )  # fmt: skip
 
 
-def _options(frame: Frame, forms: Forms) -> np.ndarray:
-    return np.array([*frame, *_choices(forms), num_workers()], dtype=np.int32)
+def _options(layout: BufferLayout, forms: Forms) -> np.ndarray:
+    return np.array([*layout, *_choices(forms), num_workers()], dtype=np.int32)
 
 
 def _choices(forms: Forms) -> tuple[bool, bool]:
@@ -53,7 +53,7 @@ def sums_in_views(
     voxels: MapState,
     cells: Cells,
     views: Float[Array, "P 20"],
-    frame: Frame,
+    layout: BufferLayout,
     forms: Forms,
     num_bins: int,
     *,
@@ -73,28 +73,28 @@ def sums_in_views(
     directions = fibonacci_lattice(voxels.num_bins).astype(np.float32)
     space = (cells.x, cells.y, cells.z, cells.unexplored.astype(jnp.uint8))
     results = jax.ffi.ffi_call(SUMS, [sums, sums, *bits])(
-        *_shared(voxels), views, _options(frame, forms), directions, *_tables(num_bins), *space
+        *_shared(voxels), views, _options(layout, forms), directions, *_tables(num_bins), *space
     )
     return tuple(results) if keep else tuple(results[:2])
 
 
 def means_in_pixels(
-    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms
+    voxels: MapState, views: Float[Array, "P 20"], layout: BufferLayout, forms: Forms
 ) -> Float[Array, " P"]:
     """`reference.mean_in_pixels` of many views, on as many cores as the process may use."""
-    return _look(voxels, views, frame, forms, 0)[0]
+    return _look(voxels, views, layout, forms, 0)[0]
 
 
 def rows_in_pixels(
-    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms
+    voxels: MapState, views: Float[Array, "P 20"], layout: BufferLayout, forms: Forms
 ) -> Int[Array, "P h w"]:
     """`reference.rows_in_pixels` of many views."""
-    rows = _look(voxels, views, frame, forms, frame.height * frame.width)[1]
-    return rows.reshape(-1, frame.height, frame.width)
+    rows = _look(voxels, views, layout, forms, layout.height * layout.width)[1]
+    return rows.reshape(-1, layout.height, layout.width)
 
 
 def _look(
-    voxels: MapState, views: Float[Array, "P 20"], frame: Frame, forms: Forms, room: int
+    voxels: MapState, views: Float[Array, "P 20"], layout: BufferLayout, forms: Forms, room: int
 ) -> tuple[Array, Array]:
     register(PIXELS)
     num = views.shape[0]
@@ -104,7 +104,7 @@ def _look(
     ]
     directions = fibonacci_lattice(voxels.num_bins).astype(np.float32)
     means, rows = jax.ffi.ffi_call(PIXELS, shapes)(
-        *_shared(voxels), views, _options(frame, forms), directions
+        *_shared(voxels), views, _options(layout, forms), directions
     )
     return means, rows
 

@@ -130,9 +130,9 @@ def _write_rows(keys, side, shape, num, image):
 
 
 @kernel
-def _look_share(next_view, views, is_sound, frame, state, index, forms, directions, results):
+def _look_share(next_view, views, is_sound, layout, state, index, forms, directions, results):
     """Looks from one view after the other until none is left."""
-    wraps, shape = frame
+    wraps, shape = layout
     starts, spheres, rows, centers = index
     means, images = results
     voxel_size, side = state[5], side_of(shape)
@@ -172,13 +172,13 @@ def look_all(
 
 
 @kernel
-def pixels_pass(state, views, frame, forms, directions, workers, results):
+def pixels_pass(state, views, layout, forms, directions, workers, results):
     """Finds what each pixel of many views shows.
 
     Args:
         state: as in `sums_pass`.
         views: [P, VIEW_SIZE].
-        frame: whether views wrap, and height and width of their buffers [px].
+        layout: whether views wrap, and height and width of their buffers [px].
         forms: whether kappa is always 1, whether delta is that of pairs.
         directions: of the voxels' bins [b, 3].
         workers: threads.
@@ -195,7 +195,7 @@ def pixels_pass(state, views, frame, forms, directions, workers, results):
     centers, rows = np.empty((3, num), np.float32), np.empty(num, np.int32)
     gather_centers(slots, state[0], voxel_size, workers, centers, rows)
     look_all(
-        views, is_sound, frame[0], frame[1][0], frame[1][1], state[0], state[1], state[2],
+        views, is_sound, layout[0], layout[1][0], layout[1][1], state[0], state[1], state[2],
         state[3], state[4], voxel_size, starts, spheres, rows, centers, forms[0], forms[1],
         directions, workers, results[0], results[1],
     )  # fmt: skip

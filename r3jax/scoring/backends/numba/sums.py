@@ -290,10 +290,10 @@ def unexplored_of(cells, unexplored):
 
 @kernel
 def _score_share(
-    next_view, views, is_sound, frame, voxel_size, index, known, empty, options, results
+    next_view, views, is_sound, layout, voxel_size, index, known, empty, options, results
 ):
     """Scores views until none is left; what is claimed by one thread is left out by the others."""
-    wraps, shape = frame
+    wraps, shape = layout
     starts, spheres = index
     lacks, counts, seen_bits, cell_bits = results
     side = side_of(shape)
@@ -349,14 +349,14 @@ def score_all(
 
 
 @kernel
-def sums_pass(state, cells, views, frame, forms, tables, workers, results):
+def sums_pass(state, cells, views, layout, forms, tables, workers, results):
     """Sums what many views of one map would show.
 
     Args:
         state: key [2, N], visited [W, N], count [N], m2 [N], resolution [N], voxel size [m].
         cells: x, y, z [m] and unexplored [c].
         views: [P, VIEW_SIZE].
-        frame: whether views wrap, and height and width of their buffers [px].
+        layout: whether views wrap, and height and width of their buffers [px].
         forms: whether kappa is always 1, whether delta is that of pairs.
         tables: directions of the voxels' bins [b, 3]; candidates of each octahedral cell
             [S^2, K] and directions of the panorama's bins [B, 3].
@@ -377,7 +377,7 @@ def sums_pass(state, cells, views, frame, forms, tables, workers, results):
     )  # fmt: skip
     empty, numbers = unexplored_of(cells[:3], cells[3])
     score_all(
-        views, is_sound, frame[0], frame[1][0], frame[1][1], voxel_size, starts, spheres,
+        views, is_sound, layout[0], layout[1][0], layout[1][1], voxel_size, starts, spheres,
         voxels, visited, rows, empty, numbers, forms[0], tables[0], tables[1], tables[2], workers,
         results[0], results[1], results[2], results[3],
     )  # fmt: skip
