@@ -7,7 +7,7 @@ The mission clock is the model's: a decision 0.3 s, one reconsidered on arrival 
 published. What is done in `--work` is not done again.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,10 @@ import tyro
 
 from experiments.pages.artifacts import Origin, markdown_table, write_csv, write_markdown
 from experiments.suite import Options as SuiteOptions
-from experiments.suite import Records, origin, request_of, run_requests
+from experiments.suite import Records, by_method_and_scene, origin, request_of, run_requests
 from r3jax.apps.benchmark.plan import Request
 from r3jax.evaluation.comparison import (
     check_equal_terms,
-    methods_of,
-    scenes_of,
     scores_by_method,
     snapshots_of,
     with_short_names,
@@ -55,12 +53,10 @@ class Options(SuiteOptions):
 
 def main(options: Options) -> Path:
     """Runs what is left of the cells, writes the page, and returns the folder of the results."""
-    requests = requests_of(options)
-    _, cells, _ = run_requests(options, "seconds", requests)
-    records = labeled(options, requests)
+    records = run_modes(options)
     folder = options.out / NAME / options.size
     write_page(folder, records, origin(f"experiments.{NAME}", records))
-    print(f"results  {folder}, {len(cells)} cells")
+    print(f"results  {folder}")
     return folder
 
 
@@ -82,10 +78,10 @@ def requests_of(options: Options) -> list[Request]:
     return [replace(common, conditions=each) for each in conditions]
 
 
-def labeled(options: Options, requests: Sequence[Request]) -> Records:
-    """The records of all modes; the mode stands among the settings of the policy, for its name."""
+def run_modes(options: Options) -> Records:
+    """Runs what is left; the mode stands among the settings of the policy, for its name."""
     found: list[Mapping[str, Any]] = []
-    for mode, request in zip(options.modes, requests, strict=True):
+    for mode, request in zip(options.modes, requests_of(options), strict=True):
         _, _, records = run_requests(options, "seconds", [request])
         for record in records:
             settings = record["settings"] | ({"on the way": mode} if mode else {})
@@ -114,27 +110,18 @@ def write_page(folder: Path, records: Records, source: Origin) -> None:
 def quality_rows(records: Records) -> list[dict[str, str]]:
     """A line per method: every scene, the mean over them, and the difference from the reference."""
     scores = scores_by_method(records, "psnr")
-    scenes = scenes_of(records)
-    rows: list[dict[str, str]] = []
-    for method in methods_of(records):
-        mine, row = scores[method], {"method": method}
-        for scene in scenes:
-            values = mine[scene]
-            frames = [
-                record["exploration"]["views"]
-                for record in records
-                if _name(record) == (method, scene)
-            ]
-            low = float(np.mean(np.percentile(values, 5, axis=1)))
-            row[scene] = f"{values.mean():.2f} [{low:.1f}] / {np.mean(frames):.0f}"
-        row["mean"] = f"{np.mean([mine[scene].mean() for scene in scenes]):.2f}"
+    rows: dict[str, dict[str, str]] = {}
+    frames = [record["exploration"]["views"] for record in records]
+    for method, scene, mine in by_method_and_scene(records, frames):
+        values = scores[method][scene]
+        low = float(np.mean(np.percentile(values, 5, axis=1)))
+        row = rows.setdefault(method, {"method": method})
+        row[scene] = f"{values.mean():.2f} [{low:.1f}] / {np.mean(mine):.0f}"
+    for method, row in rows.items():
+        mine = scores[method]
+        row["mean"] = f"{np.mean([values.mean() for values in mine.values()]):.2f}"
         row[f"minus {REFERENCE}"] = _difference(mine, scores.get(REFERENCE))
-        rows.append(row)
-    return rows
-
-
-def _name(record: Mapping[str, Any]) -> tuple[str, str]:
-    return methods_of([record])[0], record["scene"]
+    return list(rows.values())
 
 
 def _difference(mine: dict[str, np.ndarray], reference: dict[str, np.ndarray] | None) -> str:

@@ -228,11 +228,6 @@ def add_frame(
         allow_growth=config.allow_growth,
         drop_edges=config.drop_edges,
     )
-    return map_state, add_to_grid(grid, frame, config)
-
-
-def add_to_grid(grid: OccupancyGrid, frame: Frame, config: MappingConfig) -> OccupancyGrid:
-    """Adds a frame to a grid: what its rays went through, and where the camera stands."""
     # Depth before the body: a hit measured in this frame must not be vouched away.
     grid = _integrate_depth(grid, frame, config.max_range)
-    return _mark_free_ball(grid, frame.position, config.body_radius)
+    return map_state, _mark_free_ball(grid, frame.position, config.body_radius)
