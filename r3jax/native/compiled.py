@@ -11,6 +11,7 @@ from numba import extending, njit, types
 
 _Function = Callable[..., Any]
 
+_BARE = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 
@@ -51,12 +52,12 @@ def kernel(function: _Function) -> _Function:
     (counting and listing intersections, blending and its gradient) then do.
     """
     # A type checker hooked into the import may have wrapped the function; Numba needs the bare one.
-    return njit(cache=True, error_model="numpy")(inspect.unwrap(function))
+    return njit(cache=True, error_model="numpy", **_BARE)(inspect.unwrap(function))
 
 
 def inlined(function: _Function) -> _Function:
     """Compiles a small function into its callers."""
-    return njit(cache=True, error_model="numpy", forceinline=True)(inspect.unwrap(function))
+    return njit(cache=True, error_model="numpy", **_BARE, forceinline=True)(inspect.unwrap(function))
 
 
 def inlined_fast(function: _Function) -> _Function:
@@ -64,19 +65,19 @@ def inlined_fast(function: _Function) -> _Function:
 
     NaN and infinity keep their meaning.
     """
-    compiler = njit(cache=True, error_model="numpy", forceinline=True, fastmath=_FAST)
+    compiler = njit(cache=True, error_model="numpy", **_BARE, forceinline=True, fastmath=_FAST)
     return compiler(inspect.unwrap(function))
 
 
 def inlined_fused(function: _Function) -> _Function:
     """The same where LLVM may do no more than fuse a product with a sum."""
-    compiler = njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
+    compiler = njit(cache=True, error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"})
     return compiler(inspect.unwrap(function))
 
 
 def parallel_kernel(function: _Function) -> _Function:
     """Compiles a kernel whose `prange` loops share the cores that the process may use."""
-    return njit(cache=True, error_model="numpy", parallel=True)(inspect.unwrap(function))
+    return njit(cache=True, error_model="numpy", **_BARE, parallel=True)(inspect.unwrap(function))
 
 
 @intrinsic

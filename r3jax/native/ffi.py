@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 from llvmlite import ir
-from numba import cfunc, get_num_threads, prange, types
+from numba import cfunc, get_num_threads, njit, prange, types
 from numba.np.numpy_support import carray
 from numba.np.ufunc.parallel import threading_layer
 
@@ -158,7 +158,7 @@ def bytes1(frame, kind, index):
     return carray(_bytes(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
 
-@parallel_kernel
+@njit(cache=True, parallel=True)
 def _wake_up(x):
     for i in prange(x.shape[0]):
         x[i] = i
