@@ -3,6 +3,8 @@
 A wall with a plate before it, and unexplored cells to the side of both.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,9 +63,21 @@ def cells_where(unexplored) -> object:
 
 WALL = surface(2.0, (-1.2, 1.2), (0.1, 2.5))
 PLATE = surface(1.0, (0.1, 0.6), (0.9, 1.6))
-BARE = voxels_with(WALL)
-HIDDEN = voxels_with(WALL, PLATE)
-CELLS = cells_where(lambda x, y, z: (y < -0.9) & (x < 1.8))
+
+
+@functools.cache
+def bare():
+    return voxels_with(WALL)
+
+
+@functools.cache
+def hidden():
+    return voxels_with(WALL, PLATE)
+
+
+@functools.cache
+def cells():
+    return cells_where(lambda x, y, z: (y < -0.9) & (x < 1.8))
 
 
 def numbers_of(seed: int, reach: float = 1.0) -> np.ndarray:
@@ -139,7 +153,7 @@ def by_hand(around, numbers: np.ndarray, angle: float) -> float:
 
 def law_oracle(modules: Modules, seed: int = 0) -> None:
     stand = STAND if modules["surrogate"] is real else Stand(modules["surrogate"])
-    around = stand.around(HIDDEN, CELLS, SOFT, HALF)
+    around = stand.around(hidden(), cells(), SOFT, HALF)
     numbers = numbers_of(seed)
     found = float(stand.value(around, jnp.asarray(numbers, jnp.float32), SOFT))
     assert found == pytest.approx(by_hand(around, numbers, float(SOFT.angle)), rel=1e-4)
@@ -153,7 +167,7 @@ def test_the_sum_matches_an_oracle(seed):
 @given(seeds)
 def test_the_slope_is_that_of_finite_differences(seed):
     """In float64, of the oracle."""
-    around = STAND.around(HIDDEN, CELLS, SOFT, HALF)
+    around = STAND.around(hidden(), cells(), SOFT, HALF)
     numbers, step = numbers_of(seed, 0.9), 1e-5
     found = np.asarray(STAND.slope(around, jnp.asarray(numbers, jnp.float32), SOFT))
     angle = float(SOFT.angle)
@@ -177,9 +191,9 @@ def law_exact(modules: Modules, seed: int = 0) -> None:
     """Nothing hides, hard borders: from the middle of the box it is the utility of any view."""
     stand = STAND if modules["surrogate"] is real else Stand(modules["surrogate"])
     numbers = numbers_of(seed, 0.0)
-    around = stand.around(BARE, CELLS, CRISP, HALF)
+    around = stand.around(bare(), cells(), CRISP, HALF)
     found = float(stand.value(around, jnp.asarray(numbers, jnp.float32), CRISP))
-    wanted = float(exact(BARE, CELLS, CAMERA, pose_of(numbers), SCORING).total)
+    wanted = float(exact(bare(), cells(), CAMERA, pose_of(numbers), SCORING).total)
     slack = on_the_border(around, numbers) + 0.5 * float(SCORING.lambda1)
     assert wanted > 50.0
     assert found == pytest.approx(wanted, abs=slack + 0.01 * wanted)
@@ -198,13 +212,13 @@ def law_nodes(modules: Modules) -> None:
     edges they differ by a voxel.
     """
     stand = STAND if modules["surrogate"] is real else Stand(modules["surrogate"])
-    around = stand.around(HIDDEN, CELLS, CRISP, HALF)
+    around = stand.around(hidden(), cells(), CRISP, HALF)
     sides = [np.zeros(3), *(s * BOX * np.eye(3)[i] for i in range(3) for s in (-1.0, 1.0))]
     found, wanted = [], []
     for side in sides:
         numbers = np.concatenate([MIDDLE + side, [0.1, 0.0]])
         found.append(float(stand.value(around, jnp.asarray(numbers, jnp.float32), CRISP)))
-        view = exact(HIDDEN, CELLS, CAMERA, pose_of(numbers), SCORING)
+        view = exact(hidden(), cells(), CAMERA, pose_of(numbers), SCORING)
         wanted.append(float(view.total))
     np.testing.assert_allclose(found, wanted, rtol=0.15)
     assert np.ptp(wanted) > 0.5 * wanted[0]
@@ -242,7 +256,7 @@ def test_a_camera_that_stays_needs_one_node():
     start = pose_of(np.append(MIDDLE, (0.0, 0.0)))
     place = jnp.asarray(MIDDLE, jnp.float32)
     look = jax.jit(real.surrogate_of, static_argnames="moves")
-    args = (HIDDEN, CELLS, CAMERA, start, place, place, SCORING, SOFT)
+    args = (hidden(), cells(), CAMERA, start, place, place, SCORING, SOFT)
     still, moving = look(*args, moves=False), look(*args)
     assert still.worth.shape[0] == 1
     for row in moving.worth:
