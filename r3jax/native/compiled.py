@@ -12,6 +12,9 @@ from numba import extending, njit, types
 _Function = Callable[..., Any]
 
 _BARE = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""No entries for callers in Python or C: kernels call each other, and XLA calls handlers. Each
+entry would hold the kernel once more, to be compiled once more."""
+
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 
@@ -57,7 +60,9 @@ def kernel(function: _Function) -> _Function:
 
 def inlined(function: _Function) -> _Function:
     """Compiles a small function into its callers."""
-    return njit(cache=True, error_model="numpy", **_BARE, forceinline=True)(inspect.unwrap(function))
+    return njit(cache=True, error_model="numpy", **_BARE, forceinline=True)(
+        inspect.unwrap(function)
+    )
 
 
 def inlined_fast(function: _Function) -> _Function:
@@ -71,7 +76,9 @@ def inlined_fast(function: _Function) -> _Function:
 
 def inlined_fused(function: _Function) -> _Function:
     """The same where LLVM may do no more than fuse a product with a sum."""
-    compiler = njit(cache=True, error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"})
+    compiler = njit(
+        cache=True, error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"}
+    )
     return compiler(inspect.unwrap(function))
 
 

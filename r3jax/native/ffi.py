@@ -22,7 +22,7 @@ from numba import cfunc, get_num_threads, njit, prange, types
 from numba.np.numpy_support import carray
 from numba.np.ufunc.parallel import threading_layer
 
-from r3jax.native.compiled import inlined, intrinsic, parallel_kernel
+from r3jax.native.compiled import inlined, intrinsic
 
 # Offsets in bytes in the structs of XLA's FFI, API version `version.WRITTEN_FOR`.
 _EXTENSION, _API = 8, 16
@@ -158,10 +158,12 @@ def bytes1(frame, kind, index):
     return carray(_bytes(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
 
-@njit(cache=True, parallel=True)
-def _wake_up(x):
+def _number(x):
     for i in prange(x.shape[0]):
         x[i] = i
+
+
+_wake_up = njit(cache=True, parallel=True)(inspect.unwrap(_number))
 
 
 def require_threads() -> None:

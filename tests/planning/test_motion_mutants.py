@@ -108,12 +108,12 @@ def law_turns_cost(modules: Modules) -> None:
 def law_heights_count_from_the_first_view(modules: Modules) -> None:
     """Not from the latest one: a hand that has come up does not come up from there again."""
     config, first = config_of("handheld"), level_start()
-    state = modules["decision"].initial_state(CAMERA, GRID, motion=config.motion)
+    state = modules["decision"].initial_state(CAMERA, GRID, config=config)
     higher = first.copy()
     higher[2, 3] += 0.1
     for pose in (first, higher):
         args = state, empty_map(64), GRID, pose, config
-        state, travel, _ = modules["decision"].prepare_decision(*args)
+        state, travel, *_ = modules["decision"].prepare_decision(*args)
         low, high = first[2, 3] - 0.6, first[2, 3] + 0.4
         np.testing.assert_allclose(travel.heights, (low, high), atol=1e-6)
     assert modules["decision"].initial_state(CAMERA, GRID).start_height is None
