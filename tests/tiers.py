@@ -1,4 +1,4 @@
-"""Which cases of a parametrized test run in `make test`, and which in `make test-all` alone."""
+"""Which cases of a parametrized test run in `make test`, in `make test-all`, in `make stress`."""
 
 from collections.abc import Collection, Iterable
 from typing import Any
@@ -6,10 +6,18 @@ from typing import Any
 import pytest
 
 
-def quick_and_full(cases: Iterable[Any], quick: Collection[Any]) -> list[Any]:
-    """Marks every case as `full` but those of `quick`, which must be among them."""
+def quick_and_full(
+    cases: Iterable[Any], quick: Collection[Any], slow: Collection[Any] = ()
+) -> list[Any]:
+    """Marks every case as `full` but those of `quick` and `slow`, which must be among them."""
     cases = list(cases)
-    unknown = [case for case in quick if case not in cases]
+    unknown = [case for case in (*quick, *slow) if case not in cases]
     if unknown:
         raise LookupError(f"{unknown} are not among the cases {cases}")
-    return [case if case in quick else pytest.param(case, marks=pytest.mark.full) for case in cases]
+
+    def marked(case: Any) -> Any:
+        if case in quick:
+            return case
+        return pytest.param(case, marks=pytest.mark.slow if case in slow else pytest.mark.full)
+
+    return [marked(case) for case in cases]

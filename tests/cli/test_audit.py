@@ -91,7 +91,10 @@ def test_the_same_words_give_the_same_numbers(captures, audited, tmp_path):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["nerfstudio", "nerfstudio/transforms.json", "colmap"])
+@pytest.mark.parametrize(
+    "name",
+    ["nerfstudio", pytest.param("nerfstudio/transforms.json", marks=pytest.mark.slow), "colmap"],
+)
 def test_other_formats_are_audited(captures, tmp_path, name, capsys):
     words = [] if name == "colmap" else ["--voxel-size", "0.15"]
     assert audit(captures / name, tmp_path / "out", *words) == 0

@@ -18,6 +18,7 @@ from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.box_room import write_room
 from tests.cli.small_runs import explore, main_without_report
+from tests.tiers import quick_and_full
 from tests.trace.runs import make_header, make_view
 
 
@@ -152,7 +153,11 @@ def test_ctrl_c_leaves_a_run_that_can_be_read_and_a_report(room, tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    "place", ["exploration.loop.start_state", "cli.commands.explore.write_data_set"]
+    "place",
+    quick_and_full(
+        ["exploration.loop.start_state", "cli.commands.explore.write_data_set"],
+        ["exploration.loop.start_state"],
+    ),
 )
 def test_ctrl_c_names_what_goes_on_at_any_moment(room, tmp_path, monkeypatch, capsys, place):
     def interrupt(*_):
@@ -183,7 +188,7 @@ def test_the_demo_overwrites_its_own_folder_only(tmp_path):
     assert read_run(tmp_path / "other").header == make_header()
 
 
-@pytest.mark.parametrize("name", _COMMANDS)
+@pytest.mark.parametrize("name", quick_and_full(_COMMANDS, ["explore", "audit"]))
 def test_help_begins_with_examples_that_parse_and_shows_no_default_of_none(name, capsys):
     with pytest.raises(SystemExit):
         main([name, "--help"])

@@ -142,6 +142,7 @@ def test_the_background_is_the_trainings(own):
     assert black.psnr < evaluated(own).rows[0].psnr - 20.0
 
 
+@pytest.mark.full
 def test_too_small_a_budget_is_raised_or_named(own):
     many = jax.tree.map(lambda x: jnp.tile(x, (10,) + (1,) * (x.ndim - 1)), SCENE)
     large = eqx.tree_at(lambda s: s.log_scales, many, many.log_scales + 1.5)

@@ -102,12 +102,14 @@ def test_equal_images_have_distance_0():
     np.testing.assert_allclose(load_lpips()(x, x), np.zeros(3), atol=1e-12)
 
 
+@pytest.mark.full
 def test_it_is_symmetric_and_positive():
     x, y = jnp.asarray(noise(7)), jnp.asarray(smooth(8))
     np.testing.assert_allclose(load_lpips()(x, y), load_lpips()(y, x), rtol=1e-5)
     assert np.all(load_lpips()(x, y) > 0.0)
 
 
+@pytest.mark.full
 def test_more_noise_looks_worse():
     x, other = smooth(9, 1), noise(10, 1)
     mixed = [x + np.float32(t) * (other - x) for t in (0.05, 0.2, 0.6)]
@@ -147,6 +149,7 @@ def test_the_linear_layers_are_those_of_version_0_1(network, digest):
     assert hashlib.sha256(content).hexdigest() == digest
 
 
+@pytest.mark.full
 def test_vgg_agrees_with_a_published_value():
     """torchmetrics' documentation prints 0.3493 for ten pairs of uniform noise, 100 x 100 px.
 

@@ -1,6 +1,6 @@
 """One process of a run that is to be killed: begins it, or goes on with it. Not a test itself.
 
-python -m tests.exploration.killed_run FOLDER VIEWS
+python -m tests.exploration.killed_run FOLDER VIEWS POLICY
 """
 
 import os
@@ -29,7 +29,7 @@ def small_policy(name: str) -> Policy:
     return make_policy(name, num_candidates=8, num_frontier=3, scoring=SCORING)
 
 
-def go_on(path: Path, views: int, policy: str = "ours-pano") -> None:
+def go_on(path: Path, views: int, policy: str) -> None:
     """Begins a run in `path`, or goes on with the one that is there."""
     simulator = BoxRoom()
     planner = small_policy(policy)
@@ -67,4 +67,4 @@ if __name__ == "__main__":
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     _slow_disk()
-    go_on(Path(sys.argv[1]), int(sys.argv[2]))
+    go_on(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3])

@@ -220,7 +220,9 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("name", quick_and_full(RUNS, ["wander", "ours-pano"]))
+@pytest.mark.parametrize(
+    "name", quick_and_full(RUNS, ["wander", "ours-pano"], slow=["planned", "r3con"])
+)
 def test_a_run_that_is_cut_off_on_the_way_goes_on_as_if_it_had_not_been(tmp_path, name):
     policy, config, budget = RUNS[name]
     whole, _ = record(tmp_path / "whole", policy, config, budget)

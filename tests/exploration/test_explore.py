@@ -234,6 +234,7 @@ def test_a_checkpoint_that_the_disk_refuses_is_told_in_the_last_row(tmp_path, mo
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.full
 def test_the_table_grows_before_it_is_full_and_loses_nothing():
     small = replace(CONFIG, capacity=1 << 12)
     result = explore(BoxRoom(), Wander(), budget="views:4", config=small)

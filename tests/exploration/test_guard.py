@@ -80,7 +80,15 @@ class Watched:
         return self.inner.follow(state, map_state, grid, T_world_camera, waypoints)
 
 
-@pytest.mark.parametrize("name", quick_and_full(policy_names(), ["ours-pano"]))
+@pytest.mark.parametrize(
+    "name",
+    quick_and_full(
+        policy_names(),
+        ["ours-pano"],
+        slow=set(policy_names())
+        - {"ours-pano", "ours-ahead", "active-gs", "active-gamer", "cover"},
+    ),
+)
 def test_no_policy_holds_the_simulator(name):
     policy = Watched(make_policy(name, num_candidates=20, num_frontier=6))
     result = explore(BoxRoom(), policy, budget="views:3", config=CONFIG)

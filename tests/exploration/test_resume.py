@@ -86,7 +86,11 @@ def whole(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "name",
-    quick_and_full(["wander", "ours-pano", "active-gs", "uniform", "frontier"], ["wander"]),
+    quick_and_full(
+        ["wander", "ours-pano", "active-gs", "uniform", "frontier"],
+        ["wander"],
+        slow=["uniform", "frontier"],
+    ),
 )
 def test_a_run_in_two_parts_is_the_run_in_one(tmp_path, whole, name):
     run_in(tmp_path / "run", name, CUT)
@@ -150,16 +154,19 @@ def damage(path, how):
 
 @pytest.mark.parametrize(
     "how",
-    [
-        "no checkpoint",
-        "an older version's checkpoint",
-        "an empty file",
-        "another view's checkpoint",
-        "a checkpoint after the trace",
-        "a torn row",
-        "a half-written checkpoint",
-        "a half-written image",
-    ],
+    quick_and_full(
+        [
+            "no checkpoint",
+            "an older version's checkpoint",
+            "an empty file",
+            "another view's checkpoint",
+            "a checkpoint after the trace",
+            "a torn row",
+            "a half-written checkpoint",
+            "a half-written image",
+        ],
+        ["no checkpoint", "a torn row"],
+    ),
 )
 def test_damage_costs_time_and_nothing_else(tmp_path, whole, how):
     run_in(tmp_path / "run", "uniform", CUT)
@@ -260,13 +267,13 @@ def test_the_wall_clock_goes_on_too(tmp_path):
     assert np.all(np.diff([row.seconds for row in result.rows]) > 0.0)
 
 
-def _start(path, views):
-    command = [sys.executable, "-m", "tests.exploration.killed_run", str(path), str(views)]
+def _start(path, views, name):
+    command = [sys.executable, "-m", "tests.exploration.killed_run", str(path), str(views), name]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
-def _finish(path, views):
-    process = _start(path, views)
+def _finish(path, views, name):
+    process = _start(path, views, name)
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors.decode()
 
@@ -275,11 +282,11 @@ def _size(path):
     return path.stat().st_size if path.exists() else 0
 
 
-def _kill_at_random_moments(path, views, kills, span, rng):
+def _kill_at_random_moments(path, views, name, kills, span, rng):
     """Kills process after process while it writes the run; how many views each one left."""
     left = []
     for _ in range(kills):
-        process = _start(path, views)
+        process = _start(path, views, name)
         begun = _size(path / "history.jsonl")
         while process.poll() is None and _size(path / "history.jsonl") == begun:
             time.sleep(0.002)
@@ -292,16 +299,16 @@ def _kill_at_random_moments(path, views, kills, span, rng):
 
 
 @pytest.mark.parametrize(
-    ("views", "kills", "span"),
+    ("views", "name", "kills", "span"),
     [
-        (6, 1, 1.5),
-        pytest.param(8, 3, 1.5, marks=pytest.mark.full),
-        pytest.param(40, 30, 2.5, marks=pytest.mark.slow),
+        (6, "frontier", 1, 1.5),
+        pytest.param(8, "ours-pano", 3, 1.5, marks=pytest.mark.full),
+        pytest.param(40, "ours-pano", 30, 2.5, marks=pytest.mark.slow),
     ],
 )
-def test_a_run_survives_kills_at_random_moments(tmp_path, views, kills, span):
-    _finish(tmp_path / "whole", views)
-    left = _kill_at_random_moments(tmp_path / "run", views, kills, span, random.Random(views))
+def test_a_run_survives_kills_at_random_moments(tmp_path, views, name, kills, span):
+    _finish(tmp_path / "whole", views, name)
+    left = _kill_at_random_moments(tmp_path / "run", views, name, kills, span, random.Random(views))
     assert left == sorted(left)  # nothing that was recorded is ever lost
-    _finish(tmp_path / "run", views)
+    _finish(tmp_path / "run", views, name)
     assert_same_run(tmp_path / "run", tmp_path / "whole")

@@ -18,7 +18,7 @@ from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
 
-CASES = 200
+CASES = 100
 """In the normal suite."""
 
 

@@ -23,7 +23,7 @@ from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
 
-CASES = 300
+CASES = 150
 """In the normal suite."""
 
 NAMES = ("scene.glb", "scene.gltf", "scene.ply", "scene.obj", "scene.stl", "scene.off", "scene.zip")

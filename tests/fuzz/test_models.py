@@ -28,7 +28,7 @@ from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
 
-CASES = 300
+CASES = 150
 """In the normal suite."""
 
 METRIC = {

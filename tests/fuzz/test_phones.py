@@ -27,7 +27,7 @@ from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
 
-CASES = 100
+CASES = 50
 """Of each, in the normal suite."""
 
 

@@ -22,7 +22,7 @@ from tests.trace.runs import make_header, make_view
 
 pytestmark = pytest.mark.full
 
-CASES = 300
+CASES = 150
 """In the normal suite."""
 
 

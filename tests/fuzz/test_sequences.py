@@ -21,7 +21,7 @@ from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
 
-CASES = 150
+CASES = 80
 """Of each, in the normal suite."""
 
 

@@ -31,7 +31,7 @@ from tests.fuzz.worker import Reader
 
 pytestmark = pytest.mark.full
 
-CASES = 100
+CASES = 50
 """In the normal suite: each takes 50 ms."""
 
 

@@ -253,6 +253,7 @@ def test_log_odds_stay_within_their_limits(grid):
     assert float(after.log_odds.max()) == pytest.approx(4.5)
 
 
+@pytest.mark.full
 def test_a_range_may_be_set_and_frames_may_be_mapped_over(grid):
     frames = [frame_at([1.0, 2.5, 1.3], target) for target in ([5.0, 2.5, 1.3], [5.0, 4.0, 1.3])]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *frames)

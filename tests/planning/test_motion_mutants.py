@@ -202,7 +202,7 @@ MUTANTS = [
     ),
     Mutant("greedy", "pose, travel.heights)", "pose)", LAWS[0]),
     Mutant("greedy", "limits.path_costs(lengths, candidates.direction)", "lengths", law_turns_cost),
-    Mutant("greedy", "memory, self.config.motion)", "memory)", LAWS[3]),
+    Mutant("greedy", "memory, self.config)", "memory)", LAWS[3]),
     Mutant(
         "decision",
         "seconds=limits.seconds(length, candidates.direction[best])",

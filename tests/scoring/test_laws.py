@@ -128,6 +128,7 @@ def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)
 
 
+@pytest.mark.full
 def test_the_derivative_of_the_lack_is_that_of_the_dense_sum():
     voxels = make_voxels()
     visible = select(voxels.present)

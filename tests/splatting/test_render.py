@@ -88,6 +88,7 @@ def test_an_open_budget_is_raised_outside_jit(backend, monkeypatch):
     np.testing.assert_allclose(image.rgb, expected.rgb, atol=1e-5)
 
 
+@pytest.mark.full
 def test_gradients_by_background_and_offsets(backend):
     """Moving all centers by a pixel moves the image: the offsets' gradient is the centers'."""
     scene, (camera, pose) = random_cloud(9, COUNT), view(*SIZE)
@@ -104,6 +105,7 @@ def test_gradients_by_background_and_offsets(backend):
         assert np.linalg.norm(one - other) < 1e-3 * np.linalg.norm(other)
 
 
+@pytest.mark.full
 def test_gradients_by_intrinsics(backend):
     scene, (camera, pose) = random_cloud(10, COUNT), view(*SIZE)
 

@@ -93,7 +93,10 @@ def cut_off(folder, order, steps):
     return [order[:steps].count(number) for number in range(2)]
 
 
-@pytest.mark.parametrize(("name", "steps"), [("wander", 1), ("wander", 5), ("active-gs", 5)])
+@pytest.mark.parametrize(
+    ("name", "steps"),
+    [("wander", 1), ("wander", 5), pytest.param("active-gs", 5, marks=pytest.mark.slow)],
+)
 def test_a_team_that_was_cut_off_is_the_team_that_was_not(tmp_path, whole, name, steps):
     source, order = whole(name)
     shutil.copytree(source, tmp_path / "team")

@@ -164,7 +164,13 @@ def best_of_all(turning, places, width):
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("num", "width", "allowed"), [(2, 5, np.inf), (2, 5, 1.0), (3, 4, np.inf), (3, 4, 1.0)]
+    ("num", "width", "allowed"),
+    [
+        (2, 5, np.inf),
+        pytest.param(2, 5, 1.0, marks=pytest.mark.slow),
+        pytest.param(3, 4, np.inf, marks=pytest.mark.slow),
+        (3, 4, 1.0),
+    ],
 )
 def test_a_plan_is_the_best_of_all_chains(num, width, allowed):
     """Exact for two frames; for three the best chain to each direction is kept: hardly less."""
