@@ -129,6 +129,14 @@ def _few_programs():
         ctypes.CDLL(None).malloc_trim(0)  # else glibc keeps what was freed
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_process_that_compiles_ahead():
+    """Two test processes use the cores; what one compiles the other finds on the disk."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("r3jax.cli.kernels.COMMANDS", ())
+        yield
+
+
 @pytest.fixture(scope="session")
 def shared():
     """`shared("golden", "file.npz")` is the path of shared data, or skips the test."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 
 import r3jax
+from r3jax.cli import kernels
 from r3jax.cli.errors import UserError, one_line, printable
 from r3jax.cli.options import (
     AuditOptions,
@@ -110,11 +111,16 @@ def _run(name: str, options: object) -> int:
     from r3jax.cli.checks import check_options  # not for --help, which needs no NumPy
 
     check_options(options)
+    if name in kernels.COMMANDS:
+        kernels.compile_ahead(_cache() / "kernels")
     return getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}")(options)
 
 
 def _keep_compilations() -> None:
     """Lets the second start find what the first one compiled, unless JAX is told otherwise."""
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(base / "r3jax" / "jax"))
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_cache() / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "r3jax"

@@ -10,9 +10,13 @@ and nothing can wait for a thread of XLA's pool while it occupies the only one.
 # Code generators get what llvmlite makes, which has no types.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
+import contextlib
+import fcntl
 import inspect
 import os
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Generator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -187,6 +191,17 @@ def num_workers() -> int:
     return min(get_num_threads(), len(os.sched_getaffinity(0)))
 
 
+@contextlib.contextmanager
+def _one_process_at_a_time(name: str) -> Generator[None]:
+    """Waits for other processes that compile the same: what they leave on the disk is found."""
+    path = Path(tempfile.gettempdir()) / f"r3jax-{os.getuid()}-{name}.lock"
+    with contextlib.ExitStack() as held:
+        # A folder that cannot be written: both compile. Let go by the end of a process, too.
+        with contextlib.suppress(OSError):
+            fcntl.flock(held.enter_context(open(path, "w")), fcntl.LOCK_EX)
+        yield
+
+
 def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> tuple[Any, ...]:
     """Compiles handlers (or takes them from the disk) and tells XLA of them by their names.
 
@@ -198,7 +213,8 @@ def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> tuple[Any, .
     """
     require_threads()
     compiler = cfunc(types.int64(types.int64), cache=True)
-    compiled = tuple(compiler(inspect.unwrap(handler)) for handler in handlers.values())
+    with _one_process_at_a_time("-".join(handlers)):
+        compiled = tuple(compiler(inspect.unwrap(handler)) for handler in handlers.values())
     for name, handler in zip(handlers, compiled, strict=True):
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler.address), platform="cpu")
     return compiled
