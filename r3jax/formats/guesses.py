@@ -63,6 +63,13 @@ def _of_archive(path: Path) -> str | None:
     return "this archive holds no capture that is known: unpack it and give the folder"
 
 
+def _bags(path: Path, names: list[str]) -> str | None:
+    found = [name for name in names if name.lower().endswith((".bag", ".mcap", ".db3"))]
+    if not found or "metadata.yaml" in names:
+        return None
+    return f"this folder holds several ROS bags: give one of them, such as {path / found[0]}"
+
+
 def _exr(path: Path, names: list[str]) -> str | None:
     if not any(name.endswith(".exr") or name.startswith("EXR_RGBD/") for name in names):
         return None
@@ -144,6 +151,6 @@ def _count(names: list[str], suffixes: tuple[str, ...]) -> int:
 
 
 _GUESSES: tuple[Callable[[Path, list[str]], str | None], ...] = (
-    *(_exr, _stray, _frames, _colmap, _metashape, _video, _images, _model),
+    *(_bags, _exr, _stray, _frames, _colmap, _metashape, _video, _images, _model),
 )
 """From the particular to the general."""

@@ -80,8 +80,7 @@ def test_an_archive_of_something_else_gets_a_guess(tmp_path, files, message):
         ("clip.mp4", r"ns-process-data video --data \S+clip\.mp4 --output-dir OUT"),
         ("mesh.GLB", "a folder of the images that a model was made of"),
         ("map.db", "databases of RTAB-Map and COLMAP are not read: export"),
-        ("drive.mcap", r"ROS bags are not read: export .* in TUM's layout"),
-        ("notes.txt", r"transforms\.json, or an app's file \(\.zip, \.r3d, \.sens\)"),
+        ("notes.txt", r"transforms\.json, or an app's file \(\.zip, \.r3d, \.sens, \.bag"),
     ],
 )
 def test_a_file_that_is_no_capture_says_what_to_do(tmp_path, name, message):
