@@ -18,6 +18,8 @@ from r3jax.formats.recordings import Recording, is_recording, read_recording
 from r3jax.formats.ros.bag_reader import read_bag
 from r3jax.formats.ros.bags import is_bag
 from r3jax.formats.ros.names import Topics
+from r3jax.formats.ros.rtabmap_database import is_rtabmap_database, read_rtabmap_database
+from r3jax.formats.ros.rtabmap_export import is_rtabmap_export, read_rtabmap_export
 from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
 from r3jax.formats.sequences.scannet import is_scannet, read_scannet
 from r3jax.formats.sequences.scannet_sens import is_sens, read_sens
@@ -38,6 +40,8 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_arkit_scenes, read_arkit_scenes),
     (is_scannet, read_scannet),
     (is_sens, read_sens),
+    (is_rtabmap_export, read_rtabmap_export),
+    (is_rtabmap_database, read_rtabmap_database),
     (is_bag, read_bag),
 )
 """Folders and archives of posed images: what each looks like, and its reader."""
@@ -48,7 +52,8 @@ _KNOWN = (
     "recording of Record3D (.r3d) or Stray Scanner (rgb.mp4, odometry.csv), a scene of ARKitScenes "
     "(lowres_wide.traj), ScanNet (.sens, or color/, depth/, pose/, intrinsic/), Replica-SLAM "
     "(traj.txt, results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes "
-    "(frame-*.color.png), a ROS bag (.bag, .mcap, .db3, or metadata.yaml)"
+    "(frame-*.color.png), a ROS bag (.bag, .mcap, .db3, or metadata.yaml), "
+    "RTAB-Map (.db, or *_camera_poses.txt)"
 )
 
 _MOST_BELOW = 100

@@ -45,7 +45,12 @@ def _names(path: Path) -> list[str]:
 
 
 def _of_archive(path: Path) -> str | None:
-    """A zip archive that is damaged, or of something else."""
+    """A zip archive or database that is damaged, or of something else."""
+    if path.suffix.lower() == ".db":
+        return (
+            "this is no database of RTAB-Map: of COLMAP give the folder of a model (colmap mapper "
+            f"--database_path {path} --image_path IMAGES --output_path OUT)"
+        )
     if path.suffix.lower() not in SUFFIXES:
         return None
     try:

@@ -43,7 +43,7 @@ class Robot:
     """An encoding of sensor_msgs/Image, or jpeg."""
 
     depth: str = "16UC1"
-    """16UC1, 32FC1, or either with compressedDepth before it."""
+    """16UC1, 32FC1, or either with compressedDepth or compressedDepth rvl before it."""
 
     pose: str = "tf"
     """tf; odometry: of base_link, with /tf_static; pose: of the camera, without any tf."""
@@ -116,7 +116,7 @@ def camera_info(lens: Lens, frame: str, time: int) -> dict[str, Any]:
 def depth_fields(pose: np.ndarray, robot: Robot, lens: Lens, frame: str, time: int) -> Any:
     """The first pixel has no measurement."""
     meters = view(pose, lens)[1]
-    encoding = robot.depth.removeprefix("compressedDepth ")
+    encoding = robot.depth.split()[-1]
     steps = np.rint(1000 * meters).astype("<u2")
     steps[0, 0] = 0
     if not robot.depth.startswith("compressedDepth"):
@@ -127,8 +127,37 @@ def depth_fields(pose: np.ndarray, robot: Robot, lens: Lens, frame: str, time: i
     if encoding == "32FC1":
         steps = np.rint(a / meters + b).astype("<u2")
         steps[0, 0] = 0
-    data = struct.pack("<iff", 0, a, b) + encoded(steps)
-    return packed(data, f"{encoding}; compressedDepth png", frame, time)
+    kind = "rvl" if "rvl" in robot.depth else "png"
+    data = struct.pack("<iff", 0, a, b) + (rvl(steps) if kind == "rvl" else encoded(steps))
+    return packed(data, f"{encoding}; compressedDepth {kind}", frame, time)
+
+
+def rvl(steps: np.ndarray) -> bytes:
+    """RVL as its paper gives it, one nibble after the other, with the size before it."""
+    nibbles: list[int] = []
+
+    def put(number: int) -> None:
+        while True:
+            number, low = number >> 3, number & 7
+            nibbles.append(low | (8 if number else 0))
+            if not number:
+                return
+
+    pixels, at, before = steps.ravel().astype(int).tolist(), 0, 0
+    while at < len(pixels):
+        end = next((i for i in range(at, len(pixels)) if pixels[i]), len(pixels))
+        put(end - at)
+        at = end
+        end = next((i for i in range(at, len(pixels)) if not pixels[i]), len(pixels))
+        put(end - at)
+        for value in pixels[at:end]:
+            put((value - before) * 2 if value >= before else (before - value) * 2 - 1)
+            before = value
+        at = end
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = np.array(nibbles, np.uint32).reshape(-1, 8)
+    words = (words << np.arange(28, -1, -4, dtype=np.uint32)).sum(axis=1).astype("<u4")
+    return struct.pack("<II", steps.shape[1], steps.shape[0]) + words.tobytes()
 
 
 def messages(robot: Robot) -> Iterator[Sent]:

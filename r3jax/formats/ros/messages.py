@@ -12,6 +12,7 @@ import numpy as np
 
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import DEPTH_MODES, IMAGE_FORMATS
+from r3jax.formats.ros.rvl import unpack_rvl
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size
 
@@ -106,7 +107,7 @@ def depth_of(message: Any) -> np.ndarray:
 
     Args:
         message: sensor_msgs/Image of 16UC1 (millimeters) or 32FC1 (meters), or CompressedImage of
-            the same as PNG, by image_transport's compressedDepth or plainly.
+            the same as PNG or RVL, by image_transport's compressedDepth or plainly.
 
     Raises:
         ForeignFileError: another encoding; data that are damaged or too few.
@@ -144,19 +145,18 @@ def _rows(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
 
 
 def _unpacked(data: bytes, stored: str, is_meters: bool) -> np.ndarray:
-    """Depth from a PNG of 16 bits, with image_transport's header or without."""
-    if "rvl" in stored.lower():
-        raise ForeignFileError(
-            "depth that is packed by RVL is not read: record it as PNG, or not compressed"
-        )
+    """Depth from a PNG of 16 bits or RVL, with image_transport's header or without."""
     inverse = None
     if "compressedDepth" in stored:
         if len(data) < _COMPRESSED_DEPTH_HEAD.size:
             raise ForeignFileError("a depth image is cut off")
         inverse = _COMPRESSED_DEPTH_HEAD.unpack_from(data)[1:]
         data = data[_COMPRESSED_DEPTH_HEAD.size :]
-    wanted = "depth must be a 16-bit PNG"
-    steps = image_pixels(data, ("PNG",), image_size(data, ("PNG",)), DEPTH_MODES, wanted)
+    if "rvl" in stored.lower():
+        steps = unpack_rvl(data)
+    else:
+        wanted = "depth must be a 16-bit PNG"
+        steps = image_pixels(data, ("PNG",), image_size(data, ("PNG",)), DEPTH_MODES, wanted)
     if not is_meters:
         return clean_depth(0.001 * steps.astype(np.float64))
     if inverse is None:
