@@ -33,7 +33,7 @@ def run_audit(options: AuditOptions) -> int:
         capture = open_capture(options.capture, "z", parse_topics(options.topics))
         folder = options.out or Path("runs") / "audit" / capture.name
         _check_folder(folder)
-        path = None if options.path is None else path_of(options.path)
+        path = None if options.path is None else path_of(options.path, capture.source)
         source = source_of(capture.source, capture.name)
         with Stages(progress) as stages:
             found = audit(source, _settings_of(options), path, stages.on_progress)
