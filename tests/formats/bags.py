@@ -162,10 +162,10 @@ def rvl(steps: np.ndarray) -> bytes:
 
 def messages(robot: Robot) -> Iterator[Sent]:
     """All that the robot sends, in the order of time but for what /tf_static says at the start."""
-    statics = [("base_link", "camera_link", T_BASE_LINK), ("camera_link", OPTICAL, T_LINK_OPTICAL)]
-    statics.append((OPTICAL, DEPTH_OPTICAL, T_COLOR_DEPTH))
+    fixed = [("base_link", "camera_link", T_BASE_LINK), ("camera_link", OPTICAL, T_LINK_OPTICAL)]
+    fixed.append((OPTICAL, DEPTH_OPTICAL, T_COLOR_DEPTH))
     if robot.pose != "pose":
-        moves = [transform(parent, child, START, T) for parent, child, T in statics]
+        moves = [transform(parent, child, START, T) for parent, child, T in fixed]
         yield Sent("/tf_static", "tf2_msgs/msg/TFMessage", START, {"transforms": moves})
     depth_lens = smaller()
     depth_frame = OPTICAL if robot.registered else DEPTH_OPTICAL

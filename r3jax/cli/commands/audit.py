@@ -46,7 +46,8 @@ def run_audit(options: AuditOptions) -> int:
     _show(Console(), found, {"report": page, **written})
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")
-    progress.next("audit", options.capture)
+    topics = () if options.topics is None else ("--topics", options.topics)
+    progress.next("audit", options.capture, *topics)
     return 0
 
 

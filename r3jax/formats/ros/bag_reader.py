@@ -19,7 +19,7 @@ from r3jax.formats.lenses import Lens
 from r3jax.formats.phones.shots import UP_Z
 from r3jax.formats.posed_images import Pixels, PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.ros.bags import Bag, find_bag
+from r3jax.formats.ros.bags import Bag, Stamped, find_bag
 from r3jax.formats.ros.messages import depth_of, frame_of, lens_of, rgb_of, stamp_of
 from r3jax.formats.ros.names import Topics
 from r3jax.formats.ros.topics import (
@@ -88,9 +88,8 @@ def read_bag(path: Path | str, topics: Topics | None = None) -> PosedImages:
             f"there is no camera_info that belongs to {color.name}: record it, or name it by "
             "--topics info=TOPIC",
         )
-    tree = _transforms(bag)
+    tree, images, depths = _scan(bag, (color.name, depth.name))
     chain, source = _chain(bag, tree, topics, frame_of(color.first))
-    images, depths = _images(bag, color.name), _images(bag, depth.name)
     start = int(images.stamps[0])
     at = nearest((images.stamps - start) * 1e-9, (depths.stamps - start) * 1e-9, _MAX_GAP)
     poses, has_pose = tree.poses(chain, images.stamps)
@@ -146,13 +145,20 @@ def _stamp(message: Any, time: int) -> int:
     return stamp_of(message) or time
 
 
-def _images(bag: Bag, topic: str) -> _Images:
-    """Times of all images of a topic."""
-    found = [(_stamp(one.message, one.time), one.time) for one in bag.messages([topic])]
-    stamps, times = np.array(found, np.int64).reshape(-1, 2).T
-    if not len(stamps):
-        raise FormatError(bag.path, f"there is no message on {topic}")
-    return _Images(topic, stamps, times)
+def _scan(bag: Bag, names: tuple[str, str]) -> tuple[TransformTree, _Images, _Images]:
+    """All of /tf and /tf_static and the times of the images of two topics, in one pass."""
+    tree = TransformTree()
+    found: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
+    for one in bag.messages([*bag.topics(*TF), *names]):
+        if one.topic in found:
+            found[one.topic].append((_stamp(one.message, one.time), one.time))
+        else:
+            _add_transforms(tree, one)
+    for name in names:
+        if not found[name]:
+            raise FormatError(bag.path, f"there is no message on {name}")
+    color, depth = (_Images(name, *np.array(found[name], np.int64).T) for name in names)
+    return tree, color, depth
 
 
 def _checked(rgb: np.ndarray, lens: Lens) -> np.ndarray:
@@ -178,21 +184,18 @@ def _lens(bag: Bag, image: ImageTopic, named: str | None) -> Lens | None:
         return lens_of(bag.first(name), is_rectified="rect" in image.name.rpartition("image")[2])
 
 
-def _transforms(bag: Bag) -> TransformTree:
-    """All of /tf and /tf_static."""
-    tree = TransformTree()
-    for one in bag.messages(bag.topics(*TF)):
-        is_static = one.topic.endswith("tf_static")
-        for sample in one.message.transforms:
-            move = sample.transform
-            tree.add(
-                frame_of(sample),
-                str(sample.child_frame_id).lstrip("/"),
-                None if is_static else _stamp(sample, one.time),
-                _vector(move.translation),
-                _vector(move.rotation, "xyzw"),
-            )
-    return tree
+def _add_transforms(tree: TransformTree, one: Stamped) -> None:
+    """Adds a message of /tf or /tf_static."""
+    is_static = one.topic.endswith("tf_static")
+    for sample in one.message.transforms:
+        move = sample.transform
+        tree.add(
+            frame_of(sample),
+            str(sample.child_frame_id).lstrip("/"),
+            None if is_static else _stamp(sample, one.time),
+            _vector(move.translation),
+            _vector(move.rotation, "xyzw"),
+        )
 
 
 def _vector(message: Any, names: str = "xyz") -> np.ndarray:
