@@ -280,3 +280,14 @@ def test_transforms_are_interpolated_and_never_guessed():
     tree.add("camera", "map", None, np.zeros(3), none)  # a circle has an end
     assert tree.chain("camera") == ["camera", "base", "map"]
     assert DEPTH_OPTICAL not in tree.edges
+
+
+def test_a_transform_that_is_repeated_does_not_move():
+    tree, none = TransformTree(), np.array([0.0, 0.0, 0.0, 1.0])
+    for time in (1, 2, 3):
+        tree.add("base", "camera", time, np.ones(3), none)
+    assert tree.is_timed(["camera", "base"])
+    assert not tree.is_moving(["camera", "base"])
+    tree.add("base", "camera", 4, np.array([1.0, 1.0, 1.1]), none)
+    assert tree.is_moving(["camera", "base"])
+    assert not tree.is_moving(["base"])

@@ -88,4 +88,5 @@ def _conclude(
     which = () if options.name == TrainOptions.name else ("--name", options.name)
     where = which if options.out is None else ("--model", folder)
     how = () if options.hold_out else ("--views", "all")
-    console.next("evaluate", options.path, *where, *how)
+    topics = () if options.topics is None else ("--topics", options.topics)
+    console.next("evaluate", options.path, *where, *how, *topics)

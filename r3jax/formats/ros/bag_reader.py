@@ -9,7 +9,7 @@ odometry. Optical frames have the axes of OpenCV, and worlds are z up (REP 103, 
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from r3jax.formats.lenses import Lens
 from r3jax.formats.phones.shots import UP_Z
 from r3jax.formats.posed_images import Pixels, PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.ros.bags import Bag, Stamped, find_bag
+from r3jax.formats.ros.bag_poses import add_transforms, find_chain
+from r3jax.formats.ros.bags import Bag, find_bag
 from r3jax.formats.ros.messages import depth_of, frame_of, lens_of, rgb_of, stamp_of
 from r3jax.formats.ros.names import Topics
 from r3jax.formats.ros.topics import (
@@ -28,7 +29,6 @@ from r3jax.formats.ros.topics import (
     check_topics,
     find_images,
     find_info,
-    find_pose,
 )
 from r3jax.formats.ros.transforms import TransformTree
 from r3jax.formats.sequences.tum import nearest
@@ -52,11 +52,19 @@ class _Images:
     times: np.ndarray
     """By the bag, [n] int64 [ns]."""
 
+    def __len__(self) -> int:
+        """Number of images."""
+        return len(self.stamps)
+
+    def take(self, chosen: np.ndarray) -> "_Images":
+        """Some of them, [k]."""
+        return _Images(self.topic, self.stamps[chosen], self.times[chosen])
+
     def read(self, bag: Bag, index: int) -> Any:
         """The message of one image."""
         time = int(self.times[index])
         for stamped in bag.messages([self.topic], time, time + 1):
-            if _stamp(stamped.message, stamped.time) == self.stamps[index]:
+            if stamp_of(stamped.message, stamped.time) == self.stamps[index]:
                 return stamped.message
         raise FormatError(bag.path, f"an image on {self.topic} is not there any more")
 
@@ -80,69 +88,81 @@ def read_bag(path: Path | str, topics: Topics | None = None) -> PosedImages:
     path, topics = Path(path), topics or Topics()
     bag = Bag(find_bag(path) or path)
     check_topics(bag, topics)
-    color, depth = find_images(bag, topics)
-    lens = _lens(bag, color, topics.info)
+    topic, depth_topic = find_images(bag, topics)
+    lens = _lens(bag, topic, topics.info)
     if lens is None:
         raise FormatError(
             bag.path,
-            f"there is no camera_info that belongs to {color.name}: record it, or name it by "
+            f"there is no camera_info that belongs to {topic.name}: record it, or name it by "
             "--topics info=TOPIC",
         )
-    tree, images, depths = _scan(bag, (color.name, depth.name))
-    chain, source = _chain(bag, tree, topics, frame_of(color.first))
+    tree, images, depths = _scan(bag, (topic.name, depth_topic.name))
+    chain, source = find_chain(bag, tree, topics, frame_of(topic.first))
+    _, has_pose = tree.poses(chain, images.stamps)
+    color, depth = _matched(bag, images, depths, has_pose, source)
+    camera = _depth_camera(bag, tree, (topic, depth_topic), lens, topics.depth_info)
+    gone = len(images) - len(color)
+    lost = f" {gone} of {len(images)} frames lack depth or a pose and are left out." if gone else ""
+    return PosedImages(
+        path=path,
+        image_paths=tuple(color.name(bag, i) for i in range(len(color))),
+        lenses=(lens,) * len(color),
+        poses=np.stack(
+            [mend_pose(bag.path, "a pose", pose) for pose in tree.poses(chain, color.stamps)[0]]
+        ),
+        depth_paths=tuple(depth.name(bag, i) for i in range(len(color))),
+        pixels=Pixels(
+            lambda index: _rgb(bag, color, index, lens),
+            lambda index: _depth(bag, depth, index, lens, camera),
+        ),
+        depth_lenses=None if camera.own is None else (camera.own,) * len(color),
+        up=UP_Z if chain[-1] in _WORLDS else None,
+        remark=f"Color is {topic.name}, depth {depth_topic.name}, poses are those of {chain[0]} in "
+        f"{chain[-1]} by {source}.{camera.remark}{lost}",
+    )
+
+
+def _matched(
+    bag: Bag, images: _Images, depths: _Images, has_pose: np.ndarray, source: str
+) -> tuple[_Images, _Images]:
+    """Color images that have a pose and depth, and the depth image nearest in time to each.
+
+    Raises:
+        FormatError: there is none; says what is lacking.
+    """
     start = int(images.stamps[0])
     at = nearest((images.stamps - start) * 1e-9, (depths.stamps - start) * 1e-9, _MAX_GAP)
-    poses, has_pose = tree.poses(chain, images.stamps)
     chosen = np.flatnonzero((at >= 0) & has_pose)
     if not len(chosen):
         raise FormatError(
             bag.path,
-            f"of {len(images.stamps)} images on {color.name} none has both a depth image on "
-            f"{depth.name} within {_MAX_GAP:g} s ({int((at >= 0).sum())} have one) and a pose by "
+            f"of {len(images)} images on {images.topic} none has both a depth image on "
+            f"{depths.topic} within {_MAX_GAP:g} s ({int((at >= 0).sum())} have one) and a pose by "
             f"{source} ({int(has_pose.sum())} have one): do their clocks differ?",
         )
-    move, note = _registration(bag, tree, (color, depth), int(images.stamps[chosen[0]]))
-    depth_lens = _lens(bag, depth, topics.depth_info)
-    if move is not None and (depth_lens is None or not lens.is_pinhole):
-        raise FormatError(
-            bag.path,
-            f"{depth.name} is not registered to {color.name}, and the cameras are not known well "
-            "enough to do it here: record registered depth (RealSense: align_depth.enable:=true)",
-        )
-
-    def rgb(index: int) -> np.ndarray:
-        number = int(chosen[index])
-        with naming(images.name(bag, number)):
-            return _checked(rgb_of(images.read(bag, number)), lens)
-
-    def z_depth(index: int) -> np.ndarray:
-        number = int(at[chosen[index]])
-        with naming(depths.name(bag, number)):
-            found = depth_of(depths.read(bag, number))
-        if move is None or depth_lens is None:
-            return found
-        return register_depth(found, depth_lens, lens, move)
-
-    gone = len(images.stamps) - len(chosen)
-    lost = f" {gone} of {gone + len(chosen)} frames lack depth or a pose and are left out."
-    has_own = move is None and depth_lens is not None and lens.is_pinhole
-    return PosedImages(
-        path=path,
-        image_paths=tuple(images.name(bag, int(i)) for i in chosen),
-        lenses=(lens,) * len(chosen),
-        poses=np.stack([mend_pose(bag.path, "a pose", poses[i]) for i in chosen]),
-        depth_paths=tuple(depths.name(bag, int(at[i])) for i in chosen),
-        pixels=Pixels(rgb, z_depth),
-        depth_lenses=(depth_lens,) * len(chosen) if has_own and depth_lens else None,
-        up=UP_Z if chain[-1] in _WORLDS else None,
-        remark=f"Color is {color.name}, depth {depth.name}, poses are those of {chain[0]} in "
-        f"{chain[-1]} by {source}." + note + (lost if gone else ""),
-    )
+    return images.take(chosen), depths.take(at[chosen])
 
 
-def _stamp(message: Any, time: int) -> int:
-    """When a message was taken [ns]: as its header says, else when it was recorded."""
-    return stamp_of(message) or time
+def _rgb(bag: Bag, images: _Images, index: int, lens: Lens) -> np.ndarray:
+    """Colors [H, W, 3] uint8."""
+    with naming(images.name(bag, index)):
+        rgb = rgb_of(images.read(bag, index))
+        if rgb.shape[:2] != (lens.height, lens.width):
+            raise ForeignFileError(
+                f"the image has {rgb.shape[1]} x {rgb.shape[0]} pixels, its camera_info says "
+                f"{lens.width} x {lens.height}"
+            )
+        return rgb
+
+
+def _depth(bag: Bag, depths: _Images, index: int, lens: Lens, camera: "_DepthCamera") -> np.ndarray:
+    """z-depth [h, w] float32, registered where it is not."""
+    with naming(depths.name(bag, index)):
+        depth = depth_of(depths.read(bag, index))
+    if camera.elsewhere is None:
+        return depth
+    depth_lens, T_color_depth = camera.elsewhere
+    return register_depth(depth, depth_lens, lens, T_color_depth)
 
 
 def _scan(bag: Bag, names: tuple[str, str]) -> tuple[TransformTree, _Images, _Images]:
@@ -151,28 +171,14 @@ def _scan(bag: Bag, names: tuple[str, str]) -> tuple[TransformTree, _Images, _Im
     found: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
     for one in bag.messages([*bag.topics(*TF), *names]):
         if one.topic in found:
-            found[one.topic].append((_stamp(one.message, one.time), one.time))
+            found[one.topic].append((stamp_of(one.message, one.time), one.time))
         else:
-            _add_transforms(tree, one)
+            add_transforms(tree, one)
     for name in names:
         if not found[name]:
             raise FormatError(bag.path, f"there is no message on {name}")
     color, depth = (_Images(name, *np.array(found[name], np.int64).T) for name in names)
     return tree, color, depth
-
-
-def _checked(rgb: np.ndarray, lens: Lens) -> np.ndarray:
-    """Colors whose size is what the camera says.
-
-    Raises:
-        FormatError: it is not; without a name, which the caller adds.
-    """
-    if rgb.shape[:2] != (lens.height, lens.width):
-        raise ForeignFileError(
-            f"the image has {rgb.shape[1]} x {rgb.shape[0]} pixels, its camera_info says "
-            f"{lens.width} x {lens.height}"
-        )
-    return rgb
 
 
 def _lens(bag: Bag, image: ImageTopic, named: str | None) -> Lens | None:
@@ -184,83 +190,49 @@ def _lens(bag: Bag, image: ImageTopic, named: str | None) -> Lens | None:
         return lens_of(bag.first(name), is_rectified="rect" in image.name.rpartition("image")[2])
 
 
-def _add_transforms(tree: TransformTree, one: Stamped) -> None:
-    """Adds a message of /tf or /tf_static."""
-    is_static = one.topic.endswith("tf_static")
-    for sample in one.message.transforms:
-        move = sample.transform
-        tree.add(
-            frame_of(sample),
-            str(sample.child_frame_id).lstrip("/"),
-            None if is_static else _stamp(sample, one.time),
-            _vector(move.translation),
-            _vector(move.rotation, "xyzw"),
-        )
+class _DepthCamera(NamedTuple):
+    """How depth images lie to the color images."""
+
+    own: Lens | None = None
+    """Lens of a depth camera at the place of the color camera; None: it covers what that does."""
+
+    elsewhere: tuple[Lens, np.ndarray] | None = None
+    """Lens of a depth camera elsewhere, and `T_color_depth` [4, 4]."""
+
+    remark: str = ""
 
 
-def _vector(message: Any, names: str = "xyz") -> np.ndarray:
-    return np.array([getattr(message, name) for name in names], dtype=np.float64)
+def _depth_camera(
+    bag: Bag,
+    tree: TransformTree,
+    images: tuple[ImageTopic, ImageTopic],
+    lens: Lens,
+    named: str | None,
+) -> _DepthCamera:
+    """Where the depth camera is: by tf, if the frames differ.
 
-
-def _chain(bag: Bag, tree: TransformTree, topics: Topics, camera: str) -> tuple[list[str], str]:
-    """Frames from the camera to the world, and the topic that says how they move."""
-    name = topics.pose
-    if name is None and not tree.is_moving(tree.chain(camera, topics.world)):
-        name = find_pose(bag)
-    moved = None if name is None else _add_poses(bag, tree, topics, name, camera)
-    chain = tree.chain(camera, topics.world)
-    if moved is not None and moved not in chain[:-1]:
-        raise FormatError(
-            bag.path,
-            f"{name} says where {moved} is, but no transform leads there from {camera}, the frame "
-            f"of the images: record /tf_static, too; or, if {name} is the camera's own pose, give "
-            f"--topics pose={name},frame={camera}",
-        )
-    if topics.world is not None and chain[-1] != topics.world:
-        raise FormatError(
-            bag.path, f"no transform leads from {camera} to {topics.world}, only to {chain[-1]}"
-        )
-    if not tree.is_moving(chain):
-        raise FormatError(
-            bag.path,
-            f"nothing says where {camera}, the frame of the images, was: record /tf and "
-            "/tf_static, or odometry (--topics pose=TOPIC)",
-        )
-    return chain, name or "tf"
-
-
-def _add_poses(bag: Bag, tree: TransformTree, topics: Topics, name: str, camera: str) -> str:
-    """Adds the poses of a topic as transforms; returns the frame that they move."""
-    child = topics.frame or str(getattr(bag.first(name), "child_frame_id", "")).lstrip("/")
-    child = child or camera
-    tree.edges.pop(child, None)
-    for one in bag.messages([name]):
-        place, turn = _pose_of(one.message)
-        stamp = _stamp(one.message, one.time)
-        tree.add(frame_of(one.message), child, stamp, _vector(place), _vector(turn, "xyzw"))
-    return child
-
-
-def _pose_of(message: Any) -> tuple[Any, Any]:
-    """Position and orientation of a message that holds one pose."""
-    if hasattr(message, "transform"):
-        return message.transform.translation, message.transform.rotation
-    pose = message.pose
-    pose = pose.pose if hasattr(pose, "pose") else pose  # with a covariance
-    return pose.position, pose.orientation
-
-
-def _registration(
-    bag: Bag, tree: TransformTree, images: tuple[ImageTopic, ImageTopic], time: int
-) -> tuple[np.ndarray | None, str]:
-    """`T_color_depth` [4, 4] where the depth camera lies elsewhere, and what to remark."""
+    Raises:
+        FormatError: elsewhere, and not to be registered here.
+    """
     color, depth = (frame_of(image.first) for image in images)
+    depth_lens = _lens(bag, images[1], named)
+    own = _DepthCamera(own=depth_lens if lens.is_pinhole else None)
     if color == depth:
-        return None, ""
+        return own
     upwards = {frame: tree.chain(frame) for frame in (color, depth)}
     if upwards[color][-1] != upwards[depth][-1]:
-        return None, f" No transform leads from {depth} to {color}: they count as one place."
-    at = np.array([time])
+        note = f" No transform leads from {depth} to {color}: they count as one place."
+        return own._replace(remark=note)
+    at = np.array([stamp_of(images[0].first)])
     T_root = {frame: tree.poses(chain, at)[0][0] for frame, chain in upwards.items()}
     move = np.linalg.inv(T_root[color]) @ T_root[depth]
-    return (None if np.allclose(move, np.eye(4), atol=1e-4) else move), ""
+    if np.allclose(move, np.eye(4), atol=1e-4):
+        return own
+    if depth_lens is None or not lens.is_pinhole:
+        raise FormatError(
+            bag.path,
+            f"{images[1].name} is not registered to {images[0].name}, and the cameras are not "
+            "known well enough to do it here: record registered depth (RealSense: "
+            "align_depth.enable:=true)",
+        )
+    return _DepthCamera(elsewhere=(depth_lens, move))

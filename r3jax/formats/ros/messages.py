@@ -42,10 +42,10 @@ _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 """Format, and the two numbers of the inverse depth."""
 
 
-def stamp_of(message: Any) -> int:
-    """When a message was taken, by its header [ns]; 0 where nobody filled it in."""
+def stamp_of(message: Any, otherwise: int = 0) -> int:
+    """When a message was taken, by its header [ns]; `otherwise` where nobody filled it in."""
     stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or otherwise
 
 
 def frame_of(message: Any) -> str:

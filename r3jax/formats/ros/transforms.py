@@ -20,6 +20,9 @@ _MAX_GAP = 1_000_000_000
 _MAX_HOLD = 50_000_000
 """So long before its first and after its last sample an edge stays where it was [ns]."""
 
+_STILL = 1e-3
+"""Samples that differ by no more are the same [m, and parts of a quaternion]."""
+
 _MAX_DENORMAL = 1e-2
 """Quaternions longer or shorter by more are none."""
 
@@ -115,9 +118,15 @@ class TransformTree:
             found.append(parent)
         return found
 
-    def is_moving(self, chain: list[str]) -> bool:
+    def is_timed(self, chain: list[str]) -> bool:
         """True if an edge of a chain has samples in time."""
         return any(self.edges[frame].times for frame in chain[:-1])
+
+    def is_moving(self, chain: list[str]) -> bool:
+        """True if these samples differ; ROS 1 repeats what never moves all the time."""
+        edges = [self.edges[frame] for frame in chain[:-1]]
+        samples = [part for edge in edges for part in (edge.positions, edge.rotations)]
+        return any(np.ptp(np.stack(part), axis=0).max() > _STILL for part in samples)
 
     def poses(self, chain: list[str], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses of a chain's first frame in its last one, [n, 4, 4], and which are known [n].
