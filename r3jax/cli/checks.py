@@ -30,6 +30,7 @@ from r3jax.cli.options import (
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.formats.errors import check_capture
+from r3jax.formats.ros.names import parse_topics
 from r3jax.planning.policies import check_policy
 from r3jax.planning.robot.motion import Motion, make_motion
 from r3jax.simulators.scenes.names import check_scene
@@ -143,6 +144,7 @@ def _(options: BenchmarkOptions) -> None:
 def _(options: TrainOptions) -> None:
     check_folder_name(options.name)
     check_resolution(options.resolution)
+    parse_topics(options.topics)
     check_capture(options.path)
 
 
@@ -152,11 +154,13 @@ def _(options: EvaluateOptions) -> None:
     check_resolution(options.resolution)
     if options.worst < 0:
         raise ValueError(f"--worst must not be negative, got {options.worst}")
+    parse_topics(options.topics)
     check_capture(options.path)
 
 
 @_check.register
 def _(options: AuditOptions) -> None:
+    parse_topics(options.topics)
     check_capture(options.capture)
     if options.out is not None:
         _check_folder(options.out)

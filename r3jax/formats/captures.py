@@ -15,6 +15,11 @@ from r3jax.formats.phones.record3d import is_record3d, read_record3d
 from r3jax.formats.phones.stray_scanner import is_stray_scanner, read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.recordings import Recording, is_recording, read_recording
+from r3jax.formats.ros.bag_reader import read_bag
+from r3jax.formats.ros.bags import is_bag
+from r3jax.formats.ros.names import Topics
+from r3jax.formats.ros.rtabmap_database import is_rtabmap_database, read_rtabmap_database
+from r3jax.formats.ros.rtabmap_export import is_rtabmap_export, read_rtabmap_export
 from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
 from r3jax.formats.sequences.scannet import is_scannet, read_scannet
 from r3jax.formats.sequences.scannet_sens import is_sens, read_sens
@@ -35,6 +40,9 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_arkit_scenes, read_arkit_scenes),
     (is_scannet, read_scannet),
     (is_sens, read_sens),
+    (is_rtabmap_export, read_rtabmap_export),
+    (is_rtabmap_database, read_rtabmap_database),
+    (is_bag, read_bag),
 )
 """Folders and archives of posed images: what each looks like, and its reader."""
 
@@ -44,7 +52,8 @@ _KNOWN = (
     "recording of Record3D (.r3d) or Stray Scanner (rgb.mp4, odometry.csv), a scene of ARKitScenes "
     "(lowres_wide.traj), ScanNet (.sens, or color/, depth/, pose/, intrinsic/), Replica-SLAM "
     "(traj.txt, results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes "
-    "(frame-*.color.png)"
+    "(frame-*.color.png), a ROS bag (.bag, .mcap, .db3, or metadata.yaml), "
+    "RTAB-Map (.db, or *_camera_poses.txt)"
 )
 
 _MOST_BELOW = 100
@@ -86,17 +95,22 @@ class Capture:
         return Path("runs") / self.name / "models"
 
 
-def open_capture(path: Path, up: Literal["y", "z"] = "y") -> Capture:
+def open_capture(path: Path, up: Literal["y", "z"] = "y", topics: Topics | None = None) -> Capture:
     """Opens a run, a recording, or posed images of any format.
 
     Args:
         path: the folder, or the archive as an app shares it; of nerfstudio also the file.
         up: axis of a recording's world that points up; the others stay as they are.
+        topics: names of a ROS bag's topics and frames; None: all are guessed.
 
     Raises:
         FormatError: it is none of them, or one that is broken.
         RunError: it is a run, but broken.
     """
+    if topics is not None:
+        if not is_bag(path):
+            raise FormatError(path, "topics were named, but this is no ROS bag")
+        return Capture(path, read_bag(path, topics))
     if path.is_file() and path.suffix == ".json":
         return Capture(path, read_transforms(path))
     if (path / "run.json").exists():

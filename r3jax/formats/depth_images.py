@@ -67,3 +67,38 @@ def keep_confident(depth: np.ndarray, confidence: np.ndarray, best: int) -> np.n
             f"image {depth.shape[1]} x {depth.shape[0]}"
         )
     return np.where(confidence >= best, depth, np.float32(0.0))
+
+
+def register_depth(
+    depth: np.ndarray, depth_lens: Lens, lens: Lens, T_color_depth: np.ndarray
+) -> np.ndarray:
+    """Moves the depth of one camera into the image of another beside it (forward warping).
+
+    Every measurement becomes a point, which falls into one pixel; the nearest hides the others.
+    The result is a little coarser than the depth, so that few of its pixels stay empty.
+
+    Args:
+        depth: z-depth [h, w] float32.
+        depth_lens: pinhole of the depth camera.
+        lens: pinhole of the color camera.
+        T_color_depth: takes points of the depth camera to the color camera, [4, 4].
+
+    Returns:
+        z-depth [h', w'] float32 that covers what the color image covers; 0 where nothing fell.
+    """
+    fx, fy, cx, cy = depth_lens.intrinsics
+    row, column = np.nonzero((depth > 0.0) & np.isfinite(depth))
+    z = depth[row, column].astype(np.float64)
+    local = np.stack([(column + 0.5 - cx) / fx * z, (row + 0.5 - cy) / fy * z, z], axis=1)
+    x, y, z = (local @ T_color_depth[:3, :3].T + T_color_depth[:3, 3]).T
+    fx_color, fy_color, cx_color, cy_color = lens.intrinsics
+    coarser = 0.9 * min(1.0, fx / fx_color, fy / fy_color)
+    height, width = (max(1, int(side * coarser)) for side in (lens.height, lens.width))
+    z_or_far = np.where(z > 1e-3, z, np.inf)
+    u = np.floor((fx_color * x / z_or_far + cx_color) * width / lens.width)
+    v = np.floor((fy_color * y / z_or_far + cy_color) * height / lens.height)
+    is_in = (z > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    nearest = np.full((height, width), np.inf)
+    place = v[is_in].astype(np.int64), u[is_in].astype(np.int64)
+    np.minimum.at(nearest, place, z[is_in])
+    return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)

@@ -33,7 +33,7 @@ def naming(path: Path) -> Generator[None]:
         raise FormatError(path, str(error)) from None
 
 
-CAPTURE_FILES = (".json", ".zip", ".r3d", ".sens")
+CAPTURE_FILES = (".json", ".zip", ".r3d", ".sens", ".bag", ".mcap", ".db3", ".db")
 """Suffixes of the files that may be a capture; all others are folders."""
 
 _ADVICE = {
@@ -58,16 +58,6 @@ _ADVICE = {
         ),
         "this is a file; a capture is a folder of the images that a model was made of, which no "
         "model holds: export raw data of the scan",
-    ),
-    **dict.fromkeys(
-        (".bag", ".db3", ".mcap"),
-        "ROS bags are not read: export images, depth and poses in TUM's layout (rgb.txt, "
-        "depth.txt, groundtruth.txt), or hand the topics to r3jax.observe (docs/howto/slam.md)",
-    ),
-    ".db": (
-        "the databases of RTAB-Map and COLMAP are not read: export a folder with images, depth and "
-        "poses (RTAB-Map: File, Export poses in the format of RGB-D SLAM, as TUM's "
-        "groundtruth.txt)"
     ),
 }
 """What to do with other files; {} is the path."""

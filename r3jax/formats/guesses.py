@@ -45,7 +45,12 @@ def _names(path: Path) -> list[str]:
 
 
 def _of_archive(path: Path) -> str | None:
-    """A zip archive that is damaged, or of something else."""
+    """A zip archive or database that is damaged, or of something else."""
+    if path.suffix.lower() == ".db":
+        return (
+            "this is no database of RTAB-Map: of COLMAP give the folder of a model (colmap mapper "
+            f"--database_path {path} --image_path IMAGES --output_path OUT)"
+        )
     if path.suffix.lower() not in SUFFIXES:
         return None
     try:
@@ -61,6 +66,13 @@ def _of_archive(path: Path) -> str | None:
         if sentence is not None:
             return f"unpack this archive first; {sentence}"
     return "this archive holds no capture that is known: unpack it and give the folder"
+
+
+def _bags(path: Path, names: list[str]) -> str | None:
+    found = [name for name in names if name.lower().endswith((".bag", ".mcap", ".db3"))]
+    if not found or "metadata.yaml" in names:
+        return None
+    return f"this folder holds several ROS bags: give one of them, such as {path / found[0]}"
 
 
 def _exr(path: Path, names: list[str]) -> str | None:
@@ -144,6 +156,6 @@ def _count(names: list[str], suffixes: tuple[str, ...]) -> int:
 
 
 _GUESSES: tuple[Callable[[Path, list[str]], str | None], ...] = (
-    *(_exr, _stray, _frames, _colmap, _metashape, _video, _images, _model),
+    *(_bags, _exr, _stray, _frames, _colmap, _metashape, _video, _images, _model),
 )
 """From the particular to the general."""

@@ -7,7 +7,8 @@ OpenGL camera axes (x right, y up, z backward), camera to world, pixel centers a
 
 Read, poses stay in the coordinates of the file, as do the points of `ply_file_path`: those are the
 capture's own, and suggested cameras have to come back in them. `applied_transform` says how they
-were made of the coordinates of an earlier program; it is kept and not undone.
+were made of the coordinates of an earlier program; it is kept and not undone. `applied_scale` is
+undone where there are depth images, which nobody scaled: poses are in their units again.
 
 Written, they are in meters, world z up. Depth images are uint16; one step is
 `depth_unit_scale_factor` meters; 0 is no measurement and `depth_beyond_range_value` means that
@@ -82,6 +83,11 @@ def read_transforms(path: Path | str) -> PosedImages:
         path = path / "transforms.json"
     with naming(path):
         content = parse_json(read_bytes(path, _MAX_BYTES))
+        if isinstance(content, list):
+            raise ForeignFileError(
+                "this is a list of poses as `ns-export cameras` writes it, in the coordinates of a "
+                "training and without cameras: give the transforms.json of the data set"
+            )
         check_fields("transforms", content, {"frames": list[dict[str, Any]]})
         frames: list[dict[str, Any]] = content["frames"]
         if not frames:
@@ -92,20 +98,37 @@ def read_transforms(path: Path | str) -> PosedImages:
         points_path = None if points is None else below(path.parent, points)
         moved, unit = _applied(content), _depth_unit(content)
         depths = [_depth(path.parent, i, frame) for i, frame in enumerate(frames)]
+        scale = _applied_scale(content)
     lenses = [
         _lens(path, f"frames[{i}]", {**content, **frame}, image)
         for i, (frame, image) in enumerate(zip(frames, images, strict=True))
     ]
-    poses = [_pose(path, f"frames[{i}]", frame) for i, frame in enumerate(frames)]
+    poses = np.stack([_pose(path, f"frames[{i}]", frame) for i, frame in enumerate(frames)])
+    remark = None
+    if scale != 1.0:
+        if any(depths):
+            poses[:, :3, 3] /= scale
+            moved = None if moved is None else moved / np.array([[scale]] * 3 + [[1.0]])
+            points_path = None  # in the scaled coordinates, and depth says more
+            remark = (
+                f"The positions in transforms.json were scaled by {scale:g} (applied_scale): that "
+                "is undone here, and lengths and suggested views are in the units of the depth."
+            )
+        else:
+            remark = (
+                f"The positions in transforms.json are scaled by {scale:g} (applied_scale), and "
+                "so are all lengths here: without depth images that is not undone."
+            )
     return PosedImages(
         path=path,
         image_paths=tuple(images),
         lenses=tuple(lenses),
-        poses=np.stack(poses),
+        poses=poses,
         depth_paths=tuple(depths),
         depth_unit=unit,
         points_path=points_path,
         T_capture_original=moved,
+        remark=remark,
     )
 
 
@@ -136,13 +159,23 @@ def _depth_unit(content: _Fields) -> DepthUnit:
 
 def _applied(content: _Fields) -> np.ndarray | None:
     """`applied_transform` and `applied_scale` as one 4x4 matrix."""
-    rows, scale = content.get("applied_transform"), content.get("applied_scale")
-    if rows is None and scale is None:
+    rows = content.get("applied_transform")
+    if rows is None and content.get("applied_scale") is None:
         return None
-    check_type("applied_scale", scale, float | None)
     move = np.eye(4) if rows is None else _matrix("applied_transform", rows)
-    move[:3] *= 1.0 if scale is None else scale
+    move[:3] *= _applied_scale(content)
     return move
+
+
+def _applied_scale(content: _Fields) -> float:
+    """What all positions were multiplied by; 1 where nobody says so."""
+    scale = content.get("applied_scale")
+    check_type("applied_scale", scale, float | None)
+    if scale is None:
+        return 1.0
+    if not 1e-9 < scale < 1e9:
+        raise ForeignFileError(f"the applied_scale {scale:g} makes no sense")
+    return float(scale)
 
 
 def _matrix(name: str, rows: Any) -> np.ndarray:

@@ -21,6 +21,8 @@ from tests.apps.audit.room import (
     write_nerfstudio,
     write_recording,
 )
+from tests.formats import rtabmap
+from tests.formats.bags import COLOR, write_bag
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -88,6 +90,29 @@ def test_the_same_words_give_the_same_numbers(captures, audited, tmp_path):
     assert audit(captures / "recording", tmp_path / "again", "--voxel-size", "0.15") == 0
     for name in ("audit.json", "suggested_transforms.json", "voxels.ply"):
         assert (tmp_path / "again" / name).read_bytes() == (audited / name).read_bytes()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("kind", ["bag", "rtabmap"])
+def test_recordings_of_robots_are_audited(tmp_path, kind, capsys):
+    words = ["--voxel-size", "0.15"]
+    if kind == "bag":
+        path = write_bag(tmp_path / "drive")
+        words += ["--topics", f"color={COLOR}"]
+    else:
+        path = tmp_path / "map.db"
+        path.write_bytes(rtabmap.database())
+    assert audit(path, tmp_path / "out", *words) == 0
+    captured = capsys.readouterr()
+    said = " ".join(captured.out.split())  # lines are wrapped
+    if kind == "bag":
+        assert f"Color is {COLOR}, depth /camera/aligned_depth" in said
+        assert f"next r3jax audit {path} --topics color={COLOR}" in " ".join(captured.err.split())
+    else:
+        assert "1 of 4 images lack depth or a pose and are left out." in said
+    record = json.loads((tmp_path / "out" / "audit.json").read_text())
+    assert record["depth_from"] == "depth"
+    assert record["unit"] == "metre"
 
 
 @pytest.mark.full

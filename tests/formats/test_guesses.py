@@ -1,5 +1,7 @@
 """Folders that are no capture: what they most likely are, and the command that converts them."""
 
+import sqlite3
+
 import pytest
 
 from r3jax.formats.captures import open_capture
@@ -79,15 +81,20 @@ def test_an_archive_of_something_else_gets_a_guess(tmp_path, files, message):
     [
         ("clip.mp4", r"ns-process-data video --data \S+clip\.mp4 --output-dir OUT"),
         ("mesh.GLB", "a folder of the images that a model was made of"),
-        ("map.db", "databases of RTAB-Map and COLMAP are not read: export"),
-        ("drive.mcap", r"ROS bags are not read: export .* in TUM's layout"),
-        ("notes.txt", r"transforms\.json, or an app's file \(\.zip, \.r3d, \.sens\)"),
+        ("notes.txt", r"transforms\.json, or an app's file \(\.zip, \.r3d, \.sens, \.bag"),
     ],
 )
 def test_a_file_that_is_no_capture_says_what_to_do(tmp_path, name, message):
     (tmp_path / name).touch()
     with pytest.raises(FormatError, match=message):
         check_capture(tmp_path / name)
+
+
+def test_a_database_of_colmap_says_what_to_do(tmp_path):
+    with sqlite3.connect(tmp_path / "database.db") as connection:
+        connection.execute("CREATE TABLE cameras (camera_id INTEGER)")
+    with pytest.raises(FormatError, match="no database of RTAB-Map: of COLMAP give the folder of"):
+        open_capture(tmp_path / "database.db")
 
 
 def test_files_of_apps_pass_the_first_check(tmp_path):

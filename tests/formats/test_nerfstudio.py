@@ -137,6 +137,25 @@ def test_applied_transform_is_kept_and_poses_stay_in_the_files_coordinates(folde
     assert moved is not None
     np.testing.assert_array_equal(moved @ [2, 4, 6, 1], [1, 3, -2, 1])
     assert read_transforms(written(folder)).T_capture_original is None
+    assert "so are all lengths here: without depth images that is not undone" in images.remark
+
+
+def test_an_applied_scale_is_undone_where_depth_tells_the_units(folder):
+    rows = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]
+    depth = {"0.depth_file_path": "depth.png", "ply_file_path": "points.ply"}
+    images = read_transforms(written(folder, applied_transform=rows, applied_scale=0.5, **depth))
+    metric = read_transforms(written(folder)).poses
+    np.testing.assert_array_equal(images.poses[:, :3, 3], 2 * metric[:, :3, 3])
+    np.testing.assert_array_equal(images.poses[:, :3, :3], metric[:, :3, :3])
+    np.testing.assert_array_equal(images.T_capture_original @ [2, 4, 6, 1], [2, 6, -4, 1])
+    assert images.points_path is None
+    assert "scaled by 0.5 (applied_scale): that is undone" in images.remark
+
+
+def test_exported_poses_without_cameras_say_what_to_give(folder):
+    (folder / "transforms.json").write_text("[]")
+    with pytest.raises(FormatError, match=r"as `ns-export cameras` writes it.* give the"):
+        read_transforms(folder)
 
 
 def test_depth_is_in_millimetres_unless_the_file_says_otherwise(folder):
@@ -196,6 +215,7 @@ DAMAGES = {
     "half a pixel": ({"w": 10.5}, "`w` must be a whole number"),
     "k4": ({"k4": 0.1}, "k4 belongs to a fisheye"),
     "unit": ({"depth_unit_scale_factor": 0}, "makes no sense"),
+    "applied scale": ({"applied_scale": 0.0}, "the applied_scale 0 makes no sense"),
     "applied": ({"applied_transform": [[1.0]]}, "`applied_transform` must be a 3x4"),
     "no size": (
         {"w": None, "0.file_path": "gone"},

@@ -45,6 +45,7 @@ MODULES = (
     "phones:RECORD3D",
     "phones:ARKIT_SCENES",
     "phones:SCANNET",
+    "rtabmap:EXPORT",
 )
 """Of this folder, with the name of the reader where it is not READER."""
 

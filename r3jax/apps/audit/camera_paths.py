@@ -4,8 +4,9 @@
     transforms.json      frames with intrinsics, without images
 
 nerfstudio's viewer saves paths in the coordinates of its training, which by default are turned,
-centered and scaled; they are a capture's own only where it was told not to (`--orientation-method
-none --center-method none --auto-scale-poses False`).
+centered and scaled. Where the training's dataparser_transforms.json lies beside the path, that is
+undone; else they are taken for the capture's own, as which nerfstudio trains if it is told to
+(`--orientation-method none --center-method none --auto-scale-poses False`).
 """
 
 import json
@@ -21,6 +22,7 @@ from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
+from r3jax.formats.normalization import NAME, read_normalization
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import mend_pose
 from r3jax.formats.validation.errors import ForeignFileError
@@ -178,15 +180,25 @@ def write_path_transforms(path: Path, poses: np.ndarray, camera: Camera) -> None
     write_atomic(path, (json.dumps(content, indent=1) + "\n").encode())
 
 
-def path_of(path: Path) -> CameraPath:
+def path_of(path: Path, capture: object = None) -> CameraPath:
     """Reads the poses of a camera path, or of any capture.
+
+    Args:
+        path: the file or folder.
+        capture: in whose coordinates they are to be; counts where a dataparser_transforms.json
+            lies beside a camera_path.json.
 
     Raises:
         FormatError: it is neither, or damaged.
         RunError: it is a damaged run.
     """
     if is_camera_path(path):
-        return read_camera_path(path)
+        found, normalization = read_camera_path(path), path.parent / NAME
+        if not normalization.exists():
+            return found
+        moved = capture.T_capture_original if isinstance(capture, PosedImages) else None
+        poses = read_normalization(normalization).undone(found.poses, moved)
+        return CameraPath(poses, found.lenses)
     source = open_capture(path, "z").source
     if isinstance(source, PosedImages):
         return CameraPath(source.poses, source.lenses)

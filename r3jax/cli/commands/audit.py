@@ -15,6 +15,7 @@ from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import AuditOptions
 from r3jax.cli.progress import Stages
 from r3jax.formats.captures import open_capture
+from r3jax.formats.ros.names import parse_topics
 
 _SHOWN = 5
 """Regions that the console lists."""
@@ -29,10 +30,10 @@ def run_audit(options: AuditOptions) -> int:
     """
     progress = Console(stderr=True)
     try:
-        capture = open_capture(options.capture, "z")
+        capture = open_capture(options.capture, "z", parse_topics(options.topics))
         folder = options.out or Path("runs") / "audit" / capture.name
         _check_folder(folder)
-        path = None if options.path is None else path_of(options.path)
+        path = None if options.path is None else path_of(options.path, capture.source)
         source = source_of(capture.source, capture.name)
         with Stages(progress) as stages:
             found = audit(source, _settings_of(options), path, stages.on_progress)
@@ -45,7 +46,8 @@ def run_audit(options: AuditOptions) -> int:
     _show(Console(), found, {"report": page, **written})
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")
-    progress.next("audit", options.capture)
+    topics = () if options.topics is None else ("--topics", options.topics)
+    progress.next("audit", options.capture, *topics)
     return 0
 
 

@@ -21,6 +21,7 @@ from r3jax.cli.options import EvaluateOptions
 from r3jax.cli.progress import Stages
 from r3jax.evaluation.scores import Summary
 from r3jax.formats.captures import open_capture
+from r3jax.formats.ros.names import parse_topics
 
 
 def run_evaluate(options: EvaluateOptions) -> int:
@@ -34,7 +35,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
         check_resolution(options.resolution)
         if options.worst < 0:
             raise ValueError(f"--worst must not be negative, got {options.worst}")
-        capture = open_capture(options.path, options.up)
+        capture = open_capture(options.path, options.up, parse_topics(options.topics))
         model = find_model(capture, options.name, options.model)
         test = choose_views(options.views, capture, model, options.up)
         with Stages(progress) as stages:

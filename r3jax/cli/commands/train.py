@@ -8,6 +8,7 @@ from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one
 from r3jax.cli.options import TrainOptions
 from r3jax.cli.progress import Stages, TrainProgress
 from r3jax.formats.captures import open_capture
+from r3jax.formats.ros.names import parse_topics
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.training import train
 from r3jax.splatting.training.config import TrainConfig
@@ -28,7 +29,7 @@ def run_train(options: TrainOptions) -> int:
         check_resolution(options.resolution)
         check_folder_name(options.name)
         config = _config(options)
-        capture = open_capture(options.path, options.up)
+        capture = open_capture(options.path, options.up, parse_topics(options.topics))
         folder = (options.out or capture.models) / options.name
         replace = options.overwrite or options.resume
         check_free(folder, replace=replace)
@@ -87,4 +88,5 @@ def _conclude(
     which = () if options.name == TrainOptions.name else ("--name", options.name)
     where = which if options.out is None else ("--model", folder)
     how = () if options.hold_out else ("--views", "all")
-    console.next("evaluate", options.path, *where, *how)
+    topics = () if options.topics is None else ("--topics", options.topics)
+    console.next("evaluate", options.path, *where, *how, *topics)

@@ -47,12 +47,17 @@ class AuditOptions(AuditTermOptions):
     )
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
-    """nerfstudio's transforms.json or its folder, a COLMAP model, a scene of Replica-SLAM, TUM or
-    7-Scenes, a recording (images/, depth/, poses.txt, K.txt), or a run."""
+    """A phone's scan as the app shares it, a ROS bag, nerfstudio's transforms.json or its folder, a
+    COLMAP model, a scene of ScanNet, Replica-SLAM, TUM or 7-Scenes, a recording (images/, depth/,
+    poses.txt, K.txt), or a run."""
 
     path: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Camera path to judge, in the capture's coordinates: nerfstudio's camera_path.json, or any
     capture. By default the capture's own frames, each judged without itself."""
+
+    topics: Annotated[str | None, tyro.conf.arg(metavar="NAMES")] = None
+    """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
+    depth_info, frame, world. By default they are found."""
 
     views: int = 10
     """Further views to suggest."""

@@ -57,6 +57,10 @@ class RenderingOptions:
     up: Literal["y", "z"] = "y"
     """Axis of a recording's world that points up."""
 
+    topics: Annotated[str | None, tyro.conf.arg(metavar="NAMES")] = None
+    """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
+    depth_info, frame, world. By default they are found."""
+
     seed: int = 0
     """All randomness follows from it."""
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from r3jax.apps.audit.camera_paths import (
     is_camera_path,
+    path_of,
     read_camera_path,
     write_camera_path,
     write_path_transforms,
@@ -54,6 +55,36 @@ def test_axes_and_angles_are_nerfstudios(folder):
     focal = 0.5 * content["render_height"] / np.tan(np.radians(camera["fov"]) / 2)
     assert focal == pytest.approx(50.0)
     assert camera["aspect"] == pytest.approx(64 / 48)
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_a_path_of_a_training_comes_back_by_its_normalization(tmp_path, depth):
+    """By the definition: x_trained = s * (transform @ x), x before applied_transform and scale."""
+    applied = np.array([[1.0, 0, 0, 3], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    turn, scale, applied_scale = random_pose(3), 0.07, 0.5
+    original = np.stack([random_pose(i) for i in range(4)])
+    trained = turn @ original
+    trained[:, :3, 3] *= scale
+    write_camera_path(tmp_path / "path.json", trained, CAMERA)
+    content = {"transform": turn[:3].tolist(), "scale": scale}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(content))
+    in_file = applied @ original
+    in_file[:, :3, 3] *= applied_scale
+    write_path_transforms(tmp_path / "transforms.json", in_file, CAMERA)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content |= {"applied_transform": applied[:3].tolist(), "applied_scale": applied_scale}
+    if depth:
+        content["frames"][0]["depth_file_path"] = "depth.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = read_transforms(tmp_path)
+    np.testing.assert_allclose(
+        path_of(tmp_path / "path.json", capture).poses, capture.poses, rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(path_of(tmp_path / "path.json").poses, original, atol=1e-9)
+    bad = {"transform": (2 * turn[:3]).tolist(), "scale": scale}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(bad))
+    with pytest.raises(FormatError, match=r"dataparser_transforms\.json: the transform"):
+        path_of(tmp_path / "path.json", capture)
 
 
 def change(content, **fields):

@@ -1,0 +1,1 @@
+"""Recordings of robots: ROS bags and RTAB-Map."""

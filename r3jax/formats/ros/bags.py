@@ -1,0 +1,153 @@
+"""Bags of ROS 1 and ROS 2, opened by `rosbags`: topics, and messages by topic and time.
+
+A bag is a file of ROS 1 (.bag), of ROS 2 (.mcap or .db3), or the folder that `ros2 bag record`
+writes (metadata.yaml). Whatever `rosbags` says of a damaged one becomes one kind of error.
+"""
+
+import io
+import os
+import weakref
+from collections.abc import Collection, Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.validation.files import check_regular
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+"""Files of ROS 1, and of ROS 2's two storages."""
+
+_METADATA = "metadata.yaml"
+
+
+class Stamped(NamedTuple):
+    """A message as it lies in a bag."""
+
+    topic: str
+    time: int
+    """When it was recorded [ns]; its own stamp may be another."""
+
+    message: Any
+
+
+class _File(io.BufferedReader):
+    """A file that makes no more room for a damaged number of bytes than it has itself."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(min(-1 if size is None else size, os.fstat(self.fileno()).st_size))
+
+
+class _BagPath(type(Path())):
+    """A path that rosbags opens in that way, and all paths below it."""
+
+    def open(self, mode: str = "r", *args: Any, **kwargs: Any) -> Any:
+        return _File(io.FileIO(self)) if mode == "rb" else super().open(mode, *args, **kwargs)
+
+
+class Bag:
+    """An opened bag; it closes itself when nobody holds it any more."""
+
+    def __init__(self, path: Path):
+        """Opens it and reads what topics it has.
+
+        Args:
+            path: the file or folder.
+
+        Raises:
+            FormatError: rosbags is not installed; no bag, one that is damaged, or not finished.
+        """
+        highlevel, typesys = _load_rosbags(path)
+        self.path = path
+        for file in [path] if path.is_file() else list(path.iterdir()):
+            with naming(file):
+                check_regular(file)
+        with self._reading("opened"):
+            # Bags of ROS 2 before Iron do not say what their messages look like.
+            default = typesys.get_typestore(typesys.Stores.LATEST)
+            self._reader: Any = highlevel.AnyReader([_BagPath(path)], default_typestore=default)
+            self._reader.open()
+            weakref.finalize(self, self._reader.close)
+        self.types: dict[str, str] = {
+            one.topic: one.msgtype for one in self._reader.connections if one.msgcount
+        }
+        """Type of the messages of every topic that has some, such as sensor_msgs/msg/Image."""
+
+    def topics(self, *types: str) -> list[str]:
+        """Names of the topics of these types, sorted."""
+        return sorted(name for name, one in self.types.items() if one in types)
+
+    def messages(
+        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+    ) -> Iterator[Stamped]:
+        """Messages of some topics in the order of their recording.
+
+        Args:
+            topics: their names.
+            start: recorded then or later [ns]; None: from the beginning.
+            stop: recorded before [ns]; None: to the end.
+
+        Raises:
+            FormatError: the bag is damaged there.
+        """
+        wanted = [one for one in self._reader.connections if one.topic in topics]
+        if not wanted:
+            return
+        with self._reading("read"):
+            found = self._reader.messages(wanted, start, stop)
+            for connection, time, data in found:
+                message = self._reader.deserialize(data, connection.msgtype)
+                yield Stamped(connection.topic, time, message)
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic.
+
+        Raises:
+            FormatError: the bag is damaged there, or promises messages that are not there.
+        """
+        for stamped in self.messages([topic]):
+            return stamped.message
+        raise FormatError(self.path, f"there is no message on {topic}")
+
+    @contextmanager
+    def _reading(self, what: str) -> Generator[None]:
+        """Names the bag in whatever goes wrong in rosbags, SQLite or a decompressor."""
+        try:
+            yield
+        except (FormatError, GeneratorExit):
+            raise
+        except Exception as error:
+            reason = f"{error!s:.200}" or type(error).__name__
+            raise FormatError(
+                self.path,
+                f"the bag cannot be {what} ({reason}): record or copy it again, or try "
+                "`ros2 bag reindex` or `rosbag reindex`",
+            ) from None
+
+
+def find_bag(path: Path) -> Path | None:
+    """The bag that a path stands for: itself, or the only bag file in a folder."""
+    if path.is_file():
+        return path if path.suffix.lower() in SUFFIXES else None
+    if not path.is_dir():
+        return None
+    bags = [one for one in sorted(path.iterdir()) if one.suffix.lower() in SUFFIXES]
+    if (path / _METADATA).exists() and (bags or any(path.glob("*.zstd"))):
+        return path
+    return bags[0] if len(bags) == 1 and bags[0].is_file() else None
+
+
+def is_bag(path: Path) -> bool:
+    """True if a file or folder looks like a bag of ROS."""
+    return find_bag(path) is not None
+
+
+def _load_rosbags(path: Path) -> tuple[ModuleType, ModuleType]:
+    try:
+        from rosbags import highlevel, typesys
+    except ImportError:
+        raise FormatError(
+            path, "ROS bags are read by rosbags, which is not installed: pip install 'r3jax[ros]'"
+        ) from None
+    return highlevel, typesys

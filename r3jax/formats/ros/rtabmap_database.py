@@ -1,0 +1,227 @@
+"""Reads a database of RTAB-Map (SQLite), as its apps and its node for ROS save a map.
+
+    Node.pose           12 float32: 3x4 matrix of the robot in the map, z up [m]
+    Data.image          JPEG or PNG
+    Data.depth          PNG of 16 bits [mm], PNG of four channels that are the bytes of float32 [m],
+                        or RVL of 16 bits; a JPEG is the right image of a stereo camera
+    Data.calibration    11 int32: version, kind, size, numbers of elements; then float64 K, D, R, P
+                        and 12 float32: the camera, optical axes, on the robot
+    Admin.opt_ids       ids and poses of the optimized graph, by zlib, with 12 bytes behind it;
+    Admin.opt_poses     where they are there, they go before Node.pose, and other nodes are left out
+
+(https://github.com/introlab/rtabmap: DatabaseSchema.sql, Compression.cpp, CameraModel.cpp)
+"""
+
+import sqlite3
+import zlib
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.lenses import Lens
+from r3jax.formats.phones.shots import UP_Z
+from r3jax.formats.posed_images import DEPTH_MODES, IMAGE_FORMATS, Pixels, PosedImages
+from r3jax.formats.poses import mend_pose
+from r3jax.formats.ros.messages import clean_depth
+from r3jax.formats.ros.rtabmap_export import COMMAND, rectified_lens
+from r3jax.formats.ros.rvl import unpack_rvl
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular
+from r3jax.formats.validation.images import image_pixels, image_size
+
+_HEADER = 11
+_RVL = b"DEPTHRVL"
+_MAX_GRAPH = 256 << 20
+"""A pose takes 48 bytes [bytes]."""
+
+_NODES = (
+    "SELECT Node.id, Node.pose, Data.calibration FROM Node JOIN Data ON Data.id = Node.id "
+    "WHERE length(Data.image) > 0 AND length(Data.depth) > 0 ORDER BY Node.id"
+)
+
+
+def is_rtabmap_database(path: Path) -> bool:
+    """True if the file is a database with the tables of RTAB-Map."""
+    if path.suffix.lower() != ".db" or not path.is_file():
+        return False
+    try:
+        names = {name for (name,) in _query(path, "SELECT name FROM sqlite_master")}
+    except FormatError:
+        return False
+    return {"Node", "Data", "Link"} <= names
+
+
+def read_rtabmap_database(path: Path | str) -> PosedImages:
+    """Opens a database and checks everything but the pixels.
+
+    Args:
+        path: the .db file.
+
+    Raises:
+        FormatError: no SQLite, damaged, of an old version, of a stereo camera or several cameras;
+            no node with an image, depth, a camera and a pose.
+    """
+    path = Path(path)
+    rows = _query(path, _NODES)
+    (total,) = _query(path, "SELECT count(*) FROM Data WHERE length(image) > 0")[0]
+    with naming(path):
+        optimized = _optimized(path)
+        nodes = [node for row in rows if (node := _node(path, row, optimized)) is not None]
+    if not nodes:
+        raise FormatError(
+            path,
+            f"of {total} images in it none has depth, a camera and a pose: export what there is by "
+            f"{COMMAND.format(path)}",
+        )
+    gone = total - len(nodes)
+    which = "odometry's: the graph was never optimized" if optimized is None else "optimized"
+    lost = f" {gone} of {total} images lack depth or a pose and are left out." if gone else ""
+    return PosedImages(
+        path=path,
+        image_paths=tuple(path / "image" / str(node.id) for node in nodes),
+        lenses=tuple(node.lens for node in nodes),
+        poses=np.stack([node.pose for node in nodes]),
+        depth_paths=tuple(path / "depth" / str(node.id) for node in nodes),
+        pixels=Pixels(
+            lambda index: _rgb(path, nodes[index]), lambda index: _depth(path, nodes[index])
+        ),
+        up=UP_Z,
+        remark=f"Poses are {which}.{lost}",
+    )
+
+
+class _Node(NamedTuple):
+    """A node with an image."""
+
+    id: int
+    lens: Lens
+    pose: np.ndarray
+    """`T_map_camera`, [4, 4]."""
+
+
+def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
+    """All rows of a query; the database is only read, whoever else has it open.
+
+    Raises:
+        FormatError: missing, no database, damaged, or without such tables.
+    """
+    with naming(path):
+        check_regular(path)
+        try:
+            name = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+            with closing(sqlite3.connect(name, uri=True)) as connection:
+                return connection.execute(sql, values).fetchall()
+        except (sqlite3.Error, UnicodeError, OverflowError) as error:
+            raise ForeignFileError(
+                f"this database cannot be read ({error!s:.200}): was RTAB-Map closed when it was "
+                f"copied? Or export it: {COMMAND.format(path)}"
+            ) from None
+
+
+def _optimized(path: Path) -> dict[int, np.ndarray] | None:
+    """Poses of the robot by the node's id, [4, 4]; None where the graph was never optimized."""
+    columns = {row[1] for row in _query(path, "PRAGMA table_info(Admin)")}
+    if not {"opt_ids", "opt_poses"} <= columns:
+        return None
+    rows = _query(path, "SELECT opt_ids, opt_poses FROM Admin WHERE opt_poses IS NOT NULL")
+    if not rows:
+        return None
+    ids, poses = (_unzipped(blob) for blob in rows[0])
+    if not ids or len(poses) != 12 * len(ids):
+        raise ForeignFileError("the optimized poses are damaged: are they as many as their ids?")
+    numbers = np.frombuffer(ids, "<i4")
+    return dict(zip(numbers.tolist(), _poses(poses), strict=True))
+
+
+def _unzipped(blob: Any) -> bytes:
+    """The bytes of a matrix that RTAB-Map compressed; its size and type follow them."""
+    if not isinstance(blob, bytes):
+        raise ForeignFileError("the optimized poses are no bytes")
+    try:
+        data = zlib.decompressobj().decompress(blob, _MAX_GRAPH)
+    except zlib.error as error:
+        raise ForeignFileError(f"the optimized poses are damaged ({error})") from None
+    return data[: len(data) // 4 * 4]
+
+
+def _poses(data: bytes) -> np.ndarray:
+    """Matrices [n, 4, 4] of rows of 12 float32."""
+    poses = np.tile(np.eye(4), (len(data) // 48, 1, 1))
+    poses[:, :3] = np.frombuffer(data, "<f4").reshape(-1, 3, 4)
+    return poses
+
+
+def _node(
+    path: Path, row: tuple[Any, ...], optimized: dict[int, np.ndarray] | None
+) -> _Node | None:
+    """A node; None where it has no camera or no pose."""
+    number, pose, calibration = row
+    is_known = isinstance(number, int) and isinstance(calibration, bytes)
+    if not is_known or not isinstance(pose, bytes) or len(pose) != 48:
+        return None
+    T_map_robot = _poses(pose)[0] if optimized is None else optimized.get(number)
+    if T_map_robot is None or not T_map_robot[:3, :3].any():  # RTAB-Map's null is all zero
+        return None
+    lens, T_robot_camera = _camera(path, number, calibration)
+    which = f"the pose of node {number}"
+    return _Node(number, lens, mend_pose(path, which, T_map_robot @ T_robot_camera))
+
+
+def _camera(path: Path, number: int, data: bytes) -> tuple[Lens, np.ndarray]:
+    """A node's lens, and the camera on the robot."""
+    header = np.frombuffer(data[: 4 * _HEADER], "<i4").tolist()
+    if len(header) < _HEADER or header[3] != 0:
+        raise ForeignFileError(
+            "its cameras are those of a stereo rig or of an old version: export depth images by "
+            f"{COMMAND.format(path)}"
+        )
+    width, height, *counts, places = header[4:]
+    if min(counts) < 0 or max(counts) > 64 or places != 12:
+        raise ForeignFileError(f"the camera of node {number} is damaged")
+    begin = 4 * _HEADER
+    middle = begin + 8 * sum(counts)
+    end = middle + 4 * places
+    if len(data) < end:
+        raise ForeignFileError(f"the camera of node {number} is cut off")
+    if len(data) >= end + 4 * _HEADER:
+        raise ForeignFileError("a node has several cameras, which are not read: export one of them")
+    parts = np.split(np.frombuffer(data[begin:middle], "<f8"), np.cumsum(counts)[:-1])
+    K, P = parts[0], parts[3]
+    matrix = P if len(P) == 12 else K
+    if len(matrix) not in (9, 12):
+        raise ForeignFileError(f"the camera of node {number} has no matrix")
+    return rectified_lens(matrix, (width, height)), _poses(data[middle:end])[0]
+
+
+def _blob(path: Path, column: str, node: _Node) -> bytes:
+    rows = _query(path, f"SELECT {column} FROM Data WHERE id = ?", (node.id,))
+    if len(rows) != 1 or not isinstance(rows[0][0], bytes):
+        raise ForeignFileError("this is no image")
+    return rows[0][0]
+
+
+def _rgb(path: Path, node: _Node) -> np.ndarray:
+    with naming(path / "image" / str(node.id)):
+        data = _blob(path, "image", node)
+        image_size(data, IMAGE_FORMATS)  # refuses what would not fit into memory
+        return image_pixels(data, IMAGE_FORMATS, (node.lens.width, node.lens.height))
+
+
+def _depth(path: Path, node: _Node) -> np.ndarray:
+    """z-depth [h, w] float32."""
+    with naming(path / "depth" / str(node.id)):
+        data = _blob(path, "depth", node)
+        if data.startswith(_RVL):
+            return clean_depth(0.001 * unpack_rvl(data[len(_RVL) :]).astype(np.float64))
+        size = image_size(data, ("PNG",))
+        wanted = "depth must be a PNG of 16 bits or of four channels"
+        pixels = image_pixels(data, ("PNG",), size, (*DEPTH_MODES, "RGBA"), wanted)
+        if pixels.ndim == 2:
+            return clean_depth(0.001 * pixels.astype(np.float64))
+        stored = np.ascontiguousarray(pixels[..., [2, 1, 0, 3]])  # OpenCV's order
+        return clean_depth(stored.view("<f4")[..., 0])

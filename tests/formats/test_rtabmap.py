@@ -1,0 +1,123 @@
+"""RTAB-Map, exported and as a database: what it shows lies where the room has its walls."""
+
+import sqlite3
+import struct
+
+import numpy as np
+import pytest
+
+from r3jax.formats.captures import open_capture
+from r3jax.formats.errors import FormatError
+from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.ros.rvl import unpack_rvl
+from r3jax.formats.validation.errors import ForeignFileError
+from tests.formats import rtabmap
+from tests.formats.bags import camera_poses, rvl
+from tests.formats.phones import FACTOR, LENS, NUM, Z_UP_FROM_ROOM
+from tests.formats.test_phones import JPEG, assert_shows_the_room, damaged
+from tests.fuzz.tree import lay_out
+
+LOSSLESS = 1.5
+"""Mean error of colors [of 255] that rounding leaves."""
+
+
+def test_an_export_shows_the_room(tmp_path):
+    lay_out(tmp_path / "scan", rtabmap.export())
+    images = open_capture(tmp_path / "scan").source
+    assert isinstance(images, PosedImages)
+    assert len(images) == NUM
+    assert images.remark is None
+    assert set(images.lenses) == {LENS}
+    assert_shows_the_room(images, Z_UP_FROM_ROOM, JPEG)
+    np.testing.assert_array_equal(images.up, [0, 0, 1])
+
+
+EXPORT = {
+    "images": (damaged("rgb/", lambda data: data[:40]), r"scan_rgb/3\.jpg: the image cannot"),
+    "ids": (damaged("scan_depth", None), "named by their ids: rtabmap-export --images_id"),
+    "format": (
+        damaged("poses", lambda data: data.replace(b" 3\n", b"\n")),
+        r"poses\.txt: line 2 has 8 numbers, not 9",
+    ),
+    "matrix": (
+        damaged("yaml", lambda data: data.replace(b"camera_matrix", b"no")),
+        r"scan_calib/3\.yaml: there is no camera_matrix in it",
+    ),
+    "short": (
+        damaged("yaml", lambda data: data.replace(b"0., 0., 1. ]", b"1. ]", 1)),
+        "camera_matrix must have 9 numbers, got 7",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", EXPORT)
+def test_a_damaged_export_is_named(tmp_path, damage):
+    break_it, message = EXPORT[damage]
+    lay_out(tmp_path / "scan", break_it(rtabmap.export()))
+    with pytest.raises(FormatError, match=message):
+        open_capture(tmp_path / "scan")
+
+
+@pytest.mark.parametrize("optimized", [True, False])
+def test_a_database_shows_the_room(tmp_path, optimized):
+    (tmp_path / "map.db").write_bytes(rtabmap.database(optimized))
+    capture = open_capture(tmp_path / "map.db")
+    assert capture.name == "map"
+    images = capture.source
+    assert isinstance(images, PosedImages)
+    assert len(images) == (NUM - 1 if optimized else NUM)
+    assert_shows_the_room(images, Z_UP_FROM_ROOM, LOSSLESS)
+    np.testing.assert_allclose(images.poses, camera_poses()[: len(images)], atol=1e-5)
+    for index in range(len(images)):
+        assert (images.depth(index)[:FACTOR, :FACTOR] == 0).all()
+    assert images.remark == (
+        "Poses are optimized. 1 of 4 images lack depth or a pose and are left out."
+        if optimized
+        else "Poses are odometry's: the graph was never optimized."
+    )
+
+
+STATEMENTS = {
+    "stereo": (
+        "UPDATE Data SET calibration = ?",
+        (struct.pack("<11i", 0, 21, 4, 1, *[0] * 7),),
+        "stereo rig or of an old version: export depth images by rtabmap-export",
+    ),
+    "two cameras": (
+        "UPDATE Data SET calibration = ?", (2 * rtabmap.calibration(),), "several cameras",
+    ),
+    "cut off": (
+        "UPDATE Data SET calibration = ?", (rtabmap.calibration()[:80],), "node 5 is cut off",
+    ),
+    "no depth": ("UPDATE Data SET depth = NULL", (), "of 4 images in it none has depth"),
+    "graph": ("UPDATE Admin SET opt_ids = opt_poses", (), "the optimized poses are damaged"),
+    "zlib": ("UPDATE Admin SET opt_ids = ?", (b"1234",), "the optimized poses are damaged"),
+    "old": ("ALTER TABLE Data DROP COLUMN depth", (), "no such column.* rtabmap-export"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", STATEMENTS)
+def test_a_database_that_lacks_something_says_so(tmp_path, damage):
+    sql, values, message = STATEMENTS[damage]
+    path = tmp_path / "map.db"
+    path.write_bytes(rtabmap.database())
+    connection = sqlite3.connect(path)
+    connection.execute(sql, values)
+    connection.commit()
+    connection.close()
+    with pytest.raises(FormatError, match=message) as found:
+        open_capture(path)
+    assert str(path) in str(found.value)
+
+
+def test_rvl_comes_back_and_damage_is_refused():
+    rng = np.random.default_rng(0)
+    steps = rng.integers(0, 65_536, (17, 23)).astype(np.uint16)
+    steps[rng.random(steps.shape) < 0.4] = 0
+    for image in (steps, np.zeros((2, 3), np.uint16), np.full((1, 5), 65_535, np.uint16)):
+        np.testing.assert_array_equal(unpack_rvl(rvl(image)), image)
+    good = rvl(steps)
+    for bad in (good[:4], good[:40], struct.pack("<II", 1 << 20, 1 << 20), good[:8] + b"\xff" * 40,
+                good[:8] + b"\xff\xff\xff\x0f" * 9):  # fmt: skip
+        with pytest.raises(ForeignFileError, match="a depth image "):
+            unpack_rvl(bad)
