@@ -276,7 +276,7 @@ def _beside(
         numbers += [i, other] if other not in numbers else [i]
         captions += [f"{ratio:.2f} x as bright as {names.label(other)}"]
         if len(captions) < len(numbers):
-            captions.append(f"the same surface, {1 / ratio:.2f} x")
+            captions.append(f"{1 / ratio:.2f} x as bright as {names.label(i)}")
     return numbers, captions
 
 

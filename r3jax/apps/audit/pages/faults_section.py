@@ -1,13 +1,10 @@
 """The part of the page that says what is wrong with single pictures, and shows them."""
 
 import html
-import io
-
-import numpy as np
-from PIL import Image
 
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.faults.faults import Finding
+from r3jax.apps.audit.pages.thumbnails import small_png
 from r3jax.apps.report.page import image, section
 
 _SHOWN = 8
@@ -75,22 +72,4 @@ def thumbnail(audit: Audit, index: int) -> bytes:
     """A small PNG of an image of the capture, its upper edge up."""
     rgb, _ = audit.source.read(index)
     up = audit.survey.alignment.rotation.T @ [0.0, 0.0, 1.0]
-    return small_png(rgb, audit.source.poses[index], up)
-
-
-def small_png(rgb: np.ndarray, pose: np.ndarray, up: np.ndarray, side: int = _SIDE) -> bytes:
-    """A small PNG of an image, turned by quarters until the vertical points up.
-
-    Args:
-        rgb: colors, [H, W, 3] uint8.
-        pose: `T_world_camera`, [4, 4].
-        up: the vertical, [3] in the same world.
-        side: longer side at most [px].
-    """
-    right, down = (pose[:3, :3].T @ up)[:2]
-    turns = round(float(np.degrees(np.arctan2(right, -down))) / 90.0)
-    picture = Image.fromarray(np.ascontiguousarray(np.rot90(rgb, turns)))
-    picture.thumbnail((side, side))
-    buffer = io.BytesIO()
-    picture.save(buffer, format="png")
-    return buffer.getvalue()
+    return small_png(rgb, audit.source.poses[index], up, _SIDE)

@@ -7,6 +7,7 @@ import numpy as np
 from r3jax.apps.audit.alignment import AXES
 from r3jax.apps.audit.audit import SATURATED, Audit
 from r3jax.apps.audit.diagnosis import FEW, FINE
+from r3jax.apps.audit.pages.steps import steps_between
 from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 
 MEANING = {
@@ -116,10 +117,10 @@ def verdict(audit: Audit) -> list[str]:
 def saturation() -> str:
     """What R cannot say of a capture that is covered well."""
     return (
-        f"With a mean of {SATURATED:g} or more, R says that everything was seen well enough, and "
-        "not which view renders better: of a kitchen of 250 pictures with a mean of 0.96, each "
-        "held out once, R and PSNR had a rank correlation of -0.00. So views are not ranked here; "
-        "what is left to gain lies in the pictures themselves."
+        f"With a mean of {SATURATED:g} or more, R says that these pictures show what others show "
+        "well enough, and not which of them renders better: of a kitchen of 250 pictures with a "
+        "mean of 0.96, each held out once, R and PSNR had a rank correlation of -0.00. So these "
+        "pictures are not ranked; what is left to gain among them lies in the pictures themselves."
     )
 
 
@@ -150,39 +151,10 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
 
 
 def directions(audit: Audit, view: Suggestion, like: int) -> str:
-    """The way from an image of the capture to a suggested view, as a person would follow it.
-
-    Forward and left are those of the image, in the plane; an image that looks straight up or
-    down is faced as its upper edge.
-    """
+    """The way from an image of the capture to a suggested view, as a person would follow it."""
     here = audit.survey.alignment.poses(audit.source.poses[[like]])[0]
-    axis = here[:3, 2] if np.hypot(*here[:2, 2]) > 0.05 else -here[:3, 1]
-    forward = axis[:2] / np.hypot(*axis[:2])
-    offset = view.pose[:3, 3] - here[:3, 3]
-    ahead = float(offset[:2] @ forward)
-    left = float(forward[0] * offset[1] - forward[1] * offset[0])
-    steps = [
-        f"{length(audit, abs(amount))} {forth if amount > 0 else back}"
-        for amount, forth, back in (
-            (ahead, "forward", "back"), (left, "to the left", "to the right"),
-        )
-        if abs(amount) >= 0.05
-    ]  # fmt: skip
-    parts = [f"Stand where {audit.source.labels[like]} was taken"]
-    if steps:
-        parts.append(f"go {' and '.join(steps)}")
-    if abs(offset[2]) >= 0.05:
-        higher = "higher" if offset[2] > 0 else "lower"
-        parts.append(f"hold the camera {length(audit, abs(float(offset[2])))} {higher}")
-    looks = view.pose[:3, 2]
-    elevation = np.degrees(np.arcsin(np.clip(looks[2], -1.0, 1.0)))
-    if abs(elevation) < 80.0:
-        turn = np.degrees(np.arctan2(forward[0] * looks[1] - forward[1] * looks[0],
-                                     forward @ looks[:2]))  # fmt: skip
-        side = "left" if turn > 0 else "right"
-        parts.append(f"turn {abs(turn):.0f}° {side}" if abs(turn) >= 5.0 else "do not turn")
-    way = "up" if elevation > 0 else "down"
-    parts.append("look level" if abs(elevation) < 5.0 else f"look {abs(elevation):.0f}° {way}")
+    way = steps_between(here, view.pose, lambda value: length(audit, value))
+    parts = [f"Stand where {audit.source.labels[like]} was taken", *way]
     return f"{', '.join(parts[:-1])} and {parts[-1]}."
 
 
