@@ -6,7 +6,7 @@ from pathlib import Path
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.camera_paths import path_of
 from r3jax.apps.audit.live.follow import follow
-from r3jax.apps.audit.live.page import open_guide
+from r3jax.apps.audit.live.page import LOOPBACK, open_guide
 from r3jax.apps.audit.outputs import suggested_poses, write_outputs
 from r3jax.apps.audit.pages import sentences
 from r3jax.apps.audit.pages.audit_page import write_report
@@ -18,9 +18,6 @@ from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import AuditOptions
 from r3jax.cli.progress import Stages
 from r3jax.formats.captures import open_capture
-
-THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
-"""Addresses that no other machine can reach."""
 
 _SHOWN = 5
 """Regions that the console lists."""
@@ -53,7 +50,7 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         UserError: nothing came in.
         ValueError, OSError: as `follow`, `open_guide` and `_audit`.
     """
-    if options.host not in THIS_MACHINE:
+    if options.host not in LOOPBACK:
         text = f"everybody who can reach {options.host} sees the page"
         progress.say(text, style="yellow")
     with open_guide(options.host, options.port) as page:

@@ -19,7 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
 
 from r3jax.apps.audit.faults.blocks import BlockImage
 from r3jax.apps.audit.faults.overlap import FEWEST, Overlap, neighbors_of
@@ -32,6 +33,9 @@ _MATCHES = 200
 
 _ROUNDS = 4
 """Times that matches are weighted anew."""
+
+_SIX = np.arange(6)
+"""Unknowns of a frame."""
 
 _PRIOR = 0.02
 """Motions are sought that are small beside this, where nothing else decides: translations as a
@@ -139,17 +143,20 @@ def _matched(
 def _solved(count: int, matches: list[_Matches]) -> np.ndarray:
     """The motion of each frame: translation and rotation, [n, 6]."""
     scale = _scatter(np.concatenate([match.error for match in matches]))
-    x = np.zeros(6 * count)
+    size = 6 * count
+    own = np.stack([np.r_[6 * m.first + _SIX, 6 * m.second + _SIX] for m in matches])  # [k, 12]
+    row, column = np.broadcast_arrays(own[:, :, None], own[:, None, :])
+    x, prior = np.zeros(size), sparse.identity(size, format="csc") / _PRIOR**2
     for _ in range(_ROUNDS):
-        left, right = np.eye(6 * count) / _PRIOR**2, np.zeros(6 * count)
-        for match in matches:
-            i, j = 6 * match.first, 6 * match.second
-            own = np.r_[i : i + 6, j : j + 6]
-            weight = _weight(match.error + match.rows @ x[own], scale)
+        left, right = [], np.zeros(size)
+        for unknowns, match in zip(own, matches, strict=True):
+            weight = _weight(match.error + match.rows @ x[unknowns], scale)
             weighted = match.rows * weight[:, None]
-            left[np.ix_(own, own)] += weighted.T @ match.rows
-            right[own] -= weighted.T @ match.error
-        x = linalg.solve(left, right, assume_a="pos")
+            left.append(weighted.T @ match.rows)
+            right[unknowns] -= weighted.T @ match.error
+        places = row.ravel(), column.ravel()
+        normal = sparse.coo_matrix((np.stack(left).ravel(), places), (size, size)).tocsc()
+        x = np.asarray(spsolve(normal + prior, right))
     return x.reshape(count, 6)
 
 
@@ -157,14 +164,14 @@ def _scale(matches: list[_Matches]) -> float:
     """The factor of all depths that fits the poses best; NaN where it changes next to nothing."""
     error = np.concatenate([match.error for match in matches])
     longer = np.concatenate([match.longer for match in matches])
-    s = 0.0
+    s = information = 0.0
     for _ in range(4 * _ROUNDS):
         left = error + s * longer
         weight = _weight(left, _scatter(left))
         information = float((weight * longer**2).sum()) + 1e-12
         s = -float((weight * longer * error).sum()) / information
     # Neighboring matches err alike: so many of them count as one.
-    deviation = np.sqrt(_ALIKE / information)
+    deviation = np.sqrt(_ALIKE / max(information, 1e-12))
     return float(np.exp(s)) if deviation < _SURE_OF_SCALE else float("nan")
 
 

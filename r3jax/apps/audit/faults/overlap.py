@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
 
 from r3jax.apps.audit.faults.blocks import BlockImage
 
@@ -124,20 +126,17 @@ def levels(count: int, pairs: np.ndarray, difference: np.ndarray, weight: np.nda
     Returns:
         [n]; a frame without pairs has 0.
     """
-    x, (i, j) = np.zeros(count), pairs.T
+    x, every, (i, j) = np.zeros(count), np.arange(count), pairs.T
     for _ in range(_REWEIGHTED):
         error = np.abs(x[i] - x[j] - difference)
         w = weight / np.maximum(error, _SMALLEST_ERROR)
         # Next to nothing on the diagonal: frames without a link stay at 0.
-        laplacian = 1e-6 * max(float(w.max(initial=0.0)), 1.0) * np.eye(count)
-        right = np.zeros(count)
-        np.add.at(laplacian, (i, i), w)
-        np.add.at(laplacian, (j, j), w)
-        np.add.at(laplacian, (i, j), -w)
-        np.add.at(laplacian, (j, i), -w)
-        np.add.at(right, i, w * difference)
-        np.add.at(right, j, -w * difference)
-        x = np.linalg.solve(laplacian, right)
+        least = 1e-6 * max(float(w.max(initial=0.0)), 1.0)
+        value = np.concatenate([w, w, -w, -w, np.full(count, least)])
+        row, column = np.r_[i, j, i, j, every], np.r_[i, j, j, i, every]
+        laplacian = sparse.coo_matrix((value, (row, column)), (count, count)).tocsc()
+        change = np.bincount(np.r_[i, j], np.r_[w * difference, -w * difference], count)
+        x = np.asarray(spsolve(laplacian, change))
     return x
 
 

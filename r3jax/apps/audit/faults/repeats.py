@@ -30,8 +30,8 @@ def repeats(images: Sequence[BlockImage]) -> list[list[int]]:
         depth = image.median_depth
         reach = _MOVED * image.camera.width / float(image.camera.fx)
         apart = np.linalg.norm(place - place[i], axis=1) / (depth if np.isfinite(depth) else 1.0)
-        near = np.flatnonzero((apart < reach) & ~grouped)
-        alike = [int(j) for j in near if j == i or (j > i and _is_like(image, images[j], reach))]
+        near: list[int] = np.flatnonzero((apart < reach) & ~grouped).tolist()
+        alike = [j for j in near if j == i or (j > i and _is_like(image, images[j], reach))]
         if len(alike) > 1:
             grouped[alike] = True
             groups.append(alike)
@@ -46,4 +46,6 @@ def _is_like(a: BlockImage, b: BlockImage, reach: float) -> bool:
     turn = np.arccos(np.clip(0.5 * (np.trace(between) - 1.0), -1.0, 1.0))
     difference = np.abs(a.color - b.color)
     known = np.isfinite(difference)
-    return turn < reach and known.any() and float(difference[known].mean()) < _DIFFERS
+    if turn > reach or not known.any():
+        return False
+    return float(difference[known].mean()) < _DIFFERS

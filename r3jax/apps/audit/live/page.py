@@ -17,6 +17,7 @@ import threading
 from collections.abc import Generator, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -29,8 +30,8 @@ from r3jax.geometry.cameras import Camera
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Decision
 
-_LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
-"""Names under which a page is asked for that nobody else can reach."""
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+"""Addresses that no other machine can reach."""
 
 _LATEST = 480
 """Longer side of the latest picture [px]."""
@@ -158,11 +159,10 @@ def open_guide(host: str = "127.0.0.1", port: int = 8080) -> Generator[GuidePage
     Raises:
         OSError: the port is in use or not permitted, or the address is not one of this machine.
     """
-    server = ThreadingHTTPServer((host, port), _Handler)
-    server.daemon_threads = True
+    server = _Server((host, port), _Handler)
     address = f"[{host}]" if ":" in host else host
     page = GuidePage(f"http://{address}:{server.server_port}")
-    server.page = page  # pyright: ignore[reportAttributeAccessIssue]
+    server.page, server.is_private = page, host in LOOPBACK
     thread = threading.Thread(target=server.serve_forever, name="guide", daemon=True)
     thread.start()
     try:
@@ -173,12 +173,24 @@ def open_guide(host: str = "127.0.0.1", port: int = 8080) -> Generator[GuidePage
         thread.join()
 
 
+class _Server(ThreadingHTTPServer):
+    """Serves one page."""
+
+    daemon_threads = True
+    page: GuidePage
+
+    is_private: bool
+    """True if nobody but this machine can reach it."""
+
+
 class _Handler(BaseHTTPRequestHandler):
     """Answers the page's questions."""
 
     def do_GET(self) -> None:
         """Sends the page, its news or a picture."""
-        found = self._page.answer(self.path) if self._is_known_name() else None
+        server = self.server
+        assert isinstance(server, _Server)
+        found = server.page.answer(self.path) if self._is_known_name(server) else None
         if found is None:
             self.send_error(http.HTTPStatus.NOT_FOUND)
             return
@@ -191,15 +203,10 @@ class _Handler(BaseHTTPRequestHandler):
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.wfile.write(content)
 
-    @property
-    def _page(self) -> GuidePage:
-        return self.server.page  # pyright: ignore[reportAttributeAccessIssue]
-
-    def _is_known_name(self) -> bool:
+    def _is_known_name(self, server: _Server) -> bool:
         """False if somebody else's page asks, under a name that it has given this machine."""
-        if str(self.server.server_address[0]) not in ("127.0.0.1", "::1"):
-            return True
-        return self.headers.get("Host", "").rpartition(":")[0] in _LOOPBACK
+        name = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+        return name in LOOPBACK or not server.is_private
 
     def log_message(self, format: str, *args: object) -> None:
         """Says nothing on the console."""
