@@ -160,9 +160,15 @@ class Guide:
         key, number = jax.random.key(0), 0
         while (question := self._latest()) is not None:
             planner, frame = question
-            decision, _, _ = decide(planner, frame.T_world_camera, jax.random.fold_in(key, number))
             number += 1
-            self._show(frame, decision)
+            try:
+                decision, _, _ = decide(
+                    planner, frame.T_world_camera, jax.random.fold_in(key, number)
+                )
+            except Exception as error:  # whatever it was: the next frame may do better
+                self._page.say("No view could be chosen here; go on.", str(error))
+            else:
+                self._show(frame, decision)
 
     def _latest(self) -> tuple[Planner, Frame] | None:
         question = self._questions.get()

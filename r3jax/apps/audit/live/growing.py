@@ -85,7 +85,8 @@ class GrowingCapture:
         self._when = time.monotonic()
         try:
             staged = stage(self._path, self._scratch)
-            name = self._path.resolve().name
+            path = self._path.resolve()
+            name = (path.parent if path.is_file() else path).name
             source = source_of(open_capture(staged, "z").source, name)
         except (ValueError, OSError) as error:  # half of it is written; or it is none
             self.waiting_for, self._is_pending = str(error), True

@@ -105,8 +105,9 @@ class GuidePage:
         """
         if decision is None:
             self._target = []
-            text = "Nothing is left that can be reached: you are done here."
-            self._tell(next=text, note="", is_current=True, target=None, way=[])
+            text = "Nothing new can be reached from here."
+            note = "Step back and look around; or end the scan."
+            self._tell(next=text, note=note, is_current=True, target=None, way=[])
             return
         self._target = [decision.T_world_camera]
         self._tell(

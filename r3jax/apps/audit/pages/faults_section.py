@@ -24,7 +24,7 @@ TITLES = {
 }
 """Heading of each kind of finding."""
 
-_GRID = "display:grid;grid-template-columns:repeat(auto-fill,minmax(200px,1fr));gap:10px"
+_GRID = "display:grid;grid-template-columns:repeat(auto-fill,minmax(145px,1fr));gap:10px"
 _FIGURE = '<figure style="margin:0">{}<figcaption style="font-size:13px">{}</figcaption></figure>'
 
 
