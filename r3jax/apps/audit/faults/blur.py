@@ -25,6 +25,15 @@ _TEXTURED = 4.0
 _SCALES = 1.4
 """Frames that saw a surface from so many times as far are not compared: fine detail is lost."""
 
+_NOISE = 0.5
+"""Added to detail: a logarithm of next to nothing would be all noise."""
+
+_WITNESSES = 2
+"""Of two frames alone nobody knows which is the odd one."""
+
+_OBLIQUE = 25.0
+"""Nor are those that saw it from directions farther apart, as what is oblique looks finer [deg]."""
+
 _SHARP = 75.0
 """Percentile of the neighbors' sharpness that a frame is held against."""
 
@@ -55,7 +64,7 @@ def sharpness(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Sharpne
     level = np.stack([levels(count, linked, column, weight) for column in ratios.T], axis=1)
     relative = np.full(level.shape, np.nan)
     for i, near in enumerate(neighbors_of(count, linked)):
-        if len(near):
+        if len(near) >= _WITNESSES:
             relative[i] = level[i] - np.percentile(level[near], _SHARP, axis=0)
     along = relative[:, 1:]
     return Sharpness(
@@ -73,7 +82,9 @@ def _log_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndarray
     first, second = images[pair.first], images[pair.second]
     own, other = pair.own[pair.agrees], pair.other[pair.agrees]
     ratio = first.depth[own] / second.depth[other]
-    is_alike = (ratio < _SCALES) & (ratio > 1.0 / _SCALES)
+    rays = [_directions(first, own), _directions(second, other)]
+    is_alike = np.einsum("ij,ij->i", *rays) > np.cos(np.radians(_OBLIQUE))
+    is_alike &= (ratio < _SCALES) & (ratio > 1.0 / _SCALES)
     a, b = first.detail[own[is_alike]], second.detail[other[is_alike]]
     is_textured = np.maximum(a.sum(axis=1), b.sum(axis=1)) > _TEXTURED * len(DIRECTIONS)
     a, b = a[is_textured], b[is_textured]
@@ -87,8 +98,10 @@ def _log_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndarray
     return change - 2.0 * gain, len(a)
 
 
-_NOISE = 0.5
-"""Added to detail: a logarithm of next to nothing would be all noise."""
+def _directions(image: BlockImage, blocks: np.ndarray) -> np.ndarray:
+    """Unit directions in which a frame sees some of its blocks, [m, 3]."""
+    offset = image.points()[blocks] - image.pose[:3, 3]
+    return offset / np.linalg.norm(offset, axis=1, keepdims=True)
 
 
 def image_motion(images: Sequence[BlockImage]) -> np.ndarray:

@@ -25,7 +25,7 @@ from r3jax.apps.audit.source import Source
 BLURRED = 0.45
 """Less of its neighbors' detail than this, and a frame is blurred: a motion of 3 pixels at the
 working resolution leaves 0.35, and sharp frames of a rendered walk 0.8 and more. In a recording by
-HoloLens those that look blurred have 0.26 to 0.45."""
+HoloLens those that look blurred have 0.26 to 0.48, and those that look sharp 0.45 and more."""
 
 _SMEARED = 0.6
 """Detail kept along one direction over that along another, below which a blur has a direction:
@@ -304,7 +304,8 @@ def _pose(poses: Offsets, images: Sequence[BlockImage], names: _Names) -> Findin
     depth = np.array([image.median_depth for image in images])
     least = np.fmax(_OFF * depth, _OFF_TYPICAL * poses.typical)
     off = np.nan_to_num(poses.distance / least)
-    numbers = [int(i) for i in np.argsort(-off) if off[i] > 1.0]
+    is_off = poses.is_explained & (off > 1.0)
+    numbers = [int(i) for i in np.argsort(-off) if is_off[i]]
     if not numbers:
         return None
     length = lambda value: f"{100 * value:.1f} cm" if names.unit == "m" else f"{value:.3g} u"

@@ -34,6 +34,15 @@ _MATCHES = 200
 _ROUNDS = 4
 """Times that matches are weighted anew."""
 
+_PARALLEL = 0.8
+"""Surfaces whose normals have a smaller cosine are different ones."""
+
+_MOST, _APART, _BROUGHT = 90.0, 6.0, 0.4
+"""Percentile of a frame's distances that must be so many times the typical one for its pose to be
+off, and the share of it that moving the frame may leave. Moved along a wall a frame still fits that
+wall, so few of its surfaces may tell: a shift by 5 cm gives 15 and 0.2, frames whose poses are true
+2 to 3 and 0.9 to 1."""
+
 _SIX = np.arange(6)
 """Unknowns of a frame."""
 
@@ -70,6 +79,11 @@ class Offsets:
     """How far the surfaces of each frame lie from where its neighbors show them, beyond what moves
     all of them, [n] [capture units]; NaN: not compared."""
 
+    is_explained: np.ndarray
+    """True where the frame's surfaces lie apart from its neighbors', of which there are two or
+    more, and moving the frame brings them together, [n]. Elsewhere a distance means little: nothing
+    need hold a frame that shows one wall."""
+
     typical: float
     """Median distance of matching surfaces along their normals [capture units]: noise of the depth
     and of the poses; NaN: nothing could be compared."""
@@ -89,7 +103,8 @@ def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
     found = [_matched(pair, points, normals, centers) for pair in pairs]
     matches = [match for match in found if len(match.error) >= FEWEST]
     if not matches:
-        return Offsets(np.full(count, np.nan), float("nan"), float("nan"))
+        unknown = np.full(count, np.nan)
+        return Offsets(unknown, np.zeros(count, dtype=bool), float("nan"), float("nan"))
     motion = _solved(count, matches)
     linked = np.array([(match.first, match.second) for match in matches], dtype=np.int64)
     distance = np.full(count, np.nan)
@@ -99,8 +114,27 @@ def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
             moved = [_moved(motion[j], own - centers[j]) for j in (i, *near.tolist())]
             beside = moved[0] - np.median(moved[1:], axis=0)
             distance[i] = unit * float(np.median(np.linalg.norm(beside, axis=1)))
-    errors = np.concatenate([np.abs(match.error) for match in matches])
-    return Offsets(distance, unit * float(np.median(errors)), _scale(matches))
+    typical = float(np.median(np.abs(np.concatenate([match.error for match in matches]))))
+    explained = _explained(count, matches, motion, typical)
+    return Offsets(distance, explained, unit * typical, _scale(matches))
+
+
+def _explained(
+    count: int, matches: list[_Matches], motion: np.ndarray, typical: float
+) -> np.ndarray:
+    """Which frames the motion explains, [n]: see `Offsets.is_explained`."""
+    before, after = ([list[np.ndarray]() for _ in range(count)] for _ in range(2))
+    for match in matches:
+        left = match.error + match.rows @ motion[[match.first, match.second]].ravel()
+        for i in (match.first, match.second):
+            before[i].append(np.abs(match.error))
+            after[i].append(np.abs(left))
+    explained = np.zeros(count, dtype=bool)
+    for i in range(count):
+        if len(before[i]) >= 2:
+            apart, left = (np.percentile(np.concatenate(x[i]), _MOST) for x in (before, after))
+            explained[i] = apart > _APART * typical and left < _BROUGHT * apart
+    return explained
 
 
 def _normals(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -129,7 +163,8 @@ def _matched(
     is_near = np.abs(pair.ratio - 1.0) < _GATE
     own, other = pair.own[is_near], pair.other[is_near]
     normal = normals[pair.second][other]
-    flat = np.flatnonzero(np.isfinite(normal[:, 0]) & np.isfinite(normals[pair.first][own, 0]))
+    # NaN where either has no normal.
+    flat = np.flatnonzero(np.einsum("ij,ij->i", normal, normals[pair.first][own]) > _PARALLEL)
     flat = flat[:: max(1, -(-len(flat) // _MATCHES))]
     own, other, normal = own[flat], other[flat], normal[flat]
     p, q = points[pair.first][own], points[pair.second][other]

@@ -42,6 +42,12 @@ def faults_section(audit: Audit) -> str:
             f"<p class=note>Nothing can be said of {alone} of the {faults.looked_at} pictures: no "
             "other one shows the same surface.</p>"
         )
+    unsaid = sum(value is None for value in faults.record.get("detail", []))
+    if unsaid > alone:
+        body += (
+            f"<p class=note>Nobody can tell whether {unsaid} of the {faults.looked_at} pictures "
+            "are blurred: it takes two others of the same surface, from about the same side.</p>"
+        )
     note = (
         "Pictures are compared block by block where two of them show the same surface, at most "
         "640 pixels wide; finer blur than a pixel of that does not show."

@@ -7,7 +7,7 @@ from scipy import ndimage
 from r3jax.apps.audit.faults.faults import Faults, faults_of, find_faults
 from r3jax.apps.audit.source import source_of
 from r3jax.formats.recordings import read_recording
-from tests.apps.audit.faults.walk import VIEWS, blocks, walk
+from tests.apps.audit.faults.walk import VIEWS, blocks, scattered, walk
 from tests.conftest import shared_path
 
 NAMES = [f"{i:02d}.png" for i in range(VIEWS)]
@@ -39,6 +39,13 @@ def test_nothing_is_wrong_with_a_rendered_walk():
     found = faults(walk())
     assert found.findings == ()
     assert found.compared == found.looked_at == VIEWS
+
+
+def test_views_that_are_far_apart_are_no_faults():
+    """The same wall from aside has other detail, and one wall does not hold a pose."""
+    found = faults(scattered())
+    assert found.findings == ()
+    assert found.compared == len(scattered())
 
 
 @pytest.mark.parametrize(("axis", "pixels"), [(1, 3), (0, 3), (1, 9)])

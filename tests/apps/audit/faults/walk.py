@@ -18,17 +18,28 @@ Picture = tuple[np.ndarray, np.ndarray, np.ndarray]
 @functools.cache
 def walk() -> tuple[Picture, ...]:
     """Steps of 10 cm and 6 degrees, colors and depth without noise."""
+    return rendered([(0.1 * (i - VIEWS / 2), 6.0 * i) for i in range(VIEWS)])
+
+
+@functools.cache
+def scattered() -> tuple[Picture, ...]:
+    """Few views far apart, as a planner takes them: 60 cm to the side, 35 degrees."""
+    return rendered([(0.6 * (i % 3 - 1), 35.0 * (i // 3)) for i in range(12)])
+
+
+def rendered(steps: list[tuple[float, float]]) -> tuple[Picture, ...]:
+    """Views of the flat: how far to the side of its start [m], and how far turned [deg]."""
     world = r3jax.open_scene("flat", camera=CAMERA)
     start = np.asarray(world.start_pose, np.float64)
     pictures = []
-    for i in range(VIEWS):
-        angle = np.radians(6.0 * i)
+    for aside, degrees in steps:
+        angle = np.radians(degrees)
         turn = np.array(
             [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
         )
         pose = start.copy()
         pose[:3, :3] = turn @ start[:3, :3]
-        pose[:3, 3] += 0.1 * (i - VIEWS / 2) * start[:3, 0]
+        pose[:3, 3] += aside * start[:3, 0]
         frame = world.render(pose)
         rgb = np.rint(255 * np.asarray(frame.rgb)).astype(np.uint8)
         depth = np.asarray(frame.depth, np.float64)
