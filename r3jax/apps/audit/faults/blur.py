@@ -26,7 +26,10 @@ _SCALES = 1.4
 """Frames that saw a surface from so many times as far are not compared: fine detail is lost."""
 
 _NOISE = 0.5
-"""Added to detail: a logarithm of next to nothing would be all noise."""
+"""Detail that is next to nothing (of 255, squared)."""
+
+_PLAIN = 10.0
+"""Percentile of the blocks' detail that is taken for noise: some walls are plain everywhere."""
 
 _WITNESSES = 2
 """Of two frames alone nobody knows which is the odd one."""
@@ -85,17 +88,27 @@ def _log_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndarray
     rays = [_directions(first, own), _directions(second, other)]
     is_alike = np.einsum("ij,ij->i", *rays) > np.cos(np.radians(_OBLIQUE))
     is_alike &= (ratio < _SCALES) & (ratio > 1.0 / _SCALES)
-    a, b = first.detail[own[is_alike]], second.detail[other[is_alike]]
-    is_textured = np.maximum(a.sum(axis=1), b.sum(axis=1)) > _TEXTURED * len(DIRECTIONS)
+    noise = [_noise(image) for image in (first, second)]
+    a = np.maximum(first.detail[own[is_alike]] - noise[0], 0.0)
+    b = np.maximum(second.detail[other[is_alike]] - noise[1], 0.0)
+    least = max(_TEXTURED * len(DIRECTIONS), float(np.sum(noise, axis=1).max()))
+    is_textured = np.maximum(a.sum(axis=1), b.sum(axis=1)) > least
     a, b = a[is_textured], b[is_textured]
     if len(a) < FEWEST:
         return np.full(1 + len(DIRECTIONS), np.nan), 0
     both = [np.concatenate([x.sum(axis=1, keepdims=True), x], axis=1) for x in (a, b)]
-    change = np.median(np.log(both[0] + _NOISE) - np.log(both[1] + _NOISE), axis=0)
+    # Added to both: a logarithm of next to nothing would be all noise.
+    added = _NOISE + 0.25 * np.mean(noise)
+    change = np.median(np.log(both[0] + added) - np.log(both[1] + added), axis=0)
     # A darker image has less contrast and is no less sharp: detail is a square of contrast.
     contrasts = [x.contrast[n[is_alike][is_textured]] for x, n in ((first, own), (second, other))]
     gain = np.median(np.log(contrasts[0] + 1.0) - np.log(contrasts[1] + 1.0))
     return change - 2.0 * gain, len(a)
+
+
+def _noise(image: BlockImage) -> np.ndarray:
+    """Detail of the plainest blocks in each direction, [4]: noise of the sensor."""
+    return np.percentile(image.detail, _PLAIN, axis=0)
 
 
 def _directions(image: BlockImage, blocks: np.ndarray) -> np.ndarray:

@@ -47,7 +47,7 @@ _PAIRS_OF_CHANCE = 2
 _OFF = 0.01
 """Poses that are off by less, as a share of the median depth, are as good as depth cameras are."""
 
-_OFF_TYPICAL = 12.0
+_OFF_TYPICAL = 6.0
 """And so are those that are off by less than so many times what surfaces differ anyway. Both let
 5 cm in a room be found; of the recording by HoloLens (2.6 mm) no frame is off by 3 cm."""
 

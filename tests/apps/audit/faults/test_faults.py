@@ -41,6 +41,28 @@ def test_nothing_is_wrong_with_a_rendered_walk():
     assert found.compared == found.looked_at == VIEWS
 
 
+def measured(damaged_rgb=None, shift: float = 0.0):
+    """The walk as a sensor would measure it: noise of 3 of 255, of 1 % of the depth, of 5 mm."""
+    rng, pictures = np.random.default_rng(0), []
+    for i, (rgb, depth, pose) in enumerate(walk()):
+        true = damaged_rgb if i == DAMAGED and damaged_rgb is not None else rgb
+        moved = pose.copy()
+        moved[:3, 3] += rng.normal(0.0, 0.005, 3)
+        moved[1, 3] += shift * (i == DAMAGED)
+        noisy = to_bytes(true + rng.normal(0.0, 3.0, rgb.shape))
+        pictures.append((noisy, depth * rng.normal(1.0, 0.01, depth.shape), moved))
+    return pictures
+
+
+def test_noise_is_no_fault_and_hides_none():
+    assert faults(measured()).findings == ()
+    (blur,) = faults(measured(ndimage.uniform_filter1d(own_rgb(), 9, axis=1))).findings
+    (pose,) = faults(measured(shift=0.05)).findings
+    assert (blur.kind, blur.frames) == ("blur", (DAMAGED,))
+    assert (pose.kind, pose.frames) == ("pose", (DAMAGED,))
+    assert pose.value == pytest.approx(0.05, abs=0.015)
+
+
 def test_views_that_are_far_apart_are_no_faults():
     """The same wall from aside has other detail, and one wall does not hold a pose."""
     found = faults(scattered())
