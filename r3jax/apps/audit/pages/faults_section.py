@@ -33,7 +33,8 @@ def faults_section(audit: Audit) -> str:
     faults = audit.faults
     body = "".join(_finding(audit, finding) for finding in faults.findings)
     if not faults.findings:
-        body = "<p>Nothing: sharp, evenly lit, and where their poses say.</p>"
+        good = ("sharp, evenly lit, and " if audit.source.has_images else "") + "where they say"
+        body = f"<p>Nothing that could be found: they are {good}.</p>"
     alone = faults.looked_at - faults.compared
     if not faults.compared:
         body = "<p>Nobody can tell: no two pictures show the same surface.</p>"
