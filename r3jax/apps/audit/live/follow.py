@@ -101,13 +101,16 @@ class Guide:
         self._recent.clear()
         self._page.forget()
 
-    def add(self, source: Source, arrival: Arrival) -> None:
-        """Maps a frame, and shows what is known with it."""
+    def add(self, source: Source, arrival: Arrival, *, is_latest: bool) -> None:
+        """Maps a frame; shows what is known with it, unless others have come since."""
         if self._planner is None:
             self._begin(source, arrival)
         assert self._planner is not None
         frame = source.framed(arrival.picture, arrival.index, self._alignment)
         self._planner = observe(self._planner, frame)
+        if not is_latest:
+            self._page.passed(frame)
+            return
         warnings = self._warnings(source, arrival)
         self._page.observed(self._planner, frame, name=arrival.name, warnings=warnings)
         self._since += 1
@@ -235,7 +238,13 @@ def _step(capture: GrowingCapture, guide: Guide, page: GuidePage) -> bool:
         return False
     if has_moved or (arrivals and guide.needs_anew(capture.source or source)):
         guide.forget()
-        arrivals = capture.again(source)
+        page.say("Mapping everything again ...", "poses were corrected, or the place is larger")
+        earlier: Arrival | None = None
+        for arrival in capture.again(source):
+            if earlier is not None:
+                guide.add(source, earlier, is_latest=False)
+            earlier = arrival
+        arrivals = [] if earlier is None else [earlier]
     for arrival in arrivals:
-        guide.add(source, arrival)
+        guide.add(source, arrival, is_latest=arrival is arrivals[-1])
     return bool(arrivals)

@@ -9,6 +9,7 @@ import os
 import stat
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,9 @@ from r3jax.formats.captures import open_capture
 
 _MOVED, _TURNED = 0.02, 1.0
 """Poses that were corrected by less stay where they are [m], [deg]."""
+
+_BATCH = 8
+"""Frames that are read at once at most: a folder may hold thousands from the start."""
 
 _AGAIN = 1.0
 """A folder is looked at again after so long, whatever its times say [s]."""
@@ -72,8 +76,8 @@ class GrowingCapture:
         """Looks once.
 
         Returns:
-            The capture as it is now, frames that are new in it, and whether poses of earlier ones
-            were corrected.
+            The capture as it is now, some frames that are new in it, and whether poses of earlier
+            ones were corrected.
 
         Raises:
             ValueError: the capture has no depth images.
@@ -97,12 +101,15 @@ class GrowingCapture:
         return source, self._arrivals(source), self._has_moved(source)
 
     def _arrivals(self, source: Source) -> list[Arrival]:
-        """The new frames that can be read."""
+        """The first of the new frames that can be read."""
         found: list[Arrival] = []
         self._is_pending, self.waiting_for = False, ""
         for index, key in enumerate(_keys(source)):
             if key in self._taken:
                 continue
+            if len(found) == _BATCH:
+                self._is_pending = True
+                break
             try:
                 picture = source.read(index)
             except (ValueError, OSError) as error:
@@ -125,17 +132,16 @@ class GrowingCapture:
                 moved, self._taken[key] = True, after
         return moved
 
-    def again(self, source: Source) -> list[Arrival]:
-        """All frames that came in, read once more.
-
-        Raises:
-            FormatError, RunError: a file has gone since.
-        """
-        return [
-            Arrival(source.labels[index], index, source.read(index))
-            for index, key in enumerate(_keys(source))
-            if key in self._taken
-        ]
+    def again(self, source: Source) -> Iterator[Arrival]:
+        """All frames that came in and can still be read, one by one."""
+        for index, key in enumerate(_keys(source)):
+            if key not in self._taken:
+                continue
+            try:
+                picture = source.read(index)
+            except (ValueError, OSError):  # it has gone since
+                continue
+            yield Arrival(source.labels[index], index, picture)
 
 
 def subset(source: Source, indices: list[int]) -> Source:

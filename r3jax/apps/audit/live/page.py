@@ -66,6 +66,10 @@ class GuidePage:
         """Forgets the path: poses were corrected, and all frames will come again."""
         self._path, self._target = [], []
 
+    def passed(self, frame: Frame) -> None:
+        """Takes note of a frame on the path that need not be shown, as others have come since."""
+        self._path.append(np.asarray(frame.T_world_camera, np.float64)[:3, 3])
+
     def observed(
         self, planner: Planner, frame: Frame, *, name: str = "", warnings: Iterable[str] = ()
     ) -> None:

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from r3jax.apps.audit.live import growing
 from r3jax.apps.audit.live.growing import GrowingCapture
 from r3jax.apps.audit.live.staging import complete_lines
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
@@ -71,6 +72,19 @@ def test_a_frame_counts_once_all_of_it_is_there(writer, capture):
     assert names(capture) == ["000.png"]
     assert names(capture) == []
     assert state_of(writer.path) == before
+
+
+def test_a_folder_that_is_full_already_comes_in_by_and_by(writer, capture, monkeypatch):
+    monkeypatch.setattr(growing, "_BATCH", 4)
+    for number in range(6):
+        writer.file("images", number)
+        writer.file("depth", number)
+    writer.poses(writer.lines(*range(6)))
+    assert [names(capture), names(capture), names(capture)] == [
+        ["000.png", "001.png", "002.png", "003.png"],
+        ["004.png", "005.png"],
+        [],
+    ]
 
 
 def test_half_a_picture_is_waited_for_and_others_go_on(writer, capture):
