@@ -162,6 +162,14 @@ def _(options: EvaluateOptions) -> None:
 def _(options: AuditOptions) -> None:
     parse_topics(options.topics)
     check_capture(options.capture)
+    if options.live and options.path is not None:
+        raise ValueError("--live follows a capture, --path judges a path in one: give one of them")
+    if options.live and options.capture.is_file() and options.capture.suffix != ".json":
+        raise ValueError(f"{options.capture}: this is a file that does not grow; --live is without")
+    if not options.live and (options.port, options.host) != (8080, "127.0.0.1"):
+        raise ValueError("--port and --host are for the page of --live")
+    if not 0 <= options.port <= 65535:
+        raise ValueError(f"--port must lie between 0 and 65535, got {options.port}")
     if options.out is not None:
         _check_folder(options.out)
         _check_replaceable(options.out)

@@ -8,6 +8,8 @@ import pytest
 
 from r3jax.apps.audit import capture_maps
 from r3jax.apps.audit.camera_paths import write_camera_path
+from r3jax.apps.audit.live.growing import subset
+from r3jax.apps.audit.source import source_of
 from r3jax.apps.audit.survey import AuditSettings
 from r3jax.cli.commands import audit as command
 from r3jax.cli.main import main
@@ -211,3 +213,15 @@ def test_a_wrong_unit_of_depth_ends_in_one_line_and_no_folder(captures, tmp_path
     assert "the depth images contradict the poses" in said
     assert "multiplied by 0.2" in said
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.full
+def test_what_came_in_while_scanning_is_audited_in_the_end(captures, tmp_path, capsys, monkeypatch):
+    source = source_of(open_capture(captures / "recording", "z").source, "scan")
+    came_in = [subset(source, list(range(12))), None]
+    monkeypatch.setattr(command, "follow", lambda *_, **__: came_in.pop(0))
+    words = ["--live", "--port", "0", "--voxel-size", "0.15", "--views", "0"]
+    assert audit(captures / "recording", tmp_path / "out", *words) == 0
+    assert "http://127.0.0.1:" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "audit.json").read_text())["pictures"] == 12
+    assert "no frame came in" in refused(capsys, captures / "recording", "--live", "--port", 0)

@@ -39,6 +39,10 @@ REFUSED = {
     "evaluate runs --name ../x": "--name is the name of one folder",
     "audit scan.mp4": "scan.mp4: this is a video without poses: ns-process-data video",
     "audit scan.ply": "scan.ply: this is a file; a capture is a folder",
+    "audit runs --live --path scan.ply": "--live follows a capture, --path judges a path",
+    "audit scan.r3d --live": "a file that does not grow",
+    "audit runs --port 9000": "--port and --host are for the page of --live",
+    "audit runs --live --port 99999": "--port must lie between 0 and 65535",
     "replay runs": "runs: this folder is not a run",
     "merge runs/run nowhere": "nowhere: there is no such folder",
     "info nowhere": "nowhere: there is no such folder",
@@ -49,7 +53,7 @@ REFUSED = {
 def test_names_budgets_and_paths_are_refused_before_jax_is_imported(tmp_path):
     with RunWriter(tmp_path / "runs" / "run", make_header()):
         pass
-    for name in ("scan.mp4", "scan.ply"):
+    for name in ("scan.mp4", "scan.ply", "scan.r3d"):
         (tmp_path / name).touch()
     program = (
         "import json, sys\n"

@@ -21,6 +21,7 @@ from r3jax.apps.audit.diagnosis import (
     places_in_hull,
     view_score,
 )
+from r3jax.apps.audit.faults.faults import Faults, find_faults
 from r3jax.apps.audit.source import Source, thinned
 from r3jax.apps.audit.suggest import SuggestedViews, Task, suggest
 from r3jax.apps.audit.survey import RANGE, AuditSettings, Survey, survey_of
@@ -36,6 +37,10 @@ from r3jax.scoring.utility import visible_unexplored
 _WORTH_OF_UNSEEN = 0.05
 """A cell at the edge of the known counts as this share of the voxels that it may hide: who audits a
 capture wants it to render well first, and larger second."""
+
+SATURATED = 0.9
+"""Mean renderability of frames from which on it ranks none of them: of a kitchen of 250 pictures,
+each held out once, it was 0.96, and its rank correlation with PSNR -0.00."""
 
 _IN_VAIN = 3
 """Unexplored cells that so many images looked at in vain (glass, black) are left alone."""
@@ -95,6 +100,9 @@ class Audit:
     plan: SuggestedViews
     """Views to take, and what they promise."""
 
+    faults: Faults
+    """What is wrong with single frames: blur, light, poses, repetition."""
+
     @property
     def diagnosis(self) -> Diagnosis:
         """Diagnosis of every voxel, of the capture as it is."""
@@ -104,6 +112,11 @@ class Audit:
     def camera(self) -> Camera:
         """Camera of the suggested views, thinned out as the map's images were."""
         return thinned(self.lens.camera, self.source.stride)
+
+    @property
+    def is_saturated(self) -> bool:
+        """True where frames render so well, as far as R can tell, that R does not rank them."""
+        return float(self.renderability.mean()) >= SATURATED
 
     @property
     def renderability(self) -> np.ndarray:
@@ -138,6 +151,8 @@ def audit(
     step = lambda: on_progress("", 1)
     on_progress("looking at the capture", 0)
     survey = survey_of(source, settings)
+    on_progress("comparing pictures", len(survey.chosen))
+    faults = find_faults(source, survey.chosen, step)
     on_progress("mapping", 2 * len(survey.chosen))
     seen = see(source, survey, settings.folds, step)
     unit = _WORTH_OF_UNSEEN * (survey.cell_size / survey.voxel_size) ** 2
@@ -170,6 +185,7 @@ def audit(
         unseen=tuple(unseen_regions(seen.grid, edges)),
         unseen_area=float(edges.sum()) * survey.cell_size**2,
         plan=plan,
+        faults=faults,
     )
 
 

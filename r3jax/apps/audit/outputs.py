@@ -145,6 +145,11 @@ def record_of(audit: Audit) -> dict[str, Any]:
             }
             for view, pose in zip(plan.views, suggested_poses(audit), strict=True)
         ],
+        "faults": {
+            "findings": [dataclasses.asdict(finding) for finding in audit.faults.findings],
+            "pictures_compared": audit.faults.compared,
+            "of_each_picture": audit.faults.record,
+        },
         "mean_after_random_views": list(plan.random_mean),
     }
 

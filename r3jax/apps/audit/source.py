@@ -241,7 +241,11 @@ class Source:
         Raises:
             FormatError, RunError: a file is missing or broken.
         """
-        rgb, depth = self.read(index)
+        return self.framed(self.read(index), index, alignment)
+
+    def framed(self, picture: Picture, index: int, alignment: Alignment) -> Frame:
+        """An image that has been read, in the audit's coordinates."""
+        rgb, depth = picture
         return Frame(
             rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
             depth=jnp.asarray(depth * np.float32(alignment.scale)),

@@ -271,6 +271,10 @@ class Survey:
     unit: str
     """`m`, or `u` where nobody knows what a unit is."""
 
+    doubt: str | None = None
+    """How depth images and poses contradict each other, where they were to be trusted all the same;
+    None: they do not, or the capture would have been refused."""
+
     def length(self, in_audit: float) -> float:
         """A length of the audit, in the capture's units."""
         return in_audit / self.alignment.scale
@@ -289,8 +293,14 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
     images = _depth_images(source, chosen)
     depths, points = _measured(source, images)
     median, far = (float(v) for v in np.percentile(depths, [50.0, 95.0]))
-    if source.is_dense and not settings.trust_depth:
-        _check_depth(images, median)
+    doubt = None
+    if source.is_dense:
+        try:
+            _check_depth(images, median)
+        except ValueError as error:
+            if not settings.trust_depth:
+                raise
+            doubt = str(error).partition(" --trust-depth")[0]
     scale = RANGE / _range(far, source.is_metric, settings.max_range)
     cameras = source.poses[:, :3, 3]
     is_near = float(np.abs(cameras).max()) * scale < _FAR_AWAY
@@ -312,6 +322,7 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
         median_depth=median,
         far_depth=far,
         unit="m" if source.is_metric else "u",
+        doubt=doubt,
     )
 
 

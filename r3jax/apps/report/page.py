@@ -17,7 +17,7 @@ _PAGE = Template(
  h3 { font-size: 15px; margin: 22px 0 2px }
  .lead { font-size: 17px; color: #374151; margin: 0 0 18px } .lead p { margin: 0 0 6px }
  section { background: white; border-radius: 10px; padding: 18px 22px; margin: 16px 0;
-   box-shadow: 0 1px 3px #0001 }
+   overflow-x: auto; box-shadow: 0 1px 3px #0001 }
  .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px }
  .card { background: white; border-radius: 10px; padding: 12px 16px; box-shadow: 0 1px 3px #0001 }
  .card b { display: block; font-size: 23px; line-height: 1.3 } .card span { color: #6b7280;

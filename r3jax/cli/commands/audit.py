@@ -1,14 +1,17 @@
 """`r3jax audit`: what a capture lacks, how its frames would render, which views would help."""
 
+import tempfile
 from pathlib import Path
 
 from r3jax.apps.audit.audit import Audit, audit
-from r3jax.apps.audit.camera_paths import path_of
+from r3jax.apps.audit.camera_paths import CameraPath, path_of
+from r3jax.apps.audit.live.follow import follow
+from r3jax.apps.audit.live.page import LOOPBACK, open_guide
 from r3jax.apps.audit.outputs import suggested_poses, write_outputs
 from r3jax.apps.audit.pages import sentences
 from r3jax.apps.audit.pages.audit_page import write_report
 from r3jax.apps.audit.pages.ground_plan import letter
-from r3jax.apps.audit.source import source_of
+from r3jax.apps.audit.source import Source, source_of
 from r3jax.apps.audit.survey import AuditSettings
 from r3jax.cli.console import Console, Table
 from r3jax.cli.errors import UserError, one_line
@@ -30,25 +33,66 @@ def run_audit(options: AuditOptions) -> int:
     """
     progress = Console(stderr=True)
     try:
-        capture = open_capture(options.capture, "z", parse_topics(options.topics))
-        folder = options.out or Path("runs") / "audit" / capture.name
-        _check_folder(folder)
-        path = None if options.path is None else path_of(options.path, capture.source)
-        source = source_of(capture.source, capture.name)
-        with Stages(progress) as stages:
-            found = audit(source, _settings_of(options), path, stages.on_progress)
-            folder.mkdir(parents=True, exist_ok=True)
-            stages.on_progress("writing the report", 0)
-            written = write_outputs(found, folder)
-            page = write_report(found, folder, written.values())
+        if options.live:
+            with tempfile.TemporaryDirectory(prefix="r3jax-") as scratch:
+                _follow(options, Path(scratch), progress)
+        else:
+            capture = open_capture(options.capture, "z", parse_topics(options.topics))
+            path = None if options.path is None else path_of(options.path, capture.source)
+            _audit(options, source_of(capture.source, capture.name), path, progress)
     except (ValueError, OSError) as error:
         raise UserError(one_line(error)) from error
+    return 0
+
+
+def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
+    """Guides until Ctrl-C, then audits what came in; the page stays up until that is done.
+
+    Raises:
+        UserError: nothing came in.
+        ValueError, OSError: as `follow`, `open_guide` and `_audit`.
+    """
+    if options.host not in LOOPBACK:
+        text = f"everybody who can reach {options.host} sees the page"
+        progress.say(text, style="yellow")
+    with open_guide(options.host, options.port) as page:
+        progress.say(f"guide     {page.url}")
+        progress.say("Ctrl-C ends the scan, and audits it")
+        source = follow(options.capture, page, scratch, up=options.up)
+        if source is None:
+            raise UserError(f"{options.capture}: no frame came in")
+        page.say("The scan has ended.", "its audit is being written")
+        _audit(options, source, None, progress)
+
+
+def _audit(
+    options: AuditOptions, source: Source, path: CameraPath | None, progress: Console
+) -> None:
+    """Audits a capture, writes what belongs to it, and shows what was found.
+
+    Args:
+        options: as asked.
+        source: the capture.
+        path: frames to judge instead of its own.
+        progress: where progress is told.
+
+    Raises:
+        UserError: a folder that holds something else.
+        ValueError, OSError: as `audit` and `write_outputs`.
+    """
+    folder = options.out or Path("runs") / "audit" / source.name
+    _check_folder(folder)
+    with Stages(progress) as stages:
+        found = audit(source, _settings_of(options), path, stages.on_progress)
+        folder.mkdir(parents=True, exist_ok=True)
+        stages.on_progress("writing the report", 0)
+        written = write_outputs(found, folder)
+        page = write_report(found, folder, written.values())
     _show(Console(), found, {"report": page, **written})
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")
     topics = () if options.topics is None else ("--topics", options.topics)
     progress.next("audit", options.capture, *topics)
-    return 0
 
 
 def _settings_of(options: AuditOptions) -> AuditSettings:

@@ -37,12 +37,31 @@ class AuditTermOptions:
     """Seed of the random views that the suggested ones are compared with."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class GuideOptions:
+    """A page that says where to go next, while the capture is being taken."""
+
+    TITLE: ClassVar[str] = "guidance while scanning"
+
+    live: bool = False
+    """Follow a folder that another program is writing: the page in the browser shows what is done
+    and where to go next. Ctrl-C ends it, with an audit of what came in."""
+
+    port: int = 8080
+    """Port of the page that --live shows; 0 takes any free one."""
+
+    host: str = "127.0.0.1"
+    """Address that --live listens at. By default nobody but this machine can see the page; 0.0.0.0
+    shows it to everybody who can reach the machine, such as a phone."""
+
+
 @dataclass(frozen=True)
-class AuditOptions(AuditTermOptions):
+class AuditOptions(GuideOptions, AuditTermOptions):
     """Audit a capture: what it lacks for splats, how frames would render, which views to add."""
 
     EXAMPLES: ClassVar[tuple[str, ...]] = (
         "r3jax audit scans/kitchen",
+        "r3jax audit scans/kitchen --live --host 0.0.0.0",
         "r3jax audit scans/kitchen/transforms.json --path camera_path.json --views 20",
     )
 

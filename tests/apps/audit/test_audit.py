@@ -1,6 +1,7 @@
 """Whole audits of a room in which it is known what is wrong."""
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -107,6 +108,16 @@ def test_suggested_views_are_in_the_open_and_promise_more_than_random_ones(corne
         assert (eye <= SIZE - MARGIN + 0.02).all()
         assert abs(view.pose[2, 0]) < 1e-6  # no roll
         assert view.gain >= 1
+
+
+def test_where_everything_was_seen_well_views_are_not_ranked(corner):
+    said = {}
+    for value in (0.95, 0.6):
+        frames = [replace(f, score=replace(f.score, renderability=value)) for f in corner.frames]
+        said[value] = " ".join(verdict(replace(corner, frames=tuple(frames))))
+    assert "pictures are not ranked" in said[0.95]
+    assert "the worst" not in said[0.95]
+    assert "the worst" in said[0.6]
 
 
 def test_a_gain_is_what_all_surfaces_gain_together(corner):
@@ -330,6 +341,7 @@ def test_a_median_depth_that_no_room_has_is_refused_unless_it_is_meant():
     with pytest.raises(ValueError, match=r"median depth is 2000 m: is its unit right"):
         survey_of(millimeters, AuditSettings())
     assert survey_of(millimeters, AuditSettings(up="-y", trust_depth=True)).median_depth == 2000.0
+    assert "unit" in str(survey_of(millimeters, AuditSettings(up="-y", trust_depth=True)).doubt)
 
 
 @pytest.mark.parametrize(

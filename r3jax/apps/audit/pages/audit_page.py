@@ -13,6 +13,7 @@ from r3jax.apps.audit.outputs import suggested_poses
 from r3jax.apps.audit.pages import audit_figures, sentences
 from r3jax.apps.audit.pages.audit_colors import COLOR_OF_CAUSE
 from r3jax.apps.audit.pages.audit_figures import region_figure
+from r3jax.apps.audit.pages.faults_section import faults_section
 from r3jax.apps.audit.pages.ground_plan import letter, plan_figure
 from r3jax.apps.audit.suggest import Suggestion
 from r3jax.apps.report import style
@@ -35,6 +36,7 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         OSError: the disk is full, not writable, ...
     """
     parts = [
+        faults_section(audit),
         section(
             "From above",
             "Letters: regions to mend, in the color of their cause; dotted circles: where the "
@@ -182,8 +184,11 @@ def _frames_section(audit: Audit) -> str:
         if audit.is_own_path
         else "Each frame of the path is scored by the map of all pictures."
     )
-    body = _image(audit_figures.frames_figure(audit)) + "<h3>The worst</h3>"
-    body += _image(audit_figures.worst_figure(audit))
+    body = _image(audit_figures.frames_figure(audit))
+    if audit.is_saturated:
+        body = f"<p>{html.escape(sentences.saturation())}</p>{body}"
+    else:
+        body += "<h3>The worst</h3>" + _image(audit_figures.worst_figure(audit))
     return section("How well the frames would render", own, body)
 
 

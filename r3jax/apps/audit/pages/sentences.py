@@ -5,8 +5,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from r3jax.apps.audit.alignment import AXES
-from r3jax.apps.audit.audit import Audit
+from r3jax.apps.audit.audit import SATURATED, Audit
 from r3jax.apps.audit.diagnosis import FEW, FINE
+from r3jax.apps.audit.pages.steps import steps_between
 from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 
 MEANING = {
@@ -35,6 +36,9 @@ _SHORT = {
     "distance": "only from too far away",
     "noise": "in contradictory colors",
 }
+
+_MOST_SAID = 4
+"""Findings on single pictures that the summary repeats."""
 
 _ORDINARY = ("angle", "rare", "distance", "noise")
 
@@ -76,6 +80,11 @@ def verdict(audit: Audit) -> list[str]:
         )
     if audit.source.remark is not None:
         sentences.insert(0, audit.source.remark)
+    if audit.survey.doubt is not None:
+        sentences.insert(0, f"Do not believe this page: {audit.survey.doubt}")
+    if audit.faults.findings:
+        said = " ".join(finding.what for finding in audit.faults.findings[:_MOST_SAID])
+        sentences.append(f"The pictures themselves: {said}")
     if audit.unseen:
         sentences.append(
             f"Free space ends in about {area(audit, audit.unseen_area)} that no picture shows."
@@ -83,10 +92,13 @@ def verdict(audit: Audit) -> list[str]:
     mean = float(audit.renderability.mean())
     worst = min(audit.frames, key=lambda frame: frame.score.renderability)
     what = "A frame of this capture" if audit.is_own_path else "A frame of the path"
-    sentences.append(
-        f"{what} has a renderability of {mean:.2f} on average, the worst ({worst.label}) "
-        f"{worst.score.renderability:.2f}."
-    )
+    if audit.is_saturated:
+        sentences.append(f"{what} has a renderability of {mean:.2f} on average. {saturation()}")
+    else:
+        sentences.append(
+            f"{what} has a renderability of {mean:.2f} on average, the worst ({worst.label}) "
+            f"{worst.score.renderability:.2f}."
+        )
     if plan.views:
         count = len(plan.views)
         views, drawn = (
@@ -100,6 +112,16 @@ def verdict(audit: Audit) -> list[str]:
             f"{plan.random_mean[-1]:.2f}."
         )
     return sentences
+
+
+def saturation() -> str:
+    """What R cannot say of a capture that is covered well."""
+    return (
+        f"With a mean of {SATURATED:g} or more, R says that these pictures show what others show "
+        "well enough, and not which of them renders better: of a kitchen of 250 pictures with a "
+        "mean of 0.96, each held out once, R and PSNR had a rank correlation of -0.00. So these "
+        "pictures are not ranked; what is left to gain among them lies in the pictures themselves."
+    )
 
 
 def _list(parts: list[str]) -> str:
@@ -129,39 +151,10 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
 
 
 def directions(audit: Audit, view: Suggestion, like: int) -> str:
-    """The way from an image of the capture to a suggested view, as a person would follow it.
-
-    Forward and left are those of the image, in the plane; an image that looks straight up or
-    down is faced as its upper edge.
-    """
+    """The way from an image of the capture to a suggested view, as a person would follow it."""
     here = audit.survey.alignment.poses(audit.source.poses[[like]])[0]
-    axis = here[:3, 2] if np.hypot(*here[:2, 2]) > 0.05 else -here[:3, 1]
-    forward = axis[:2] / np.hypot(*axis[:2])
-    offset = view.pose[:3, 3] - here[:3, 3]
-    ahead = float(offset[:2] @ forward)
-    left = float(forward[0] * offset[1] - forward[1] * offset[0])
-    steps = [
-        f"{length(audit, abs(amount))} {forth if amount > 0 else back}"
-        for amount, forth, back in (
-            (ahead, "forward", "back"), (left, "to the left", "to the right"),
-        )
-        if abs(amount) >= 0.05
-    ]  # fmt: skip
-    parts = [f"Stand where {audit.source.labels[like]} was taken"]
-    if steps:
-        parts.append(f"go {' and '.join(steps)}")
-    if abs(offset[2]) >= 0.05:
-        higher = "higher" if offset[2] > 0 else "lower"
-        parts.append(f"hold the camera {length(audit, abs(float(offset[2])))} {higher}")
-    looks = view.pose[:3, 2]
-    elevation = np.degrees(np.arcsin(np.clip(looks[2], -1.0, 1.0)))
-    if abs(elevation) < 80.0:
-        turn = np.degrees(np.arctan2(forward[0] * looks[1] - forward[1] * looks[0],
-                                     forward @ looks[:2]))  # fmt: skip
-        side = "left" if turn > 0 else "right"
-        parts.append(f"turn {abs(turn):.0f}° {side}" if abs(turn) >= 5.0 else "do not turn")
-    way = "up" if elevation > 0 else "down"
-    parts.append("look level" if abs(elevation) < 5.0 else f"look {abs(elevation):.0f}° {way}")
+    way = steps_between(here, view.pose, lambda value: length(audit, value))
+    parts = [f"Stand where {audit.source.labels[like]} was taken", *way]
     return f"{', '.join(parts[:-1])} and {parts[-1]}."
 
 

@@ -1,0 +1,141 @@
+"""What is kept of an image to compare it with others: numbers per block of pixels.
+
+Frames are compared where they show the same surface, at one working resolution: images of at most
+640 pixels, in blocks, 80 of them along the longer side. A block keeps its mean color, its depth,
+and how much fine detail it has in four directions. That is 150 kB a frame, whatever the camera's
+resolution.
+
+Shape symbols: H, W image size; h, w blocks of an image; b blocks in a row.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from r3jax.geometry.cameras import Camera
+
+_ACROSS = 80
+"""Blocks along the longer side of an image."""
+
+_LEAST_SIDE = 4
+"""Smaller blocks hold no detail [px]."""
+
+_FLAT = 0.1
+"""Depths of a block that differ by more of their mean belong to several surfaces."""
+
+_DARK, _BRIGHT = 12.0, 243.0
+"""Blocks with values beyond these are clipped, or nearly: their brightness says little."""
+
+DIRECTIONS = ("across", "down the diagonal", "down", "up the diagonal")
+"""Directions in which detail is measured."""
+
+
+@dataclass(frozen=True)
+class BlockImage:
+    """An image in blocks."""
+
+    color: np.ndarray
+    """Mean color, [b, 3] float32, 0 to 255; NaN where a pixel is clipped, or nearly."""
+
+    detail: np.ndarray
+    """Mean squared second difference of brightness in each of `DIRECTIONS`, [b, 4] float32."""
+
+    contrast: np.ndarray
+    """Standard deviation of brightness over the block and those round it, which hardly any blur
+    changes, [b] float32."""
+
+    depth: np.ndarray
+    """Mean z-depth of the one surface that it shows, [b] float32 [capture units]; NaN: none."""
+
+    pose: np.ndarray
+    """`T_world_camera`, [4, 4] float64 [capture units]."""
+
+    camera: Camera
+    """Pinhole whose pixels are the blocks."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of rows and columns."""
+        return self.camera.height, self.camera.width
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth [capture units]; NaN if there is none."""
+        known = self.depth[np.isfinite(self.depth)]
+        return float(np.median(known)) if len(known) else float("nan")
+
+    def points(self) -> np.ndarray:
+        """What the middle of each block shows, [b, 3] float64 in the world; NaN without depth."""
+        height, width = self.shape
+        column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        x = (column.ravel() - float(self.camera.cx)) / float(self.camera.fx)
+        y = (row.ravel() - float(self.camera.cy)) / float(self.camera.fy)
+        local = self.depth.astype(np.float64)[:, None] * np.stack([x, y, np.ones_like(x)], 1)
+        return local @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+
+def block_image(rgb: np.ndarray, depth: np.ndarray, camera: Camera, pose: np.ndarray) -> BlockImage:
+    """Cuts an image into blocks.
+
+    Args:
+        rgb: colors, [H, W, 3] uint8.
+        depth: z-depth, [H, W] [capture units]; 0 no measurement, inf nothing within range.
+        camera: its pinhole.
+        pose: `T_world_camera`, [4, 4].
+    """
+    side = min(max(_LEAST_SIDE, round(max(depth.shape) / _ACROSS)), *depth.shape)
+    blocks = Camera(
+        depth.shape[1] // side,
+        depth.shape[0] // side,
+        *(float(value) / side for value in (camera.fx, camera.fy, camera.cx, camera.cy)),
+    )
+    pixels = _cut(rgb.astype(np.float32), side)
+    is_clipped = (pixels.min(axis=(1, 2)) < _DARK) | (pixels.max(axis=(1, 2)) > _BRIGHT)
+    color = np.where(is_clipped[:, None], np.float32(np.nan), pixels.mean(axis=1))
+    brightness = rgb.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+    detail = _cut(_second_differences(brightness), side).mean(axis=1)
+    return BlockImage(
+        color=color,
+        detail=detail,
+        contrast=_contrast(_cut(brightness[..., None], side)[..., 0].mean(axis=1), blocks),
+        depth=_one_depth(_cut(depth[..., None], side)),
+        pose=pose,
+        camera=blocks,
+    )
+
+
+def _cut(image: np.ndarray, side: int) -> np.ndarray:
+    """The pixels of each block of an image [H, W, c], [b, side * side, c]."""
+    h, w = image.shape[0] // side, image.shape[1] // side
+    parts = image[: h * side, : w * side].reshape(h, side, w, side, -1)
+    return parts.swapaxes(1, 2).reshape(h * w, side * side, -1)
+
+
+def _second_differences(image: np.ndarray) -> np.ndarray:
+    """Squared second differences of an image [H, W] in `DIRECTIONS`, [H, W, 4]; 0 at the rim."""
+    found = np.zeros((*image.shape, len(DIRECTIONS)), np.float32)
+    middle = 2.0 * image[1:-1, 1:-1]
+    found[1:-1, 1:-1, 0] = (image[1:-1, :-2] + image[1:-1, 2:] - middle) ** 2
+    # Diagonal neighbors are farther by the root of two: the second difference is twice as large.
+    found[1:-1, 1:-1, 1] = (0.5 * (image[:-2, :-2] + image[2:, 2:] - middle)) ** 2
+    found[1:-1, 1:-1, 2] = (image[:-2, 1:-1] + image[2:, 1:-1] - middle) ** 2
+    found[1:-1, 1:-1, 3] = (0.5 * (image[2:, :-2] + image[:-2, 2:] - middle)) ** 2
+    return found
+
+
+def _contrast(mean: np.ndarray, blocks: Camera) -> np.ndarray:
+    """Standard deviation of the blocks' brightness [b] among 3x3 of them, [b]."""
+    padded = np.pad(mean.reshape(blocks.height, blocks.width), 1, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    return windows.std(axis=(2, 3)).ravel().astype(np.float32)
+
+
+def _one_depth(depth: np.ndarray) -> np.ndarray:
+    """The mean depth of blocks [b, p, 1] that show one surface, [b]; NaN for the others."""
+    known = (depth[..., 0] > 0.0) & np.isfinite(depth[..., 0])
+    values = np.where(known, depth[..., 0], 0.0)
+    count = known.sum(axis=1)
+    mean = values.sum(axis=1) / np.maximum(count, 1)
+    low = np.where(known, values, np.inf).min(axis=1)
+    is_one = (count > 0) & (values.max(axis=1) - low < _FLAT * mean)
+    return np.where(is_one, mean, np.nan).astype(np.float32)

@@ -1,0 +1,360 @@
+"""What is wrong with single frames, as findings: which frames, what it is, what to do next time.
+
+Every frame is read once and kept as blocks; it is compared with a few neighbors, so time and memory
+grow with the number of frames (of which an audit uses at most `max_frames`), and not with its
+square. Each threshold says how it was chosen; `tests/apps/audit/faults` holds them to a rendered
+walk, damaged on purpose, and to a real recording.
+
+Shape symbols: n frames.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from r3jax.apps.audit.faults.blocks import BlockImage, block_image
+from r3jax.apps.audit.faults.blur import Sharpness, image_motion, sharpness
+from r3jax.apps.audit.faults.light import Light, light
+from r3jax.apps.audit.faults.offsets import Offsets, offsets
+from r3jax.apps.audit.faults.overlap import overlaps
+from r3jax.apps.audit.faults.repeats import repeats
+from r3jax.apps.audit.source import Source
+
+BLURRED = 0.45
+"""Less of its neighbors' detail than this, and a frame is blurred: a motion of 3 pixels at the
+working resolution leaves 0.35, and sharp frames of a rendered walk 0.8 and more. In a recording by
+HoloLens those that look blurred have 0.26 to 0.48, and those that look sharp 0.45 and more."""
+
+_SMEARED = 0.6
+"""Detail kept along one direction over that along another, below which a blur has a direction:
+0.2 to 0.35 after a motion of 3 to 9 pixels, 0.8 to 1 in sharp frames."""
+
+_FAST = 0.25
+"""An image that moves by so much of its width between two frames moves fast."""
+
+_NEAR = 0.25
+"""Phones do not focus on what is nearer [m]."""
+
+LIGHT = 0.05
+"""Change of brightness or tint that a splat cannot explain: 5 % of a mid gray alone limits PSNR to
+32 dB. Frames of a rendered walk, with their highlights, differ by up to 1 %."""
+
+_PAIRS_OF_CHANCE = 2
+"""The so many largest differences between two frames may be a mirror's, and are not believed."""
+
+_OFF = 0.01
+"""Poses that are off by less, as a share of the median depth, are as good as depth cameras are."""
+
+_OFF_TYPICAL = 6.0
+"""And so are those that are off by less than so many times what surfaces differ anyway. Both let
+5 cm in a room be found; of the recording by HoloLens (2.6 mm) no frame is off by 3 cm."""
+
+SCALE = 0.03
+"""Depths that fit the poses better by another factor than 1 +- this have a wrong scale."""
+
+Kind = Literal["blur", "focus", "brightness", "tint", "pose", "scale", "repeat"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong."""
+
+    kind: Kind
+    """What it is."""
+
+    what: str
+    """The same in a sentence, with numbers."""
+
+    todo: str
+    """What to do next time, a sentence."""
+
+    frames: tuple[int, ...]
+    """Images of the capture that show it, the worst first; none where it is all of them."""
+
+    captions: tuple[str, ...]
+    """What to say of each of these frames."""
+
+    value: float
+    """How bad the worst is; see `what` for its meaning."""
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What is wrong with single frames."""
+
+    findings: tuple[Finding, ...]
+
+    compared: int
+    """Frames of which at least one other shows the same surface."""
+
+    looked_at: int
+    """Frames that were looked at."""
+
+    record: dict[str, Any]
+    """Numbers of every frame, by name; None where nothing can be said."""
+
+
+def find_faults(
+    source: Source, chosen: np.ndarray, on_frame: Callable[[], None] = lambda: None
+) -> Faults:
+    """Looks for blur, changing light, depth that contradicts the poses, and repetition.
+
+    Args:
+        source: the capture.
+        chosen: images that are looked at.
+        on_frame: called after each of them.
+
+    Raises:
+        FormatError, RunError: a file is missing or broken.
+    """
+    images: list[BlockImage] = []
+    for index in chosen.tolist():
+        images.append(block_image(*source.read(index), source.camera(index), source.poses[index]))
+        on_frame()
+    return faults_of(images, chosen, source.labels, source.is_metric, source.has_images)
+
+
+def faults_of(
+    images: Sequence[BlockImage],
+    chosen: np.ndarray,
+    labels: Sequence[str],
+    is_metric: bool = True,
+    has_colors: bool = True,
+) -> Faults:
+    """As `find_faults`, of images in blocks.
+
+    Args:
+        images: one for each chosen.
+        chosen: their numbers in the capture, [n].
+        labels: names of all images of the capture.
+        is_metric: True if a unit is a meter.
+        has_colors: False if the colors are made up.
+    """
+    pairs = overlaps(images)
+    poses = offsets(images, pairs)
+    names = _Names(chosen, labels, "m" if is_metric else "u")
+    findings = [_scale(poses), _pose(poses, images, names)]
+    record: dict[str, Any] = {"pictures": chosen.tolist(), "pose_off_by": _numbers(poses.distance)}
+    if has_colors:
+        sharp, lit = sharpness(images, pairs), light(images, pairs)
+        findings = [
+            *_blur(sharp, images, names),
+            _brightness(lit, names),
+            _tint(lit, names),
+            *findings,
+            _repeat(images, names),
+        ]
+        record["detail"] = _numbers(sharp.share)
+        record["brightness"] = _numbers(np.exp(lit.change(lit.brightness)))
+    compared = {i for pair in pairs for i in (pair.first, pair.second)}
+    found = tuple(finding for finding in findings if finding is not None)
+    return Faults(found, len(compared), len(images), record)
+
+
+@dataclass(frozen=True)
+class _Names:
+    """How to call frames."""
+
+    chosen: np.ndarray
+    labels: Sequence[str]
+    unit: str
+
+    def label(self, number: int) -> str:
+        """The label of the frame with this number among those looked at."""
+        return self.labels[int(self.chosen[number])]
+
+    def finding(
+        self,
+        kind: Kind,
+        what: str,
+        todo: str,
+        numbers: Sequence[int],
+        captions: Sequence[str],
+        value: float,
+    ) -> Finding:
+        """A finding on some of the frames looked at."""
+        frames = tuple(int(self.chosen[number]) for number in numbers)
+        return Finding(kind, what, todo, frames, tuple(captions), value)
+
+
+def _blur(sharp: Sharpness, images: Sequence[BlockImage], names: _Names) -> list[Finding | None]:
+    """Blurred frames, by what is likely the cause."""
+    motion = image_motion(images)
+    is_blurred = np.nan_to_num(sharp.share, nan=1.0) < BLURRED
+    moved = is_blurred & ((sharp.lost_along < _SMEARED) | (motion > _FAST))
+    out: list[Finding | None] = []
+    for kind, mask in (("blur", moved), ("focus", is_blurred & ~moved)):
+        numbers = [int(i) for i in np.argsort(sharp.share) if mask[i]]
+        if not numbers:
+            continue
+        near = [images[i].median_depth < _NEAR for i in numbers]
+        details = [
+            f"{100 * sharp.share[i]:.0f} % of the detail"
+            + (
+                f"; the picture moved by {100 * motion[i]:.0f} % of its width"
+                if kind == "blur" and motion[i] > _FAST
+                else "; smeared along one direction"
+                if kind == "blur"
+                else "; nearer than 25 cm"
+                if images[i].median_depth < _NEAR and names.unit == "m"
+                else ""
+            )
+            for i in numbers
+        ]
+        share = float(sharp.share[numbers[0]])
+        what = (
+            f"{_pictures(numbers)} blurred by motion: as little as {100 * share:.0f} % of the "
+            "fine detail that neighbors show of the same surface."
+            if kind == "blur"
+            else f"{_pictures(numbers)} out of focus, or shaken: as little as {100 * share:.0f} % "
+            "of the fine detail that neighbors show of the same surface, in all directions."
+        )
+        todo = (
+            "Turn and walk more slowly, and turn on the light: a dark room makes the exposure "
+            "long. Leave these pictures out of the training."
+            if kind == "blur"
+            else "Stay farther away than 25 cm, and wait until the focus has settled. Leave these "
+            "pictures out of the training."
+            if any(near)
+            else "Wait until the focus has settled, or lock it. Leave these pictures out of the "
+            "training."
+        )
+        out.append(names.finding("blur" if kind == "blur" else "focus", what, todo, numbers,
+                                 details, share))  # fmt: skip
+    return out
+
+
+def _pictures(numbers: Sequence[int]) -> str:
+    return "1 picture is" if len(numbers) == 1 else f"{len(numbers)} pictures are"
+
+
+def _largest(lit: Light, values: np.ndarray) -> float:
+    """The largest difference [log] between two frames that is believed, and no mirror's."""
+    if not len(lit.pairs):
+        return 0.0
+    differences = np.sort(np.abs(np.subtract(*values[lit.pairs.T])))[::-1]
+    return float(differences[min(_PAIRS_OF_CHANCE, len(differences) - 1)])
+
+
+def _brightness(lit: Light, names: _Names) -> Finding | None:
+    largest = _largest(lit, lit.brightness)
+    if largest < np.log1p(LIGHT):
+        return None
+    typical = float(np.median(np.abs(np.subtract(*lit.brightness[lit.pairs.T]))))
+    change = lit.change(lit.brightness)
+    numbers, captions = _beside(lit, lit.brightness, change, names)
+    what = (
+        f"Brightness changes by up to {100 * np.expm1(largest):.0f} % between pictures of the same "
+        f"surface (half of the pairs: by more than {100 * np.expm1(typical):.0f} %)."
+    )
+    todo = (
+        "Lock the exposure before you start (iPhone: hold a finger on the picture until AE/AF LOCK "
+        "appears; many scanning apps have a switch). For pictures that exist, train with a "
+        "correction of exposure for each picture."
+    )
+    return names.finding("brightness", what, todo, numbers, captions, float(np.expm1(largest)))
+
+
+def _beside(
+    lit: Light, values: np.ndarray, change: np.ndarray, names: _Names
+) -> tuple[list[int], list[str]]:
+    """Frames that differ most from their neighbors, each beside one that shows the difference."""
+    order = [int(i) for i in np.argsort(-np.abs(np.nan_to_num(change)))]
+    numbers: list[int] = []
+    captions: list[str] = []
+    both = np.concatenate([lit.pairs, lit.pairs[:, ::-1]])
+    # A large difference is seen where much of the pictures is the same.
+    shown = np.tile(np.sqrt(lit.shared), 2) * np.abs(values[both[:, 0]] - values[both[:, 1]])
+    for i in order:
+        if i in numbers or not abs(np.nan_to_num(change[i])) >= np.log1p(LIGHT):
+            continue
+        own = both[:, 0] == i
+        other = int(both[own, 1][np.argmax(shown[own])])
+        ratio = np.exp(values[i] - values[other])
+        numbers += [i, other] if other not in numbers else [i]
+        captions += [f"{ratio:.2f} x as bright as {names.label(other)}"]
+        if len(captions) < len(numbers):
+            captions.append(f"{1 / ratio:.2f} x as bright as {names.label(i)}")
+    return numbers, captions
+
+
+def _tint(lit: Light, names: _Names) -> Finding | None:
+    largest = max(_largest(lit, values) for values in lit.tint.T)
+    if largest < np.log1p(LIGHT):
+        return None
+    changes = np.stack([lit.change(values) for values in lit.tint.T], axis=1)
+    worst = np.abs(np.nan_to_num(changes)).max(axis=1)
+    numbers = [int(i) for i in np.argsort(-worst) if worst[i] >= np.log1p(LIGHT)]
+    captions = [
+        f"red {100 * np.expm1(changes[i, 0]):+.0f} %, blue {100 * np.expm1(changes[i, 1]):+.0f} % "
+        "against green"
+        for i in numbers
+    ]
+    what = (
+        f"White balance drifts: the same surfaces are up to {100 * np.expm1(largest):.0f} % redder "
+        "or bluer from one picture to another."
+    )
+    todo = "Lock the white balance, and do not mix daylight with lamps of another color."
+    return names.finding("tint", what, todo, numbers, captions, float(np.expm1(largest)))
+
+
+def _pose(poses: Offsets, images: Sequence[BlockImage], names: _Names) -> Finding | None:
+    depth = np.array([image.median_depth for image in images])
+    least = np.fmax(_OFF * depth, _OFF_TYPICAL * poses.typical)
+    off = np.nan_to_num(poses.distance / least)
+    is_off = poses.is_explained & (off > 1.0)
+    numbers = [int(i) for i in np.argsort(-off) if is_off[i]]
+    if not numbers:
+        return None
+    length = lambda value: f"{100 * value:.1f} cm" if names.unit == "m" else f"{value:.3g} u"
+    worst = float(poses.distance[numbers[0]])
+    what = (
+        f"{len(numbers)} {'pose contradicts' if len(numbers) == 1 else 'poses contradict'} the "
+        f"depth: surfaces lie up to {length(worst)} from where the neighbors show them (elsewhere "
+        f"they agree to {length(poses.typical)})."
+    )
+    todo = (
+        "Move slowly past plain walls and close the loop, so that tracking does not slip; run the "
+        "app's own refinement of poses, or leave these pictures out."
+    )
+    captions = [f"off by {length(float(poses.distance[i]))}" for i in numbers]
+    return names.finding("pose", what, todo, numbers, captions, worst)
+
+
+def _scale(poses: Offsets) -> Finding | None:
+    if not abs(poses.scale - 1.0) > SCALE:  # NaN is not
+        return None
+    longer = "short" if poses.scale > 1.0 else "long"
+    what = (
+        f"All depths are {100 * abs(1.0 / poses.scale - 1.0):.0f} % too {longer} for the poses: "
+        f"they fit best if multiplied by {poses.scale:.3f}."
+    )
+    todo = (
+        "Check the unit of the depth images and the calibration of the depth camera "
+        "(depth_unit_scale_factor in a transforms.json)."
+    )
+    return Finding("scale", what, todo, (), (), poses.scale)
+
+
+def _repeat(images: Sequence[BlockImage], names: _Names) -> Finding | None:
+    groups = repeats(images)
+    spare = sum(len(group) - 1 for group in groups)
+    if not spare:
+        return None
+    shown = [(i, group[0]) for group in groups for i in group]
+    captions = [
+        f"repeats {names.label(first)}" if i != first else "is repeated" for i, first in shown
+    ]
+    what = (
+        f"{spare} picture{' repeats' if spare == 1 else 's repeat'} another one: nearly the same "
+        "pose and the same pixels. They add nothing."
+    )
+    todo = "Take the next picture after a step to the side, or a turn by 10 degrees or more."
+    return names.finding("repeat", what, todo, [i for i, _ in shown], captions, float(spare))
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    """Numbers for JSON, which has no NaN."""
+    return [round(float(v), 4) if np.isfinite(v) else None for v in values]

@@ -1,0 +1,225 @@
+"""Which poses contradict the depth: by how much each frame would have to move to fit the others.
+
+One step of point-to-plane alignment (Chen and Medioni 1991) of all frames at once: a small motion
+of every frame is sought that brings the surfaces of neighbors onto each other, along their normals,
+
+    n . (p_i + d_i(p_i) - q_j - d_j(q_j)) = 0,    d(p) = t + w x (p - c)
+
+with c the frame's own camera, by least squares that are weighted anew with Cauchy's weights, as
+most of the error lies where one frame does not show what the other does. What a frame's surfaces
+move beside its neighbors' is what its pose is off. A drift that all frames share does not show.
+
+With the poses as they are, the same equations with d(p) = s (p - c) and one s for all give the
+scale of the depths.
+
+Shape symbols: n frames; m matches of a pair; b blocks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from r3jax.apps.audit.faults.blocks import BlockImage
+from r3jax.apps.audit.faults.overlap import FEWEST, Overlap, neighbors_of
+
+_GATE = 0.15
+"""Surfaces farther apart than this are different ones, as a share of their distance."""
+
+_MATCHES = 200
+"""Matches of a pair that are used at most."""
+
+_ROUNDS = 4
+"""Times that matches are weighted anew."""
+
+_PARALLEL = 0.8
+"""Surfaces whose normals have a smaller cosine are different ones."""
+
+_MOST, _APART, _BROUGHT = 90.0, 6.0, 0.4
+"""Percentile of a frame's distances that must be so many times the typical one for its pose to be
+off, and the share of it that moving the frame may leave. Moved along a wall a frame still fits that
+wall, so few of its surfaces may tell: a shift by 5 cm gives 15 and 0.2, frames whose poses are true
+2 to 3 and 0.9 to 1."""
+
+_SIX = np.arange(6)
+"""Unknowns of a frame."""
+
+_PRIOR = 0.02
+"""Motions are sought that are small beside this, where nothing else decides: translations as a
+share of the median depth, rotations in radians."""
+
+_SURE_OF_SCALE = 0.01
+"""Standard deviation up to which the scale counts as known."""
+
+_ALIKE = 100.0
+"""Matches that err together: those of a wall in a pair of frames."""
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Matches of one pair: rows of the equations."""
+
+    first: int
+    second: int
+    rows: np.ndarray
+    """What the twelve unknowns of both frames move each match along its normal, [m, 12]."""
+    longer: np.ndarray
+    """What longer depths move each match along its normal, [m]."""
+    error: np.ndarray
+    """Distance along the normal, [m] [median depths]."""
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """By how much poses are off."""
+
+    distance: np.ndarray
+    """How far the surfaces of each frame lie from where its neighbors show them, beyond what moves
+    all of them, [n] [capture units]; NaN: not compared."""
+
+    is_explained: np.ndarray
+    """True where the frame's surfaces lie apart from its neighbors', of which there are two or
+    more, and moving the frame brings them together, [n]. Elsewhere a distance means little: nothing
+    need hold a frame that shows one wall."""
+
+    typical: float
+    """Median distance of matching surfaces along their normals [capture units]: noise of the depth
+    and of the poses; NaN: nothing could be compared."""
+
+    scale: float
+    """By which factor all depths would fit the poses better; NaN: nobody knows, as where the camera
+    only turned."""
+
+
+def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
+    """Aligns all frames by a small motion each."""
+    count = len(images)
+    unit = float(np.median([d for d in (image.median_depth for image in images) if d > 0.0] or [1]))
+    points = [image.points() / unit for image in images]
+    normals = [_normals(p, image.shape) for p, image in zip(points, images, strict=True)]
+    centers = [image.pose[:3, 3] / unit for image in images]
+    found = [_matched(pair, points, normals, centers) for pair in pairs]
+    matches = [match for match in found if len(match.error) >= FEWEST]
+    if not matches:
+        unknown = np.full(count, np.nan)
+        return Offsets(unknown, np.zeros(count, dtype=bool), float("nan"), float("nan"))
+    motion = _solved(count, matches)
+    linked = np.array([(match.first, match.second) for match in matches], dtype=np.int64)
+    distance = np.full(count, np.nan)
+    for i, near in enumerate(neighbors_of(count, linked)):
+        if len(near):
+            own = points[i][np.isfinite(points[i][:, 0])]
+            moved = [_moved(motion[j], own - centers[j]) for j in (i, *near.tolist())]
+            beside = moved[0] - np.median(moved[1:], axis=0)
+            distance[i] = unit * float(np.median(np.linalg.norm(beside, axis=1)))
+    typical = float(np.median(np.abs(np.concatenate([match.error for match in matches]))))
+    explained = _explained(count, matches, motion, typical)
+    return Offsets(distance, explained, unit * typical, _scale(matches))
+
+
+def _explained(
+    count: int, matches: list[_Matches], motion: np.ndarray, typical: float
+) -> np.ndarray:
+    """Which frames the motion explains, [n]: see `Offsets.is_explained`."""
+    before, after = ([list[np.ndarray]() for _ in range(count)] for _ in range(2))
+    for match in matches:
+        left = match.error + match.rows @ motion[[match.first, match.second]].ravel()
+        for i in (match.first, match.second):
+            before[i].append(np.abs(match.error))
+            after[i].append(np.abs(left))
+    explained = np.zeros(count, dtype=bool)
+    for i in range(count):
+        if len(before[i]) >= 2:
+            apart, left = (np.percentile(np.concatenate(x[i]), _MOST) for x in (before, after))
+            explained[i] = apart > _APART * typical and left < _BROUGHT * apart
+    return explained
+
+
+def _normals(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Unit normals of the surfaces, [b, 3], from the blocks beside; NaN at edges."""
+    grid = points.reshape(*shape, 3)
+    normal = np.full(grid.shape, np.nan)
+    across = grid[1:-1, 2:] - grid[1:-1, :-2]
+    down = grid[2:, 1:-1] - grid[:-2, 1:-1]
+    crossed = np.cross(across, down)
+    length = np.linalg.norm(crossed, axis=-1, keepdims=True)
+    # At an edge between two surfaces the middle is not halfway between its neighbors.
+    width = np.maximum(np.linalg.norm(across, axis=-1), np.linalg.norm(down, axis=-1))
+    bent = np.linalg.norm(
+        grid[1:-1, 2:] + grid[1:-1, :-2] + grid[2:, 1:-1] + grid[:-2, 1:-1] - 4 * grid[1:-1, 1:-1],
+        axis=-1,
+    )
+    is_flat = (bent < 0.25 * width)[..., None] & (length > 0.0)
+    normal[1:-1, 1:-1] = np.where(is_flat, crossed / np.where(length > 0.0, length, 1.0), np.nan)
+    return normal.reshape(-1, 3)
+
+
+def _matched(
+    pair: Overlap, points: list[np.ndarray], normals: list[np.ndarray], centers: list[np.ndarray]
+) -> _Matches:
+    """The equations of one pair."""
+    is_near = np.abs(pair.ratio - 1.0) < _GATE
+    own, other = pair.own[is_near], pair.other[is_near]
+    normal = normals[pair.second][other]
+    # NaN where either has no normal.
+    flat = np.flatnonzero(np.einsum("ij,ij->i", normal, normals[pair.first][own]) > _PARALLEL)
+    flat = flat[:: max(1, -(-len(flat) // _MATCHES))]
+    own, other, normal = own[flat], other[flat], normal[flat]
+    p, q = points[pair.first][own], points[pair.second][other]
+    turn = lambda x, i: np.cross(x - centers[i], normal)
+    rows = np.concatenate([normal, turn(p, pair.first), -normal, -turn(q, pair.second)], axis=1)
+    along = lambda x: np.einsum("ij,ij->i", normal, x)
+    longer = along((p - centers[pair.first]) - (q - centers[pair.second]))
+    return _Matches(pair.first, pair.second, rows, longer, along(p - q))
+
+
+def _solved(count: int, matches: list[_Matches]) -> np.ndarray:
+    """The motion of each frame: translation and rotation, [n, 6]."""
+    scale = _scatter(np.concatenate([match.error for match in matches]))
+    size = 6 * count
+    own = np.stack([np.r_[6 * m.first + _SIX, 6 * m.second + _SIX] for m in matches])  # [k, 12]
+    row, column = np.broadcast_arrays(own[:, :, None], own[:, None, :])
+    x, prior = np.zeros(size), sparse.identity(size, format="csc") / _PRIOR**2
+    for _ in range(_ROUNDS):
+        left, right = [], np.zeros(size)
+        for unknowns, match in zip(own, matches, strict=True):
+            weight = _weight(match.error + match.rows @ x[unknowns], scale)
+            weighted = match.rows * weight[:, None]
+            left.append(weighted.T @ match.rows)
+            right[unknowns] -= weighted.T @ match.error
+        places = row.ravel(), column.ravel()
+        normal = sparse.coo_matrix((np.stack(left).ravel(), places), (size, size)).tocsc()
+        x = np.asarray(spsolve(normal + prior, right))
+    return x.reshape(count, 6)
+
+
+def _scale(matches: list[_Matches]) -> float:
+    """The factor of all depths that fits the poses best; NaN where it changes next to nothing."""
+    error = np.concatenate([match.error for match in matches])
+    longer = np.concatenate([match.longer for match in matches])
+    s = information = 0.0
+    for _ in range(4 * _ROUNDS):
+        left = error + s * longer
+        weight = _weight(left, _scatter(left))
+        information = float((weight * longer**2).sum()) + 1e-12
+        s = -float((weight * longer * error).sum()) / information
+    # Neighboring matches err alike: so many of them count as one.
+    deviation = np.sqrt(_ALIKE / max(information, 1e-12))
+    return float(np.exp(s)) if deviation < _SURE_OF_SCALE else float("nan")
+
+
+def _scatter(errors: np.ndarray) -> float:
+    """Standard deviation of errors without those that are off, from their median."""
+    return max(1.4826 * float(np.median(np.abs(errors))), 1e-4)
+
+
+def _weight(error: np.ndarray, scatter: float) -> np.ndarray:
+    """Cauchy's weights of matches."""
+    return 1.0 / (1.0 + (error / (2.0 * scatter)) ** 2) / scatter**2
+
+
+def _moved(motion: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """How a motion [6] moves points at offsets [m, 3] from its center, [m, 3]."""
+    return motion[:3] + np.cross(motion[3:], offset)

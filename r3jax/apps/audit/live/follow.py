@@ -1,0 +1,250 @@
+"""Guides whoever scans: maps frames as they come in, and asks for the next view beside it.
+
+The same three verbs as in a robot: `start`, `observe`, `decide`. A frame is on the page as soon as
+it is in the map; the decision is made in a thread of its own, so that no frame waits for it. A
+view to take stays the same until the camera has been near it, or some frames have come: nobody
+follows advice that changes with every step.
+"""
+
+import queue
+import threading
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from r3jax.apps.audit.alignment import Alignment, estimated_up, rotation_to_z, up_of
+from r3jax.apps.audit.faults.blocks import BlockImage, block_image
+from r3jax.apps.audit.faults.faults import Kind, faults_of
+from r3jax.apps.audit.live.growing import Arrival, GrowingCapture
+from r3jax.apps.audit.live.page import GuidePage
+from r3jax.apps.audit.source import Source
+from r3jax.frame import Frame
+from r3jax.mapping.config import MappingConfig
+from r3jax.planning.planner import Planner, decide, observe, start
+from r3jax.planning.policy import Decision
+
+_POLL = 0.05
+"""Between two looks at the folder [s]."""
+
+_HALF_SIZE = np.array([10.0, 10.0, 3.5])
+"""The space that is explored: so far round the first camera [m]."""
+
+_RIM = 2.0
+"""A camera nearer to the rim than this makes the space larger, by as much again [m]."""
+
+_TILTED = 5.0
+"""The vertical is estimated; if it was off by more, all is mapped anew [deg]."""
+
+_NEAR, _FACING = 0.5, 30.0
+"""A view counts as taken from as near as this [m], in a direction as near as this [deg]."""
+
+_PATIENCE = 8
+"""Frames after which another view is looked for, whatever happened to the last one."""
+
+_COMPARED = 8
+"""Latest frames that a new one is compared with for blur and light."""
+
+_CAPACITY = 1 << 17
+"""Rows of the map: 200 square meters of surface before all is compiled anew for a larger one."""
+
+
+_WARNINGS: dict[Kind, str] = {
+    "blur": "Blurred: move more slowly, or turn on the light.",
+    "focus": "Out of focus: stay farther away, and wait until it has settled.",
+    "brightness": "Brightness has changed: lock the exposure.",
+    "tint": "White balance has changed: lock it.",
+    "pose": "The pose contradicts the depth: go back to what was seen before, slowly.",
+    "scale": "The scale of the depth is wrong.",
+    "repeat": "Nothing new: move on.",
+}
+"""What to say of the latest frame at once."""
+
+
+class Guide:
+    """Maps frames and asks for views. A context manager: leaving it ends its thread."""
+
+    def __init__(self, page: GuidePage, up: str | None = None, policy: str = "ours-pano"):
+        """Knows nothing yet.
+
+        Args:
+            page: shows it.
+            up: axis of the capture that points up; None: as it says, or as the cameras were held.
+            policy: decides on views.
+        """
+        self._page, self._up_name, self._policy = page, up, policy
+        self._planner: Planner | None = None
+        self._alignment = Alignment(np.eye(3), 1.0, np.zeros(3))
+        self._bounds = np.zeros((2, 3))
+        self._recent: deque[tuple[str, BlockImage]] = deque(maxlen=_COMPARED)
+        self._target: np.ndarray | None = None
+        self._since = 0
+        self._questions: queue.SimpleQueue[tuple[Planner, Frame] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._decide, name="guide", daemon=True)
+
+    def needs_anew(self, source: Source) -> bool:
+        """True if what was mapped must be mapped again: the vertical or the space has changed."""
+        if self._planner is None:
+            return False
+        old = self._alignment.rotation[2]
+        is_tilted = float(old @ self._up(source)) < np.cos(np.radians(_TILTED))
+        stood = self._alignment.points(source.poses[:, :3, 3])[:, :2]
+        low, high = self._bounds[:, :2]
+        is_outside = (stood < low + _RIM).any() or (stood > high - _RIM).any()
+        return is_tilted or bool(is_outside)
+
+    def forget(self) -> None:
+        """Forgets everything: all frames will be added again."""
+        self._planner, self._target = None, None
+        self._recent.clear()
+        self._page.forget()
+
+    def add(self, source: Source, arrival: Arrival, *, is_latest: bool) -> None:
+        """Maps a frame; shows what is known with it, unless others have come since."""
+        if self._planner is None:
+            self._begin(source, arrival)
+        assert self._planner is not None
+        frame = source.framed(arrival.picture, arrival.index, self._alignment)
+        self._planner = observe(self._planner, frame)
+        if not is_latest:
+            self._page.passed(frame)
+            return
+        warnings = self._warnings(source, arrival)
+        self._page.observed(self._planner, frame, name=arrival.name, warnings=warnings)
+        self._since += 1
+        if self._target is None or self._since > _PATIENCE or self._has_arrived(frame):
+            self._target, self._since = None, 0
+            self._questions.put((self._planner, frame))
+
+    def _up(self, source: Source) -> np.ndarray:
+        if self._up_name is not None:
+            return up_of(self._up_name)
+        return source.up if source.up is not None else estimated_up(source.poses)
+
+    def _begin(self, source: Source, arrival: Arrival) -> None:
+        self._alignment = Alignment(rotation_to_z(self._up(source)), 1.0, np.zeros(3))
+        poses = self._alignment.poses(source.poses)
+        center = poses[arrival.index, :3, 3]
+        far = np.abs(poses[:, :3, 3] - center).max(axis=0) + 2.0 * _RIM
+        half = np.where([True, True, False], np.maximum(_HALF_SIZE, 1.5 * far), _HALF_SIZE)
+        self._bounds = np.stack([center - half, center + half])
+        self._planner = start(
+            source.camera(arrival.index),
+            self._bounds,
+            self._policy,
+            starts=[poses[arrival.index]],
+            config=MappingConfig(capacity=_CAPACITY),
+        )
+
+    def _warnings(self, source: Source, arrival: Arrival) -> list[str]:
+        """What is wrong with the latest frame beside those before it."""
+        camera, pose = source.camera(arrival.index), source.poses[arrival.index]
+        self._recent.append((arrival.name, block_image(*arrival.picture, camera, pose)))
+        names, images = zip(*self._recent, strict=True)
+        last = len(images) - 1
+        found = faults_of(images, np.arange(len(images)), names).findings
+        return [
+            f"{_WARNINGS[finding.kind]} ({finding.captions[finding.frames.index(last)]})"
+            for finding in found
+            if last in finding.frames
+        ]
+
+    def _has_arrived(self, frame: Frame) -> bool:
+        """True if the camera is where it was sent, and looks there."""
+        assert self._target is not None
+        pose = np.asarray(frame.T_world_camera, np.float64)
+        is_near = np.linalg.norm(pose[:3, 3] - self._target[:3, 3]) < _NEAR
+        return bool(is_near and pose[:3, 2] @ self._target[:3, 2] > np.cos(np.radians(_FACING)))
+
+    def _decide(self) -> None:
+        """Answers the latest question, again and again."""
+        key, number = jax.random.key(0), 0
+        while (question := self._latest()) is not None:
+            planner, frame = question
+            number += 1
+            try:
+                decision, _, _ = decide(
+                    planner, frame.T_world_camera, jax.random.fold_in(key, number)
+                )
+            except Exception as error:  # whatever it was: the next frame may do better
+                self._page.say("No view could be chosen here; go on.", str(error))
+            else:
+                self._show(frame, decision)
+
+    def _latest(self) -> tuple[Planner, Frame] | None:
+        question = self._questions.get()
+        while question is not None and not self._questions.empty():
+            question = self._questions.get()
+        return question
+
+    def _show(self, frame: Frame, decision: Decision | None) -> None:
+        self._target = None if decision is None else decision.T_world_camera
+        self._page.decided(frame, decision)
+
+    def __enter__(self) -> "Guide":
+        """The guide itself."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        """Ends the thread once it has answered."""
+        self._questions.put(None)
+        self._thread.join()
+
+
+def follow(
+    path: Path,
+    page: GuidePage,
+    scratch: Path,
+    *,
+    up: str | None = None,
+    stop: threading.Event | None = None,
+) -> Source | None:
+    """Follows a growing capture until Ctrl-C, or until it is told to stop.
+
+    Args:
+        path: the folder, or a transforms.json; nothing in it is written.
+        page: shows what is done and where to go next.
+        scratch: an empty folder of our own, which stays as long as the result is read.
+        up: axis of the capture that points up.
+        stop: set by another thread.
+
+    Returns:
+        What came in, to be audited; None if nothing did.
+
+    Raises:
+        ValueError: the capture has no depth images.
+    """
+    stop = threading.Event() if stop is None else stop
+    capture = GrowingCapture(path, scratch)
+    try:
+        with Guide(page, up) as guide:
+            while not stop.is_set():
+                if not _step(capture, guide, page):
+                    stop.wait(_POLL)
+    except KeyboardInterrupt:
+        pass
+    return capture.source
+
+
+def _step(capture: GrowingCapture, guide: Guide, page: GuidePage) -> bool:
+    """Looks once, and maps what is new; True if something was."""
+    source, arrivals, has_moved = capture.look()
+    if source is None:
+        if capture.waiting_for:
+            page.say("Waiting for the first frame ...", capture.waiting_for)
+        return False
+    if has_moved or (arrivals and guide.needs_anew(capture.source or source)):
+        guide.forget()
+        page.say("Mapping everything again ...", "poses were corrected, or the place is larger")
+        earlier: Arrival | None = None
+        for arrival in capture.again(source):
+            if earlier is not None:
+                guide.add(source, earlier, is_latest=False)
+            earlier = arrival
+        arrivals = [] if earlier is None else [earlier]
+    for arrival in arrivals:
+        guide.add(source, arrival, is_latest=arrival is arrivals[-1])
+    return bool(arrivals)
