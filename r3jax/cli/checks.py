@@ -45,7 +45,7 @@ LEAST_CAPACITY = 1 << 14
 _WITH_RESUME = ("resume", "budget", "until", "live", "port")
 _WITH_FORK = (
     "fork", "at", "policy", "budget", "until", "name", "out", "overwrite", "candidates", "lambda1",
-    "lambda2", "refine", "patience", "live", "port",
+    "lambda2", "refine", "live", "port",
 )  # fmt: skip
 """Options that make sense beside these; all others are fixed by the recorded run."""
 

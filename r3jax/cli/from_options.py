@@ -50,7 +50,6 @@ def policy_of_options(options: ExploreOptions, max_range: float, motion: Motion)
         "num_candidates": options.candidates,
         "lambda2": options.lambda2,
         "refine": options.refine,
-        "patience": options.patience,
     }
     if options.candidates is not None:
         # Keeps the share that is aimed at the frontier, whatever the number.

@@ -155,9 +155,6 @@ class PlanningOptions:
     refine: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """The best N candidates of `ours` and its kin climb the utility by its gradient (0: none)."""
 
-    patience: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Surfaces that N views should have shown, and did not, are given up (0: none)."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class PageOptions:
@@ -212,12 +209,5 @@ class ExploreOptions(
     @property
     def changes_policy(self) -> bool:
         """True if a fork decides otherwise than the run that it leaves."""
-        given = (
-            self.policy,
-            self.candidates,
-            self.lambda1,
-            self.lambda2,
-            self.refine,
-            self.patience,
-        )
+        given = (self.policy, self.candidates, self.lambda1, self.lambda2, self.refine)
         return any(value is not None for value in given)
