@@ -123,7 +123,7 @@ def compared(
         decision, _, _ = decide()
         milliseconds = 1e3 * (time.perf_counter() - begin)
         config, state = policies[who].config, states[who]
-        *_, masked = prepare_decision(state, map_state, grid, pose, config)
+        _, _, masked = prepare_decision(state, map_state, grid, pose, config)
         utility = exact(map_state, masked, state.camera, decision, config)
         row |= {f"{word}_utility": utility, f"{word}_ms": round(milliseconds, 2)}
     return row | {"gain": row["refined_utility"] / max(row["plain_utility"], 1e-9) - 1.0}

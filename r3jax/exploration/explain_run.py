@@ -94,7 +94,7 @@ def explain_run(
             yield None
         else:
             pose, (map_state, grid) = before
-            memory = memory or initial_state(run.camera, grid, config=config)
+            memory = memory or initial_state(run.camera, grid, motion=config.motion)
             choice = row.choice
             # The memory goes from view to view: cells that were given up count for nothing later.
             memory, explanation = explain_path(

@@ -51,10 +51,6 @@ class PlannerConfig:
     refine_radius: float = 0.4
     """A climb ends at this distance along each axis [m]; 0: it turns the view and no more."""
 
-    patience: int = 0
-    """A surface that so many views should have shown, and none of them observed, promises nothing
-    any more (`planning.vain_looks`); 0: it promises the same for ever, as in the paper."""
-
     motion: Motion = field(default_factory=Motion)
     """What carries the camera: where it may be, how it may look and how fast it goes."""
 
@@ -78,8 +74,6 @@ class PlannerConfig:
                 f"refine must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.refine}"
             )
-        if not 0 <= self.patience <= 255:
-            raise ValueError(f"patience must lie between 0 and 255, got {self.patience}")
         # An infinite lambda2, times a path of no length, would be NaN.
         for name in ("radius", "refine_radius", "lambda2", "safety_margin"):
             value = getattr(self, name)

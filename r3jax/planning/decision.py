@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -19,8 +19,8 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.motion import Motion
 from r3jax.planning.robot.travel import Travel, plan_travel
-from r3jax.planning.vain_looks import count_vain_looks, no_looks, without_hopeless
 from r3jax.scoring.explain import Explanation, explain_view
 from r3jax.scoring.utility import visible_unexplored
 
@@ -45,10 +45,6 @@ class PlannerState(eqx.Module):
     """Height of the first view [m], NaN before it; None for a motion whose heights do not count
     from it."""
 
-    vain_looks: UInt8[Array, " S"] | None = None
-    """Views that should have observed each voxel and did not (`planning.vain_looks`); None where
-    patience has no end."""
-
     memory: Any = None
     """Arrays that one policy keeps beside the map: a pytree of its own."""
 
@@ -70,17 +66,15 @@ class Stopwatch:
 
 
 def initial_state(
-    camera: Camera, grid: OccupancyGrid, memory: Any = None, config: PlannerConfig | None = None
+    camera: Camera, grid: OccupancyGrid, memory: Any = None, motion: Motion | None = None
 ) -> PlannerState:
     """The memory of a robot that has not moved yet."""
     nowhere = np.zeros(grid.log_odds.shape, dtype=bool)
     looks = np.zeros(grid.log_odds.shape, dtype=np.int32)
-    config = PlannerConfig() if config is None else config
-    is_relative = config.motion.is_relative
+    is_relative = motion is not None and motion.is_relative
     # NaN, not None, until the first view: the tree of arrays keeps its structure from there on.
     start_height = jnp.asarray(jnp.nan, dtype=jnp.float32) if is_relative else None
-    vain_looks = jnp.asarray(no_looks()) if config.patience else None
-    return PlannerState(camera, nowhere, looks, start_height, vain_looks, memory)
+    return PlannerState(camera, nowhere, looks, start_height, memory)
 
 
 def prepare_decision(
@@ -89,8 +83,8 @@ def prepare_decision(
     grid: OccupancyGrid,
     T_world_camera: np.ndarray,
     config: PlannerConfig,
-) -> tuple[PlannerState, Travel, MapState, OccupancyGrid]:
-    """Where the robot can go from here, and map and grid without what is not worth a look.
+) -> tuple[PlannerState, Travel, OccupancyGrid]:
+    """Where the robot can go from here, and the grid without cells that are not worth a look.
 
     Args:
         state: the policy's memory.
@@ -100,10 +94,9 @@ def prepare_decision(
         config: the safety margin, what carries the camera, and how far it sees.
 
     Returns:
-        The memory with the view from here counted in, the paths, and map and grid for scoring:
-        cells that no robot can look at, those that several views left unexplored
-        (`mask_unexplorable`), and surfaces that `config.patience` views failed to observe
-        (`without_hopeless`) are not worth a look in them.
+        The memory with the view from here counted in, the paths, and the grid for scoring: cells
+        that no robot can look at, and those that several views left unexplored, are not worth a
+        look in it (`mask_unexplorable`).
     """
     # float64: in float32 a robot on a border of cells could stand in either of them.
     position = np.asarray(T_world_camera, dtype=np.float64)[:3, 3]
@@ -118,19 +111,7 @@ def prepare_decision(
     state = replace(state, looks=state.looks + np.asarray(visible, dtype=np.int32))
     # Three looks in vain: more would not help, and the utility would call for them for ever.
     is_exhausted = state.looks >= ENOUGH_LOOKS
-    state, known = _without_hopeless(state, map_state, pose, config)
-    return state, travel, known, mask_unexplorable(grid, travel.reachable, is_exhausted)
-
-
-def _without_hopeless(
-    state: PlannerState, map_state: MapState, pose: Float[Array, "4 4"], config: PlannerConfig
-) -> tuple[PlannerState, MapState]:
-    """Counts what the view from here failed to observe; the map without what is given up."""
-    if state.vain_looks is None:
-        return state, map_state
-    counts = count_vain_looks(state.vain_looks, map_state, state.camera, pose, config.scoring)
-    patience = jnp.asarray(config.patience, dtype=jnp.uint8)
-    return replace(state, vain_looks=counts), without_hopeless(map_state, counts, patience)
+    return state, travel, mask_unexplorable(grid, travel.reachable, is_exhausted)
 
 
 def _with_start(state: PlannerState, height: float) -> PlannerState:
@@ -151,7 +132,7 @@ def follow_path(
 ) -> PlannerState:
     """The memory of a robot that goes a way which its policy did not choose."""
     # As for a decision of its own: looks in vain count, whoever chose the way.
-    state, travel, *_ = prepare_decision(state, map_state, grid, T_world_camera, config)
+    state, travel, _ = prepare_decision(state, map_state, grid, T_world_camera, config)
     return _with_path(state, travel, waypoints)
 
 
@@ -179,11 +160,9 @@ def explain_path(
         The memory with the path counted in, and the utility by cause; of the unexplored cells those
         count that decisions are scored on (`prepare_decision`).
     """
-    state, travel, known, scoring_grid = prepare_decision(
-        state, map_state, grid, T_world_camera, config
-    )
+    state, travel, scoring_grid = prepare_decision(state, map_state, grid, T_world_camera, config)
     pose = jnp.asarray(T_chosen, dtype=jnp.float32)
-    explanation = explain_view(known, scoring_grid, state.camera, pose, config.scoring)
+    explanation = explain_view(map_state, scoring_grid, state.camera, pose, config.scoring)
     return _with_path(state, travel, waypoints), explanation
 
 

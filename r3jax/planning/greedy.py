@@ -119,7 +119,7 @@ class GreedyPolicy(ABC):
         """The state before the first frame; nothing in it is random."""
         del key
         memory = self.first_memory(camera, grid)
-        return initial_state(camera, grid, memory, self.config)
+        return initial_state(camera, grid, memory, self.config.motion)
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
         """The map holds all that most policies need of a frame."""
@@ -186,9 +186,7 @@ class GreedyPolicy(ABC):
         """The view of the greatest `total` [C] that a path leads to now."""
         stopwatch = Stopwatch()
         with stopwatch.part("travel"):
-            state, travel, *_ = prepare_decision(
-                state, map_state, grid, T_world_camera, self.config
-            )
+            state, travel, _ = prepare_decision(state, map_state, grid, T_world_camera, self.config)
             limits = self._limits(T_world_camera, travel)
             views = limits.project_to_feasible(views)
             path = limits.path_costs(path_lengths(travel, views), views.direction)
@@ -214,12 +212,14 @@ class GreedyPolicy(ABC):
         # Two keys: a policy that draws more must not change the lots of its scores.
         draw_key, score_key = jax.random.split(key)
         with stopwatch.part("travel"):
-            state, travel, known, masked = prepare_decision(
+            state, travel, masked = prepare_decision(
                 state, map_state, grid, T_world_camera, self.config
             )
         limits = self._limits(T_world_camera, travel)
         with stopwatch.part("candidates"):
-            situation = Situation(known, grid, masked, travel, state.camera, state.memory, limits)
+            situation = Situation(
+                map_state, grid, masked, travel, state.camera, state.memory, limits
+            )
             drawn = draw(situation, draw_key)
             # No view on offer is an outcome, not an error: the loop ends with the reason.
             if not drawn.candidates.valid.any():

@@ -72,7 +72,6 @@ class Situation:
     """All that a decision may depend on: what is known, where the robot is and can go."""
 
     map_state: MapState
-    """The map; what policies have given up counts as well seen in it (`prepare_decision`)."""
 
     grid: OccupancyGrid
     """Grid as it is; for travel."""

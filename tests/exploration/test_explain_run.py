@@ -85,7 +85,7 @@ def test_reasons_are_the_utilities_of_the_trace(run, states):
 MUTANTS = [
     Mutant("explain_run", "memory = memory or initial_state(",
            "memory = initial_state(", law_of_the_trace),
-    Mutant("decision", "explain_view(known, scoring_grid,", "explain_view(known, grid,",
+    Mutant("decision", "explain_view(map_state, scoring_grid,", "explain_view(map_state, grid,",
            law_of_the_trace),
     Mutant("explain_run", "map_state, grid, pose, choice.pose", "map_state, grid, pose, pose",
            law_of_the_trace),

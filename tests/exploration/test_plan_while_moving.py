@@ -92,7 +92,7 @@ def test_on_arrival_the_best_are_scored_again_on_what_has_come_in():
     np.testing.assert_allclose(decision.candidates, best, atol=1e-6)
     # Their utilities are those of the map now, cell by cell worth a look now.
     policy = planner.policy
-    *_, masked = prepare_decision(
+    _, _, masked = prepare_decision(
         arrived.policy_state, arrived.map_state, arrived.grid, T, policy.config
     )
     for pose, utility in zip(decision.candidates, decision.utilities["utility"], strict=True):

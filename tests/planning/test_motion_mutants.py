@@ -108,12 +108,12 @@ def law_turns_cost(modules: Modules) -> None:
 def law_heights_count_from_the_first_view(modules: Modules) -> None:
     """Not from the latest one: a hand that has come up does not come up from there again."""
     config, first = config_of("handheld"), level_start()
-    state = modules["decision"].initial_state(CAMERA, GRID, config=config)
+    state = modules["decision"].initial_state(CAMERA, GRID, motion=config.motion)
     higher = first.copy()
     higher[2, 3] += 0.1
     for pose in (first, higher):
         args = state, empty_map(64), GRID, pose, config
-        state, travel, *_ = modules["decision"].prepare_decision(*args)
+        state, travel, _ = modules["decision"].prepare_decision(*args)
         low, high = first[2, 3] - 0.6, first[2, 3] + 0.4
         np.testing.assert_allclose(travel.heights, (low, high), atol=1e-6)
     assert modules["decision"].initial_state(CAMERA, GRID).start_height is None
@@ -202,7 +202,7 @@ MUTANTS = [
     ),
     Mutant("greedy", "pose, travel.heights)", "pose)", LAWS[0]),
     Mutant("greedy", "limits.path_costs(lengths, candidates.direction)", "lengths", law_turns_cost),
-    Mutant("greedy", "memory, self.config)", "memory)", LAWS[3]),
+    Mutant("greedy", "memory, self.config.motion)", "memory)", LAWS[3]),
     Mutant(
         "decision",
         "seconds=limits.seconds(length, candidates.direction[best])",

@@ -296,7 +296,7 @@ def test_cells_looked_at_in_vain_are_left_alone():
     config = PlannerConfig()
     in_view = None
     for look in range(ENOUGH_LOOKS):
-        state, _, _, masked = prepare_decision(state, empty_map(64), grid, pose, config)
+        state, _, masked = prepare_decision(state, empty_map(64), grid, pose, config)
         seen = np.asarray(state.looks) == look + 1
         assert in_view is None or np.array_equal(seen, in_view)
         in_view = seen
@@ -305,5 +305,5 @@ def test_cells_looked_at_in_vain_are_left_alone():
     assert in_view.sum() > 50
     assert np.asarray(masked.unexplored).any()  # what no view has shown still counts
     away = poses_along(center(14, 6, 4)[None], np.array([[-1.0, 0.0, 0.0]]))[0]
-    state, *_ = prepare_decision(state, empty_map(64), grid, away, config)
+    state, _, _ = prepare_decision(state, empty_map(64), grid, away, config)
     assert not np.any((np.asarray(state.looks) > ENOUGH_LOOKS) & in_view)
