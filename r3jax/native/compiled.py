@@ -11,7 +11,7 @@ from numba import extending, njit, types
 
 _Function = Callable[..., Any]
 
-_BARE = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_BARE: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """No entries for callers in Python or C: kernels call each other, and XLA calls handlers. Each
 entry would hold the kernel once more, to be compiled once more."""
 
