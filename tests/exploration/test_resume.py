@@ -302,7 +302,7 @@ def _kill_at_random_moments(path, views, name, kills, span, rng):
     ("views", "name", "kills", "span"),
     [
         (6, "frontier", 1, 1.5),
-        pytest.param(8, "ours-pano", 3, 1.5, marks=pytest.mark.full),
+        pytest.param(8, "ours-pano", 3, 1.5, marks=pytest.mark.slow),
         pytest.param(40, "ours-pano", 30, 2.5, marks=pytest.mark.slow),
     ],
 )

@@ -21,6 +21,7 @@ import pytest
 
 from r3jax.apps.models import judge
 from r3jax.apps.report import revisits
+from r3jax.cli import kernels
 from r3jax.cli.commands import audit, benchmark, explore, replay, train
 from r3jax.cli.main import _COMMANDS, main
 from r3jax.exploration.config import ExplorationConfig
@@ -179,6 +180,7 @@ def with_work_left_out() -> None:
     def begin(*_: Any, **__: Any) -> Any:
         raise Begun
 
+    kernels.COMMANDS = ()
     audit.audit = begin
     explore.explore = begin
     train.train.fit = begin

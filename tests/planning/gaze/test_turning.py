@@ -166,7 +166,7 @@ def best_of_all(turning, places, width):
 @pytest.mark.parametrize(
     ("num", "width", "allowed"),
     [
-        (2, 5, np.inf),
+        pytest.param(2, 5, np.inf, marks=pytest.mark.slow),
         pytest.param(2, 5, 1.0, marks=pytest.mark.slow),
         pytest.param(3, 4, np.inf, marks=pytest.mark.slow),
         (3, 4, 1.0),

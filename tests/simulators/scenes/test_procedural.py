@@ -88,7 +88,7 @@ def test_another_process_builds_the_same_bytes(worlds):
     assert done.stdout.decode().strip() == worlds["flat"].content_hash
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_a_second_build_is_equal_and_scenes_differ(worlds):
     assert procedural.build("office").content_hash == worlds["office"].content_hash
     assert len({w.content_hash for w in map(worlds.__getitem__, NAMES)}) == len(NAMES)
