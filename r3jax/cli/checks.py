@@ -166,7 +166,7 @@ def _(options: AuditOptions) -> None:
         raise ValueError("--live follows a capture, --path judges a path in one: give one of them")
     if options.live and options.capture.is_file() and options.capture.suffix != ".json":
         raise ValueError(f"{options.capture}: this is a file that does not grow; --live is without")
-    if not options.live and (options.port, options.host) != (8080, "127.0.0.1"):
+    if not options.live and (options.port, options.host) != (AuditOptions.port, AuditOptions.host):
         raise ValueError("--port and --host are for the page of --live")
     if not 0 <= options.port <= 65535:
         raise ValueError(f"--port must lie between 0 and 65535, got {options.port}")

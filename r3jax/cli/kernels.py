@@ -4,7 +4,7 @@ Numba holds Python's lock while it compiles, over a minute of one core for all k
 that has another core to spare finds them on the disk, or waits for the one that it needs
 (`native.ffi.register_handlers`). Afterwards the disk has them, and nothing is started.
 
-    python -m r3jax.cli.kernels
+    python -m r3jax.cli.kernels NOTE
 """
 
 import contextlib
@@ -35,6 +35,8 @@ def compile_ahead(cache: Path) -> None:
     with contextlib.suppress(OSError):
         subprocess.Popen(
             [sys.executable, "-m", "r3jax.cli.kernels", str(note)],
+            # Kernels are for CPUs: a GPU's memory is the command's.
+            env={**os.environ, "JAX_PLATFORMS": "cpu"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -167,6 +167,7 @@ def _number(x):
         x[i] = i
 
 
+# No `parallel_kernel`: this one is called from Python.
 _wake_up = njit(cache=True, parallel=True)(inspect.unwrap(_number))
 
 

@@ -134,8 +134,8 @@ def _rows(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
     used = width * channels * kind.itemsize
     if not 0 < width * height <= MAX_PIXELS:
         raise ForeignFileError(f"an image has {width} x {height} pixels")
-    data = np.asarray(message.data, np.uint8) if not isinstance(message.data, bytes) else None
-    data = np.frombuffer(message.data, np.uint8) if data is None else data
+    is_bytes = isinstance(message.data, bytes)
+    data = (np.frombuffer if is_bytes else np.asarray)(message.data, np.uint8)
     if step < used or len(data) < step * height:
         raise ForeignFileError(
             f"an image of {width} x {height} pixels and {step} bytes a row has {len(data)} bytes"

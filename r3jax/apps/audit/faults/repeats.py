@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from r3jax.apps.audit.faults.blocks import BlockImage
+from r3jax.geometry.cameras import angle_between
 
 _MOVED = 0.005
 """Views whose images are shifted by less show the same [share of the width]: 3 of 640 pixels."""
@@ -42,10 +43,8 @@ def _is_like(a: BlockImage, b: BlockImage, reach: float) -> bool:
     """True if two frames from one place show the same pixels."""
     if a.shape != b.shape:
         return False
-    between = a.pose[:3, :3].T @ b.pose[:3, :3]
-    turn = np.arccos(np.clip(0.5 * (np.trace(between) - 1.0), -1.0, 1.0))
     difference = np.abs(a.color - b.color)
     known = np.isfinite(difference)
-    if turn > reach or not known.any():
+    if angle_between(a.pose, b.pose) > reach or not known.any():
         return False
     return float(difference[known].mean()) < _DIFFERS

@@ -18,6 +18,7 @@ import numpy as np
 from r3jax.apps.audit.live.staging import stage
 from r3jax.apps.audit.source import Picture, Source, source_of
 from r3jax.formats.captures import open_capture
+from r3jax.geometry.cameras import angle_between
 
 _MOVED, _TURNED = 0.02, 1.0
 """Poses that were corrected by less stay where they are [m], [deg]."""
@@ -127,8 +128,7 @@ class GrowingCapture:
                 continue
             before, after = self._taken[key], source.poses[index]
             step = float(np.linalg.norm(before[:3, 3] - after[:3, 3]))
-            turn = 0.5 * (float(np.trace(before[:3, :3].T @ after[:3, :3])) - 1.0)
-            if step > _MOVED or turn < np.cos(np.radians(_TURNED)):
+            if step > _MOVED or angle_between(before, after) > np.radians(_TURNED):
                 moved, self._taken[key] = True, after
         return moved
 
