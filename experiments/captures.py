@@ -80,12 +80,15 @@ def requests_of(options: Options) -> list[Request]:
 
 def run_modes(options: Options) -> Records:
     """Runs what is left; the mode stands among the settings of the policy, for its name."""
+    # What is compared here is no unequal term: the tables' own check would refuse it.
+    compared = {name for settings in MODES.values() for name in settings}
     found: list[Mapping[str, Any]] = []
     for mode, request in zip(options.modes, requests_of(options), strict=True):
         _, _, records = run_requests(options, "seconds", [request])
         for record in records:
             settings = record["settings"] | ({"on the way": mode} if mode else {})
-            found.append({**record, "settings": settings})
+            sensing = {k: v for k, v in record["sensing"].items() if k not in compared}
+            found.append({**record, "settings": settings, "sensing": sensing})
     return with_short_names(found)
 
 
