@@ -177,6 +177,7 @@ def log_odds_at(
     return jnp.where(inside, grid.log_odds[x, y, z], outside)
 
 
+@jax.jit
 def frontier(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
     """Free cells with an unexplored face neighbor: where known space ends."""
     return grid.free & _has_face_neighbor(grid.unexplored)

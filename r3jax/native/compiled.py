@@ -58,6 +58,16 @@ def kernel(function: _Function) -> _Function:
     return njit(cache=True, error_model="numpy", **_BARE)(inspect.unwrap(function))
 
 
+def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Function]:
+    """Compiles a kernel that Python calls, and other kernels may; the disk keeps it.
+
+    Args:
+        parallel: its `prange` loops share the cores that the process may use.
+    """
+    compiler = njit(cache=True, error_model="numpy", parallel=parallel)
+    return lambda function: compiler(inspect.unwrap(function))
+
+
 def inlined(function: _Function) -> _Function:
     """Compiles a small function into its callers."""
     return njit(cache=True, error_model="numpy", **_BARE, forceinline=True)(

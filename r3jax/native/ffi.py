@@ -22,11 +22,11 @@ from typing import Any
 import jax
 import numpy as np
 from llvmlite import ir
-from numba import cfunc, get_num_threads, njit, prange, types
+from numba import cfunc, get_num_threads, prange, types
 from numba.np.numpy_support import carray
 from numba.np.ufunc.parallel import threading_layer
 
-from r3jax.native.compiled import inlined, intrinsic
+from r3jax.native.compiled import called_from_python, inlined, intrinsic
 
 # Offsets in bytes in the structs of XLA's FFI, API version `version.WRITTEN_FOR`.
 _EXTENSION, _API = 8, 16
@@ -162,13 +162,10 @@ def bytes1(frame, kind, index):
     return carray(_bytes(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
 
-def _number(x):
+@called_from_python(parallel=True)
+def _wake_up(x):
     for i in prange(x.shape[0]):
         x[i] = i
-
-
-# No `parallel_kernel`: this one is called from Python.
-_wake_up = njit(cache=True, parallel=True)(inspect.unwrap(_number))
 
 
 def require_threads() -> None:

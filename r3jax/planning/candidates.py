@@ -161,10 +161,11 @@ def region_of_interest(
     for target, aim in zip(drawn, travel.centers(drawn), strict=True):
         if len(positions) == num:
             break
-        stops = travel.stops(_stops_round(travel, target))
-        if len(stops) == 0:
+        cells = _stops_round(travel, target)
+        if len(cells) == 0:
             continue
-        position = _jitter(stops[rng.integers(len(stops))], travel.cell_size, rng)
+        stop = travel.stops(cells[rng.integers(len(cells))])
+        position = _jitter(stop, travel.cell_size, rng)
         if in_plain_view(travel, position, aim):
             positions.append(position)
             aims.append(aim)
@@ -179,18 +180,14 @@ def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
     Returns:
         Indices of cells, [n, 3], n <= 256.
     """
-    closest, farthest = VIEW_DISTANCE
-    reach = int(np.ceil(farthest / travel.cell_size))
-    # Not past the array: a negative start of a slice would count from its end.
-    low = np.maximum(target - reach, 0)
-    window = tuple(slice(a, b) for a, b in zip(low, target + reach + 1, strict=True))
-    cells = np.argwhere(travel.goals[window]) + low
-    distance = np.linalg.norm(cells - target, axis=1) * travel.cell_size
-    # Stable, so that ties fall in the order of the cells on every machine.
-    nearest = np.argsort(distance, kind="stable")[:_NEIGHBORS]
+    # Imported only here: whoever plans no way does not wait for Numba.
+    from r3jax.planning.robot.cells import nearest_in_ring
+
+    reach = int(np.ceil(VIEW_DISTANCE[1] / travel.cell_size))
     # Cut after the nearest are taken, so that a near wall leaves few places, not far ones.
-    is_apart = (distance[nearest] >= closest) & (distance[nearest] <= farthest)
-    return cells[nearest[is_apart]]
+    return nearest_in_ring(
+        travel.goals, target, reach, travel.cell_size, *VIEW_DISTANCE, _NEIGHBORS
+    )
 
 
 def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.75)) -> np.ndarray:

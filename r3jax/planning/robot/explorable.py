@@ -5,11 +5,8 @@ unexplored for ever. A planner that counts them is drawn to them for ever.
 """
 
 import numpy as np
-from scipy import ndimage
 
 from r3jax.mapping.occupancy import OccupancyGrid
-
-_FACES = ndimage.generate_binary_structure(3, 1)
 
 
 def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarray) -> np.ndarray:
@@ -27,10 +24,13 @@ def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarr
     Returns:
         The unexplored cells that count, [X, Y, Z] bool.
     """
+    # Imported only here: whoever plans no way does not wait for Numba.
+    from r3jax.planning.robot.cells import flood
+
     # Free space seen through a window counts for nothing: no robot gets there to look on.
-    open_space = _regions_that_touch(free, reached)
-    # Dilated by one cell: the two kinds of cells border on each other, and share none.
-    return _regions_that_touch(unexplored, ndimage.binary_dilation(open_space, _FACES))
+    open_space = flood(free, reached)
+    # Grown by one cell: the two kinds of cells border on each other, and share none.
+    return flood(unexplored, _grown(open_space))
 
 
 def mask_unexplorable(
@@ -44,18 +44,19 @@ def mask_unexplorable(
         exhausted: cells that were looked at in vain, [X, Y, Z] bool; None: there are none.
     """
     # Labels of regions are no work for XLA: their number is not known beforehand.
-    free, unexplored = np.asarray(grid.free), np.asarray(grid.unexplored)
+    free, unexplored = np.array(grid.free), np.array(grid.unexplored)
     is_hopeless = unexplored & ~explorable_cells(free, unexplored, reached)
     if exhausted is not None:
         is_hopeless |= unexplored & exhausted
     return grid.ignoring(is_hopeless)
 
 
-def _regions_that_touch(mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The regions of a mask, connected over faces, that hold at least one seed."""
-    labels = np.zeros(mask.shape, dtype=np.int32)
-    ndimage.label(mask, _FACES, output=labels)
-    is_wanted = np.zeros(int(labels.max()) + 1, dtype=bool)
-    is_wanted[labels[seeds]] = True
-    is_wanted[0] = False  # the label of everything that is not in the mask
-    return is_wanted[labels]
+def _grown(mask: np.ndarray) -> np.ndarray:
+    """A mask and all face neighbors of its cells."""
+    grown = mask.copy()
+    for axis in range(3):
+        # Views, so that each axis is grown in place.
+        cells, before = np.moveaxis(grown, axis, 0), np.moveaxis(mask, axis, 0)
+        cells[1:] |= before[:-1]
+        cells[:-1] |= before[1:]
+    return grown

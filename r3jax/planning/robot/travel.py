@@ -23,9 +23,6 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.planning.robot.motion import UNLIMITED, check_height
 from r3jax.planning.robot.shortest_paths import shortest_paths
 
-_BORDER = 1e-3
-"""A segment that passes a corner closer than this counts as touching it [cells]."""
-
 _INSET = 1e-2
 """A camera at a fixed height that is a border of layers counts as so far inside its own [cells]:
 the next layer is none of its cells."""
@@ -33,8 +30,6 @@ the next layer is none of its cells."""
 _TOUCH = 1e-3
 """A height this close to a border of layers is on the upper one's side, and a body this close to
 matter touches it [cells]."""
-
-_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * _BORDER
 
 
 @dataclass(frozen=True)
@@ -119,17 +114,23 @@ class Travel:
         The straight line where it is safe, else the path over the cells' centers: no shorter
         than what `path` returns.
         """
-        return np.array([self._length(position) for position in positions])
+        from r3jax.planning.robot.cells import segments_are_inside
 
-    def _length(self, position: np.ndarray) -> float:
-        cell = self.cell_of(position)
-        if not (self.contains(cell) and self.reachable[cell]):
-            return float("inf")
-        # The straight line first: no way is shorter, and `path` takes it too.
-        if segment_is_inside(self.usable, *self._in_cells(self.start, position)):
-            return float(np.linalg.norm(position - self.start))
-        last = float(np.linalg.norm(position - self.stops(np.array(cell))))
-        return self.distance(cell) + last
+        cells = np.floor((positions - self.origin) / self.cell_size).astype(np.int64)
+        is_inside = np.all((cells >= 0) & (cells < self.usable.shape), axis=1)
+        # Cell 0 stands in for those outside: a negative index would read from the far side.
+        cells = np.where(is_inside[:, None], cells, 0)
+        x, y, z = cells.T
+        from_start = np.linalg.norm(self.stops(np.array(self.start_cell)) - self.start)
+        last = np.linalg.norm(positions - self.stops(cells), axis=1)
+        lengths = np.where(is_inside, from_start + self.cost[x, y, z] + last, np.inf)
+        # The straight line where it is safe: no way is shorter, and `path` takes it too.
+        near = np.flatnonzero(np.isfinite(lengths))
+        ends = self.scaled(positions[near])
+        is_straight = segments_are_inside(self.usable, self.scaled(self.start), ends)
+        straight = near[is_straight]
+        lengths[straight] = np.linalg.norm(positions[straight] - self.start, axis=1)
+        return lengths
 
     def path(self, position: np.ndarray) -> np.ndarray:
         """Waypoints [K, 3] [m] from the robot to a position; every segment is safe throughout.
@@ -151,6 +152,8 @@ class Travel:
 
     def cells_along(self, waypoints: np.ndarray) -> np.ndarray:
         """Cells of the grid that the path over waypoints [K, 3] [m] crosses, [X, Y, Z] bool."""
+        from r3jax.planning.robot.cells import segment_cells
+
         swept = np.zeros(self.usable.shape, dtype=bool)
         for a, b in itertools.pairwise(waypoints):
             cells = segment_cells(*self._in_cells(a, b))
@@ -217,7 +220,7 @@ def plan_travel(
         ValueError: a position that is not finite, or not at an allowed height.
     """
     # Copied to the host once per decision; all that follows is lookups of single cells.
-    free = np.asarray(grid.free)
+    free = np.array(grid.free)
     cell_size = float(grid.cell_size)
     origin = np.asarray(grid.origin, dtype=np.float64)
     start = np.asarray(position, dtype=np.float64)
@@ -290,27 +293,10 @@ def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
         a: one end, in cells (cell (0, 0, 0) spans 0 to 1), [3].
         b: the other end.
     """
-    cells = segment_cells(a, b)
-    # NumPy would wrap negative indices round to the other side.
-    if np.any(cells < 0) or np.any(cells >= mask.shape):
-        return False
-    return bool(mask[cells[:, 0], cells[:, 1], cells[:, 2]].all())
+    # Imported only here: whoever plans no way does not wait for Numba.
+    from r3jax.planning.robot.cells import segments_are_inside
 
-
-def segment_cells(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cells that a segment between two points [cells] crosses or touches, [n, 3], repeated."""
-    points = [np.stack([a, b])]
-    for axis in range(3):
-        low, high = sorted((a[axis], b[axis]))
-        # Only where a segment passes a plane between two layers does it change cells.
-        planes = np.arange(np.floor(low) + 1.0, np.ceil(high))
-        # Along an axis on which both ends agree no plane is passed: nothing is divided by zero.
-        if planes.size:
-            t = (planes - a[axis]) / (b[axis] - a[axis])
-            crossing = a + t[:, None] * (b - a)
-            # On both sides of the plane, and of any other plane that is as good as touched.
-            points.append((crossing[:, None, :] + _CORNERS).reshape(-1, 3))
-    return np.floor(np.concatenate(points)).astype(np.int64)
+    return bool(segments_are_inside(mask, a, b[None])[0])
 
 
 def layers_between(
