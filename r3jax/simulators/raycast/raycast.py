@@ -19,8 +19,8 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.simulators import start
 from r3jax.simulators.clearance import SurfaceDistance
-from r3jax.simulators.raycast import shading
-from r3jax.simulators.raycast.rays import Hits, TriangleScene, join
+from r3jax.simulators.raycast.rays import Hits, TriangleScene
+from r3jax.simulators.raycast.shading import shade
 from r3jax.simulators.raycast.shading_tables import build_shading_tables
 from r3jax.simulators.world import World
 
@@ -205,34 +205,23 @@ class RaycastSimulator:
             f"Choose a free place{place}, or leave the start out and one is searched for"
         )
 
-    def _pixel_steps(self, T: np.ndarray) -> jnp.ndarray:
+    def _pixel_steps(self, T: np.ndarray) -> np.ndarray:
         """Change of the ray's direction from one column, and one row, to the next, [2, 3]."""
         focal = np.array([[float(self._camera.fx)], [float(self._camera.fy)]])
-        return jnp.asarray((T[:3, :2].T / focal).astype(np.float32))
+        return (T[:3, :2].T / focal).astype(np.float32)
 
     def _look(self, T: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, Hits]:
         """Colors [n, 3] and hits of rays `directions` [n, 3] from the camera."""
         steps = self._pixel_steps(T)
         origin = T[None, :3, 3].astype(np.float32)
-        parts: list[tuple[Hits, jax.Array]] = []
-        # While embree works on one chunk, the kernel colors the one before it.
-        for begin in range(0, len(directions), shading.CHUNK):
-            chunk = directions[begin : begin + shading.CHUNK]
-            hits = self._scene.cast(
-                np.repeat(origin, len(chunk), axis=0), chunk, cull_back_faces=self._cull
-            )
-            parts.append((hits, shading.start_shading(self._tables, hits, origin, chunk, steps)))
-        hits = join([hits for hits, _ in parts])
-        colors = [np.asarray(color)[:, : len(part.face)].T for part, color in parts]
-        colors = np.ascontiguousarray(np.concatenate(colors))
+        origins = np.repeat(origin, len(directions), axis=0)
+        hits = self._scene.cast(origins, directions, cull_back_faces=self._cull)
+        colors = shade(self._tables, hits, origin, directions, steps)
         if self._face_mirror is not None:
             share = np.where(hits.face >= 0, self._face_mirror[hits.face], np.float32(0.0))
-            mirrored = np.flatnonzero(share)
-            for begin in range(0, len(mirrored), shading.CHUNK):
-                rays = mirrored[begin : begin + shading.CHUNK]
-                seen = self._reflect(hits, rays, origin, directions, steps)
-                weight = share[rays, None]
-                colors[rays] = (np.float32(1.0) - weight) * colors[rays] + weight * seen
+            rays = np.flatnonzero(share)
+            weight, seen = share[rays, None], self._reflect(hits, rays, origin, directions, steps)
+            colors[rays] = (np.float32(1.0) - weight) * colors[rays] + weight * seen
         return colors, hits
 
     def _reflect(
@@ -241,9 +230,9 @@ class RaycastSimulator:
         rays: np.ndarray,
         origin: np.ndarray,
         directions: np.ndarray,
-        steps: jnp.ndarray,
+        steps: np.ndarray,
     ) -> np.ndarray:
-        """What the mirrors hit by `rays` (at most CHUNK indices) show, one bounce deep, [n, 3]."""
+        """What the mirrors hit by `rays` (indices) show, one bounce deep, [n, 3]."""
         normal = self._face_normals[hits.face[rays]]
         incoming, path = directions[rays], hits.distance[rays]
         along = np.einsum("ij,ij->i", normal, incoming)
@@ -252,10 +241,7 @@ class RaycastSimulator:
         side = -np.sign(along)[:, None] * normal * np.float32(1e-4)
         points = origin + path[:, None] * incoming + side
         onward = self._scene.cast(points, outgoing, cull_back_faces=self._cull)
-        colors = shading.start_shading(
-            self._tables, onward, points, outgoing, steps, path_before=path, mirror=normal
-        )
-        return np.asarray(colors)[:, : len(rays)].T
+        return shade(self._tables, onward, points, outgoing, steps, path_before=path, mirror=normal)
 
     @functools.cached_property
     def _face_normals(self) -> np.ndarray:
@@ -279,8 +265,7 @@ class RaycastSimulator:
         pixels = np.flatnonzero(_is_edge(image, face))
         if len(pixels) == 0:
             return
-        steps = np.asarray(self._pixel_steps(T))
-        shifts = (self._offsets @ steps).astype(np.float32)  # [S, 3]
+        shifts = (self._offsets @ self._pixel_steps(T)).astype(np.float32)  # [S, 3]
         rays = (directions[pixels][None] + shifts[:, None]).reshape(-1, 3)
         colors, _ = self._look(T, rays)
         flat = image.reshape(-1, 3)

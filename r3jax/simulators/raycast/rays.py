@@ -3,7 +3,7 @@
 Shape symbols: V vertices; F faces; n rays.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,14 +29,6 @@ class Hits:
 
     is_back: np.ndarray
     """True where the face is seen from behind, [n] bool."""
-
-
-def join(parts: list[Hits]) -> Hits:
-    """Hits of several batches of rays, one after the other."""
-    if len(parts) == 1:
-        return parts[0]
-    names = [field.name for field in fields(Hits)]
-    return Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 class TriangleScene:

@@ -1,4 +1,4 @@
-"""Colors of ray hits: textures, lamps, highlights. One jitted kernel over chunks of rays.
+"""Colors of ray hits: textures, lamps, highlights; in machine code, on all cores.
 
 The color c of a hit with surface color a (texture x material color x vertex color), normal n
 turned towards the viewer, lamps i at distance d_i in direction l_i with half vector h_i
@@ -13,263 +13,276 @@ with the emission e. A world without lamps shows a.
 Textures are filtered trilinearly, with PROBES samples along the longer axis of the pixel's
 footprint: isotropic mip maps would blur floors and walls seen at a low angle.
 
-Shape symbols: n rays of a chunk; L lamps.
+Shape symbols: n rays; F faces; K materials; T textures; L lamps; S texels.
 """
 
-from collections.abc import Callable
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
+import math
+
 import numpy as np
-from jaxtyping import Array, Float, Int
+from numba import prange
 
+from r3jax.native.compiled import called_from_python, inlined_fused
+from r3jax.native.ffi import num_workers, require_threads
 from r3jax.simulators.raycast.rays import Hits
 from r3jax.simulators.raycast.shading_tables import MAX_LEVELS, ShadingTables
-
-CHUNK = 1 << 15
-"""Rays per call of the kernel."""
 
 PROBES = 2
 """Trilinear samples along the longer axis of a footprint."""
 
-LEVEL_BIAS = -0.5
+LEVEL_BIAS = np.float32(-0.5)
 """Added to the mip level. Measured against 64 rays a pixel on a furnished house: with two probes
 and this bias the images are nearest (37.8 dB; 37.4 without bias, 36.2 with one probe)."""
 
+_BLOCK = 1 << 10
+"""Rays that a thread colors at a time: rays beside each other cost alike, and the image as a whole
+does not."""
 
-class Rays(eqx.Module):
-    """A chunk of ray hits."""
+_FAINTEST = np.float32(-25.0)
+"""log2 of a highlight that counts for nothing."""
 
-    face: Int[Array, " n"]
-    """Index of the face, -1: nothing was hit."""
-
-    u: Float[Array, " n"]
-    """Barycentric weight of corner 1."""
-
-    v: Float[Array, " n"]
-    """Barycentric weight of corner 2."""
-
-    distance: Float[Array, " n"]
-    """Ray parameter of the hit, in lengths of the direction; anything where nothing was hit."""
-
-    direction: Float[Array, "n 3"]
-    """Direction of the (last) ray; not of unit length."""
-
-    origin: Float[Array, "n_or_1 3"]
-    """Where the ray starts [m]."""
-
-    mirror: Float[Array, "n_or_1 3"]
-    """Unit normal of the mirror that the ray came by, 0 for rays straight from the camera."""
-
-    path_before: Float[Array, " n_or_1"]
-    """Length of the path from the camera to `origin`, in the unit of `distance`."""
+_ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+_LEAST, _TINY, _BYTE = np.float32(1e-6), np.float32(1e-12), np.float32(255.0)
 
 
-def _dot(a: Array | list[Array], b: Array | list[Array]) -> Array:
-    """Scalar products of vectors whose three components are the rows of `a` and `b`."""
-    # Written out: XLA's reductions over such a short axis are many times slower on a CPU.
+@inlined_fused
+def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _footprint(
-    gradient: Float[Array, "6 n"],
-    normal: Float[Array, "3 n"],
-    rays: Rays,
-    distance: Float[Array, " n"],
-    pixel_steps: Float[Array, "2 3"],
-) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"]]:
-    """How far, in texels, the hit moves when the pixel moves by one column and by one row.
+@inlined_fused
+def _unit(a):
+    inverse = _ONE / max(math.sqrt(_dot(a, a)), _LEAST)
+    return a[0] * inverse, a[1] * inverse, a[2] * inverse
+
+
+@inlined_fused
+def _three(table, i, begin):
+    return table[i, begin], table[i, begin + 1], table[i, begin + 2]
+
+
+@inlined_fused
+def _moved(step, mirror, normal, along, direction, path, gradients):
+    """How far, in texels, a hit moves when the pixel moves by one column or row.
 
     With the plane's normal n and direction d, a change e of the direction moves the hit by
     t (e - d (n e) / (n d)) (Igehy, "Tracing ray differentials", 1999). A mirror reflects e.
     """
-    direction, mirror = rays.direction.T, rays.mirror.T
-    path = distance + rays.path_before
-    along = _dot(normal, direction)
-    along = jnp.where(jnp.abs(along) < 1e-6, 1e-6, along)
-
-    def moved(step: Float[Array, " 3"]) -> Float[Array, "2 n"]:
-        reflected = step[:, None] - 2.0 * mirror * _dot(mirror, step)[None, :]
-        reflected = jnp.broadcast_to(reflected, direction.shape)
-        slide = _dot(normal, reflected) / along
-        move = path[None, :] * (reflected - direction * slide[None, :])
-        return jnp.stack([_dot(gradient[:3], move), _dot(gradient[3:], move)])
-
-    return moved(pixel_steps[0]), moved(pixel_steps[1])
+    twice = _TWO * _dot(mirror, step)
+    e = step[0] - twice * mirror[0], step[1] - twice * mirror[1], step[2] - twice * mirror[2]
+    slide = _dot(normal, e) / along
+    move = (
+        path * (e[0] - direction[0] * slide), path * (e[1] - direction[1] * slide),
+        path * (e[2] - direction[2] * slide),
+    )  # fmt: skip
+    return _dot(gradients[0], move), _dot(gradients[1], move)
 
 
-def _texture_color(
-    tables: ShadingTables,
-    texture: Int[Array, " n"],
-    texel: Float[Array, "2 n"],
-    moves: tuple[Float[Array, "2 n"], Float[Array, "2 n"]],
-) -> Float[Array, "3 n"]:
-    """Filtered texture colors in [0, 1]."""
-    size = _rows(tables.sizes, texture).T  # [2, n]
-    lengths = [jnp.sqrt(move[0] ** 2 + move[1] ** 2) for move in moves]
-    is_first_longer = lengths[0] >= lengths[1]
-    long_axis = jnp.where(is_first_longer[None, :], moves[0], moves[1])
-    longer, shorter = jnp.maximum(*lengths), jnp.minimum(*lengths)
-    width = jnp.maximum(longer / PROBES, shorter)
-    level = jnp.clip(jnp.log2(jnp.maximum(width, 1e-6)) + LEVEL_BIAS, 0.0, MAX_LEVELS - 1.0)
-    fine = jnp.floor(level)
+@inlined_fused
+def _wrapped_pair(x, size):
+    """The two texels next to x of a texture that repeats, and the second one's weight."""
+    low = np.float32(math.floor(x))
+    first = np.int32(low)
+    # A branch that is foreseen nearly always: a remainder costs more than what is fetched.
+    if (first < 0) | (first >= size):
+        first = first % size
+    second = first + np.int32(1)
+    return first, (second if second < size else np.int32(0)), x - low
+
+
+@inlined_fused
+def _add_texel(texel, weight, color):
+    return (
+        color[0] + weight * np.float32(texel & np.uint32(255)),
+        color[1] + weight * np.float32((texel >> np.uint32(8)) & np.uint32(255)),
+        color[2] + weight * np.float32((texel >> np.uint32(16)) & np.uint32(255)),
+    )
+
+
+@inlined_fused
+def _texture_color(atlas, texture, x, y, moves):
+    """Filtered color of a texture in [0, 1]."""
+    texels, sizes, offsets = atlas
+    width, height = sizes[texture, 0], sizes[texture, 1]
+    a, b = moves
+    length_a = math.sqrt(a[0] * a[0] + a[1] * a[1])
+    length_b = math.sqrt(b[0] * b[0] + b[1] * b[1])
+    axis = a if length_a >= length_b else b
+    longer, shorter = max(length_a, length_b), min(length_a, length_b)
+    level = math.log2(max(longer / np.float32(PROBES), shorter, _LEAST)) + LEVEL_BIAS
+    level = min(max(level, _ZERO), np.float32(MAX_LEVELS - 1))
+    fine = np.float32(math.floor(level))
     blend = level - fine
     # Probes spread only as far as the footprint is longer than wide.
-    spread = 1.0 - jnp.minimum(shorter / jnp.maximum(longer, 1e-6), 1.0)
-
-    indices: list[Array] = []
-    weights: list[Array] = []
-    for coarser in range(2):
-        k = jnp.minimum(fine.astype(jnp.int32) + coarser, MAX_LEVELS - 1)
-        size_k = jnp.maximum(size >> k[None, :], 1)
-        start = _rows(tables.offsets.reshape(-1), texture * MAX_LEVELS + k)
-        scale = size_k.astype(jnp.float32) / size.astype(jnp.float32)
-        share = (blend if coarser else 1.0 - blend) / PROBES
+    spread = _ONE - min(shorter / max(longer, _LEAST), _ONE)
+    color = (_ZERO, _ZERO, _ZERO)
+    # Between two levels; a magnified texture has but one.
+    for coarser in range(2 if blend > _ZERO else 1):
+        k = min(np.int64(fine) + coarser, MAX_LEVELS - 1)
+        columns, rows = np.int32(max(width >> k, 1)), np.int32(max(height >> k, 1))
+        start = np.int64(offsets[texture, k])
+        scale_x, scale_y = (
+            np.float32(columns) / np.float32(width),
+            np.float32(rows) / np.float32(height),
+        )
+        share = (blend if coarser == 1 else _ONE - blend) / np.float32(PROBES)
         for probe in range(PROBES):
-            shift = ((probe + 0.5) / PROBES - 0.5) * spread
-            x, y = (texel + shift[None, :] * long_axis) * scale - 0.5
-            columns, fx = _wrapped_pair(x, size_k[0])
-            rows, fy = _wrapped_pair(y, size_k[1])
-            for i, wy in enumerate((1.0 - fy, fy)):
-                for j, wx in enumerate((1.0 - fx, fx)):
-                    indices.append(start + rows[i] * size_k[0] + columns[j])
-                    weights.append(share * wx * wy)
-    index = jnp.clip(jnp.stack(indices), 0, tables.texels.shape[0] - 1)
-    # One gather of whole texels, kept apart from what follows: fused, XLA would fetch every
-    # texel once per channel.
-    packed = jax.lax.optimization_barrier(_rows(tables.texels, index))
-    channels: list[Array] = []
-    for shift in (0, 8, 16):
-        values = [((texels >> shift) & jnp.uint32(255)).astype(jnp.float32) for texels in packed]
-        total = sum(w * value for w, value in zip(weights, values, strict=True))
-        channels.append(jnp.asarray(total))
-    return jnp.stack(channels) / 255.0
+            shift = ((np.float32(probe) + _HALF) / np.float32(PROBES) - _HALF) * spread
+            i0, i1, fx = _wrapped_pair((x + shift * axis[0]) * scale_x - _HALF, columns)
+            j0, j1, fy = _wrapped_pair((y + shift * axis[1]) * scale_y - _HALF, rows)
+            top, bottom = start + np.int64(j0) * columns, start + np.int64(j1) * columns
+            upper, lower = share * (_ONE - fy), share * fy
+            color = _add_texel(texels[top + i0], upper * (_ONE - fx), color)
+            color = _add_texel(texels[top + i1], upper * fx, color)
+            color = _add_texel(texels[bottom + i0], lower * (_ONE - fx), color)
+            color = _add_texel(texels[bottom + i1], lower * fx, color)
+    return color[0] / _BYTE, color[1] / _BYTE, color[2] / _BYTE
 
 
-def _rows(table: Array, index: Int[Array, "..."]) -> Array:
-    """`table[index]` for indices known to be inside: the check would cost more than the fetch."""
-    return table.at[index].get(mode="promise_in_bounds")
+@inlined_fused
+def _light(lamps, position, normal, view, specular, shininess):
+    """Sums over the lamps of the module's formula: diffuse light and highlights, RGB each."""
+    diffuse, highlight = (_ZERO, _ZERO, _ZERO), (_ZERO, _ZERO, _ZERO)
+    # Farther off the mirror's direction a highlight is less than float32 can add to a color.
+    edge = math.exp2(_FAINTEST / max(shininess, _LEAST)) if specular > _ZERO else _TWO
+    for i in range(lamps.shape[0]):
+        x, y, z = lamps[i, 0] - position[0], lamps[i, 1] - position[1], lamps[i, 2] - position[2]
+        squared = x * x + y * y + z * z
+        towards = x * normal[0] + y * normal[1] + z * normal[2]
+        if towards > _ZERO:
+            scale = _ONE / math.sqrt(max(squared, _TINY))
+            reach = lamps[i, 6] * lamps[i, 6]
+            light = reach / (reach + squared)
+            r, g, b = lamps[i, 3] * light, lamps[i, 4] * light, lamps[i, 5] * light
+            incidence = towards * scale
+            diffuse = (
+                diffuse[0] + r * incidence, diffuse[1] + g * incidence, diffuse[2] + b * incidence,
+            )  # fmt: skip
+            half = x * scale + view[0], y * scale + view[1], z * scale + view[2]
+            along, length = _dot(normal, half), max(_dot(half, half), _TINY)
+            if (along > _ZERO) & (along * along > edge * edge * length):
+                gloss = math.exp2(shininess * math.log2(along / math.sqrt(length)))
+                highlight = (
+                    highlight[0] + r * gloss, highlight[1] + g * gloss, highlight[2] + b * gloss,
+                )  # fmt: skip
+    return diffuse, highlight
 
 
-def _wrapped_pair(
-    x: Float[Array, " n"], size: Int[Array, " n"]
-) -> tuple[list[Int[Array, " n"]], Float[Array, " n"]]:
-    """The two texels next to x of a texture that repeats, and the second one's weight."""
-    # In floating point: integer remainders do not vectorize, and cost more than the fetches.
-    limit = size.astype(jnp.float32)
-    low = jnp.floor(x)
-    first = low - limit * jnp.floor(low / limit)
-    first = jnp.where(first >= limit, 0.0, first)
-    second = jnp.where(first + 1.0 >= limit, 0.0, first + 1.0)
-    return [first.astype(jnp.int32), second.astype(jnp.int32)], x - low
+@inlined_fused
+def _lit(lamps, ambient, albedo, look, position, normal, direction):
+    """The module's formula for a world with lamps; `look`: specular, shininess, emission."""
+    view = _unit((-direction[0], -direction[1], -direction[2]))
+    if _dot(normal, view) < _ZERO:
+        normal = -normal[0], -normal[1], -normal[2]
+    diffuse, highlight = _light(lamps, position, normal, view, look[0], look[1])
+    emission, dark = look[2], _ONE - ambient
+    shares = (
+        emission + (_ONE - emission) * (ambient + dark * diffuse[0]),
+        emission + (_ONE - emission) * (ambient + dark * diffuse[1]),
+        emission + (_ONE - emission) * (ambient + dark * diffuse[2]),
+    )
+    return (
+        albedo[0] * shares[0] + look[0] * highlight[0],
+        albedo[1] * shares[1] + look[0] * highlight[1],
+        albedo[2] * shares[2] + look[0] * highlight[2],
+    )
 
 
-def _lit(
-    tables: ShadingTables,
-    albedo: Float[Array, "3 n"],
-    look: Float[Array, "8 n"],
-    normal: Float[Array, "3 n"],
-    rays: Rays,
-    distance: Float[Array, " n"],
-) -> Float[Array, "3 n"]:
-    """The module's formula for a world with lamps."""
-    unit: Callable[[Array], Array] = lambda x: x / jnp.maximum(jnp.sqrt(_dot(x, x)), 1e-6)[None, :]
-    view = unit(-rays.direction.T)
-    facing = jnp.where((_dot(normal, view) < 0.0)[None, :], -normal, normal)
-    position = rays.origin.T + distance[None, :] * rays.direction.T
-    # All that is per ray is worked out once, not once per lamp.
-    view, facing, position = jax.lax.optimization_barrier((view, facing, position))
-
-    def per_lamp(x: Array) -> list[Array]:
-        return [row[None, :] for row in x]  # [1, n] each, against [L, 1]
-
-    view_of, facing_of = per_lamp(view), per_lamp(facing)
-    offset = [tables.lamps[:, k, None] - position[None, k] for k in range(3)]
-    squared = _dot(offset, offset)
-    fall = 1.0 / (1.0 + squared / tables.lamps[:, 6, None] ** 2)
-    scale = jax.lax.rsqrt(jnp.maximum(squared, 1e-12))
-    to_lamp = [x * scale for x in offset]
-    incidence = _dot(facing_of, to_lamp)
-    half = [x + y for x, y in zip(to_lamp, view_of, strict=True)]
-    cosine = _dot(facing_of, half) * jax.lax.rsqrt(jnp.maximum(_dot(half, half), 1e-12))
-    specular, shininess, emission = look[3], look[4], look[5]
-    gloss = jnp.exp2(shininess[None, :] * jnp.log2(jnp.maximum(cosine, 1e-6)))
-    gloss = jnp.where(incidence > 0.0, gloss, 0.0)
-    colors = tables.lamps[:, 3:6].T  # [3, L]
-    diffuse = colors @ (fall * jnp.maximum(incidence, 0.0))
-    highlight = colors @ (fall * gloss)
-    received = tables.ambient + (1.0 - tables.ambient) * diffuse
-    lit = emission[None, :] + (1.0 - emission)[None, :] * received
-    return albedo * lit + specular[None, :] * highlight
+@inlined_fused
+def _color_of_hit(world, face, u, v, distance, origin, direction, mirror, before, steps):
+    """Color of one hit."""
+    faces, corner_colors, materials, atlas, lamps, ambient = world
+    material = np.int64(faces[face, 15])
+    normal, albedo = _three(faces, face, 12), _three(materials, material, 0)
+    texture = np.int64(materials[material, 6])
+    if texture >= 0:
+        x = faces[face, 0] + u * faces[face, 2] + v * faces[face, 4]
+        y = faces[face, 1] + u * faces[face, 3] + v * faces[face, 5]
+        along, path = _dot(normal, direction), distance + before
+        along = _LEAST if abs(along) < _LEAST else along
+        gradients = _three(faces, face, 6), _three(faces, face, 9)
+        moves = (
+            _moved(_three(steps, 0, 0), mirror, normal, along, direction, path, gradients),
+            _moved(_three(steps, 1, 0), mirror, normal, along, direction, path, gradients),
+        )
+        c = _texture_color(atlas, texture, x, y, moves)
+        albedo = albedo[0] * c[0], albedo[1] * c[1], albedo[2] * c[2]
+    if corner_colors.shape[0] > 0:
+        w, at = _ONE - u - v, corner_colors[face]
+        albedo = (
+            albedo[0] * (w * at[0] + u * at[3] + v * at[6]),
+            albedo[1] * (w * at[1] + u * at[4] + v * at[7]),
+            albedo[2] * (w * at[2] + u * at[5] + v * at[8]),
+        )
+    if lamps.shape[0] == 0:
+        return albedo
+    position = (
+        origin[0] + distance * direction[0], origin[1] + distance * direction[1],
+        origin[2] + distance * direction[2],
+    )  # fmt: skip
+    look = _three(materials, material, 3)
+    return _lit(lamps, ambient, albedo, look, position, normal, direction)
 
 
-@jax.jit
+@called_from_python(parallel=True)
+def _shade_all(
+    faces, corner_colors, materials, texels, sizes, offsets, lamps, ambient,
+    face, u, v, distance, directions, origins, mirrors, before, steps, workers, colors,
+):  # fmt: skip
+    """Colors all hits. Flat arguments: Numba's threads take no nested ones."""
+    num = face.shape[0]
+    blocks = (num + _BLOCK - 1) // _BLOCK
+    for worker in prange(workers):
+        # Every `workers`-th block, so that each thread gets of all parts of the image.
+        for block in range(worker, blocks, workers):
+            for i in range(block * _BLOCK, min((block + 1) * _BLOCK, num)):
+                if face[i] < 0:
+                    colors[i, 0] = colors[i, 1] = colors[i, 2] = _ZERO
+                else:
+                    color = _color_of_hit(
+                        (faces, corner_colors, materials, (texels, sizes, offsets), lamps, ambient),
+                        face[i], u[i], v[i], distance[i],
+                        _three(origins, min(i, origins.shape[0] - 1), 0), _three(directions, i, 0),
+                        _three(mirrors, min(i, mirrors.shape[0] - 1), 0),
+                        before[min(i, before.shape[0] - 1)], steps,
+                    )  # fmt: skip
+                    for channel in range(3):
+                        colors[i, channel] = min(max(color[channel], _ZERO), _ONE)
+
+
 def shade(
-    tables: ShadingTables, rays: Rays, pixel_steps: Float[Array, "2 3"]
-) -> Float[Array, "3 n"]:
-    """Colors of a chunk of hits, in [0, 1]; black where nothing was hit.
-
-    Args:
-        tables: the world's tables.
-        rays: the hits.
-        pixel_steps: by how much the camera's ray direction changes from one column (row 0) and
-            from one row (row 1) of pixels to the next.
-    """
-    face = jnp.maximum(rays.face, 0)
-    distance = jnp.where(rays.face >= 0, rays.distance, 1.0)
-    # One row of 64 bytes per ray; without the barrier each use would fetch it again.
-    row = jax.lax.optimization_barrier(_rows(tables.faces, face)).T
-    look = jax.lax.optimization_barrier(_rows(tables.materials, row[15].astype(jnp.int32))).T
-    normal = row[12:15]
-    texel = row[0:2] + rays.u[None, :] * row[2:4] + rays.v[None, :] * row[4:6]
-    moves = _footprint(row[6:12], normal, rays, distance, pixel_steps)
-    texture = look[6].astype(jnp.int32)
-    sampled = _texture_color(tables, jnp.maximum(texture, 0), texel, moves)
-    albedo = look[:3] * jnp.where(texture[None, :] >= 0, sampled, 1.0)
-    if tables.corner_colors.shape[0] > 1:
-        corner = jax.lax.optimization_barrier(_rows(tables.corner_colors, face)).T
-        w0 = (1.0 - rays.u - rays.v)[None, :]
-        mixed = w0 * corner[:3] + rays.u[None, :] * corner[3:6] + rays.v[None, :] * corner[6:]
-        albedo = albedo * mixed
-    color = albedo
-    if tables.lamps.shape[0] > 0:
-        color = _lit(tables, albedo, look, normal, rays, distance)
-    return jnp.where(rays.face[None, :] >= 0, jnp.clip(color, 0.0, 1.0), 0.0)
-
-
-def start_shading(
     tables: ShadingTables,
     hits: Hits,
     origins: np.ndarray,
     directions: np.ndarray,
-    pixel_steps: Float[Array, "2 3"],
+    pixel_steps: np.ndarray,
     *,
     path_before: np.ndarray | None = None,
     mirror: np.ndarray | None = None,
-) -> Float[Array, "3 chunk"]:
-    """Colors of at most CHUNK hits, of which the first n columns count.
-
-    Returns at once: the kernel runs in the background until the result is read.
+) -> np.ndarray:
+    """Colors of hits in [0, 1], black where nothing was hit, [n, 3] float32.
 
     Args:
         tables: the world's tables.
         hits: of n rays.
         origins: where the rays start, [n, 3], or [1, 3] if all start there [m].
-        directions: of the rays [n, 3].
-        pixel_steps: see `shade`.
+        directions: of the rays [n, 3], of any length.
+        pixel_steps: by how much the camera's ray direction changes from one column (row 0) and
+            from one row (row 1) of pixels to the next [2, 3].
         path_before: length of the path to `origins`, in the same unit as the hits' distances [n].
-        mirror: normals of the mirrors that the rays come by [n, 3].
+        mirror: unit normals of the mirrors that the rays come by [n, 3].
     """
+    require_threads()
     path_before = np.zeros(1, np.float32) if path_before is None else path_before
     mirror = np.zeros((1, 3), np.float32) if mirror is None else mirror
-    columns = (hits.face, hits.u, hits.v, hits.distance, directions, origins, mirror, path_before)
-    return shade(tables, Rays(*(jnp.asarray(_filled(c)) for c in columns)), pixel_steps)
-
-
-def _filled(column: np.ndarray) -> np.ndarray:
-    """The column extended to CHUNK rows, unless it is a single row that serves all."""
-    missing = CHUNK - len(column)
-    if missing == 0 or len(column) == 1:
-        return column
-    return np.concatenate([column, np.zeros((missing, *column.shape[1:]), column.dtype)])
+    per_ray = (hits.face, hits.u, hits.v, hits.distance, directions, origins, mirror, path_before)
+    colors = np.empty((len(hits.face), 3), np.float32)
+    _shade_all(
+        tables.faces, tables.corner_colors, tables.materials, tables.texels, tables.sizes,
+        tables.offsets, tables.lamps, tables.ambient,
+        # One layout and writable, whatever the caller's are: each other one compiles anew.
+        *(np.require(x, requirements="CW") for x in per_ray), pixel_steps, num_workers(), colors,
+    )  # fmt: skip
+    return colors

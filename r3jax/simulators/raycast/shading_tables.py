@@ -2,19 +2,16 @@
 
 All textures lie in one flat array of texels, mip levels included: the kernel fetches any texel of
 any material by one integer index. Levels are box-filtered on the stored (sRGB-encoded) bytes, as
-GL's own mipmaps and Habitat's are. Sizes are rounded up, so that worlds share compiled kernels.
+GL's own mipmaps and Habitat's are.
 
 Shape symbols: F faces; K materials; T textures; L lamps; S texels of all levels of all textures.
 """
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Float, Int, UInt32
 
 from r3jax.simulators.world import World
 
@@ -30,7 +27,7 @@ class TextureAtlas:
     """red + 256 green + 65536 blue, [S] uint32."""
 
     sizes: np.ndarray
-    """Width and height of level 0, [T, 2] int32; 1 in the rows beyond the last texture."""
+    """Width and height of level 0, [T, 2] int32."""
 
     offsets: np.ndarray
     """Index of each level's first texel, [T, MAX_LEVELS] int32; the last level repeats."""
@@ -43,15 +40,14 @@ def build_atlas(images: list[np.ndarray]) -> TextureAtlas:
         images: textures [h, w, 3] uint8 of any size.
 
     Returns:
-        The atlas. Its tables are rounded up in size (see `round_up`).
+        The atlas.
 
     Raises:
         ValueError: the textures together are too large to be indexed with 31 bits.
     """
     pieces: list[np.ndarray] = []
-    rows = round_up(len(images), least=16)
-    sizes = np.ones((rows, 2), dtype=np.int32)
-    offsets = np.zeros((rows, MAX_LEVELS), dtype=np.int64)
+    sizes = np.ones((len(images), 2), dtype=np.int32)
+    offsets = np.zeros((len(images), MAX_LEVELS), dtype=np.int64)
     total = 0
     for i, image in enumerate(images):
         sizes[i] = image.shape[1], image.shape[0]
@@ -63,15 +59,12 @@ def build_atlas(images: list[np.ndarray]) -> TextureAtlas:
                 total += len(pieces[-1])
             else:
                 offsets[i, k] = offsets[i, k - 1]
-    length = round_up(total)
-    if length >= 2**31:
+    if total >= 2**31:
         raise ValueError(
             f"the world's textures hold {total:.3g} texels, more than the 2^31 that can be "
             "indexed: halve the texture sizes"
         )
-    texels = np.zeros(length, dtype=np.uint32)
-    if pieces:
-        np.concatenate(pieces, out=texels[:total])
+    texels = np.concatenate(pieces) if pieces else np.zeros(0, np.uint32)
     return TextureAtlas(texels, sizes, offsets.astype(np.int32))
 
 
@@ -100,37 +93,33 @@ def _pack(image: np.ndarray) -> np.ndarray:
     return quads.reshape(-1, 4).view("<u4")[:, 0]
 
 
-def round_up(count: int, least: int = 1024) -> int:
-    """The next power of two, at least `least`: most worlds then share one compiled kernel."""
-    return 1 << (max(count, least) - 1).bit_length()
-
-
-class ShadingTables(eqx.Module):
+@dataclass(frozen=True)
+class ShadingTables:
     """What the kernel needs to know of a world, as tables."""
 
-    faces: Float[Array, "F 16"]
+    faces: Float[np.ndarray, "F 16"]
     """Texel coordinates of corner 0 and of the edges to corners 1 and 2 (6 numbers); gradients
     of the texel coordinates [1/m] (6); unit normal (3); index of the material (1)."""
 
-    corner_colors: Float[Array, "F_or_1 9"]
-    """Vertex colors; one row of ones where the world has none."""
+    corner_colors: Float[np.ndarray, "F_or_0 9"]
+    """Vertex colors; no row where the world has none."""
 
-    materials: Float[Array, "K 8"]
+    materials: Float[np.ndarray, "K 8"]
     """Color (3), specular, shininess, emission, index of the texture (-1: none), 0."""
 
-    texels: UInt32[Array, " S"]
+    texels: UInt32[np.ndarray, " S"]
     """See `TextureAtlas`."""
 
-    sizes: Int[Array, "T 2"]
+    sizes: Int[np.ndarray, "T 2"]
     """Width and height of the textures."""
 
-    offsets: Int[Array, "T levels"]
+    offsets: Int[np.ndarray, "T levels"]
     """First texel of each level."""
 
-    lamps: Float[Array, "L 7"]
-    """Position (3), color (3), reach; black ones fill up to a multiple of 8."""
+    lamps: Float[np.ndarray, "L 7"]
+    """Position (3), color (3), reach."""
 
-    ambient: Float[Array, ""]
+    ambient: np.float32
     """Share of the surface color that shows without any lamp."""
 
 
@@ -152,22 +141,17 @@ def build_shading_tables(world: World, *, lighting: bool) -> ShadingTables:
         rows[k] = (*material.color, *look, texture_of[k], 0.0)
     faces = _face_table(world, material_size)
     colors = world.face_color
-    corner_colors = np.ones((1, 9)) if colors is None else _padded(colors.reshape(-1, 9))
+    colors = np.zeros((0, 9)) if colors is None else colors.reshape(-1, 9)
     lamps = [(*lamp.position, *lamp.color, lamp.reach) for lamp in world.lamps if lighting]
-    # Dark lamps fill up the table, so that worlds share compiled kernels.
-    lamps += [(0.0,) * 6 + (1.0,)] * (-len(lamps) % 8)
-    as_float: Callable[[np.ndarray | float], Array] = lambda x: jnp.asarray(
-        np.asarray(x, dtype=np.float32)
-    )
     return ShadingTables(
-        faces=as_float(_padded(faces)),
-        corner_colors=as_float(corner_colors),
-        materials=as_float(_padded(rows, least=16)),
-        texels=jnp.asarray(atlas.texels),
-        sizes=jnp.asarray(atlas.sizes),
-        offsets=jnp.asarray(atlas.offsets),
-        lamps=as_float(np.reshape(lamps, (-1, 7))),
-        ambient=as_float(world.ambient),
+        faces=faces.astype(np.float32),
+        corner_colors=colors.astype(np.float32),
+        materials=rows,
+        texels=atlas.texels,
+        sizes=atlas.sizes,
+        offsets=atlas.offsets,
+        lamps=np.reshape(lamps, (-1, 7)).astype(np.float32),
+        ambient=np.float32(world.ambient),
     )
 
 
@@ -187,12 +171,6 @@ def _unique_textures(world: World) -> tuple[list[np.ndarray], list[int]]:
             images.append(material.texture)
         texture_of.append(index[key])
     return images, texture_of
-
-
-def _padded(table: np.ndarray, least: int = 1024) -> np.ndarray:
-    """Adds rows of zeros up to `round_up`, so that worlds share compiled kernels."""
-    extra = round_up(len(table), least) - len(table)
-    return np.concatenate([table, np.zeros((extra, table.shape[1]), table.dtype)])
 
 
 def _face_table(world: World, material_size: np.ndarray) -> np.ndarray:
