@@ -17,15 +17,15 @@ from r3jax.cli.options.groups import (
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Explore a small embedded flat, train splats on the views, judge them; takes minutes."""
+    """Explore a small embedded flat, train splats on the frames, judge them; takes minutes."""
 
     EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax demo", "r3jax demo --views 12 --iterations 500")
 
     out: Path = Path("runs")
     """Folder that holds the runs; the demo overwrites `demo` in it and nothing else."""
 
-    views: int = 24
-    """Views to take."""
+    views: int = 16
+    """Views to choose; frames on the way to them come on top."""
 
     resolution: int = 256
     """Width and height of the images [px]."""
