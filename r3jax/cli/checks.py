@@ -47,7 +47,11 @@ _WITH_FORK = (
     "fork", "at", "policy", "budget", "until", "name", "out", "overwrite", "candidates", "lambda1",
     "lambda2", "refine", "live", "port",
 )  # fmt: skip
-"""Options that make sense beside these; all others are fixed by the recorded run."""
+_WITH_SUBMISSION = (
+    "submission", "check", "scenes", "snapshots", "out", "train_resolution", "iterations",
+    "gaussians", "capacity", "test_views", "lpips", "backend", "engine", "jobs", "slurm",
+)  # fmt: skip
+"""Options that make sense beside these; all others are fixed by what was recorded."""
 
 
 def check_options(options: object) -> None:
@@ -128,6 +132,15 @@ def _(options: TeamOptions) -> None:
 
 @_check.register
 def _(options: BenchmarkOptions) -> None:
+    if options.submission:
+        _refuse_others(options, "--submission", _WITH_SUBMISSION)
+        for path in options.submission:
+            if not path.is_file():
+                raise UserError(f"{path}: there is no such file")
+        if options.scenes != BenchmarkOptions.scenes and not options.scenes.startswith("mesh:"):
+            raise ValueError("--scenes tells where the mesh of a submission lies: mesh:<file>")
+    elif options.check:
+        raise ValueError("--check belongs to --submission FILE")
     for scene in words(options.scenes):
         check_scene(scene, options.scale)
     for policy in words(options.policies):
@@ -192,6 +205,10 @@ def _(options: ReplayOptions | ForecastOptions) -> None:
 @_check.register
 def _(options: ExportOptions) -> None:
     _check_run(options.path)
+    if options.format == "submission":
+        if options.out.exists():
+            raise UserError(f"{options.out}: something is there already: give another file")
+        return
     _check_folder(options.out)
     if options.out.is_dir() and any(options.out.iterdir()):
         raise UserError(f"{options.out}: something is there already: give another folder")
@@ -217,7 +234,7 @@ def _(options: MergeOptions) -> None:
 
 
 def _refuse_others(
-    options: ExploreOptions | TeamOptions, flag: str, allowed: tuple[str, ...]
+    options: ExploreOptions | TeamOptions | BenchmarkOptions, flag: str, allowed: tuple[str, ...]
 ) -> None:
     """A setting that would be ignored is a mistake.
 
@@ -228,7 +245,8 @@ def _refuse_others(
     given = [field.name for field in fields if getattr(options, field.name) != field.default]
     if given:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise ValueError(f"{flag} takes these from the recorded run, leave them out: {names}")
+        source = "submission" if flag == "--submission" else "recorded run"
+        raise ValueError(f"{flag} takes these from the {source}, leave them out: {names}")
 
 
 def _check_policy(name: str) -> None:

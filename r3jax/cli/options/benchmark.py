@@ -109,13 +109,31 @@ class MachineOptions:
     `slurm_partition=gpu`, `gpus_per_node=1`, ..."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SubmissionOptions:
+    """Views that were chosen elsewhere."""
+
+    TITLE: ClassVar[str] = "submissions"
+
+    submission: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE")] = ()
+    """Judge these submissions (`r3jax export --format submission` writes one): check them, take
+    their frames again, train and judge. Scene, seed, budget and sensor are their own; where a mesh
+    lies, --scenes tells."""
+
+    check: bool = False
+    """With --submission: check and do no more. Exits with 1 if a rule is broken."""
+
+
 @dataclass(frozen=True)
-class BenchmarkOptions(ExplorationOptions, TrainingOptions, MeshOptions, MachineOptions):
+class BenchmarkOptions(
+    SubmissionOptions, ExplorationOptions, TrainingOptions, MeshOptions, MachineOptions
+):
     """Compare policies on equal terms: explore, train and judge scenes x policies x seeds."""
 
     EXAMPLES: ClassVar[tuple[str, ...]] = (
         "r3jax benchmark --scenes flat,office --policies ours,random --seeds 0,1",
         "r3jax benchmark --budget views:60 --snapshots views:30,views:60 --jobs 2",
+        "r3jax benchmark --submission theirs.jsonl --check",
     )
 
     scenes: Annotated[str, tyro.conf.arg(metavar="A,B")] = "flat,office"
