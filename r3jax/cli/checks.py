@@ -32,6 +32,7 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.names import parse_topics
 from r3jax.planning.policies import check_policy
+from r3jax.planning.policies.foreign.commands import short_name
 from r3jax.planning.robot.motion import Motion, make_motion
 from r3jax.simulators.scenes.names import check_scene
 
@@ -312,8 +313,7 @@ def default_name(options: ExploreOptions, scene: str, policy: str) -> str:
     if kind == "habitat" and colon:
         stem = f"habitat-{stem.removesuffix('.stage_config')}"
     motion = "" if options.motion == "free" else f"-{options.motion}"
-    own = policy.rpartition(":")[2]  # of package.module:Class
-    return f"{stem}-{own}{motion}-seed{options.seed}"
+    return f"{stem}-{short_name(policy)}{motion}-seed{options.seed}"
 
 
 def team_folder(options: TeamOptions, scene: str) -> Path:
