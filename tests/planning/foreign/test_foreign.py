@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import r3jax
+from r3jax.apps.team.team import Member, explore_team
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import StopReason
@@ -244,7 +245,7 @@ def test_a_question_that_is_timed_again_is_asked_once_and_takes_as_long(tmp_path
         assert info.stage_seconds["scoring"] >= 0.2
     later = observe(again[1], room.render(first[0].T_world_camera))
     decide(later, first[0].T_world_camera, key)
-    with pytest.raises(PolicyError, match="cannot go back to view 1"):
+    with pytest.raises(PolicyError, match="has seen 2 frames and cannot go to view 1"):
         decide(planner, room.start_pose, key)
     (session,) = policy._sessions.values()
     pid = session.program._process.pid
@@ -253,6 +254,29 @@ def test_a_question_that_is_timed_again_is_asked_once_and_takes_as_long(tmp_path
         os.kill(pid, 0)
     with pytest.raises(PolicyError, match="has ended"):
         decide(later, first[0].T_world_camera, key)
+
+
+def test_a_team_may_ask_programs(tmp_path):
+    """Each is shown what the others see, too; afterwards all have ended."""
+    policies = [exec_policy(command_of(tmp_path, LOTS)) for _ in range(2)]
+    rooms = BoxRoom(), BoxRoom()
+    rooms[1].start_pose[:3, 3] += 0.6
+    team = [Member(room, policy) for room, policy in zip(rooms, policies, strict=True)]
+    result = explore_team(team, budget="views:3", config=CONFIG)
+    assert [len(member.rows) for member in result.members] == [3, 3]
+    assert [policy._sessions for policy in policies] == [{}, {}]
+
+
+def test_a_state_that_was_stored_is_not_believed(tmp_path):
+    policy, room = exec_policy(command_of(tmp_path, LOTS)), BoxRoom()
+    planner = start(room.camera, room.bounds, policy, starts=[room.start_pose], config=CONFIG)
+    seen = observe(planner, room.render(room.start_pose))
+    other = exec_policy(command_of(tmp_path, LOTS))
+    start(room.camera, room.bounds, other, config=CONFIG)
+    with pytest.raises(PolicyError, match="has seen 0 frames and cannot go to view 1"):
+        decide(dataclasses.replace(seen, policy=other), room.start_pose, jax.random.key(0))
+    policy.close()
+    other.close()
 
 
 def test_a_loop_that_is_killed_takes_its_program_along():

@@ -83,6 +83,9 @@ class _Session:
     )
     """Its last answer and the seconds that it took, by the number of frames before it."""
 
+    shown: int = 0
+    """Frames that it has been shown."""
+
 
 @dataclass(frozen=True)
 class Foreign:
@@ -245,16 +248,18 @@ class Foreign:
             # Asked again to be timed, without what was compiled: it takes as long as it took.
             time.sleep(seconds)
             return answer
-        if session.answers and seen < max(session.answers):
-            raise PolicyError(
-                f"the program {self.config.command!r} cannot go back to view {seen}: start anew"
-            )
         numbers = sorted(number for number in session.frames if number < seen)
+        # A state of the past, or one that was stored: the program would know less or more than it.
+        if seen < session.shown or numbers != list(range(session.shown, seen)):
+            raise PolicyError(
+                f"the program {self.config.command!r} has seen {session.shown} frames and cannot "
+                f"go to view {seen} from there: start anew"
+            )
         question.arrays.update(_images([session.frames[number] for number in numbers]))
         begin = time.perf_counter()
         answer = session.program.ask(question, self.config.answer_seconds)
-        for number in numbers:
-            del session.frames[number]
+        session.frames = {n: frame for n, frame in session.frames.items() if n >= seen}
+        session.shown = seen
         session.answers = {seen: (answer, time.perf_counter() - begin)}
         return answer
 
