@@ -133,6 +133,9 @@ def _(options: TeamOptions) -> None:
 
 @_check.register
 def _(options: BenchmarkOptions) -> None:
+    if options.site is not None:
+        _refuse_others(options, "--site", ("site", "out"))
+        _check_folder(options.site)
     if options.submission:
         _refuse_others(options, "--submission", _WITH_SUBMISSION)
         for path in options.submission:
@@ -246,7 +249,7 @@ def _refuse_others(
     given = [field.name for field in fields if getattr(options, field.name) != field.default]
     if given:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-        source = "submission" if flag == "--submission" else "recorded run"
+        source = {"--submission": "submission", "--site": "records"}.get(flag, "recorded run")
         raise ValueError(f"{flag} takes these from the {source}, leave them out: {names}")
 
 

@@ -21,6 +21,7 @@ from r3jax.apps.benchmark.engines.local import (
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
 from r3jax.apps.benchmark.record import collect, read_records
+from r3jax.apps.benchmark.site import write_site
 from r3jax.apps.benchmark.submitted import plan_submission, problems_of
 from r3jax.apps.benchmark.tables import Entry, Table, quality_table
 from r3jax.cli.checks import seeds_of, words
@@ -59,6 +60,8 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     console = Console(stderr=True)
     if options.check:
         return _check_submissions(console, options)
+    if options.site is not None:
+        return _write_site(console, options.out, options.site)
     try:
         parameters = _settings("slurm", options.slurm)
         if options.jobs > 0 and visible_gpus():
@@ -86,6 +89,17 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     if code == 0:
         console.next("view", paths_of(options.out, cells[0]).run)
     return code
+
+
+def _write_site(console: Console, root: Path, folder: Path) -> int:
+    """Writes the page of all records."""
+    try:
+        with console.status("reading the records ...") as status:
+            page = write_site(root, folder, lambda what: status.update(f"{what} ..."))
+    except (ValueError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    console.say(f"page     {page}")
+    return 0
 
 
 def _read(options: BenchmarkOptions, path: Path) -> Submission:

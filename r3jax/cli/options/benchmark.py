@@ -124,9 +124,20 @@ class SubmissionOptions:
     """With --submission: check and do no more. Exits with 1 if a rule is broken."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SiteOptions:
+    """A page of what is there."""
+
+    TITLE: ClassVar[str] = "page"
+
+    site: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Write a static page of all records in --out into this folder, and do no more: tables with
+    intervals, pictures of the worst views, how fast this machine is."""
+
+
 @dataclass(frozen=True)
 class BenchmarkOptions(
-    SubmissionOptions, ExplorationOptions, TrainingOptions, MeshOptions, MachineOptions
+    SubmissionOptions, SiteOptions, ExplorationOptions, TrainingOptions, MeshOptions, MachineOptions
 ):
     """Compare policies on equal terms: explore, train and judge scenes x policies x seeds."""
 
