@@ -21,7 +21,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.replay import check_decided_alone, config_of, planner_config_of
+from r3jax.exploration.replay import check_decided_alone, config_of
 from r3jax.exploration.state import COMPLETE
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
@@ -34,7 +34,6 @@ from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.robot.motion import Motion, motion_of_record
 from r3jax.trace.errors import RunError
-from r3jax.trace.header import plain_settings
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow, rigid_pose, shortest_floats, table_of
 
@@ -51,6 +50,9 @@ _MAX_BYTES = 64 << 20
 """A frame takes some hundred bytes."""
 
 _LENS = ("fx", "fy", "cx", "cy")
+
+_LARGEST = {"capacity": 1 << 22, "num_bins": 1024, "num_probes": 1024}
+"""Settings of the loop that a stranger's file could fill the memory with."""
 
 _SENSOR = ("up", "scale", "cull_backfaces", "noise", "max_range")
 """How a scene is opened, beside its name and hash."""
@@ -186,8 +188,11 @@ def submission_of_run(run: Run) -> Submission:
     given = dataclasses.asdict(config_of(run))
     default = dataclasses.asdict(ExplorationConfig())
     own = header.policy["name"] in HOMES
-    motion = planner_config_of(run).motion
+    # Of the record itself: the policy may be of a package that is not installed here.
+    motion = header.policy.get("settings", {}).get("motion")
     opened: dict[str, Any] = {"up": None, "scale": 1.0, "cull_backfaces": False} | header.scene
+    if missing := [name for name in ("name", "hash", *_SENSOR) if opened.get(name, ...) is ...]:
+        raise RunError(run.path, f"an early version recorded it without {', '.join(missing)}")
     return Submission(
         scene={name: opened[name] for name in ("name", "hash", *_SENSOR)},
         seed=header.seed,
@@ -196,7 +201,7 @@ def submission_of_run(run: Run) -> Submission:
         policy={
             "name": header.policy["name"],
             "version": f"r3jax {header.packages.get('r3jax', '')}" if own else "",
-            "settings": header.policy["settings"],
+            "settings": header.policy.get("settings", {}),
         },
         frames=_frames_of(run.rows),
         exploration={
@@ -204,7 +209,7 @@ def submission_of_run(run: Run) -> Submission:
             for name, value in given.items()
             if value != default[name] and name not in ("max_range", "checkpoint_every")
         },
-        motion=None if motion == Motion() else plain_settings(motion),
+        motion=motion,
         outcome=run.end.outcome,
         packages=header.packages,
     )
@@ -355,6 +360,9 @@ def _check_parts(header: Submission) -> None:
         raise ForeignFileError(f"`outcome` must be one of {', '.join(sorted(COMPLETE))}")
     _check_settings("exploration", header.exploration, ExplorationConfig)
     _check_settings("motion", header.motion or {}, Motion)
+    for name, largest in _LARGEST.items():
+        if header.exploration.get(name, 0) > largest:
+            raise ForeignFileError(f"`exploration.{name}` is more than {largest}")
     try:
         _ = header.config, header.robot, header.intrinsics
     except ValueError as error:

@@ -137,6 +137,7 @@ MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (changed(0, policy={"name": "mine"}), "line 1: `policy.version` must be str"),
         (changed(0, exploration={"haste": 1}), "line 1: `exploration` has an unknown 'haste'"),
         (changed(0, exploration={"speed": -1.0}), "line 1: speed must be positive"),
+        (changed(0, exploration={"num_bins": 1 << 40}), "`exploration.num_bins` is more than 1024"),
         (changed(0, motion={"speed": 0.0}), "line 1: speed must be positive and finite"),
         (changed(0, exploration={"speed": "fast"}), "line 1: `exploration.speed` must be float"),
         (changed(0, exploration={"clock": "sun"}), "line 1: `exploration.clock` must be"),

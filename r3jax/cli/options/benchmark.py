@@ -151,7 +151,7 @@ class BenchmarkOptions(
     """Embedded scenes by name, or `mesh:<file>`, with commas between."""
 
     policies: Annotated[str, tyro.conf.arg(metavar="A,B")] = "ours,ours-pano,frontier,random"
-    """Who chooses the views, with commas between."""
+    """Who chooses the views, with commas between: names, `module:Class`, `exec:COMMAND`."""
 
     seeds: Annotated[str, tyro.conf.arg(metavar="0,1")] = "0"
     """Each makes an exploration and a training of its own."""

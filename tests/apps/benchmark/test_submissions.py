@@ -302,6 +302,22 @@ def test_the_terms_are_those_of_the_exploration(submission):
     assert conditions_of(submission, base, CONDITIONS.snapshots) == CONDITIONS
 
 
+def test_a_run_of_a_policy_that_is_not_installed_is_exported(finished):
+    root, cells = finished
+    run = read_run(paths_of(root, cells[0]).run)
+    motion = {"heights": [0.0, 0.0], "speed": 0.5}
+    policy = {
+        "name": "theirs",
+        "class": "their.package:Theirs",
+        "settings": {"motion": motion, "x": 1},
+    }
+    submission = submission_of_run(
+        dataclasses.replace(run, header=dataclasses.replace(run.header, policy=policy))
+    )
+    assert submission.policy["version"] == ""
+    assert submission.robot == make_motion("free", heights=(0.0, 0.0), speed=0.5)
+
+
 @pytest.mark.parametrize(
     "how", ["cut off", "interrupted", "forked", "merged", "a start of its own"]
 )
