@@ -23,7 +23,7 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.simulators.base import Simulator
-from r3jax.simulators.clearance import cut_triangles, point_triangle
+from r3jax.simulators.clearance import SurfaceDistance, cut_triangles, point_triangle
 from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.raycast.rays import TriangleScene
@@ -134,18 +134,30 @@ class GroundTruth:
     def room_along(self, waypoints: np.ndarray) -> tuple[float, np.ndarray]:
         """Least distance to a surface along a path over waypoints [K, 3] [m], and its place [3].
 
-        Sampled every 2 cm; 0 where a surface lies across the path.
+        Sampled every 2 cm; 0 where a surface lies across the path. Glass that no depth sensor sees
+        (`Material.is_hole`) does not count: nobody who explores can know of it.
         """
+        distance, rays = self._seen_surfaces
         points = [waypoints[:1]]
         for a, b in itertools.pairwise(waypoints):
-            if not self._simulator.segment_is_clear(a, b):
+            length = float(np.linalg.norm(b - a))
+            ends = a[None].astype(np.float32), (b - a)[None].astype(np.float32)
+            if length > 0.0 and rays.cast(*ends).distance[0] <= 1.0:
                 return 0.0, 0.5 * (a + b)
-            num = max(1, math.ceil(float(np.linalg.norm(b - a)) / _ALONG))
+            num = max(1, math.ceil(length / _ALONG))
             points.append(a + (b - a) * (np.arange(1, num + 1) / num)[:, None])
         places = np.concatenate(points)
-        room = self._simulator.clearance(places)
+        room = distance(places)
         nearest = int(np.argmin(room))
         return float(room[nearest]), places[nearest]
+
+    @functools.cached_property
+    def _seen_surfaces(self) -> tuple[SurfaceDistance, TriangleScene]:
+        """The surfaces that a depth sensor sees."""
+        world = self._simulator.world
+        is_hole = np.array([material.is_hole for material in world.materials], dtype=bool)
+        faces = world.faces[~is_hole[world.face_material]]
+        return SurfaceDistance(world.vertices, faces), TriangleScene(world.vertices, faces)
 
     def _has_ceiling(self, points: np.ndarray) -> np.ndarray:
         """True where nearly all that is above a point is a surface, [n] bool."""

@@ -24,7 +24,7 @@ from r3jax.simulators.scenes.registry import scene_hash
 CLEARANCE = 0.15
 """Least distance of the camera's path to every surface [m]. Paths of policies keep a cell of 0.2 m
 between them and what is not known to be free; a surface may reach 0.05 m into a cell before a hit
-marks it."""
+marks it. Glass that the depth sensor does not see is left out, as no policy can know of it."""
 
 _SAME_PLACE = 2e-3
 """Places this close are one [m]."""
