@@ -32,6 +32,7 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.names import parse_topics
 from r3jax.planning.policies import check_policy
+from r3jax.planning.policies.foreign.commands import short_name
 from r3jax.planning.robot.motion import Motion, make_motion
 from r3jax.simulators.scenes.names import check_scene
 
@@ -47,7 +48,11 @@ _WITH_FORK = (
     "fork", "at", "policy", "budget", "until", "name", "out", "overwrite", "candidates", "lambda1",
     "lambda2", "refine", "live", "port",
 )  # fmt: skip
-"""Options that make sense beside these; all others are fixed by the recorded run."""
+_WITH_SUBMISSION = (
+    "submission", "check", "scenes", "snapshots", "out", "train_resolution", "iterations",
+    "gaussians", "capacity", "test_views", "lpips", "backend", "engine", "jobs", "slurm",
+)  # fmt: skip
+"""Options that make sense beside these; all others are fixed by what was recorded."""
 
 
 def check_options(options: object) -> None:
@@ -128,6 +133,18 @@ def _(options: TeamOptions) -> None:
 
 @_check.register
 def _(options: BenchmarkOptions) -> None:
+    if options.site is not None:
+        _refuse_others(options, "--site", ("site", "out"))
+        _check_folder(options.site)
+    if options.submission:
+        _refuse_others(options, "--submission", _WITH_SUBMISSION)
+        for path in options.submission:
+            if not path.is_file():
+                raise UserError(f"{path}: there is no such file")
+        if options.scenes != BenchmarkOptions.scenes and not options.scenes.startswith("mesh:"):
+            raise ValueError("--scenes tells where the mesh of a submission lies: mesh:<file>")
+    elif options.check:
+        raise ValueError("--check belongs to --submission FILE")
     for scene in words(options.scenes):
         check_scene(scene, options.scale)
     for policy in words(options.policies):
@@ -192,6 +209,10 @@ def _(options: ReplayOptions | ForecastOptions) -> None:
 @_check.register
 def _(options: ExportOptions) -> None:
     _check_run(options.path)
+    if options.format == "submission":
+        if options.out.exists():
+            raise UserError(f"{options.out}: something is there already: give another file")
+        return
     _check_folder(options.out)
     if options.out.is_dir() and any(options.out.iterdir()):
         raise UserError(f"{options.out}: something is there already: give another folder")
@@ -217,7 +238,7 @@ def _(options: MergeOptions) -> None:
 
 
 def _refuse_others(
-    options: ExploreOptions | TeamOptions, flag: str, allowed: tuple[str, ...]
+    options: ExploreOptions | TeamOptions | BenchmarkOptions, flag: str, allowed: tuple[str, ...]
 ) -> None:
     """A setting that would be ignored is a mistake.
 
@@ -228,7 +249,8 @@ def _refuse_others(
     given = [field.name for field in fields if getattr(options, field.name) != field.default]
     if given:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise ValueError(f"{flag} takes these from the recorded run, leave them out: {names}")
+        source = {"--submission": "submission", "--site": "records"}.get(flag, "recorded run")
+        raise ValueError(f"{flag} takes these from the {source}, leave them out: {names}")
 
 
 def _check_policy(name: str) -> None:
@@ -294,8 +316,7 @@ def default_name(options: ExploreOptions, scene: str, policy: str) -> str:
     if kind == "habitat" and colon:
         stem = f"habitat-{stem.removesuffix('.stage_config')}"
     motion = "" if options.motion == "free" else f"-{options.motion}"
-    own = policy.rpartition(":")[2]  # of package.module:Class
-    return f"{stem}-{own}{motion}-seed{options.seed}"
+    return f"{stem}-{short_name(policy)}{motion}-seed{options.seed}"
 
 
 def team_folder(options: TeamOptions, scene: str) -> Path:

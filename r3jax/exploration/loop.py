@@ -17,7 +17,7 @@ from r3jax.exploration.recording import continued, record_end, record_view
 from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, TakenView
 from r3jax.exploration.step import start_state, step
 from r3jax.planning.planner import Planner
-from r3jax.planning.policy import Policy
+from r3jax.planning.policy import LivesOutside, Policy
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RecordingStopped
 from r3jax.trace.reader import Run
@@ -76,6 +76,7 @@ def explore(
         ValueError: a budget that is not understood, a start outside the scene's box, a goal in the
             config without an `is_enough` that judges it.
         RunError: a recorded frame that is needed to go on is missing or broken.
+        PolicyError: a program that chooses the views has died, hangs, or answers nonsense.
         OracleReadError: something beside the loop asked the simulator for an image.
     """
     config = config or ExplorationConfig()
@@ -100,14 +101,18 @@ def explore(
         is_enough,
         on_stage=on_stage or (lambda stage: None),
     )
-    # Also for a resume: it gives the arrays of a checkpoint their structure, and is where to
-    # begin again if no checkpoint can be used.
-    state = start_state(mission, init_key)
     rows: list[StepRow] = []
-    if resume is not None:
-        state = continued(resume, mission, state, decided_from=decided_from)
-        rows = list(resume.rows)
-    state, stop = _go(state, mission, rows, recorder, on_view or (lambda view, planner: None))
+    try:
+        # Also for a resume: it gives the arrays of a checkpoint their structure, and is where to
+        # begin again if no checkpoint can be used.
+        state = start_state(mission, init_key)
+        if resume is not None:
+            state = continued(resume, mission, state, decided_from=decided_from)
+            rows = list(resume.rows)
+        state, stop = _go(state, mission, rows, recorder, on_view or (lambda view, planner: None))
+    finally:
+        if isinstance(policy, LivesOutside):
+            policy.close()
     return Result(state, tuple(rows), stop.reason, stop.message)
 
 

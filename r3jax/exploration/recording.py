@@ -13,6 +13,7 @@ import numpy as np
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import LoopState, Mission, Stop, TakenView
 from r3jax.exploration.step import relive
+from r3jax.planning.policy import LivesOutside
 from r3jax.trace.arrays import fill, named_arrays
 from r3jax.trace.checkpoints import Tables, map_tables
 from r3jax.trace.errors import RecordingStopped, RunError
@@ -109,8 +110,10 @@ def continued(run: Run, mission: Mission, start: LoopState, *, decided_from: int
     Raises:
         RunError: a frame that is needed is missing, broken, or not the one that was recorded.
     """
-    # A decision that began before the checkpoint's view is not in it: all is lived through again.
-    state = start if mission.config.plan_while_moving else _newest(run, start)
+    # What began before the checkpoint's view is not in it, nor what a program remembers: all is
+    # lived through again.
+    anew = mission.config.plan_while_moving or isinstance(mission.policy, LivesOutside)
+    state = start if anew else _newest(run, start)
     for row in run.rows[state.views :]:
         mission.on_stage("map")
         decides = row.step >= decided_from

@@ -50,6 +50,19 @@ class StopReason(enum.Enum):
     """A simulator or a policy raised an error."""
 
 
+COMPLETE = frozenset(
+    reason.value
+    for reason in (
+        StopReason.BUDGET,
+        StopReason.FORECAST,
+        StopReason.NO_CANDIDATE,
+        StopReason.NO_REACHABLE_CANDIDATE,
+        StopReason.STUCK,
+    )
+)
+"""Ends that belong to the result; after any other an exploration is not over."""
+
+
 @dataclass(frozen=True)
 class PlannedAhead:
     """A decision that is made while the camera flies, for when it arrives."""

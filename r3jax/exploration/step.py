@@ -367,7 +367,9 @@ def _look(
     """
     mission.on_stage("render")
     begin = time.perf_counter()
-    pose = np.asarray(shot.T_world_camera, dtype=np.float64)
+    # Rounded as the trace has it: the image is taken from the very pose that is recorded, so that
+    # whoever has the poses has the images.
+    pose = np.asarray(shot.T_world_camera, dtype=np.float32).astype(np.float64)
     # Announced first, so that an image that nobody chose is noticed.
     mission.simulator.commit(state.views, pose)
     # Rounded as it will be on disk before the map sees it: a replay integrates the same bits.

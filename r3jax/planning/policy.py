@@ -15,6 +15,10 @@ from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.travel import Travel
 
 
+class PolicyError(RuntimeError):
+    """A policy that cannot decide, and why: the run ends, what was recorded stays."""
+
+
 class DecisionOutcome(enum.Enum):
     """How a decision ended. Anything but MOVED ends the run, with the reason in the trace."""
 
@@ -161,4 +165,16 @@ class PlansAhead(Policy, Protocol):
 
         None: no path leads to any of them, and the policy is asked to decide anew.
         """
+        ...
+
+
+@runtime_checkable
+class LivesOutside(Policy, Protocol):
+    """A policy whose memory is in a program of its own: it cannot be stored, and must be ended.
+
+    A run of it is gone on with from its first view: the program is shown and asked all anew.
+    """
+
+    def close(self) -> None:
+        """Ends the programs."""
         ...

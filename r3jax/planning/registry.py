@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policies import HOMES, REGISTERED, home_of, known_names
+from r3jax.planning.policies.foreign.commands import COMMAND
 from r3jax.planning.policy import Policy
 
 PolicyClass = TypeVar("PolicyClass", bound=type)
@@ -72,12 +73,14 @@ def make_policy(name: str, **settings: Any) -> Policy:
     """Makes a policy by name.
 
     Args:
-        name: one of `policy_names()`, or `package.module:Class`.
+        name: one of `policy_names()`, `package.module:Class`, or `exec:COMMAND`.
         **settings: fields of its `Config` that differ from their defaults.
 
     Raises:
         ValueError: no policy has that name, no setting has that name, or a value is impossible.
     """
+    if name.startswith(COMMAND):
+        settings = settings | {"command": name.removeprefix(COMMAND)}
     config = config_class(name)
     # Checked here: the error of the dataclass itself would not list the settings there are.
     known = [field.name for field in fields(config)]

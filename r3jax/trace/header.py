@@ -20,7 +20,7 @@ from r3jax.formats.validation.names import check_relative
 from r3jax.formats.validation.versions import VersionError, check_version
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
-from r3jax.planning.policy import Policy
+from r3jax.planning.policy import LivesOutside, Policy
 from r3jax.planning.robot.motion import Motion
 from r3jax.trace.errors import RunError
 
@@ -118,8 +118,13 @@ def plain_settings(settings: Any) -> Any:
 
 
 def policy_fields(policy: Policy) -> dict[str, Any]:
-    """Describes a policy as a header does: its name, its settings, and the class of a plug-in."""
+    """Describes a policy as a header does: its name, its settings, and the class of a plug-in.
+
+    Of a program also what it is held to on this system.
+    """
     fields = {"name": policy.name, "settings": settings_of(policy)}
+    if isinstance(policy, LivesOutside):
+        return fields | {"isolation": getattr(policy, "isolation", None)}
     if policy.name not in HOMES:  # its class finds it again
         fields["class"] = f"{type(policy).__module__}:{type(policy).__qualname__}"
     return fields

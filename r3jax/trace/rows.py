@@ -194,7 +194,7 @@ def from_json(line: str) -> StepRow | EndRow:
     row = build(
         StepRow,
         plain,
-        pose=_pose("pose", plain.get("pose")),
+        pose=rigid_pose("pose", plain.get("pose")),
         choice=None if plain.get("choice") is None else _choice(plain["choice"]),
         coverage=build(Coverage, plain.get("coverage")),
     )
@@ -207,12 +207,19 @@ def from_json(line: str) -> StepRow | EndRow:
 def _choice(plain: Any) -> Choice:
     # What is no object is refused by `build`, which says so.
     known: dict[str, Any] = plain if isinstance(plain, dict) else {}
-    waypoints = _numbers("waypoints", known.get("waypoints"), (-1, 3))
-    return build(Choice, plain, pose=_pose("choice.pose", known.get("pose")), waypoints=waypoints)
+    waypoints = table_of("waypoints", known.get("waypoints"), (-1, 3))
+    return build(
+        Choice, plain, pose=rigid_pose("choice.pose", known.get("pose")), waypoints=waypoints
+    )
 
 
-def _pose(name: str, values: Any) -> np.ndarray:
-    pose = _numbers(name, values, (4, 4))
+def rigid_pose(name: str, values: Any) -> np.ndarray:
+    """Makes a pose [4, 4] float32 of what JSON holds of it.
+
+    Raises:
+        ForeignFileError: no table of finite numbers, or not rigid; says which `name`.
+    """
+    pose = table_of(name, values, (4, 4))
     # A matrix that scales or mirrors would still project, to wrong places.
     problem = rigid_error(pose)
     if problem is not None:
@@ -220,8 +227,12 @@ def _pose(name: str, values: Any) -> np.ndarray:
     return pose
 
 
-def _numbers(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
-    """A table as float32; -1 stands for any number of rows."""
+def table_of(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
+    """Makes a table float32 of what JSON holds of it; -1 stands for any number of rows.
+
+    Raises:
+        ForeignFileError: no table of finite numbers of that shape; says which `name`.
+    """
     try:
         with np.errstate(over="ignore"):  # too large for float32: found with the infinities
             table = np.asarray(values, dtype=np.float32)

@@ -1,5 +1,6 @@
 """Free space against closed-form distances and floods; ground truth against the simulator."""
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -286,3 +287,37 @@ def test_what_has_no_mesh_is_refused():
 
     with pytest.raises(ValueError, match="a Recorded has no mesh"):
         GroundTruth(Recorded())
+
+
+@pytest.fixture(scope="module")
+def office():
+    return RaycastSimulator(open_world("office"))
+
+
+@pytest.mark.parametrize(
+    "waypoints",
+    [
+        [[1.45, 3.95, 1.2], [1.45, 3.45, 1.2]],  # the wall below a pane of glass
+        [[1.45, 4.2, 2.0], [1.45, 4.2, -0.5]],  # the floor
+        [[1.45, 4.2, 2.0], [1.45, 4.2, 1.9], [1.45, 9.0, 1.9]],  # behind a bend
+    ],
+)
+def test_a_path_through_a_surface_has_no_room(office, waypoints):
+    assert GroundTruth(office).room_along(np.array(waypoints))[0] == 0.0
+
+
+def test_a_path_through_glass_has_room(office):
+    """A pane between two rooms of the office, from 1.45 m up: a depth sensor sees nothing there."""
+    path = np.array([[1.45, 3.95, 2.25], [1.45, 3.45, 2.25]])
+    assert not office.segment_is_clear(*path)
+    assert GroundTruth(office).room_along(path)[0] > 0.15
+
+
+def test_the_room_along_a_path_is_the_least_clearance(office):
+    path = np.array([[0.65, 4.25, 2.45], [1.2, 4.25, 2.3], [1.2, 4.6, 2.3]])
+    room, place = GroundTruth(office).room_along(path)
+    share = np.linspace(0.0, 1.0, 400)[:, None]
+    points = np.concatenate([a + share * (b - a) for a, b in itertools.pairwise(path)])
+    assert room == pytest.approx(office.clearance(points).min(), abs=0.01)
+    assert office.clearance(place[None])[0] == pytest.approx(room, abs=1e-6)
+    assert GroundTruth(office).room_along(path[:1])[0] == office.clearance(path[:1])[0]

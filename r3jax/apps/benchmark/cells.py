@@ -16,6 +16,9 @@ from r3jax.trace.header import plain_settings, settings_of
 IDENTITY_VERSION = 1
 """Raised when results of an older version of this package must not be taken over."""
 
+_LONGEST_NAME = 150
+"""Of a cell's folder, before what tells it from others; file systems take 255 characters."""
+
 _LATER = {
     "drop_edges": True,
     "capture_every": None, "capture_rate": None, "gaze": "panorama", "exposure": 0.0, "blur": 1.0,
@@ -62,6 +65,9 @@ class Cell:
     cull_backfaces: bool = False
     """Whether faces seen from behind are not there."""
 
+    submission: str | None = None
+    """Hash of the submission whose frames are taken again; None: the policy explores."""
+
     @property
     def scene_name(self) -> str:
         """What tables call the scene: a mesh file without folder and suffix."""
@@ -71,7 +77,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of its folder: readable, and another one for everything that differs."""
-        readable = re.sub(r"[^\w.-]+", "_", f"{self.scene_name}-{self.policy}")
+        readable = re.sub(r"[^\w.-]+", "_", f"{self.scene_name}-{self.policy}")[:_LONGEST_NAME]
         return f"{readable}-seed{self.seed}-{self.identity_hash[:12]}"
 
     @functools.cached_property
@@ -91,15 +97,17 @@ def identity(cell: Cell) -> dict[str, Any]:
     for name in ("snapshots", "loop", "trainer"):  # the latter are among those that they are of
         del conditions[name]
     exploration = dataclasses.asdict(cell.conditions.exploration_config())
-    policy = cell.conditions.policy(cell.policy, cell.settings)
-    planner: dict[str, Any] = FORMER_SETTINGS | settings_of(policy)
+    planner: dict[str, Any] = {}
+    if cell.submission is None:
+        policy = cell.conditions.policy(cell.policy, cell.settings)
+        # What was done before a policy had settings of its own stays done.
+        planner = FORMER_SETTINGS | settings_of(policy)
     if not cell.conditions.exploration_config().captures and "motion" in planner:
         planner["motion"].pop("fixed_camera", None)  # it decides on frames on the way alone
     return {
         "version": IDENTITY_VERSION,
         "scene": cell.scene_hash,
         "policy": cell.policy,
-        # What was done before a policy had settings of its own stays done.
         "planner": planner,
         "given": plain_settings(cell.settings),
         "seed": cell.seed,
@@ -107,7 +115,7 @@ def identity(cell: Cell) -> dict[str, Any]:
         "exploration": {k: v for k, v in exploration.items() if (k, v) not in _LATER.items()},
         "training": cell.conditions.train_config(cell.seed).as_record(),
         "test_views": {"hash": cell.test_views_hash, "count": cell.num_test_views},
-    }
+    } | ({} if cell.submission is None else {"submission": cell.submission})
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def make_plan(
         request.conditions.policy(policy, request.settings)
     cells: list[Cell] = []
     for scene in request.scenes:
-        view_set = _prepare_scene(request, scene, root, on_stage)
+        view_set = prepare_scene(request, scene, root, on_stage)
         for policy, seed in itertools.product(request.policies, request.seeds):
             cells.append(
                 Cell(
@@ -104,10 +104,21 @@ def cells_left(root: Path, cells: Sequence[Cell]) -> tuple[Cell, ...]:
     return tuple(cell for cell in cells if snapshots_left(root, cell))
 
 
-def _prepare_scene(
+def prepare_scene(
     request: Request, scene: str, root: Path, on_stage: Callable[[str], None]
 ) -> ViewSet:
-    """A scene's test set; its images lie in the folder afterwards."""
+    """A scene's test set; its images lie in the folder afterwards.
+
+    Args:
+        request: how scenes are opened, and on what terms.
+        scene: which one.
+        root: folder of the benchmark.
+        on_stage: told what happens now.
+
+    Raises:
+        ValueError: an unknown scene, or one that cannot be explored.
+        OSError: a folder that cannot be written.
+    """
     conditions, folder = request.conditions, Path(root) / FOLDER
     on_stage(f"opening {scene}")
     # Always the same start, whatever the seeds: the test set is what can be reached from it.

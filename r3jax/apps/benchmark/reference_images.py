@@ -47,8 +47,15 @@ class ReferenceImages:
 
 def reference_path(root: Path, scene_hash: str, set_hash: str, conditions: Conditions) -> Path:
     """Where the images lie; another file for everything that changes them."""
-    names = ("resolution", "fov", "train_resolution")
-    what = [scene_hash, set_hash, *(getattr(conditions, name) for name in names)]
+    sizes = conditions.resolution, conditions.fov, conditions.train_resolution
+    return path_of_images(root, scene_hash, set_hash, sizes)
+
+
+def path_of_images(
+    root: Path, scene_hash: str, set_hash: str, sizes: tuple[int, float, int]
+) -> Path:
+    """The same by resolution [px], field of view [degrees], and resolution of training [px]."""
+    what = [scene_hash, set_hash, *sizes]
     key = hashlib.sha256(json.dumps(what).encode()).hexdigest()[:16]
     return Path(root) / FOLDER / f"{key}.npz"
 

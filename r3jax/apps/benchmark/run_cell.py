@@ -13,6 +13,7 @@ import time
 import traceback
 from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,14 +21,18 @@ import numpy as np
 from r3jax.apps.benchmark.cells import Cell, CellPaths, identity, paths_of, snapshots_left
 from r3jax.apps.benchmark.record import make_record, write_record
 from r3jax.apps.benchmark.reference_images import ReferenceImages, load_reference_images
+from r3jax.apps.benchmark.retake import retake
+from r3jax.apps.benchmark.submitted import load_submission
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.evaluation.maps import map_of
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.loop import explore
-from r3jax.exploration.state import StopReason
+from r3jax.exploration.state import COMPLETE, StopReason
 from r3jax.files import lock_folder, write_atomic
+from r3jax.formats.submissions import Submission, content_hash
 from r3jax.scoring.renderability import renderability
+from r3jax.simulators.base import Simulator
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
 from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.ply import write_scene
@@ -43,15 +48,6 @@ from r3jax.trace.writer import RunWriter
 
 OnStage = Callable[[str], None]
 """Told what happens now, in a few words."""
-
-_COMPLETE = {
-    StopReason.BUDGET.value,
-    StopReason.FORECAST.value,
-    StopReason.NO_CANDIDATE.value,
-    StopReason.NO_REACHABLE_CANDIDATE.value,
-    StopReason.STUCK.value,
-}
-"""Ends that belong to the result; after any other the exploration is repeated."""
 
 _LOCK_PATIENCE = 20.0
 """A worker whose parent was killed needs a moment to notice [s]."""
@@ -89,7 +85,7 @@ def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> 
     if not left:
         return
     write_atomic(paths.identity, json.dumps(identity(cell), indent=1).encode())
-    run = _finished_run(paths.run) or _explore(cell, paths, on_stage)
+    run = _finished_run(paths.run) or _explore(cell, root, paths, on_stage)
     reference = load_reference_images(root, cell)
     failures: list[str] = []
     for snapshot in left:
@@ -125,13 +121,45 @@ def _finished_run(path: Path) -> Run | None:
         run = read_run(path)
     except RunError:
         return None
-    return run if run.end is not None and run.end.outcome in _COMPLETE else None
+    return run if run.end is not None and run.end.outcome in COMPLETE else None
 
 
-def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
+def _explore(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> Run:
     """Explores, or goes on with the exploration that was cut off."""
     conditions = cell.conditions
     on_stage("opening the scene")
+    simulator = _open(cell)
+    if cell.submission is not None:
+        return _retake(cell, load_submission(root, cell.submission), simulator, paths, on_stage)
+    policy = conditions.policy(cell.policy, cell.settings)
+    header = _header(cell, simulator, policy_fields(policy))
+    on_stage("exploring")
+    recorder, begun = _begin_or_resume(paths.run, header)
+    with recorder:
+        result = explore(
+            simulator,
+            policy,
+            budget=conditions.budget,
+            seed=cell.seed,
+            config=conditions.exploration_config(),
+            recorder=recorder,
+            resume=begun,
+            on_view=lambda view, _: on_stage(f"exploring, {view.row.step + 1} views"),
+        )
+    if result.reason is StopReason.INTERRUPTED:
+        raise KeyboardInterrupt
+    if result.reason.value not in COMPLETE:
+        raise CellError(f"the exploration ended early: {result.message}")
+    return read_run(paths.run)
+
+
+def _open(cell: Cell) -> Simulator:
+    """Opens the scene of a cell.
+
+    Raises:
+        CellError: it is not the one that the cell was planned for.
+    """
+    conditions = cell.conditions
     simulator = open_scene(
         cell.scene,
         up=cell.up,
@@ -148,12 +176,16 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
             f"the scene {cell.scene} has the hash {found[:12]}, but {cell.scene_hash[:12]} when "
             "the benchmark was planned: the file has changed meanwhile, start again"
         )
-    policy = conditions.policy(cell.policy, cell.settings)
-    config = conditions.exploration_config()
-    header = RunHeader(
+    return simulator
+
+
+def _header(cell: Cell, simulator: Simulator, policy: dict[str, Any]) -> RunHeader:
+    """The header of the exploration of a cell by a policy."""
+    conditions = cell.conditions
+    return RunHeader(
         scene={
             "name": cell.scene,
-            "hash": found,
+            "hash": cell.scene_hash,
             "up": cell.up,
             "scale": cell.scale,
             "cull_backfaces": cell.cull_backfaces,
@@ -161,31 +193,32 @@ def _explore(cell: Cell, paths: CellPaths, on_stage: OnStage) -> Run:
             "max_range": conditions.max_range,
             "start": None,
         },
-        policy=policy_fields(policy),
+        policy=policy,
         budget=conditions.budget,
         seed=cell.seed,
-        config=dataclasses.asdict(config),
+        config=dataclasses.asdict(conditions.exploration_config()),
         camera=camera_fields(simulator.camera),
         bounds=np.asarray(simulator.bounds).tolist(),
         packages=package_versions(),
     )
-    on_stage("exploring")
-    recorder, begun = _begin_or_resume(paths.run, header)
-    with recorder:
-        result = explore(
-            simulator,
-            policy,
-            budget=conditions.budget,
-            seed=cell.seed,
-            config=config,
-            recorder=recorder,
-            resume=begun,
-            on_view=lambda view, _: on_stage(f"exploring, {view.row.step + 1} views"),
-        )
-    if result.reason is StopReason.INTERRUPTED:
-        raise KeyboardInterrupt
-    if result.reason.value not in _COMPLETE:
-        raise CellError(f"the exploration ended early: {result.message}")
+
+
+def _retake(
+    cell: Cell, submission: Submission, simulator: Simulator, paths: CellPaths, on_stage: OnStage
+) -> Run:
+    """Takes the frames of a submission again, from the first one: that is quickly done."""
+    motion = {} if submission.motion is None else {"motion": submission.motion}
+    policy = {"name": submission.name, "settings": motion, "submitted": submission.policy}
+    header = _header(cell, simulator, policy)
+    on_stage("taking the frames again")
+    retake(
+        submission,
+        simulator,
+        cell.conditions.exploration_config(),
+        header,
+        paths.run,
+        on_frame=lambda frame: on_stage(f"taking the frames again, {frame + 1} views"),
+    )
     return read_run(paths.run)
 
 
@@ -254,9 +287,24 @@ def _do_snapshot(
     assert run.end is not None
     outcome = run.end.outcome if len(steps) == len(run.rows) else StopReason.BUDGET.value
     record = make_record(root, cell, snapshot, steps, outcome, evaluation.rows)
+    if cell.submission is not None:
+        record |= {"submission": _submission_fields(load_submission(root, cell.submission), run)}
     write_record(paths.record(snapshot), record)
     # The model is kept, the optimizer's state is not.
     remove_checkpoints(paths.checkpoints(snapshot))
+
+
+def _submission_fields(submission: Submission, run: Run) -> dict[str, Any]:
+    """What a record tells of the submission that it judges."""
+    pairs = zip(submission.frames, run.rows, strict=True)
+    return {
+        "sha256": content_hash(submission),
+        "policy": submission.policy,
+        "packages": submission.packages,
+        # Whether the simulator computed here as it did there.
+        "same_images": sum(frame.sha256 == row.sha256 for frame, row in pairs),
+        "known_images": sum(frame.sha256 is not None for frame in submission.frames),
+    }
 
 
 def _train(

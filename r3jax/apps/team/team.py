@@ -31,7 +31,7 @@ from r3jax.exploration.step import relive, start_state, step
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.planner import add_frame, tell_policy
-from r3jax.planning.policy import Policy
+from r3jax.planning.policy import LivesOutside, Policy
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
 from r3jax.trace.errors import RecordingStopped
@@ -144,21 +144,27 @@ def explore_team(
         ValueError: no member, worlds with different boxes, a budget that is not understood, a
             negative interval, a start outside the scene's box.
         RunError: a recorded frame is missing or broken.
+        PolicyError: a program that chooses views has died, hangs, or answers nonsense.
         OracleReadError: something beside the loop asked a simulator for an image.
     """
     config = config or ExplorationConfig()
     budget = parse_budget(budget) if isinstance(budget, str) else budget
     _check(members, meet_every)
-    flying = [
-        _Flying(
-            number,
-            *_set_out(number, members, budget, seed, config, on_stage, recorded),
-            recorded=recorded,
-            recorder=None if recorders is None else recorders[number],
-        )
-        for number, recorded in enumerate(resume or [None] * len(members))
-    ]
-    return _fly(flying, meet_every, on_row or (lambda number, row: None))
+    try:
+        flying = [
+            _Flying(
+                number,
+                *_set_out(number, members, budget, seed, config, on_stage, recorded),
+                recorded=recorded,
+                recorder=None if recorders is None else recorders[number],
+            )
+            for number, recorded in enumerate(resume or [None] * len(members))
+        ]
+        return _fly(flying, meet_every, on_row or (lambda number, row: None))
+    finally:
+        for member in members:
+            if isinstance(member.policy, LivesOutside):
+                member.policy.close()
 
 
 def _check(members: Sequence[Member], meet_every: float) -> None:

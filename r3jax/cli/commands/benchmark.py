@@ -1,7 +1,8 @@
 """`r3jax benchmark`: plans the cells, has them run, and shows what came out."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,6 +21,8 @@ from r3jax.apps.benchmark.engines.local import (
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
 from r3jax.apps.benchmark.record import collect, read_records
+from r3jax.apps.benchmark.site import write_site
+from r3jax.apps.benchmark.submitted import plan_submission, problems_of
 from r3jax.apps.benchmark.tables import Entry, Table, quality_table
 from r3jax.cli.checks import seeds_of, words
 from r3jax.cli.console import (
@@ -34,31 +37,39 @@ from r3jax.cli.console import (
 from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import BenchmarkOptions
-from r3jax.evaluation.comparison import snapshots_of
+from r3jax.evaluation.comparison import check_equal_terms, snapshots_of
+from r3jax.formats.submissions import Submission, read_submission
+
+_SHOWN = 20
+"""Problems of a submission that are printed."""
 
 _LOOP = ("capture_every", "capture_rate", "gaze", "plan_while_moving")
 """Options that are settings of the loop."""
 
 
 def run_benchmark(options: BenchmarkOptions) -> int:
-    """Runs what is left of a benchmark and prints its table.
+    """Runs what is left of a benchmark and prints its table; or only checks submissions.
 
     Returns:
-        0 all cells are done, 1 some failed, 130 interrupted (start it again to go on).
+        0 all cells are done, 1 some failed or a submission breaks a rule, 130 interrupted (start it
+        again to go on).
 
     Raises:
         UserError: an unknown scene or policy, a setting that cannot work, a missing package.
     """
     console = Console(stderr=True)
+    if options.check:
+        return _check_submissions(console, options)
+    if options.site is not None:
+        return _write_site(console, options.out, options.site)
     try:
-        request = _request(options)
         parameters = _settings("slurm", options.slurm)
         if options.jobs > 0 and visible_gpus():
             # The workers have the GPUs; planning must not hold on to their memory.
             jax.config.update("jax_platforms", "cpu")
         options.out.mkdir(parents=True, exist_ok=True)
         with console.status("planning ...") as status:
-            cells = make_plan(request, options.out, lambda what: status.update(f"{what} ..."))
+            cells = _plan(options, lambda what: status.update(f"{what} ..."))
         left = cells_left(options.out, cells)
         _announce(console, options, cells, left)
         with BenchmarkProgress(console, len(cells), len(left), options.out) as progress:
@@ -67,6 +78,10 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     except (ValueError, OSError, ImportError) as error:
         raise UserError(one_line(error)) from error
     records = read_records(options.out, cells)
+    for line in _images_again(records):
+        console.say(line)
+    if options.submission:
+        records = beside(records, read_records(options.out))
     if records:
         print_results(Console(), records)
     console.say(f"records  {collected}")
@@ -74,6 +89,127 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     if code == 0:
         console.next("view", paths_of(options.out, cells[0]).run)
     return code
+
+
+def _write_site(console: Console, root: Path, folder: Path) -> int:
+    """Writes the page of all records."""
+    try:
+        with console.status("reading the records ...") as status:
+            page = write_site(root, folder, lambda what: status.update(f"{what} ..."))
+    except (ValueError, OSError) as error:
+        raise UserError(one_line(error)) from error
+    console.say(f"page     {page}")
+    return 0
+
+
+def _read(options: BenchmarkOptions, path: Path) -> Submission:
+    """A submission, its scene where the user has it: a mesh lies elsewhere on every machine."""
+    submission = read_submission(path)
+    if options.scenes == BenchmarkOptions.scenes:
+        return submission
+    return replace(submission, scene=submission.scene | {"name": options.scenes})
+
+
+def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
+    """Says of each file what is wrong with it, or how many frames are in order."""
+    code = 0
+    for path in options.submission:
+        try:
+            submission = _read(options, path)
+        except ValueError as error:
+            console.say(one_line(error), style="red")
+            code = 1
+            continue
+        with console.status(f"checking {path} ..."):
+            problems = problems_of(submission)
+        for problem in problems[:_SHOWN]:
+            console.say(f"{path}, {problem}", style="red")
+        if len(problems) > _SHOWN:
+            console.say(f"{path}: {len(problems) - _SHOWN} problems more", style="red")
+        if problems:
+            code = 1
+        else:
+            console.say(f"{path}: {len(submission.frames)} frames, all in order")
+    return code
+
+
+def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[Cell, ...]:
+    """The cells of the policies, or of the submissions."""
+    if not options.submission:
+        return make_plan(_request(options), options.out, on_stage)
+    conditions, snapshots = _judging(options), words(options.snapshots or "")
+    cells: list[Cell] = []
+    for path in options.submission:
+        submission = _read(options, path)
+        try:
+            cell = plan_submission(
+                submission,
+                conditions,
+                options.out,
+                snapshots=snapshots,
+                max_test_views=options.test_views or None,
+                on_stage=on_stage,
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+        cells.append(cell)
+    names = [(cell.scene, cell.policy, cell.seed, str(cell.settings)) for cell in cells]
+    for name, path in zip(names, options.submission, strict=True):
+        if names.count(name) > 1:
+            raise ValueError(
+                f"{path}: another submission is called {name[1]!r}, too, in {name[0]} with the "
+                f"seed {name[2]}: rename `policy.name` in one of them"
+            )
+    return tuple(cells)
+
+
+def _judging(options: BenchmarkOptions) -> Conditions:
+    """How models are trained and judged; the rest is a submission's own."""
+    return Conditions(
+        resolution=max(Conditions.resolution, options.train_resolution),
+        train_resolution=options.train_resolution,
+        iterations=options.iterations,
+        gaussians=options.gaussians,
+        capacity=options.capacity,
+        backend=options.backend,
+        lpips=options.lpips,
+    )
+
+
+def _images_again(records: Sequence[dict[str, Any]]) -> list[str]:
+    """Whether the frames of submissions are, bit for bit, those that were seen there."""
+    lines: dict[str, None] = {}
+    for record in records:
+        if (told := record.get("submission")) is not None and told["known_images"]:
+            name = f"{record['policy']}, {record['scene']}, seed {record['seed']}"
+            share = f"{told['same_images']} of {told['known_images']} images"
+            lines[f"{name}: {share} are those of the exploration, bit for bit"] = None
+    return list(lines)
+
+
+def beside(
+    records: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Records with those of the same scenes and snapshots that were made on equal terms.
+
+    Args:
+        records: of submissions.
+        others: all of the same folder.
+    """
+    chosen = list(records)
+    for other in others:
+        alike = [
+            record
+            for record in records
+            if all(record[name] == other[name] for name in ("scene", "snapshot", "budget"))
+        ]
+        if other not in chosen and alike:
+            try:
+                check_equal_terms([alike[0], other])
+            except ValueError:  # another sensor or training: a table of its own
+                continue
+            chosen.append(other)
+    return chosen
 
 
 def _request(options: BenchmarkOptions) -> Request:

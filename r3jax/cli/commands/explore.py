@@ -19,6 +19,7 @@ from r3jax.cli.progress import RunProgress, Stages
 from r3jax.exploration.loop import Result, explore
 from r3jax.exploration.state import StopReason, TakenView
 from r3jax.planning.planner import Planner
+from r3jax.planning.policy import PolicyError
 from r3jax.planning.robot.motion import motion_of
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run, read_run
@@ -71,7 +72,7 @@ def run_explore(options: ExploreOptions) -> int:
                 on_view=on_view,
                 on_stage=progress.on_stage,
             )
-        except RunError as error:
+        except (RunError, PolicyError) as error:
             raise UserError(one_line(error)) from error
     with resumable("explore", recorder.path):
         _conclude(console, recorder.path, result)

@@ -14,6 +14,7 @@ from r3jax.cli.errors import UserError, one_line, resumable, resume_command
 from r3jax.cli.from_options import run_settings, scene_settings
 from r3jax.cli.options import TeamOptions
 from r3jax.cli.progress import RunProgress, Stages
+from r3jax.planning.policy import PolicyError
 from r3jax.trace.errors import RunError
 
 DEFAULT_BUDGET = "seconds:120"
@@ -46,7 +47,7 @@ def run_team(options: TeamOptions) -> int:
                 on_row=lambda number, row: progress.on_row(row),
                 on_stage=progress.on_stage,
             )
-        except RunError as error:
+        except (RunError, PolicyError) as error:
             raise UserError(one_line(error)) from error
     with resumable("team", folder):
         _conclude(console, folder, result)

@@ -109,20 +109,49 @@ class MachineOptions:
     `slurm_partition=gpu`, `gpus_per_node=1`, ..."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SubmissionOptions:
+    """Views that were chosen elsewhere."""
+
+    TITLE: ClassVar[str] = "submissions"
+
+    submission: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE")] = ()
+    """Judge these submissions (`r3jax export --format submission` writes one): check them, take
+    their frames again, train and judge. Scene, seed, budget and sensor are their own; where a mesh
+    lies, --scenes tells."""
+
+    check: bool = False
+    """With --submission: check and do no more. Exits with 1 if a rule is broken."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiteOptions:
+    """A page of what is there."""
+
+    TITLE: ClassVar[str] = "page"
+
+    site: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Write a static page of all records in --out into this folder, and do no more: tables with
+    intervals, pictures of the worst views, how fast this machine is."""
+
+
 @dataclass(frozen=True)
-class BenchmarkOptions(ExplorationOptions, TrainingOptions, MeshOptions, MachineOptions):
+class BenchmarkOptions(
+    SubmissionOptions, SiteOptions, ExplorationOptions, TrainingOptions, MeshOptions, MachineOptions
+):
     """Compare policies on equal terms: explore, train and judge scenes x policies x seeds."""
 
     EXAMPLES: ClassVar[tuple[str, ...]] = (
         "r3jax benchmark --scenes flat,office --policies ours,random --seeds 0,1",
         "r3jax benchmark --budget views:60 --snapshots views:30,views:60 --jobs 2",
+        "r3jax benchmark --submission theirs.jsonl --check",
     )
 
     scenes: Annotated[str, tyro.conf.arg(metavar="A,B")] = "flat,office"
     """Embedded scenes by name, or `mesh:<file>`, with commas between."""
 
     policies: Annotated[str, tyro.conf.arg(metavar="A,B")] = "ours,ours-pano,frontier,random"
-    """Who chooses the views, with commas between."""
+    """Who chooses the views, with commas between: names, `module:Class`, `exec:COMMAND`."""
 
     seeds: Annotated[str, tyro.conf.arg(metavar="0,1")] = "0"
     """Each makes an exploration and a training of its own."""

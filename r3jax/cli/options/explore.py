@@ -195,7 +195,8 @@ class ExploreOptions(
     """Embedded scene by name, or `mesh:<file>` (GLB, PLY, OBJ); `r3jax info` lists them."""
 
     policy: Annotated[str | None, tyro.conf.arg(metavar="POLICY")] = None
-    """Who chooses the next view: `ours-pano` by default; `r3jax policies` lists them."""
+    """Who chooses the next view: `ours-pano` by default; `r3jax policies` lists them. A class of
+    yours is `module:Class`, a program in any language `exec:COMMAND`."""
 
     budget: Annotated[str | None, tyro.conf.arg(metavar="BUDGET")] = None
     """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `metres:M`, or

@@ -76,22 +76,25 @@ class ForecastOptions:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Export a run for other programs: nerfstudio's transforms.json, or a COLMAP model."""
+    """Export a run for other programs: nerfstudio, COLMAP, or a submission to the benchmark."""
 
     EXAMPLES: ClassVar[tuple[str, ...]] = (
         "r3jax export runs/demo --out kitchen",
         "r3jax export runs/demo --format colmap --out kitchen-colmap",
+        "r3jax export runs/demo --format submission --out demo.jsonl",
     )
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """A run folder."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
-    """Where to: a folder that does not exist yet. It needs the run no longer."""
+    """Where to: a folder that does not exist yet; of a submission, a file. It needs the run no
+    longer."""
 
-    format: Literal["nerfstudio", "colmap", "colmap-text"] = "nerfstudio"
+    format: Literal["nerfstudio", "colmap", "colmap-text", "submission"] = "nerfstudio"
     """`nerfstudio`: images, depth, points.ply, transforms.json. `colmap`: the same with
-    sparse/0/*.bin in place of transforms.json; `colmap-text`: with *.txt."""
+    sparse/0/*.bin in place of transforms.json; `colmap-text`: with *.txt. `submission`: one file of
+    poses, some kB, that `r3jax benchmark --submission` judges."""
 
 
 @dataclass(frozen=True)

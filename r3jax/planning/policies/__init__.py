@@ -1,7 +1,8 @@
 """One file or folder per policy, and where each is found: names are known without importing them.
 
 A policy comes from this package, from another one (entry-point group `r3jax.policies`), from a
-class given as `package.module:Class`, or from this process (`planning.registry.register_policy`).
+class given as `package.module:Class`, from this process (`planning.registry.register_policy`), or
+from a program of its own (`exec:COMMAND`).
 """
 
 import functools
@@ -10,6 +11,7 @@ import re
 from importlib.metadata import entry_points
 
 from r3jax.formats.validation.choices import did_you_mean
+from r3jax.planning.policies.foreign.commands import COMMAND, words_of
 
 GROUP = "r3jax.policies"
 """Entry points by which other packages offer policies: `name = "package.module:Class"`."""
@@ -33,6 +35,9 @@ HOMES = {
     }.items()
 }
 """Module and class of every policy of this package."""
+
+FOREIGN = "r3jax.planning.policies.foreign.foreign:Foreign"
+"""Module and class of the policy that asks a program."""
 
 RETIRED = {"ours-demand": "it lost 0.74 dB against ours-pano; commit e43d800 has it"}
 """Policies that have left the package: the reason, and where their code is."""
@@ -62,7 +67,9 @@ def home_of(name: str) -> str:
     Raises:
         ValueError: no policy has that name; names the known ones, and the one that was meant.
     """
-    # Before all else: who asks for a policy that has left wants the reason, not a similar name.
+    if name.startswith(COMMAND):
+        return FOREIGN
+    # Before all others: who asks for a policy that has left wants the reason, not a similar name.
     if name in RETIRED:
         raise ValueError(f"policy {name!r} has left the package: {RETIRED[name]}")
     # Before plug-ins: in recorded runs these names mean policies of this package.
@@ -74,8 +81,8 @@ def home_of(name: str) -> str:
         return name
     names = known_names()
     raise ValueError(
-        f"unknown policy {name!r}{did_you_mean(name, names)}; known: {', '.join(names)}, or a "
-        "class as package.module:Class"
+        f"unknown policy {name!r}{did_you_mean(name, names)}; known: {', '.join(names)}, a class "
+        "as package.module:Class, or a program as exec:COMMAND"
     )
 
 
@@ -83,9 +90,13 @@ def check_policy(name: str) -> None:
     """Refuses a name that no policy has, or whose package is not there; imports no policy.
 
     Raises:
-        ValueError: names the known ones, and the one that was meant.
+        ValueError: names the known ones, and the one that was meant; or the program that is not
+            there.
     """
     if name in REGISTERED:
+        return
+    if name.startswith(COMMAND):
+        words_of(name.removeprefix(COMMAND))
         return
     module = home_of(name).partition(":")[0]
     try:

@@ -19,6 +19,7 @@ CHANGES = {
     "test_views_hash": "d" * 64,
     "num_test_views": 99,
     "settings": SETTINGS | {"lambda2": 0.25},
+    "submission": "e" * 64,
 }
 
 CONDITION_CHANGES = {

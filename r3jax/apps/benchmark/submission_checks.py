@@ -1,0 +1,255 @@
+"""What a submission must keep to be judged: scene, start, free space, speed, clock, budget.
+
+Every rule is one that the loop keeps by itself for a policy that runs here. They bound what is
+possible from outside: how a policy came to its views is its own affair.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from r3jax.exploration.budget import Budget, parse_budget
+from r3jax.exploration.clock import ModelClock
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.formats.submissions import Submission, SubmittedFrame
+from r3jax.geometry.cameras import angle_between
+from r3jax.planning.robot.limits import begin_at
+from r3jax.planning.robot.motion import Motion
+from r3jax.simulators.base import Simulator
+from r3jax.simulators.free_space import GroundTruth
+from r3jax.simulators.scenes.registry import scene_hash
+
+CLEARANCE = 0.15
+"""Least distance of the camera's path to every surface [m]. Paths of policies keep a cell of 0.2 m
+between them and what is not known to be free; a surface may reach 0.05 m into a cell before a hit
+marks it. Glass that the depth sensor does not see is left out, as no policy can know of it."""
+
+_SAME_PLACE = 2e-3
+"""Places this close are one [m]."""
+
+_SAME_ANGLE = 0.1
+"""Angles this close are one [deg]."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A rule that a submission breaks."""
+
+    frame: int | None
+    """Number of the frame; None: of the terms, in the first line."""
+
+    text: str
+    """What is wrong, and what to do."""
+
+    def __str__(self) -> str:
+        """Says where, then what."""
+        where = "line 1" if self.frame is None else f"line {self.frame + 2}, frame {self.frame}"
+        return f"{where}: {self.text}"
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """What all frames keep."""
+
+    budget: Budget
+    config: ExplorationConfig
+    motion: Motion
+    heights: tuple[float, float]
+    """Lowest and highest place of the camera [m], world."""
+
+    @property
+    def speed(self) -> float:
+        """Along the path [m/s]."""
+        return self.motion.speed or self.config.speed
+
+    def cost(self, stage: str) -> float:
+        """The least that a stage takes on the mission clock [s]."""
+        return ModelClock().costs[stage] if self.config.clock == "model" else 0.0
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A frame, and how the camera came to it."""
+
+    frame: SubmittedFrame
+    before: SubmittedFrame
+    """The frame before."""
+
+    path: np.ndarray
+    """Waypoints from there, [K, 3] [m]."""
+
+    metres: float
+    """Path up to the frame [m]."""
+
+    metres_before: float
+    """Path up to the frame before [m]."""
+
+    views: int
+    """Views that were chosen, this one or the one on the way to which it was captured included."""
+
+    @property
+    def length(self) -> float:
+        """Length of the path from the frame before [m]."""
+        return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
+
+    @property
+    def seconds(self) -> float:
+        """Mission clock from the frame before until the camera arrives [s]."""
+        return self.frame.seconds - self.frame.mapping - self.before.seconds
+
+    @property
+    def turn(self) -> float:
+        """Angle between the two views [deg]."""
+        views = (self.before.pose.astype(np.float64), self.frame.pose.astype(np.float64))
+        return math.degrees(angle_between(*views))
+
+
+def check_submission(submission: Submission, simulator: Simulator) -> list[Problem]:
+    """Lists the rules that a submission breaks, in the order of its lines.
+
+    Args:
+        submission: as it was read.
+        simulator: its scene, opened as it says.
+
+    Raises:
+        ValueError: the simulator has no mesh to check paths against; a budget, or a start, that
+            cannot be.
+    """
+    found = scene_hash(simulator)
+    if found != submission.scene["hash"]:
+        told = (
+            f"the scene {submission.scene['name']} has the hash {found[:12]} here, "
+            f"{submission.scene['hash'][:12]} in the submission: use the file of the scene, and "
+            "the r3jax, that the views were chosen with"
+        )
+        return [Problem(None, told)]
+    motion, truth = submission.robot, GroundTruth(simulator)
+    start = begin_at(motion, simulator.start_pose)
+    heights = motion.heights_from(float(start[2, 3]))
+    terms = _Terms(parse_budget(submission.budget), submission.config, motion, heights)
+    problems: list[Problem] = []
+    for step in _steps(submission):
+        texts = [
+            *_in_budget(step, terms),
+            *_within_limits(step, terms),
+            *_in_free_space(step, truth),
+            *(_at_start(step, start, submission.seed) if step.frame.frame == 0 else ()),
+            *(_in_time(step, terms) if step.frame.frame > 0 else ()),
+        ]
+        problems += [Problem(step.frame.frame, text) for text in texts]
+    return problems
+
+
+def _steps(submission: Submission) -> Iterator[_Step]:
+    before, metres, views = submission.frames[0], 0.0, 0
+    for frame, path in zip(submission.frames, submission.paths(), strict=True):
+        # A frame on the way belongs to the view that it was captured on the way to.
+        step = _Step(frame, before, path, metres, metres, views + 1)
+        flown = metres + step.length if frame.metres is None else frame.metres
+        yield _Step(frame, before, path, flown, metres, views + 1)
+        before, metres, views = frame, flown, views + (not frame.captured)
+
+
+def _at_start(step: _Step, start: np.ndarray, seed: int) -> Iterator[str]:
+    """The first frame is taken at the scene's start, at no cost."""
+    apart = float(np.linalg.norm(step.frame.position - start[:3, 3]))
+    turned = math.degrees(angle_between(step.frame.pose.astype(np.float64), start))
+    if apart > _SAME_PLACE or turned > _SAME_ANGLE:
+        yield (
+            f"it lies {apart:.3f} m and {turned:.2f} degrees from the scene's start at "
+            f"{start[:3, 3].round(4).tolist()}: begin there; the seed {seed} decides where that is"
+        )
+    if step.frame.captured:
+        yield "it is captured on the way from nowhere: leave `captured` out"
+    if step.frame.metres:
+        yield f"it comes after {step.frame.metres:g} metres: the path begins here"
+
+
+def _in_budget(step: _Step, terms: _Terms) -> Iterator[str]:
+    """The frame arrives within the budget."""
+    arrival, frames = step.frame.seconds - step.frame.mapping, step.frame.frame + 1
+    spent = {"views": step.views, "frames": frames, "seconds": arrival, "metres": step.metres}
+    if not terms.budget.allows(
+        views=step.views, frames=frames, seconds=arrival, metres=step.metres
+    ):
+        spent_of_it = f"{spent[terms.budget.unit]:g} {terms.budget.unit}"
+        yield f"it takes {spent_of_it}, beyond the budget {terms.budget}: end before it"
+
+
+def _within_limits(step: _Step, terms: _Terms) -> Iterator[str]:
+    """What carries the camera can be there, and look there."""
+    motion, (low, high) = terms.motion, terms.heights
+    lowest, highest = float(step.path[:, 2].min()), float(step.path[:, 2].max())
+    if lowest < low - _SAME_PLACE or highest > high + _SAME_PLACE:
+        yield (
+            f"its path reaches from {lowest:.3f} to {highest:.3f} m in height, the robot from "
+            f"{low:.3f} to {high:.3f} m: stay there"
+        )
+    elevation = math.degrees(math.asin(max(-1.0, min(1.0, float(step.frame.pose[2, 2])))))
+    least, most = motion.elevations
+    if not least - _SAME_ANGLE <= elevation <= most + _SAME_ANGLE:
+        yield (
+            f"it looks {elevation:.2f} degrees above the horizon, the robot can from {least:g} to "
+            f"{most:g}: turn the view"
+        )
+    straight = float(np.linalg.norm(step.frame.position - step.before.position))
+    allowed = math.inf if motion.turn_per_meter is None else motion.turn_per_meter * straight
+    if step.turn > allowed + _SAME_ANGLE:
+        yield (
+            f"it turns by {step.turn:.1f} degrees over {straight:.3f} m, the robot by at most "
+            f"{allowed:.1f}: turn less, or go farther"
+        )
+
+
+def _in_free_space(step: _Step, truth: GroundTruth) -> Iterator[str]:
+    """Nothing is nearer to the path than the clearance."""
+    room, place = truth.room_along(step.path)
+    if room < CLEARANCE:
+        what = "runs through a surface" if room == 0.0 else f"comes as near as {room:.3f} m to one"
+        yield (
+            f"its path {what} at {place.round(3).tolist()}: keep {CLEARANCE} m, or give the "
+            "waypoints of a path round it as `path`"
+        )
+
+
+def _in_time(step: _Step, terms: _Terms) -> Iterator[str]:
+    """The path begins and ends at the views, and the clock leaves time for it."""
+    ends = np.stack([step.before.position, step.frame.position])
+    apart = np.linalg.norm(step.path[[0, -1]] - ends, axis=1)
+    if apart.max() > _SAME_PLACE:
+        yield f"its path ends {apart.max():.3f} m from a view: begin at the one before, end at it"
+    flown = step.metres - step.metres_before
+    if flown < _less(step.length):
+        yield f"`metres` grows by {flown:.4f}, the path has {step.length:.4f} m: count all of it"
+    mapping = terms.cost("mapping")
+    if step.frame.mapping < _less(mapping):
+        yield f"`mapping` is {step.frame.mapping:g} s, on the model clock it takes {mapping:g} s"
+    needed, why = _least_seconds(step, terms, max(flown, step.length))
+    if step.seconds < _less(needed):
+        yield (
+            f"it arrives {step.seconds:.4f} s after the frame before, {why} take {needed:.4f} s: "
+            "count planning and flight"
+        )
+
+
+def _least_seconds(step: _Step, terms: _Terms, length: float) -> tuple[float, str]:
+    """The least time that a decision and a flight take, and what it is made of."""
+    rate, flight = terms.motion.turn_rate, length / terms.speed
+    turning = 0.0 if rate is None else step.turn / rate
+    # On the way the camera turns while it flies; to a view it flies first.
+    is_whole = not (step.frame.captured or step.before.captured)
+    flight = flight + turning if is_whole else max(flight, turning)
+    why = f"{length:.3f} m at {terms.speed:g} m/s"
+    if rate is not None:
+        why += f" and a turn by {step.turn:.1f} degrees at {rate:g} degrees/s"
+    if step.before.captured or terms.config.clock != "model":  # decided before, or measured
+        return flight, why
+    stage = "reconsidering" if terms.config.plan_while_moving else "planning"
+    return flight + terms.cost(stage), f"a decision on the model clock and {why}"
+
+
+def _less(value: float) -> float:
+    """A length [m] or a time [s] with what rounding may take from it."""
+    return value * (1.0 - 1e-4) - 1e-4

@@ -1,0 +1,401 @@
+"""Submissions: an exploration as its poses, a JSON line each, from which all else is made again.
+
+    {"format": "r3jax-submission", "version": 1, "protocol": 1, "scene": {...}, "seed": 0, ...}
+    {"frame": 0, "pose": [[...], [...], [...], [...]], "seconds": 0.02}
+    {"frame": 1, "pose": [[...], [...], [...], [...]], "seconds": 1.7}
+
+The first line says on what terms the views were taken, each other line is a frame. Whoever can
+write such a file, in whatever language, can be judged by `r3jax benchmark --submission FILE`.
+
+Shape symbols: K waypoints.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.replay import check_decided_alone, config_of
+from r3jax.exploration.state import COMPLETE
+from r3jax.files import write_atomic
+from r3jax.formats.errors import naming
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import build, check_type
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json
+from r3jax.formats.validation.versions import check_version
+from r3jax.geometry.cameras import Camera
+from r3jax.planning.policies import HOMES
+from r3jax.planning.robot.motion import Motion, motion_of_record
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run
+from r3jax.trace.rows import StepRow, rigid_pose, shortest_floats, table_of
+
+FORMAT = "r3jax-submission"
+"""What the first line says it is."""
+
+VERSION = 1
+"""Format version that this package writes."""
+
+PROTOCOL = 1
+"""Version of the rules that a submission keeps: sensor, clock, speed, clearance, test views."""
+
+_MAX_BYTES = 64 << 20
+"""A frame takes some hundred bytes."""
+
+_LENS = ("fx", "fy", "cx", "cy")
+
+_LARGEST = {"capacity": 1 << 22, "num_bins": 1024, "num_probes": 1024}
+"""Settings of the loop that a stranger's file could fill the memory with."""
+
+_SENSOR = ("up", "scale", "cull_backfaces", "noise", "max_range")
+"""How a scene is opened, beside its name and hash."""
+
+
+@dataclass(frozen=True)
+class SubmittedFrame:
+    """One frame: where, when, and how the camera came there."""
+
+    frame: int
+    """Its number, from 0."""
+
+    pose: np.ndarray
+    """`T_world_camera`, [4, 4] float32."""
+
+    seconds: float
+    """Mission clock once the frame was taken and mapped [s]."""
+
+    mapping: float = 0.0
+    """Part of `seconds` that mapping took after the camera had arrived [s]."""
+
+    metres: float | None = None
+    """Path flown so far [m]; None: the sum of the paths."""
+
+    path: np.ndarray | None = None
+    """Waypoints from the frame before to this one, [K, 3] float32 [m]; None: a straight line."""
+
+    captured: bool = False
+    """True if the frame was captured on the way to a view, and not chosen itself."""
+
+    sha256: str | None = None
+    """Hash of the stored pixels (`trace.images.content_hash`); None: nobody knows."""
+
+    @property
+    def position(self) -> np.ndarray:
+        """Camera center [3] float64 [m]."""
+        return self.pose[:3, 3].astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Submission:
+    """The poses of one exploration, and the terms on which they were chosen."""
+
+    scene: dict[str, Any]
+    """`name`, `hash`, and how it is opened: `noise`, `max_range`, `up`, `scale`,
+    `cull_backfaces`."""
+
+    seed: int
+    """Of the sensor's noise, of the start, and of the training."""
+
+    budget: str
+    """For example `views:60`."""
+
+    camera: dict[str, int | float]
+    """`width`, `height`, `fx`, `fy`, `cx`, `cy` [px]."""
+
+    policy: dict[str, Any]
+    """`name`, `version`, and what else its author wants to tell."""
+
+    frames: tuple[SubmittedFrame, ...]
+    """In the order in which they were taken."""
+
+    exploration: dict[str, Any] = field(default_factory=dict[str, Any])
+    """Settings of the loop that differ from those of `ExplorationConfig`: clock, speed, ..."""
+
+    motion: dict[str, Any] | None = None
+    """What carries the camera, as in `Motion`; None: a camera that flies."""
+
+    outcome: str = "budget"
+    """Why the exploration ended: `exploration.state.StopReason`."""
+
+    packages: dict[str, str] = field(default_factory=dict[str, str])
+    """Versions of the software that chose the views."""
+
+    @property
+    def config(self) -> ExplorationConfig:
+        """Settings of the loop.
+
+        Raises:
+            ValueError: one that cannot work.
+        """
+        return ExplorationConfig(**self.exploration | {"max_range": self.scene["max_range"]})
+
+    @property
+    def robot(self) -> Motion:
+        """What carries the camera.
+
+        Raises:
+            ValueError: a setting that cannot work.
+        """
+        return motion_of_record(self.motion)
+
+    @property
+    def intrinsics(self) -> Camera:
+        """The camera of every frame."""
+        names = [field.name for field in dataclasses.fields(Camera)]
+        return Camera(**{name: self.camera[name] for name in names})  # pyright: ignore[reportArgumentType]
+
+    @property
+    def name(self) -> str:
+        """What tables call it: submitted, so that it stands beside the policy itself."""
+        return f"{self.policy['name']} (submitted)"
+
+    def paths(self) -> list[np.ndarray]:
+        """Waypoints to each frame, [K, 3] float64 [m] each; the first frame has one: its place."""
+        found = [self.frames[0].position[None]]
+        for before, frame in zip(self.frames, self.frames[1:], strict=False):
+            straight = np.stack([before.position, frame.position])
+            found.append(straight if frame.path is None else frame.path.astype(np.float64))
+        return found
+
+
+def submission_of_run(run: Run) -> Submission:
+    """Takes the poses out of a recorded run.
+
+    Raises:
+        RunError: a run that is not over, or whose views are not one policy's from the scene's own
+            start on.
+    """
+    header = run.header
+    check_decided_alone(run)
+    if header.parent is not None:
+        raise RunError(run.path, "it is a fork: part of its views is another run's choice")
+    if run.end is None or run.end.outcome not in COMPLETE:
+        raise RunError(
+            run.path,
+            f"it is not over ({run.outcome}): go on with `r3jax explore --resume {run.path}`",
+        )
+    if header.scene.get("start") is not None:
+        raise RunError(
+            run.path, "it began at a --start of its own; the protocol begins where the scene does"
+        )
+    given = dataclasses.asdict(config_of(run))
+    default = dataclasses.asdict(ExplorationConfig())
+    own = header.policy["name"] in HOMES
+    # Of the record itself: the policy may be of a package that is not installed here.
+    motion = header.policy.get("settings", {}).get("motion")
+    opened: dict[str, Any] = {"up": None, "scale": 1.0, "cull_backfaces": False} | header.scene
+    if missing := [name for name in ("name", "hash", *_SENSOR) if opened.get(name, ...) is ...]:
+        raise RunError(run.path, f"an early version recorded it without {', '.join(missing)}")
+    return Submission(
+        scene={name: opened[name] for name in ("name", "hash", *_SENSOR)},
+        seed=header.seed,
+        budget=header.budget,
+        camera=dict(header.camera),
+        policy={
+            "name": header.policy["name"],
+            "version": f"r3jax {header.packages.get('r3jax', '')}" if own else "",
+            "settings": header.policy.get("settings", {}),
+        },
+        frames=_frames_of(run.rows),
+        exploration={
+            name: value
+            for name, value in given.items()
+            if value != default[name] and name not in ("max_range", "checkpoint_every")
+        },
+        motion=motion,
+        outcome=run.end.outcome,
+        packages=header.packages,
+    )
+
+
+def _frames_of(rows: Sequence[StepRow]) -> tuple[SubmittedFrame, ...]:
+    """The frames of a trace, each with the piece of the path that leads to it."""
+    frames: list[SubmittedFrame] = []
+    waypoints, begin = np.zeros((0, 3)), 0.0
+    for number, row in enumerate(rows):
+        path = None
+        if number > 0:
+            before = rows[number - 1]
+            if row.choice is not None:  # where frames are captured it stands in the first one's row
+                waypoints, begin = row.choice.waypoints.astype(np.float64), before.metres
+            piece = piece_of_path(waypoints, before.metres - begin, row.metres - begin)
+            # Exactly from frame to frame: lengths along the path are rounded.
+            piece[0], piece[-1] = before.pose[:3, 3], row.pose[:3, 3]
+            path = piece if len(piece) > 2 else None
+        frames.append(
+            SubmittedFrame(
+                frame=row.step,
+                pose=row.pose,
+                seconds=row.seconds,
+                mapping=row.charged.get("mapping", 0.0),
+                metres=row.metres,
+                path=path,
+                captured=row.captured,
+                sha256=row.sha256,
+            )
+        )
+    return tuple(frames)
+
+
+def piece_of_path(waypoints: np.ndarray, begin: float, end: float) -> np.ndarray:
+    """Cuts the piece between two lengths [m] out of a path over waypoints [K, 3], [L, 3] [m]."""
+    if len(waypoints) < 2:
+        return np.zeros((2, 3))
+    steps = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    done = np.concatenate([[0.0], np.cumsum(steps)])
+    # Bends at the very ends of the piece are its ends.
+    between = (done > begin + 1e-4) & (done < end - 1e-4)
+    at = np.concatenate([[begin], done[between], [end]])
+    return np.stack([np.interp(at, done, waypoints[:, axis]) for axis in range(3)], axis=1)
+
+
+def write_submission(path: Path, submission: Submission) -> None:
+    """Writes the file: whole, or not at all.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    write_atomic(path, submission_text(submission).encode())
+
+
+def submission_text(submission: Submission) -> str:
+    """The lines of the file."""
+    first = {"format": FORMAT, "version": VERSION, "protocol": PROTOCOL}
+    for item in dataclasses.fields(Submission):
+        if item.name != "frames":
+            first[item.name] = getattr(submission, item.name)
+    lines = [first, *(_plain(frame) for frame in submission.frames)]
+    return "".join(
+        json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n" for line in lines
+    )
+
+
+def _plain(frame: SubmittedFrame) -> dict[str, Any]:
+    """A frame as JSON has it; what is at its default is left out."""
+    plain = {
+        item.name: getattr(frame, item.name)
+        for item in dataclasses.fields(SubmittedFrame)
+        if item.name in ("pose", "path") or getattr(frame, item.name) != item.default
+    }
+    return {
+        name: shortest_floats(value) if isinstance(value, np.ndarray) else value
+        for name, value in plain.items()
+        if value is not None
+    }
+
+
+def read_submission(path: Path) -> Submission:
+    """Reads a submission.
+
+    Raises:
+        FormatError: missing, not a submission, of another version or protocol; a field that is
+            missing, unknown or of another type; a pose that is not rigid; frames that are doubled
+            or out of order. Says which line.
+    """
+    with naming(path):
+        return parse_submission(read_bytes(path, _MAX_BYTES))
+
+
+def parse_submission(data: bytes) -> Submission:
+    """Reads the lines of a submission.
+
+    Raises:
+        ForeignFileError: as `read_submission` says.
+    """
+    lines = data.split(b"\n")
+    if lines and not lines[-1].strip():
+        lines.pop()
+    if not lines:
+        raise ForeignFileError("the file is empty: its first line should say what it is")
+    frames: list[SubmittedFrame] = []
+    header: dict[str, Any] = {}
+    for number, line in enumerate(lines, start=1):
+        try:
+            if number == 1:
+                header = _header_of(parse_json(line))
+            else:
+                frames.append(_frame_of(parse_json(line), len(frames)))
+        except ForeignFileError as error:
+            raise ForeignFileError(f"line {number}: {error}") from None
+    if not frames:
+        raise ForeignFileError("there are no frames: each takes a line after the first one")
+    return build(Submission, header, frames=tuple(frames))
+
+
+def _header_of(plain: Any) -> dict[str, Any]:
+    """The fields of the first line, but for what says that it is one."""
+    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+        raise ForeignFileError(f"this is no submission (no format {FORMAT!r})")
+    check_version(plain.get("version"), VERSION)
+    if plain.get("protocol") != PROTOCOL:
+        raise ForeignFileError(
+            f"protocol {plain.get('protocol')!s:.20}, this package judges by protocol {PROTOCOL}: "
+            "export the run again, or use the r3jax of that protocol"
+        )
+    fields = {k: v for k, v in plain.items() if k not in ("format", "version", "protocol")}
+    header = build(Submission, fields, frames=())  # types, missing and unknown names
+    _check_parts(header)
+    return fields
+
+
+def _check_parts(header: Submission) -> None:
+    """Refuses what the types of the fields alone do not tell."""
+    kinds: dict[str, Any] = {"name": str, "hash": str, "noise": float, "max_range": float}
+    kinds |= {"up": str | None, "scale": float, "cull_backfaces": bool}
+    for name, kind in kinds.items():
+        check_type(f"scene.{name}", header.scene.get(name), kind)
+    sizes, lens = dict.fromkeys(("width", "height"), int), dict.fromkeys(_LENS, float)
+    for name, kind in (sizes | lens).items():
+        check_type(f"camera.{name}", header.camera.get(name), kind)
+    for name in ("name", "version"):
+        check_type(f"policy.{name}", header.policy.get(name), str)
+    if header.outcome not in COMPLETE:
+        raise ForeignFileError(f"`outcome` must be one of {', '.join(sorted(COMPLETE))}")
+    _check_settings("exploration", header.exploration, ExplorationConfig)
+    _check_settings("motion", header.motion or {}, Motion)
+    for name, largest in _LARGEST.items():
+        if header.exploration.get(name, 0) > largest:
+            raise ForeignFileError(f"`exploration.{name}` is more than {largest}")
+    try:
+        _ = header.config, header.robot, header.intrinsics
+    except ValueError as error:
+        raise ForeignFileError(str(error)) from None
+
+
+def _check_settings(name: str, plain: dict[str, Any], kind: type) -> None:
+    """Refuses settings of other types than those of the fields of `kind`, and unknown ones."""
+    hints = get_type_hints(kind)
+    for field_name, value in plain.items():
+        if field_name not in hints:
+            raise ForeignFileError(f"`{name}` has an unknown {field_name!r:.80}")
+        check_type(f"{name}.{field_name}", value, hints[field_name])
+
+
+def _frame_of(plain: Any, number: int) -> SubmittedFrame:
+    """A frame of its line; `number` is that of the frame that comes next."""
+    known: dict[str, Any] = plain if isinstance(plain, dict) else {}
+    ready: dict[str, Any] = {"pose": rigid_pose("pose", known.get("pose"))}
+    if known.get("path") is not None:
+        ready["path"] = table_of("path", known["path"], (-1, 3))
+    frame = build(SubmittedFrame, plain, **ready)
+    if frame.frame < number:
+        raise ForeignFileError(f"frame {frame.frame} occurs twice: number the frames 0, 1, 2, ...")
+    if frame.frame > number:
+        raise ForeignFileError(f"frame {frame.frame} comes where frame {number} should be")
+    if frame.path is not None and len(frame.path) < 2:
+        raise ForeignFileError("`path` needs two waypoints: where it begins, and where it ends")
+    return frame
+
+
+def content_hash(submission: Submission) -> str:
+    """SHA-256 of what a submission says, wherever its file and that of its scene lie."""
+    # The scene is known by the hash of what it shows, not by its name.
+    nowhere = dataclasses.replace(submission, scene=submission.scene | {"name": ""})
+    return hashlib.sha256(submission_text(nowhere).encode()).hexdigest()

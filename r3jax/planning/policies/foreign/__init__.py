@@ -1,0 +1,1 @@
+"""Policies that are programs of their own, in any language: `exec:COMMAND`."""

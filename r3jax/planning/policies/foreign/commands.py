@@ -1,0 +1,38 @@
+"""Commands in the names of policies: `exec:python my_policy.py`. Light: names are checked early."""
+
+import shlex
+import shutil
+from pathlib import Path
+
+COMMAND = "exec:"
+"""What the names of such policies begin with."""
+
+
+def words_of(command: str) -> list[str]:
+    """Program and arguments of a command, split as a shell does.
+
+    Raises:
+        ValueError: there is no such program, or a quotation mark is open.
+    """
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ValueError(f"policy {COMMAND}{command}: {error}") from None
+    if not words:
+        raise ValueError(f"policy {COMMAND!r} lacks its command: {COMMAND}PROGRAM ARGUMENTS")
+    if shutil.which(words[0]) is None:
+        raise ValueError(
+            f"policy {COMMAND}{command}: there is no program {words[0]!r}; a script needs its "
+            f"interpreter, as in {COMMAND}python my_policy.py"
+        )
+    return words
+
+
+def short_name(name: str) -> str:
+    """What folders call a policy: the class of `package.module:Class`, the script of a command."""
+    if not name.startswith(COMMAND):
+        return name.rpartition(":")[2]
+    words = [word for word in words_of(name.removeprefix(COMMAND)) if not word.startswith("-")]
+    # The script, not its interpreter, nor what the script is told.
+    scripts = [word for word in words if Path(word).suffix] or words[:1]
+    return Path(scripts[0]).stem

@@ -1,0 +1,373 @@
+"""A policy that asks a program: what was seen goes to its input, the next view comes back.
+
+The program gets what a policy of this package gets to choose from: candidates that can be reached,
+with the paths to them, and the coarse grid. It answers with one of them, or with a view of its own,
+which must lie where the robot can go, too.
+
+Shape symbols: n frames; H W image size; X Y Z cells; C candidates.
+"""
+
+import itertools
+import time
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.fields import check_type
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import Candidates, candidates_along, host_generator, path_lengths
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.decision import (
+    PlannerState,
+    Stopwatch,
+    follow_path,
+    initial_state,
+    no_decision,
+    prepare_decision,
+    select_best,
+)
+from r3jax.planning.greedy import random_views
+from r3jax.planning.policies.foreign.commands import COMMAND
+from r3jax.planning.policies.foreign.messages import Message
+from r3jax.planning.policies.foreign.program import Program, limits_memory, network
+from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PolicyError, Situation
+from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.travel import Travel
+
+PROTOCOL = 1
+"""Version of the messages."""
+
+_SAME_PLACE = 1e-6
+"""Positions this close are one [m]."""
+
+
+@dataclass(frozen=True)
+class ForeignConfig(PlannerConfig):
+    """What a program is held to, and the candidates that it is offered."""
+
+    command: str = ""
+    """Program and arguments."""
+
+    answer_seconds: float = 120.0
+    """Time limit of an answer [s]."""
+
+    memory: float = 8.0
+    """What each process of the program may take [GiB]; 0: no limit."""
+
+    def __post_init__(self) -> None:
+        """Refuses values that would fail later, and says which."""
+        super().__post_init__()
+        for name in ("answer_seconds", "memory"):
+            if not 0.0 <= getattr(self, name) < 1e6:
+                raise ValueError(f"{name} must be a number >= 0, got {getattr(self, name)}")
+
+
+@dataclass
+class _Session:
+    """A program and what it was told: the one thing here that changes."""
+
+    program: Program
+
+    frames: dict[int, Frame] = field(default_factory=dict[int, Frame])
+    """Frames that it has not been shown yet, by number."""
+
+    answers: dict[int, tuple[Message, float]] = field(
+        default_factory=dict[int, tuple[Message, float]]
+    )
+    """Its last answer and the seconds that it took, by the number of frames before it."""
+
+    shown: int = 0
+    """Frames that it has been shown."""
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """Asks a program of its own: exec:COMMAND."""
+
+    config: ForeignConfig = field(default_factory=ForeignConfig)
+
+    _sessions: dict[int, _Session] = field(
+        default_factory=dict[int, _Session], compare=False, repr=False
+    )
+
+    name = "exec"
+    source = "the program itself"
+    Config = ForeignConfig
+
+    def __post_init__(self) -> None:
+        """Takes the command into the name."""
+        object.__setattr__(self, "name", COMMAND + self.config.command)
+
+    @property
+    def isolation(self) -> dict[str, Any]:
+        """What a program is held to on this system; None where it cannot be."""
+        held = self.config.memory if limits_memory() and self.config.memory else None
+        return {"memory_gib": held, "network": network()}
+
+    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
+        """Starts the program and greets it.
+
+        Raises:
+            PolicyError: it cannot be started, or does not answer.
+        """
+        session = _Session(Program(self.config.command, self.config.memory))
+        # By number, in the state: several cameras may be planned for by one policy.
+        number = next(n for n in itertools.count() if n not in self._sessions)
+        self._sessions[number] = session
+        answer = session.program.ask(self._hello(camera, grid, key), self.config.answer_seconds)
+        if answer.kind != "hello" or answer.fields.get("protocol") != PROTOCOL:
+            raise self._refused(
+                session, f"answered `hello` with {answer.kind!r:.80}, protocol "
+                f"{answer.fields.get('protocol')!r:.20}: this r3jax speaks protocol {PROTOCOL}"
+            )  # fmt: skip
+        memory = np.array([number, 0], dtype=np.int64)
+        return initial_state(camera, grid, memory, self.config.motion)
+
+    def _hello(self, camera: Camera, grid: OccupancyGrid, key: Array) -> Message:
+        """What holds for the whole run."""
+        origin, size = np.asarray(grid.origin, np.float64), float(grid.cell_size)
+        far = origin + size * np.asarray(grid.log_odds.shape)
+        lens = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+        return Message(
+            "hello",
+            {
+                "protocol": PROTOCOL,
+                "seed": _seed(key),
+                "camera": {"width": camera.width, "height": camera.height, **lens},
+                "max_range": float(self.config.scoring.max_range),
+                "bounds": [origin.tolist(), far.tolist()],
+                "cell_size": size,
+                "safety_margin": self.config.safety_margin,
+                "motion": vars(self.config.motion),
+            },
+        )
+
+    def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
+        """Keeps the frame for the next question."""
+        del map_state
+        session, seen = self._session(state)
+        # By number: a call that is made again to be timed changes nothing.
+        session.frames[seen] = frame
+        return replace(state, memory=state.memory + np.array([0, 1]))
+
+    def decide(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
+        """The view that the program chooses, and the path to it.
+
+        Raises:
+            PolicyError: no answer, or one that cannot be taken; the program has ended then.
+        """
+        stopwatch = Stopwatch()
+        # As a policy of this package: the same key offers the same candidates.
+        draw_key, ask_key = jax.random.split(key)
+        with stopwatch.part("travel"):
+            state, travel, masked = prepare_decision(
+                state, map_state, grid, T_world_camera, self.config
+            )
+        pose = np.asarray(T_world_camera, dtype=np.float64)
+        limits = Limits(self.config.motion, pose, travel.heights)
+        with stopwatch.part("candidates"):
+            situation = Situation(map_state, grid, masked, travel, state.camera, None, limits)
+            drawn = random_views(situation, self.config, key=draw_key)
+            offered = _in_reach(limits.project_to_feasible(drawn), travel, limits)
+        if not len(offered.valid):
+            decision, info = no_decision(travel, self.config, stopwatch)
+            return decision, state, info
+        session, seen = self._session(state)
+        with stopwatch.part("scoring"):
+            path = _costs(offered, travel, limits)
+            question = Message("decide", {"view": seen, "seed": _seed(ask_key)})
+            question.arrays.update(_surroundings(grid, travel, pose, offered, path))
+            answer = self._answer(session, seen, question)
+        try:
+            chosen = _view_of(answer, offered, travel, limits)
+        except ForeignFileError as error:
+            raise self._refused(session, f"chose view {seen}: {error}") from None
+        if chosen is None:
+            info = PlanInfo(DecisionOutcome.NO_CANDIDATE, len(path), len(path), stopwatch.seconds)
+            return None, state, info
+        candidates, best = chosen
+        total = np.zeros(len(candidates.valid))
+        total[best] = 1.0
+        utilities = {"total": total, "path": _costs(candidates, travel, limits)}
+        _, decision, state, info = select_best(
+            state, travel, candidates, utilities, limits, stopwatch
+        )
+        return decision, state, info
+
+    def follow(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        waypoints: np.ndarray,
+    ) -> PlannerState:
+        """The cells on the way; the program is told of frames alone."""
+        return follow_path(state, map_state, grid, T_world_camera, waypoints, self.config)
+
+    def close(self) -> None:
+        """Ends the programs."""
+        while self._sessions:
+            _, session = self._sessions.popitem()
+            session.program.close()
+
+    def _session(self, state: PlannerState) -> tuple[_Session, int]:
+        """The session of a state, and the number of frames that it has observed.
+
+        Raises:
+            PolicyError: it has ended.
+        """
+        number, seen = (int(value) for value in np.asarray(state.memory))
+        if number not in self._sessions:
+            raise PolicyError(f"the program {self.config.command!r} has ended")
+        return self._sessions[number], seen
+
+    def _answer(self, session: _Session, seen: int, question: Message) -> Message:
+        """Asks, with all frames that the program has not seen; the same question only once.
+
+        Raises:
+            PolicyError: no answer, or a question about what is long gone.
+        """
+        if seen in session.answers:
+            answer, seconds = session.answers[seen]
+            # Asked again to be timed, without what was compiled: it takes as long as it took.
+            time.sleep(seconds)
+            return answer
+        numbers = sorted(number for number in session.frames if number < seen)
+        # A state of the past, or one that was stored: the program would know less or more than it.
+        if seen < session.shown or numbers != list(range(session.shown, seen)):
+            raise PolicyError(
+                f"the program {self.config.command!r} has seen {session.shown} frames and cannot "
+                f"go to view {seen} from there: start anew"
+            )
+        question.arrays.update(_images([session.frames[number] for number in numbers]))
+        begin = time.perf_counter()
+        answer = session.program.ask(question, self.config.answer_seconds)
+        session.frames = {n: frame for n, frame in session.frames.items() if n >= seen}
+        session.shown = seen
+        session.answers = {seen: (answer, time.perf_counter() - begin)}
+        return answer
+
+    def _refused(self, session: _Session, reason: str) -> PolicyError:
+        """An error for an answer that cannot be taken; the program is ended."""
+        session.program.close()
+        return PolicyError(f"the program {self.config.command!r} {reason}")
+
+
+def _seed(key: Array) -> int:
+    """A number that follows from a key, for whatever random numbers a program draws."""
+    return int(host_generator(key).integers(1 << 31))
+
+
+def _in_reach(drawn: Candidates, travel: Travel, limits: Limits) -> Candidates:
+    """The views that are no padding and that a path leads to."""
+    if not len(drawn.valid):
+        return drawn
+    return drawn.take(np.isfinite(_costs(drawn, travel, limits)))
+
+
+def _costs(candidates: Candidates, travel: Travel, limits: Limits) -> np.ndarray:
+    """What the paths to views cost, turns included, [C] [m]."""
+    return limits.path_costs(path_lengths(travel, candidates), candidates.direction)
+
+
+def _images(frames: list[Frame]) -> dict[str, np.ndarray]:
+    """Frames as arrays: color [n, H, W, 3], depth [n, H, W] [m], poses [n, 4, 4]."""
+    if not frames:
+        return {}
+    rgb = np.stack([np.asarray(frame.rgb) for frame in frames])
+    return {
+        "rgb": np.rint(rgb * np.float32(255.0)).astype(np.uint8),
+        "depth": np.stack([np.asarray(frame.depth, np.float32) for frame in frames]),
+        "T_world_camera": np.stack(
+            [np.asarray(frame.T_world_camera, np.float32) for frame in frames]
+        ),
+    }
+
+
+def _surroundings(
+    grid: OccupancyGrid, travel: Travel, pose: np.ndarray, offered: Candidates, path: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Where the camera is, what is on offer, and what is known of the space."""
+    free, occupied = np.asarray(grid.free), np.asarray(grid.occupied)
+    return {
+        "here": pose,
+        "position": offered.position,
+        "direction": offered.direction,
+        "path": path,
+        "cells": free.astype(np.uint8) + np.uint8(2) * occupied.astype(np.uint8),
+        "stops": (travel.goals & travel.safe).astype(np.uint8),
+    }
+
+
+def _view_of(
+    answer: Message, offered: Candidates, travel: Travel, limits: Limits
+) -> tuple[Candidates, int] | None:
+    """What is on offer, the view that was chosen among it, and its number; None: no view.
+
+    Raises:
+        ForeignFileError: the answer is none, or names a view that cannot be taken; says why.
+    """
+    if answer.kind == "done":
+        return None
+    if answer.kind == "candidate":
+        index: Any = answer.fields.get("index")
+        check_type("index", index, int)
+        if not 0 <= index < len(offered.valid):
+            raise ForeignFileError(
+                f"there is no candidate {index}, there are 0 to {len(offered.valid) - 1}"
+            )
+        return offered, index
+    if answer.kind != "view":
+        raise ForeignFileError(
+            f"{answer.kind!r:.80} is no answer: send `candidate`, `view` or `done`"
+        )
+    own = limits.project_to_feasible(
+        candidates_along(*(_point(answer, name)[None] for name in ("position", "direction")))
+    )
+    position = own.position[0]
+    cell = travel.cell_of(position)
+    is_here = bool(np.abs(position - travel.start).max() <= _SAME_PLACE)
+    may_stop = travel.contains(cell) and travel.goals[cell] and travel.safe[cell]
+    if not (is_here or may_stop) or not np.isfinite(_costs(own, travel, limits)).all():
+        raise ForeignFileError(
+            f"the robot cannot go to {position.round(3).tolist()}: take a candidate, or stay in "
+            "the cells of `stops`, which known free space leads to"
+        )
+    rows = [offered, own]
+    joined = [
+        np.concatenate([getattr(c, n) for c in rows]) for n in ("position", "direction", "valid")
+    ]
+    return Candidates(*joined), len(offered.valid)
+
+
+def _point(answer: Message, name: str) -> np.ndarray:
+    """Three finite numbers of an answer; a direction has a length.
+
+    Raises:
+        ForeignFileError: they are not there.
+    """
+    value = answer.fields.get(name)
+    check_type(name, value, list[float])
+    point = np.asarray(value, dtype=np.float64)
+    if point.shape != (3,):
+        raise ForeignFileError(f"`{name}` must be three numbers, got {point.shape[0]}")
+    length = float(np.linalg.norm(point))
+    if name == "direction" and not 1e-6 < length < 1e6:
+        raise ForeignFileError(f"`direction` has the length {length:g}: give a unit vector")
+    return point

@@ -1,0 +1,212 @@
+"""A program that answers messages: started under limits, asked with a time limit, always ended."""
+
+import contextlib
+import functools
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import time
+import weakref
+from pathlib import Path
+
+from r3jax.planning.policies.foreign.commands import words_of
+from r3jax.planning.policies.foreign.messages import (
+    PREFIX,
+    Message,
+    MessageError,
+    decode,
+    encode,
+    length_of,
+)
+from r3jax.planning.policy import PolicyError
+
+_LAUNCH = Path(__file__).with_name("launch.py")
+
+_CHUNK = 1 << 16
+_TAIL = 2000
+"""Last bytes of its standard error that are kept."""
+
+_GRACE = 1.0
+"""A program whose input has ended may take so long to end [s]."""
+
+
+@functools.cache
+def network() -> str:
+    """`none` where this system lets a program be cut off from the network, else `shared`."""
+    if sys.platform != "linux":
+        return "shared"
+    words = [sys.executable, "-I", "-S", str(_LAUNCH), "0", "none", "true"]
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        if subprocess.run(words, capture_output=True, timeout=20).returncode == 0:
+            return "none"
+    return "shared"
+
+
+def limits_memory() -> bool:
+    """Whether this system holds a program to its memory."""
+    return sys.platform == "linux"
+
+
+class Program:
+    """A running program."""
+
+    def __init__(self, command: str, memory: float) -> None:
+        """Starts it.
+
+        Args:
+            command: program and arguments, as for a shell.
+            memory: that each of its processes may take [GiB]; 0: no limit.
+
+        Raises:
+            ValueError: there is no such program.
+            PolicyError: it cannot be started.
+        """
+        self.command = command
+        size = str(int(memory * (1 << 30)))
+        limits = [sys.executable, "-I", "-S", str(_LAUNCH), size, network()]
+        try:
+            self._process = subprocess.Popen(
+                [*limits, *words_of(command)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+                # A group of its own: what it starts is ended with it, and Ctrl-C is the loop's.
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise PolicyError(f"{command!r} cannot be started ({error})") from error
+        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
+            assert pipe is not None
+            os.set_blocking(pipe.fileno(), False)
+        self._said = b""
+        self.close = weakref.finalize(self, _end, self._process)
+
+    def ask(self, message: Message, seconds: float) -> Message:
+        """Sends a message and waits for the answer.
+
+        Raises:
+            PolicyError: no answer in time, none at all, or something else than a message; the
+                program has ended then.
+        """
+        if not self.close.alive:
+            raise PolicyError(f"the program {self.command!r} has ended")
+        try:
+            return decode(self._exchange(encode(message), time.monotonic() + seconds))
+        except TimeoutError:
+            reason = f"gave no answer to `{message.kind}` within {seconds:g} s"
+        except EOFError:
+            reason = self._death()
+        except MessageError as error:
+            reason = f"sent no answer to `{message.kind}`: {error}"
+        self.close()
+        said = " ".join(self._said.decode("utf-8", "replace").split())
+        last = f"; it said: {said[-600:]}" if said else ""
+        raise PolicyError(f"the program {self.command!r} {reason}{last}")
+
+    def _exchange(self, data: bytes, end: float) -> bytes:
+        """Writes and reads at the same time, so that neither side waits for the other for ever.
+
+        Raises:
+            TimeoutError: it is past `end` on the monotonic clock.
+            EOFError: the program has closed its output.
+            MessageError: what comes is no message.
+        """
+        streams = self._process.stdin, self._process.stdout, self._process.stderr
+        into, out, errors = (pipe.fileno() for pipe in streams if pipe is not None)
+        left, inbox = memoryview(data), bytearray()
+        with selectors.DefaultSelector() as selector:
+            selector.register(into, selectors.EVENT_WRITE)
+            selector.register(out, selectors.EVENT_READ)
+            selector.register(errors, selectors.EVENT_READ)
+            while True:
+                if (patience := end - time.monotonic()) <= 0.0:
+                    raise TimeoutError
+                ready = {key.fd for key, _ in selector.select(patience)}
+                if errors in ready and not self._listen(errors):
+                    selector.unregister(errors)
+                if out in ready:
+                    inbox += (chunk := os.read(out, _CHUNK))
+                    if _is_whole(inbox):
+                        return bytes(inbox)
+                    if not chunk:
+                        raise EOFError
+                if into in ready:
+                    left = left[_write(into, left) :]
+                    if not left:
+                        selector.unregister(into)
+
+    def _listen(self, errors: int) -> bool:
+        """Keeps the end of what the program says; False once it says nothing more."""
+        said = os.read(errors, _CHUNK)
+        self._said = (self._said + said)[-_TAIL:]
+        return bool(said)
+
+    def _death(self) -> str:
+        """How the program ended."""
+        code = _wait(self._process)
+        assert self._process.stderr is not None
+        with contextlib.suppress(BlockingIOError):
+            while self._listen(self._process.stderr.fileno()):
+                pass
+        if code is None:
+            return "closed its output and went on"
+        if code < 0:
+            return f"was killed by {signal.Signals(-code).name}, perhaps for its memory"
+        return f"ended with code {code}"
+
+
+def _is_whole(inbox: bytearray) -> bool:
+    """Whether a message is there.
+
+    Raises:
+        MessageError: too long, or more than one.
+    """
+    if len(inbox) < PREFIX.size:
+        return False
+    length = length_of(bytes(inbox[: PREFIX.size]))
+    if len(inbox) > length:
+        raise MessageError(f"{len(inbox) - length} bytes more than one message were sent")
+    return len(inbox) == length
+
+
+def _write(into: int, left: memoryview) -> int:
+    """Writes what the pipe takes.
+
+    Raises:
+        EOFError: nobody reads.
+    """
+    try:
+        return os.write(into, left[:_CHUNK])
+    except BlockingIOError:
+        return 0
+    except BrokenPipeError:
+        raise EOFError from None
+
+
+def _wait(process: "subprocess.Popen[bytes]") -> int | None:
+    """Waits a moment for a program to end; its code as `Popen` has it, None: it has not ended."""
+    end = time.monotonic() + _GRACE
+    while True:
+        # Left to be reaped: until then its number, that of its group, cannot become another's.
+        how = os.WEXITED | os.WNOHANG | os.WNOWAIT
+        if (found := os.waitid(os.P_PID, process.pid, how)) is not None:
+            return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
+        if time.monotonic() > end:
+            return None
+        time.sleep(0.005)
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """Ends a program and what it has started."""
+    for pipe in (process.stdin, process.stdout):
+        assert pipe is not None
+        pipe.close()
+    _wait(process)  # the end of its input is its sign to go
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert process.stderr is not None
+    process.stderr.close()

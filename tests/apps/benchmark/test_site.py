@@ -1,0 +1,95 @@
+"""The page of a benchmark: every record in a table, pictures from models and test views."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from r3jax.apps.benchmark.record import read_records
+from r3jax.apps.benchmark.reference_images import load_reference_images
+from r3jax.apps.benchmark.site import groups_on_equal_terms, probe, write_site
+from r3jax.cli.main import main
+from r3jax.evaluation.comparison import scores_by_method
+from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
+from tests.evaluation.records import benchmark, record
+
+
+def written(folder, records):
+    """A benchmark's folder that holds records and nothing else."""
+    for number, plain in enumerate(records):
+        path = (
+            folder / "cells" / f"{number}" / f"snapshot-{plain['snapshot'].replace(':', '-')}.json"
+        )
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps(plain | {"run": f"cells/{number}/run"}))
+    return folder
+
+
+def test_a_page_has_every_snapshot_and_the_worst_views(finished, tmp_path):
+    root, cells = finished
+    page = write_site(root, tmp_path / "site")
+    text = page.read_text()
+    assert re.findall(r"<h2>(.*?)</h2>", text) == ["views:2", "views:3"]
+    records = [r for r in read_records(root) if r["snapshot"] == "views:3"]
+    found = mean_over_scenes(
+        scores_by_method(records, "psnr")["random (num_candidates=10, num_frontier=3)"]
+    )
+    assert f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]" in text
+    pictures = re.findall(r'src="(pictures/.*?)"', text)
+    assert len(pictures) == 2  # one a method and scene for each snapshot
+    worst = int(np.argmin(records[0]["views"]["psnr"]))
+    assert f"seed 0: view {worst}, {min(records[0]['views']['psnr']):.1f} dB" in text
+    image = np.asarray(Image.open(page.parent / pictures[-1]))
+    assert image.shape == (48, 96, 3)
+    views = load_reference_images(root, cells[0]).views
+    np.testing.assert_array_equal(image[:, :48], views.rgb[worst])
+    # The model's half has the PSNR that the record says.
+    error = (image[:, :48].astype(float) - image[:, 48:]) / 255.0
+    psnr = -10.0 * np.log10(np.mean(error**2))
+    assert psnr == pytest.approx(records[0]["views"]["psnr"][worst], abs=0.05)
+    assert write_site(root, tmp_path / "site") == page  # again: the page is replaced
+
+
+def test_records_that_lie_alone_make_a_page_without_pictures(tmp_path):
+    records = benchmark(("ours-pano", "active-gs"), views=6)
+    odd = record("random", views=6) | {"policy": "<script>alert(1)</script>"}
+    page = write_site(written(tmp_path / "out", [*records, odd]), tmp_path / "site")
+    text = page.read_text()
+    assert "<script>" not in text
+    assert "&lt;script&gt;" in text
+    assert "its model or image is gone" in text
+    chosen = scores_by_method(records, "psnr")
+    lead = paired_difference(chosen["ours-pano"], chosen["active-gs"])
+    assert f"{lead.value:+.2f} [{lead.low:+.2f}, {lead.high:+.2f}]" in text
+    assert "arXiv 2601.07484" in text
+    assert "+2.9" in text
+
+
+def test_records_of_other_terms_have_a_table_of_their_own():
+    same = benchmark(("ours", "random"), scenes=("flat",), seeds=(0, 1), views=6)
+    other = record("ours", views=6, clock="wall")
+    twice = record("ours", seed=0, snapshot=60, views=6)
+    groups = groups_on_equal_terms([*same, other, twice])
+    assert [len(group) for group in groups] == [4, 1, 1]
+
+
+def test_a_probe_takes_some_time():
+    assert all(0.0 < seconds < 10.0 for seconds in probe(repeats=1).values())
+
+
+def test_a_page_is_not_written_over_something_else(tmp_path, capsys):
+    out = written(tmp_path / "out", [record(views=6)])
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    words = ["benchmark", "--site", str(tmp_path / "mine"), "--out", str(out)]
+    assert main(words) == 2
+    assert "holds something that is no page" in capsys.readouterr().err
+    assert main([*words, "--budget", "views:9"]) == 2
+    assert "--site takes these from the records" in capsys.readouterr().err
+    empty = ["benchmark", "--site", str(tmp_path / "site"), "--out", str(tmp_path / "none")]
+    assert main(empty) == 2
+    assert "holds no records" in capsys.readouterr().err
+    assert main(["benchmark", "--site", str(tmp_path / "site"), "--out", str(out)]) == 0
+    assert (tmp_path / "site" / "index.html").exists()

@@ -1,0 +1,125 @@
+"""Submissions, as a user meets them: exported, checked, judged beside the policies."""
+
+import json
+
+import pytest
+
+from r3jax.apps.benchmark.record import CELLS
+from r3jax.cli.main import main
+from tests.box_room import write_room
+from tests.cli.small_runs import explore
+
+pytestmark = pytest.mark.full
+
+JUDGING = ["--train-resolution", "48", "--iterations", "30", "--gaussians", "200"]
+JUDGING += ["--capacity", "400", "--test-views", "6", "--lpips", "none", "--jobs", "0"]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return write_room(tmp_path_factory.mktemp("room") / "room.ply")
+
+
+@pytest.fixture(scope="module")
+def exported(room, tmp_path_factory):
+    """A submission of three views."""
+    out = tmp_path_factory.mktemp("runs")
+    assert explore(room, out) == 0
+    path = out / "box.jsonl"
+    assert main(["export", str(out / "box"), "--format", "submission", "--out", str(path)]) == 0
+    return path
+
+
+def header(path):
+    return json.loads(path.read_text().splitlines()[0])
+
+
+def damaged(path, tmp_path, line, **fields):
+    """A copy of a submission in which some fields of a line are others."""
+    lines = [json.loads(text) for text in path.read_text().splitlines()]
+    lines[line] |= fields
+    other = tmp_path / "damaged.jsonl"
+    other.write_text("".join(json.dumps(plain) + "\n" for plain in lines))
+    return other
+
+
+def test_a_submission_takes_some_kilobytes_and_is_in_order(exported, capsys):
+    assert exported.stat().st_size < 4000
+    assert main(["benchmark", "--submission", str(exported), "--check"]) == 0
+    assert "3 frames, all in order" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_check_says_all_that_is_wrong_and_fails(exported, tmp_path, capsys):
+    late = damaged(exported, tmp_path, 2, seconds=0.1, mapping=0.0)
+    torn = tmp_path / "torn.jsonl"
+    torn.write_bytes(exported.read_bytes()[:-40])
+    words = ["--submission", str(late), str(torn), str(exported), "--check"]
+    assert main(["benchmark", *words]) == 1
+    told = " ".join(capsys.readouterr().err.split())
+    assert "damaged.jsonl, line 3, frame 1: `mapping` is 0 s" in told
+    assert "damaged.jsonl, line 3, frame 1: it arrives" in told
+    assert "torn.jsonl: line 4: this is not JSON" in told
+    assert "3 frames, all in order" in told
+
+
+def test_the_mesh_of_a_submission_may_lie_elsewhere(room, exported, tmp_path, capsys):
+    away = damaged(exported, tmp_path, 0, scene=header(exported)["scene"] | {"name": "mesh:x.ply"})
+    words = ["benchmark", "--submission", str(away), "--check"]
+    assert main(words) == 1
+    assert "x.ply" in capsys.readouterr().err
+    assert main([*words, "--scenes", room]) == 0
+
+
+def test_a_submission_stands_in_the_table_beside_a_policy(room, exported, tmp_path, capsys):
+    terms = ["--budget", "views:3", "--clock", "model", "--resolution", "48", "--fov", "90"]
+    terms += ["--voxel-size", "0.1", "--policies", "frontier", "--scenes", room]
+    terms += ["--settings", "num_candidates=10", "num_frontier=3"]
+    assert main(["benchmark", *terms, *JUDGING, "--out", str(tmp_path)]) == 0
+    capsys.readouterr()
+    words = ["benchmark", "--submission", str(exported), *JUDGING, "--out", str(tmp_path)]
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    assert "3 of 3 images are those of the exploration, bit for bit" in captured.err
+    assert "random (submitted)" in captured.out
+    assert "frontier" in captured.out
+    records = [json.loads(line) for line in (tmp_path / CELLS).read_text().splitlines()]
+    assert {record["policy"] for record in records} == {"frontier", "random (submitted)"}
+    assert main([*words[:-2], "--iterations", "20", "--out", str(tmp_path)]) == 0
+    assert "frontier" not in capsys.readouterr().out  # its training was another
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--check"], "--check belongs to --submission FILE"),
+        (["--submission", "nowhere.jsonl"], "nowhere.jsonl: there is no such file"),
+        (["--submission", "{it}", "--budget", "views:9"], "leave them out: --budget"),
+        (["--submission", "{it}", "--policies", "ours"], "from the submission, leave them out"),
+        (["--submission", "{it}", "{it}"], "another submission is called"),
+        (["--submission", "{it}", "--scenes", "office"], "--scenes tells where the mesh"),
+        (["--submission", "{bad}"], "the hash"),
+        (["--submission", "{it}", "--train-resolution", "64"], "more than the images have"),
+        (["--submission", "{it}", "--snapshots", "views:9"], "lies beyond the budget"),
+    ],
+)
+def test_a_mistake_gets_one_line_and_judges_nothing(exported, tmp_path, capsys, words, message):
+    lines = exported.read_text().splitlines()
+    first = json.loads(lines[0])
+    first["scene"]["hash"] = "0" * 64
+    bad = tmp_path / "bad.jsonl"
+    bad.write_text("\n".join([json.dumps(first), *lines[1:]]))
+    given = [word.format(it=exported, bad=bad) for word in words]
+    judging = [] if "--train-resolution" in given else JUDGING
+    assert main(["benchmark", *given, *judging, "--out", str(tmp_path / "out")]) == 2
+    told = [x for x in capsys.readouterr().err.splitlines() if x.startswith("r3jax:")]
+    assert len(told) == 1
+    assert message in told[0]
+    assert not (tmp_path / "out" / "cells").exists()
+
+
+def test_a_submission_is_not_written_over_a_file(exported, capsys):
+    run = exported.parent / "box"
+    before = exported.read_bytes()
+    assert main(["export", str(run), "--format", "submission", "--out", str(exported)]) == 2
+    assert "something is there already" in capsys.readouterr().err
+    assert exported.read_bytes() == before

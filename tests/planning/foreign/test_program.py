@@ -1,0 +1,150 @@
+"""Programs: what dies, hangs, or talks nonsense is told in a sentence, and nothing goes on."""
+
+import shlex
+import sys
+import time
+
+import pytest
+
+from r3jax.planning.policies.foreign.commands import short_name, words_of
+from r3jax.planning.policies.foreign.messages import Message
+from r3jax.planning.policies.foreign.program import Program, network
+from r3jax.planning.policy import PolicyError
+from tests.planning.foreign.children import is_running
+
+BEGIN = """
+import json, os, socket, struct, subprocess, sys, time
+TEXT = struct.pack("<II", 12, 0) + b'{"kind":"a"}'
+def receive():
+    n, m = struct.unpack("<II", sys.stdin.buffer.read(8))
+    header = json.loads(sys.stdin.buffer.read(n))
+    sys.stdin.buffer.read(m)
+    return header
+def send(data=None, **answer):
+    text = json.dumps(answer).encode()
+    data = struct.pack("<II", len(text), 0) + text if data is None else data
+    sys.stdout.buffer.write(data)
+    sys.stdout.buffer.flush()
+"""
+
+
+def python(code):
+    """A command that runs code; of the standard library alone, so that it starts quickly."""
+    return shlex.join([sys.executable, "-I", "-S", "-c", BEGIN + code])
+
+
+def asked(code, seconds=20.0, memory=0.0, **fields):
+    program = Program(python(code), memory)
+    try:
+        return program.ask(Message("decide", fields), seconds)
+    finally:
+        program.close()
+
+
+def test_a_program_answers_and_ends_with_its_input():
+    program = Program(python("while True: send(kind='view', got=receive()['x'])"), 0.0)
+    for x in range(3):
+        assert program.ask(Message("decide", {"x": x}), 20.0).fields == {"got": x}
+    process = program._process
+    program.close()
+    assert process.returncode is not None
+    program.close()  # a second time does no harm
+    with pytest.raises(PolicyError, match="has ended"):
+        program.ask(Message("decide"), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [
+        ("sys.exit(3)", "ended with code 3"),
+        ("raise ValueError('no weights')", "ended with code 1; it said: .*no weights"),
+        ("receive(); os.kill(os.getpid(), 9)", "was killed by SIGKILL, perhaps for its memory"),
+        ("receive(); os.close(1); time.sleep(60)", "closed its output and went on"),
+        ("print('Loading ...', flush=True); time.sleep(60)", "print to the standard error"),
+        (
+            "receive(); send(b'\\x02\\0\\0\\0\\0\\0\\0\\0[]'); time.sleep(60)",
+            "`header` must be dict",
+        ),
+        ("receive(); send(2 * TEXT); time.sleep(60)", "20 bytes more than one message were sent"),
+        ("receive(); send(struct.pack('<II', 1 << 31, 0))", "announce a header of 2147483648"),
+        ("receive(); send(b'\\1\\0'); sys.exit()", "ended with code 0"),
+    ],
+)
+def test_what_goes_wrong_is_told_and_the_program_ended(code, says):
+    program = Program(python(code), 0.0)
+    pid = program._process.pid
+    with pytest.raises(PolicyError, match=says):
+        program.ask(Message("decide"), 20.0)
+    assert not is_running(pid)
+
+
+def test_a_program_that_hangs_is_given_up_with_what_it_started():
+    code = "import signal; signal.signal(15, signal.SIG_IGN)\n"
+    code += "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])\n"
+    code += "print('child', child.pid, file=sys.stderr, flush=True); time.sleep(600)"
+    program = Program(python(code), 0.0)
+    pid = program._process.pid
+    begin = time.monotonic()
+    with pytest.raises(PolicyError, match=r"no answer to `decide` within 1 s.*child \d+") as told:
+        program.ask(Message("decide"), 1.0)
+    assert time.monotonic() - begin < 10.0
+    child = int(str(told.value).rpartition("child ")[2])
+    end = time.monotonic() + 5.0
+    while is_running(child) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert not is_running(child)
+    assert not is_running(pid)
+
+
+def test_a_program_that_does_not_read_is_given_up():
+    program = Program(python("time.sleep(600)"), 0.0)
+    with pytest.raises(PolicyError, match=r"within 0\.5 s"):
+        program.ask(Message("decide", {"x": "y" * 1_000_000}), 0.5)
+
+
+def test_a_program_may_say_much_on_its_standard_error():
+    code = "sys.stderr.write('x' * 1_000_000); receive(); send(kind='fine')"
+    assert asked(code).kind == "fine"
+
+
+def test_memory_has_a_limit():
+    code = "receive(); x = bytearray(600 << 20); send(kind='fine')"
+    if sys.platform == "linux":
+        with pytest.raises(PolicyError, match="MemoryError"):
+            asked(code, memory=0.25)
+    assert (
+        asked("receive(); x = bytearray(60 << 20); send(kind='fine')", memory=0.25).kind == "fine"
+    )
+
+
+def test_there_is_no_network():
+    if network() == "shared":
+        pytest.skip("this system does not let a program leave the network")
+    code = "receive(); send(kind='saw', names=[name for _, name in socket.if_nameindex()])"
+    assert asked(code).fields["names"] in ([], ["lo"])
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("", "lacks its command"),
+        ("no-such-program --fast", "there is no program 'no-such-program'"),
+        ("python 'x", "No closing quotation"),
+    ],
+)
+def test_a_command_that_is_none_is_refused(command, says):
+    with pytest.raises(ValueError, match=says):
+        words_of(command)
+
+
+@pytest.mark.parametrize(
+    ("name", "short"),
+    [
+        ("ours-pano", "ours-pano"),
+        ("my.module:Highest", "Highest"),
+        ("exec:python -u some/where/mine.py --fast", "mine"),
+        ("exec:python", "python"),
+    ],
+)
+def test_a_command_has_a_short_name(name, short):
+    assert short_name(name) == short
