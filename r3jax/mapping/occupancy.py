@@ -183,6 +183,7 @@ def frontier(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
     return grid.free & _has_face_neighbor(grid.unexplored)
 
 
+@jax.jit
 def frontier_unexplored(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
     """Unexplored cells with a free face neighbor: the first layer of the unknown."""
     return grid.unexplored & _has_face_neighbor(grid.free)

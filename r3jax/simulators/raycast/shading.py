@@ -283,6 +283,6 @@ def shade(
         tables.faces, tables.corner_colors, tables.materials, tables.texels, tables.sizes,
         tables.offsets, tables.lamps, tables.ambient,
         # One layout and writable, whatever the caller's are: each other one compiles anew.
-        *(np.require(x, requirements="CW") for x in per_ray), pixel_steps, num_workers(), colors,
+        *(np.require(x, requirements=("C", "W")) for x in per_ray), pixel_steps, num_workers(), colors,
     )  # fmt: skip
     return colors
