@@ -21,6 +21,7 @@ from r3jax.apps.audit.faults.faults import Kind, faults_of
 from r3jax.apps.audit.live.growing import Arrival, GrowingCapture
 from r3jax.apps.audit.live.page import GuidePage
 from r3jax.apps.audit.source import Source
+from r3jax.formats.ros.names import Topics
 from r3jax.frame import Frame
 from r3jax.mapping.config import MappingConfig
 from r3jax.planning.planner import Planner, decide, observe, start
@@ -200,25 +201,27 @@ def follow(
     scratch: Path,
     *,
     up: str | None = None,
+    topics: Topics | None = None,
     stop: threading.Event | None = None,
 ) -> Source | None:
     """Follows a growing capture until Ctrl-C, or until it is told to stop.
 
     Args:
-        path: the folder, or a transforms.json; nothing in it is written.
+        path: the folder, a transforms.json, or a ROS bag; nothing in it is written.
         page: shows what is done and where to go next.
         scratch: an empty folder of our own, which stays as long as the result is read.
         up: axis of the capture that points up.
+        topics: names of a bag's topics and frames; None: all are guessed.
         stop: set by another thread.
 
     Returns:
         What came in, to be audited; None if nothing did.
 
     Raises:
-        ValueError: the capture has no depth images.
+        ValueError: the capture has no depth images, or is a bag that cannot be followed.
     """
     stop = threading.Event() if stop is None else stop
-    capture = GrowingCapture(path, scratch)
+    capture = GrowingCapture(path, scratch, topics)
     try:
         with Guide(page, up) as guide:
             while not stop.is_set():
