@@ -6,7 +6,7 @@ from pathlib import Path
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.camera_paths import CameraPath, path_of
 from r3jax.apps.audit.live.follow import follow
-from r3jax.apps.audit.live.page import LOOPBACK, open_guide
+from r3jax.apps.audit.live.page import open_guide
 from r3jax.apps.audit.outputs import suggested_poses, write_outputs
 from r3jax.apps.audit.pages import sentences
 from r3jax.apps.audit.pages.audit_page import write_report
@@ -19,6 +19,7 @@ from r3jax.cli.options import AuditOptions
 from r3jax.cli.progress import Stages
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
+from r3jax.network import who_sees
 
 _SHOWN = 5
 """Regions that the console lists."""
@@ -53,9 +54,8 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         ValueError, OSError: as `follow`, `open_guide` and `_audit`.
     """
     _check_place(options.capture)
-    if options.host not in LOOPBACK:
-        text = f"everybody who can reach {options.host} sees the page"
-        progress.say(text, style="yellow")
+    if warning := who_sees(options.host):
+        progress.say(warning, style="yellow")
     with open_guide(options.host, options.port) as page:
         progress.say(f"guide     {page.url}")
         progress.say("Ctrl-C ends the scan, and audits it")
@@ -106,8 +106,7 @@ def _audit(
     _show(Console(), found, {"report": page, **written})
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")
-    topics = () if options.topics is None else ("--topics", options.topics)
-    progress.next("audit", options.capture, *topics)
+    progress.next("audit", options.capture, *options.topic_words)
 
 
 def _settings_of(options: AuditOptions) -> AuditSettings:

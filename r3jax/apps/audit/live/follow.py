@@ -24,6 +24,7 @@ from r3jax.apps.audit.source import Source
 from r3jax.formats.ros.names import Topics
 from r3jax.frame import Frame
 from r3jax.mapping.config import MappingConfig
+from r3jax.planning.growth import GrowthAhead
 from r3jax.planning.planner import Planner, decide, observe, start
 from r3jax.planning.policy import Decision
 
@@ -49,7 +50,7 @@ _COMPARED = 8
 """Latest frames that a new one is compared with for blur and light."""
 
 _CAPACITY = 1 << 17
-"""Rows of the map: 200 square meters of surface before all is compiled anew for a larger one."""
+"""Rows of the map at first: 200 square meters of surface."""
 
 
 _WARNINGS: dict[Kind, str] = {
@@ -77,6 +78,7 @@ class Guide:
         """
         self._page, self._up_name, self._policy = page, up, policy
         self._planner: Planner | None = None
+        self._growth = GrowthAhead()
         self._alignment = Alignment(np.eye(3), 1.0, np.zeros(3))
         self._bounds = np.zeros((2, 3))
         self._recent: deque[tuple[str, BlockImage]] = deque(maxlen=_COMPARED)
@@ -109,6 +111,7 @@ class Guide:
         assert self._planner is not None
         frame = source.framed(arrival.picture, arrival.index, self._alignment)
         self._planner = observe(self._planner, frame)
+        self._growth.look(self._planner, frame)
         if not is_latest:
             self._page.passed(frame)
             return
@@ -193,6 +196,7 @@ class Guide:
         """Ends the thread once it has answered."""
         self._questions.put(None)
         self._thread.join()
+        self._growth.wait()
 
 
 def follow(

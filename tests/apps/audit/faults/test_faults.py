@@ -96,7 +96,7 @@ def test_a_change_of_brightness_is_found_and_measured(gain):
 
 def test_a_step_of_the_exposure_shows_the_pictures_beside_it():
     pictures = [
-        (to_bytes((1.16 if i >= VIEWS // 2 else 1.0) * rgb / 255.0), depth, pose)
+        (to_bytes((1.16 if i >= VIEWS // 2 else 1.0) * rgb.astype(np.float64)), depth, pose)
         for i, (rgb, depth, pose) in enumerate(walk())
     ]
     found = {f.kind: f for f in faults(pictures).findings}
