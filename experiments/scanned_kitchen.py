@@ -43,14 +43,14 @@ def poses() -> np.ndarray:
     random = np.random.default_rng(0)
     ring = np.array([*PLACES, PLACES[0]], float)
     spline = CubicSpline(np.linspace(0.0, 1.0, len(ring)), ring, bc_type="periodic")
-    middle = ring[:-1].mean(axis=0)
-    tremor = gaussian_filter1d(random.normal(size=(FRAMES, 6)), 2.0, axis=0)
+    middle = np.mean(ring[:-1], axis=0)
+    tremor: np.ndarray = gaussian_filter1d(random.normal(size=(FRAMES, 6)), 2.0, axis=0)
     tremor *= [0.02, 0.02, 0.02, 0.03, 0.03, 0.03]
     found = []
     for i, shake in enumerate(tremor):
         lap, part = divmod(2.0 * i / FRAMES, 1.0)
         eye = np.array([*spline(part), 1.45 + 0.1 * np.sin(9.0 * part)]) + shake[:3]
-        away = eye[:2] - middle if lap == 0.0 else middle - eye[:2]
+        away = (eye[:2] - middle) * (1.0 if lap == 0.0 else -1.0)
         yaw = np.arctan2(away[1], away[0]) + 0.6 * np.sin(14.0 * part)
         pitch = -0.25 + 0.3 * np.sin(23.0 * part)
         ahead = [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]
@@ -125,7 +125,7 @@ class Bag:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
         tf = "tf2_msgs/msg/TFMessage"
         if tf not in self._store.types:
             text = "geometry_msgs/TransformStamped[] transforms"

@@ -53,11 +53,12 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         UserError: nothing came in.
         ValueError, OSError: as `follow`, `open_guide` and `_audit`.
     """
-    _check_place(options.capture)
     if warning := who_sees(options.host):
         progress.say(warning, style="yellow")
     with open_guide(options.host, options.port) as page:
         progress.say(f"guide     {page.url}")
+        if not options.capture.exists():
+            progress.say(f"waiting for {options.capture} to be recorded")
         progress.say("Ctrl-C ends the scan, and audits it")
         topics = parse_topics(options.topics)
         source = follow(options.capture, page, scratch, up=options.up, topics=topics)
@@ -65,19 +66,6 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
             raise UserError(f"{options.capture}: no frame came in")
         page.say("The scan has ended.", "its audit is being written")
         _audit(options, source, None, progress)
-
-
-def _check_place(path: Path) -> None:
-    """Refuses what can never come to be, such as the name of a topic."""
-    if path.exists() or path.absolute().parent.is_dir():
-        return
-    raise UserError(
-        f"{path}: there is no such capture, and no folder in which it could be recorded. Topics of "
-        "a running ROS 2 are followed by the node, which shows the same page: python "
-        f"examples/ros2_node.py --ros-args -p page_port:=8080 -r color:={path} -r depth:=... -r "
-        "camera_info:=...; or follow a bag: ros2 bag record -o drive --storage mcap TOPICS, and "
-        "r3jax audit drive --live"
-    )
 
 
 def _audit(

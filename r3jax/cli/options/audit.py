@@ -46,8 +46,8 @@ class GuideOptions:
     TITLE: ClassVar[str] = "guidance while scanning"
 
     live: bool = False
-    """Follow a folder that another program is writing: the page in the browser shows what is done
-    and where to go next. Ctrl-C ends it, with an audit of what came in."""
+    """Follow a folder or ROS bag that another program is writing: the page in the browser shows
+    what is done and where to go next. Ctrl-C ends it, with an audit of what came in."""
 
     port: int = 8080
     """Port of the page that --live shows; 0 takes any free one."""
