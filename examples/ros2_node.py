@@ -9,6 +9,7 @@ meanwhile. `path` (nav_msgs/Path) is the trajectory as a SLAM system has optimiz
 closure moves it, the key frames move along and are mapped again. See docs/howto/robot.md.
 """
 
+import contextlib
 from array import array
 from collections import deque
 from dataclasses import dataclass, replace
@@ -31,10 +32,12 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 import r3jax
+from r3jax.apps.audit.live.page import open_guide
 from r3jax.formats.depth_images import resample_depth
 from r3jax.formats.points import voxel_points
 from r3jax.formats.ros.messages import depth_of, frame_of, lens_of, rgb_of, stamp_of
 from r3jax.formats.ros.transforms import TransformTree
+from r3jax.planning.growth import GrowthAhead
 from r3jax.planning.robot.motion import make_motion
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -66,11 +69,17 @@ class NextViewNode(Node):
         self.candidates, self.stride = get("candidates", 100), get("stride", 2)
         self.period, self.patience = 1.0 / get("frame_rate", 2.0), get("patience", 60.0)
         self.arrived, self.max_range = get("arrived", 0.3), get("max_range", 5.0)
-        self.rows = get("map_rows", 1 << 18)  # all is compiled anew where the table grows
+        self.rows, self.growth = get("map_rows", 1 << 18), GrowthAhead()
 
+        self.pages = contextlib.ExitStack()
         self.pending, self.frames, self.track = deque(maxlen=10), [], None
         self.info, self.planner, self.goal, self.decisions = None, None, None, 0
         self.has_news, self.last_stamp, self.goal_stamp = False, 0, 0
+
+        self.page, port = None, get("page_port", 0)
+        if port:  # the page of `r3jax audit --live`, for this robot
+            self.page = self.pages.enter_context(open_guide(get("page_host", "127.0.0.1"), port))
+            self.get_logger().info(f"where it goes next: {self.page.url}")
 
         # Two groups: what maps and decides must not keep the images, nor tf, from coming in.
         incoming, self.working = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
@@ -148,7 +157,10 @@ class NextViewNode(Node):
             self.begin(frame.camera, key_frame.T_world_camera)
         self.frames.append(key_frame)
         self.planner = r3jax.observe(self.planner, frame)
+        self.growth.look(self.planner, frame)  # compiles for a larger map before it is one
         self.has_news = True
+        if self.page is not None:
+            self.page.observed(self.planner, frame)
 
     def begin(self, camera: r3jax.Camera, T_world_camera: np.ndarray) -> None:
         """Starts an empty map; a robot on wheels keeps its camera's height and tilt."""
@@ -178,6 +190,8 @@ class NextViewNode(Node):
         decision, self.planner, info = r3jax.decide(self.planner, here.T_world_camera, key)
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.world)
         self.clouds.publish(cloud_of(header, *voxel_points(self.planner.map_state)))
+        if self.page is not None:
+            self.page.decided(self.to_frame(here), decision)
         if decision is None:
             self.get_logger().warning(f"no next view: {info.outcome.value}")
             return
@@ -201,11 +215,15 @@ class NextViewNode(Node):
             return
         self.get_logger().info(f"loop closed: mapping {len(moved)} key frames again")
         self.frames, self.planner, self.goal, self.has_news = moved, None, None, True
+        if self.page is not None:
+            self.page.forget()
         for key_frame in moved:
             frame = self.to_frame(key_frame)
             if self.planner is None:
                 self.begin(frame.camera, key_frame.T_world_camera)
             self.planner = r3jax.observe(self.planner, frame)
+            if self.page is not None:
+                self.page.passed(frame)
 
 
 def has_moved(before: np.ndarray, now: np.ndarray) -> bool:
@@ -304,6 +322,7 @@ def main() -> None:
     except KeyboardInterrupt:
         pass
     finally:
+        node.pages.close()
         node.destroy_node()
         rclpy.try_shutdown()
 

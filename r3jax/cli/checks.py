@@ -178,11 +178,12 @@ def _(options: EvaluateOptions) -> None:
 @_check.register
 def _(options: AuditOptions) -> None:
     parse_topics(options.topics)
-    check_capture(options.capture)
+    if options.live:
+        _check_live(options.capture)
+    else:
+        check_capture(options.capture)
     if options.live and options.path is not None:
         raise ValueError("--live follows a capture, --path judges a path in one: give one of them")
-    if options.live and options.capture.is_file() and options.capture.suffix != ".json":
-        raise ValueError(f"{options.capture}: this is a file that does not grow; --live is without")
     if not options.live and (options.port, options.host) != (AuditOptions.port, AuditOptions.host):
         raise ValueError("--port and --host are for the page of --live")
     if not 0 <= options.port <= 65535:
@@ -192,6 +193,25 @@ def _(options: AuditOptions) -> None:
         _check_replaceable(options.out)
     if options.path is not None and not options.path.exists():
         raise UserError(f"{options.path}: there is no such folder or file")
+
+
+_GROWING = (".json", ".mcap", ".db3", ".bag", ".active")
+"""Suffixes of files that may grow; of those that may not be followed their reader says why."""
+
+
+def _check_live(path: Path) -> None:
+    """Refuses what does not grow, and what can never come to be, such as the name of a topic."""
+    if path.is_file() and path.suffix not in _GROWING:
+        raise ValueError(f"{path}: this is a file that does not grow; --live is without")
+    if path.exists() or path.absolute().parent.is_dir():
+        return
+    raise ValueError(
+        f"{path}: there is no such capture, and no folder in which it could be recorded. Topics of "
+        "a running ROS 2 are followed by the node, which shows the same page: python "
+        f"examples/ros2_node.py --ros-args -p page_port:=8080 -r color:={path} -r depth:=... -r "
+        "camera_info:=...; or follow a bag: ros2 bag record -o drive --storage mcap TOPICS, and "
+        "r3jax audit drive --live"
+    )
 
 
 @_check.register

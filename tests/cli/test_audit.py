@@ -224,4 +224,6 @@ def test_what_came_in_while_scanning_is_audited_in_the_end(captures, tmp_path, c
     assert audit(captures / "recording", tmp_path / "out", *words) == 0
     assert "http://127.0.0.1:" in capsys.readouterr().err
     assert json.loads((tmp_path / "out" / "audit.json").read_text())["pictures"] == 12
+    told = refused(capsys, "/no/such/topic", "--live", "--port", 0)
+    assert "-r color:=/no/such/topic" in told
     assert "no frame came in" in refused(capsys, captures / "recording", "--live", "--port", 0)

@@ -41,6 +41,7 @@ REFUSED = {
     "audit scan.ply": "scan.ply: this is a file; a capture is a folder",
     "audit runs --live --path scan.ply": "--live follows a capture, --path judges a path",
     "audit scan.r3d --live": "a file that does not grow",
+    "audit /camera/color --live": "no such capture, and no folder in which it could be recorded",
     "audit runs --port 9000": "--port and --host are for the page of --live",
     "audit runs --live --port 99999": "--port must lie between 0 and 65535",
     "replay runs": "runs: this folder is not a run",

@@ -14,7 +14,7 @@ from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.ros.bag_reader import read_bag
-from r3jax.formats.ros.messages import depth_of, lens_of, rgb_of
+from r3jax.formats.ros.messages import depth_of, is_color, lens_of, rgb_of
 from r3jax.formats.ros.names import Topics, parse_topics
 from r3jax.formats.ros.transforms import TransformTree
 from r3jax.formats.validation.errors import ForeignFileError
@@ -30,9 +30,11 @@ from tests.formats.bags import (
     depth_fields,
     image,
     moved,
+    packed,
     write_bag,
 )
 from tests.formats.phones import FACTOR, LENS, NUM, Z_UP_FROM_ROOM, room_poses, smaller, view
+from tests.formats.sequences import encoded
 from tests.formats.test_phones import JPEG, assert_shows_the_room
 
 LOSSLESS = 1.5
@@ -144,7 +146,7 @@ DAMAGED = {
         f"/odom says where base_link is, .*--topics pose=/odom,frame={OPTICAL}",
     ),
     "clocks": (Robot(depth_delay=0.1), r"of 4 images .* within 0\.02 s \(0 have one\) and a pose"),
-    "encoding": (Robot(color="bayer_rggb8"), "there are no color images"),
+    "encoding": (Robot(color="mono8"), "there are no color images"),
 }
 
 
@@ -225,7 +227,8 @@ def test_images_that_cannot_be_right_are_refused():
     whole = message(image(pixels, "rgb8", OPTICAL, 0))
     assert rgb_of(whole).shape == (4, 5, 3)
     for change, words in (
-        ({"encoding": "yuv422"}, "encoding 'yuv422' are not read, only rgb8, bgr8"),
+        ({"encoding": "nv21"}, "encoding 'nv21' are not read: rgb8, bgr8"),
+        ({"encoding": "yuv422"}, "an odd number of columns"),
         ({"data": whole.data[:30]}, "5 x 4 pixels and 20 bytes a row has 30 bytes"),
         ({"step": 14}, "14 bytes a row"),
         ({"width": 1 << 20, "height": 1 << 20}, "an image has 1048576 x 1048576 pixels"),
@@ -235,6 +238,44 @@ def test_images_that_cannot_be_right_are_refused():
     fields = depth_fields(room_poses()[0], Robot(depth="compressedDepth 16UC1"), smaller(), "", 0)
     with pytest.raises(ForeignFileError, match="a depth image is cut off"):
         depth_of(message(fields | {"data": b"123"}))
+
+
+@pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_mosaic_shows_its_colors(order):
+    rng = np.random.default_rng(0)
+    smooth = np.add.outer(np.arange(8) * 4.0, np.arange(10) * 7.0)[..., None] + [20.0, 60.0, 100.0]
+    raw = np.zeros((8, 10), np.uint8)
+    for at, name in enumerate(order):
+        part = slice(at // 2, None, 2), slice(at % 2, None, 2)
+        raw[part] = smooth[(*part, "rgb".index(name))]
+    found = rgb_of(message(image(raw, f"bayer_{order}8", OPTICAL, 0)))
+    np.testing.assert_allclose(found[1:-1, 1:-1], smooth[1:-1, 1:-1], atol=0.51)  # a plane stays
+    noise = rng.integers(0, 256, (6, 6), dtype=np.uint8)
+    packed_as_png = packed(encoded(noise), f"bayer_{order}8; png compressed", OPTICAL, 0)
+    np.testing.assert_array_equal(
+        rgb_of(message(packed_as_png)), rgb_of(message(image(noise, f"bayer_{order}8", "", 0)))
+    )
+
+
+@pytest.mark.parametrize("encoding", ["uyvy", "yuyv", "yuv422", "yuv422_yuy2"])
+def test_yuv_shows_its_colors(encoding):
+    """BT.601's own numbers of pure colors."""
+    colors = {(255, 0, 0): (81, 90, 240), (0, 255, 0): (145, 54, 34), (0, 0, 255): (41, 240, 110),
+              (255, 255, 255): (235, 128, 128), (0, 0, 0): (16, 128, 128)}  # fmt: skip
+    rows = []
+    for y, u, v in colors.values():
+        rows.append([u, y, v, y] if encoding in ("uyvy", "yuv422") else [y, u, y, v])
+    fields = image(np.array(rows, np.uint8), encoding, OPTICAL, 0) | {"width": 2}
+    assert is_color(message(fields))
+    np.testing.assert_allclose(
+        rgb_of(message(fields)), np.repeat(np.array(list(colors))[:, None], 2, axis=1), atol=2.0
+    )
+
+
+def test_gray_is_shown_where_it_is_named_and_never_chosen():
+    gray = message(image(np.arange(12, dtype=np.uint8).reshape(3, 4), "mono8", OPTICAL, 0))
+    assert not is_color(gray)
+    np.testing.assert_array_equal(rgb_of(gray)[..., 2], np.arange(12).reshape(3, 4))
 
 
 def test_depth_of_the_other_byte_order_and_infinity():

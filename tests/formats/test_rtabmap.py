@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from r3jax.formats.validation.errors import ForeignFileError
 from tests.formats import rtabmap
 from tests.formats.bags import camera_poses, rvl
 from tests.formats.phones import FACTOR, LENS, NUM, Z_UP_FROM_ROOM
+from tests.formats.sequences import encoded
 from tests.formats.test_phones import JPEG, assert_shows_the_room, damaged
 from tests.fuzz.tree import lay_out
 
@@ -121,3 +123,41 @@ def test_rvl_comes_back_and_damage_is_refused():
                 good[:8] + b"\xff\xff\xff\x0f" * 9):  # fmt: skip
         with pytest.raises(ForeignFileError, match="a depth image "):
             unpack_rvl(bad)
+
+
+def with_confidence(path, content: bytes) -> None:
+    """Gives the first node a confidence."""
+    connection = sqlite3.connect(path)
+    connection.execute("ALTER TABLE Data ADD COLUMN depth_confidence BLOB")
+    connection.execute("UPDATE Data SET depth_confidence = ? WHERE id = 5", (content,))
+    connection.commit()
+    connection.close()
+
+
+@pytest.mark.parametrize("how", ["png", "zlib"])
+def test_depth_below_the_best_confidence_is_no_measurement(tmp_path, how):
+    path = tmp_path / "map.db"
+    path.write_bytes(rtabmap.database())
+    before = open_capture(path).source
+    levels = np.full((LENS.height // FACTOR, LENS.width // FACTOR), 100, np.uint8)
+    levels[:, 1] = 99
+    packed = zlib.compress(levels.tobytes()) + struct.pack("<3i", *levels.shape, 0)
+    with_confidence(path, encoded(levels) if how == "png" else packed)
+    images = open_capture(path).source
+    stored = images.pixels.depth(0)
+    assert (stored[:, 1] == 0).all()
+    np.testing.assert_array_equal(stored[:, 2:], before.pixels.depth(0)[:, 2:])
+    np.testing.assert_array_equal(images.pixels.depth(1), before.pixels.depth(1))
+
+
+@pytest.mark.parametrize("content", [b"", b"no", zlib.compress(b"") + struct.pack("<3i", 9, 9, 0)])
+def test_a_damaged_confidence_is_refused_and_an_empty_one_is_none(tmp_path, content):
+    path = tmp_path / "map.db"
+    path.write_bytes(rtabmap.database())
+    with_confidence(path, content)
+    images = open_capture(path).source
+    if not content:
+        assert (images.depth(0) > 0).any()
+        return
+    with pytest.raises(FormatError, match=r"depth.5: its confidence is damaged"):
+        images.depth(0)

@@ -6,7 +6,7 @@ from pathlib import Path
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.camera_paths import CameraPath, path_of
 from r3jax.apps.audit.live.follow import follow
-from r3jax.apps.audit.live.page import LOOPBACK, open_guide
+from r3jax.apps.audit.live.page import open_guide
 from r3jax.apps.audit.outputs import suggested_poses, write_outputs
 from r3jax.apps.audit.pages import sentences
 from r3jax.apps.audit.pages.audit_page import write_report
@@ -19,6 +19,7 @@ from r3jax.cli.options import AuditOptions
 from r3jax.cli.progress import Stages
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
+from r3jax.network import who_sees
 
 _SHOWN = 5
 """Regions that the console lists."""
@@ -52,13 +53,15 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         UserError: nothing came in.
         ValueError, OSError: as `follow`, `open_guide` and `_audit`.
     """
-    if options.host not in LOOPBACK:
-        text = f"everybody who can reach {options.host} sees the page"
-        progress.say(text, style="yellow")
+    if warning := who_sees(options.host):
+        progress.say(warning, style="yellow")
     with open_guide(options.host, options.port) as page:
         progress.say(f"guide     {page.url}")
+        if not options.capture.exists():
+            progress.say(f"waiting for {options.capture} to be recorded")
         progress.say("Ctrl-C ends the scan, and audits it")
-        source = follow(options.capture, page, scratch, up=options.up)
+        topics = parse_topics(options.topics)
+        source = follow(options.capture, page, scratch, up=options.up, topics=topics)
         if source is None:
             raise UserError(f"{options.capture}: no frame came in")
         page.say("The scan has ended.", "its audit is being written")
@@ -91,8 +94,7 @@ def _audit(
     _show(Console(), found, {"report": page, **written})
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")
-    topics = () if options.topics is None else ("--topics", options.topics)
-    progress.next("audit", options.capture, *topics)
+    progress.next("audit", options.capture, *options.topic_words)
 
 
 def _settings_of(options: AuditOptions) -> AuditSettings:

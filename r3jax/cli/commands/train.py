@@ -88,5 +88,4 @@ def _conclude(
     which = () if options.name == TrainOptions.name else ("--name", options.name)
     where = which if options.out is None else ("--model", folder)
     how = () if options.hold_out else ("--views", "all")
-    topics = () if options.topics is None else ("--topics", options.topics)
-    console.next("evaluate", options.path, *where, *how, *topics)
+    console.next("evaluate", options.path, *where, *how, *options.topic_words)

@@ -12,9 +12,8 @@ from r3jax.cli.errors import UserError, check_viser, one_line
 from r3jax.cli.options import ViewOptions
 from r3jax.cli.progress import Stages
 from r3jax.exploration.replay import config_of
+from r3jax.network import who_sees
 from r3jax.trace.reader import Run, read_run
-
-_THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 
 
 def run_view(options: ViewOptions) -> int:
@@ -48,9 +47,8 @@ def _show(options: ViewOptions, run: Run, console: Console) -> None:
     check_viser()
     from r3jax.apps.viewer.recorded import open_run_page  # needs viser
 
-    if options.host not in _THIS_MACHINE:
-        text = f"everybody who can reach {options.host} sees the page, and can use it"
-        console.say(text, style="yellow")
+    if warning := who_sees(options.host, "sees the page, and can use it"):
+        console.say(warning, style="yellow")
     with contextlib.ExitStack() as stack:
         page = open_run_page(
             run,

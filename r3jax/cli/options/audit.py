@@ -6,9 +6,11 @@ from typing import Annotated, ClassVar, Literal
 
 import tyro
 
+from r3jax.cli.options.bags import BagOptions
+
 
 @dataclass(frozen=True, kw_only=True)
-class AuditTermOptions:
+class AuditTermOptions(BagOptions):
     """How the capture is judged."""
 
     TITLE: ClassVar[str] = "terms"
@@ -44,8 +46,8 @@ class GuideOptions:
     TITLE: ClassVar[str] = "guidance while scanning"
 
     live: bool = False
-    """Follow a folder that another program is writing: the page in the browser shows what is done
-    and where to go next. Ctrl-C ends it, with an audit of what came in."""
+    """Follow a folder or ROS bag that another program is writing: the page in the browser shows
+    what is done and where to go next. Ctrl-C ends it, with an audit of what came in."""
 
     port: int = 8080
     """Port of the page that --live shows; 0 takes any free one."""
@@ -73,10 +75,6 @@ class AuditOptions(GuideOptions, AuditTermOptions):
     path: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Camera path to judge, in the capture's coordinates: nerfstudio's camera_path.json, or any
     capture. By default the capture's own frames, each judged without itself."""
-
-    topics: Annotated[str | None, tyro.conf.arg(metavar="NAMES")] = None
-    """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
-    depth_info, frame, world. By default they are found."""
 
     views: int = 10
     """Further views to suggest."""

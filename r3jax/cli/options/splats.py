@@ -6,6 +6,8 @@ from typing import Annotated, ClassVar, Literal
 
 import tyro
 
+from r3jax.cli.options.bags import BagOptions
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
@@ -46,7 +48,7 @@ class ModelFolderOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderingOptions:
+class RenderingOptions(BagOptions):
     """How splats are rendered, and how a recording is read."""
 
     TITLE: ClassVar[str] = "machine and recording"
@@ -56,10 +58,6 @@ class RenderingOptions:
 
     up: Literal["y", "z"] = "y"
     """Axis of a recording's world that points up."""
-
-    topics: Annotated[str | None, tyro.conf.arg(metavar="NAMES")] = None
-    """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
-    depth_info, frame, world. By default they are found."""
 
     seed: int = 0
     """All randomness follows from it."""

@@ -7,6 +7,7 @@ to the frame of the color images, each interpolated at the image's stamp; or fro
 odometry. Optical frames have the axes of OpenCV, and worlds are z up (REP 103, REP 105).
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +20,8 @@ from r3jax.formats.lenses import Lens
 from r3jax.formats.phones.shots import UP_Z
 from r3jax.formats.posed_images import Pixels, PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.ros.bag_poses import add_transforms, find_chain
-from r3jax.formats.ros.bags import Bag, find_bag
+from r3jax.formats.ros.bag_poses import PoseTopic, add_transforms, find_chain, find_pose_topic
+from r3jax.formats.ros.bags import AnyBag, Bag, Stamped, find_bag
 from r3jax.formats.ros.messages import depth_of, frame_of, lens_of, rgb_of, stamp_of
 from r3jax.formats.ros.names import Topics
 from r3jax.formats.ros.topics import (
@@ -42,7 +43,7 @@ _WORLDS = ("map", "odom", "world", "earth")
 
 
 @dataclass(frozen=True)
-class _Images:
+class ImageTimes:
     """The images of a topic: when they were taken, and where they lie in the bag."""
 
     topic: str
@@ -56,11 +57,11 @@ class _Images:
         """Number of images."""
         return len(self.stamps)
 
-    def take(self, chosen: np.ndarray) -> "_Images":
+    def take(self, chosen: np.ndarray) -> "ImageTimes":
         """Some of them, [k]."""
-        return _Images(self.topic, self.stamps[chosen], self.times[chosen])
+        return ImageTimes(self.topic, self.stamps[chosen], self.times[chosen])
 
-    def read(self, bag: Bag, index: int) -> Any:
+    def read(self, bag: AnyBag, index: int) -> Any:
         """The message of one image."""
         time = int(self.times[index])
         for stamped in bag.messages([self.topic], time, time + 1):
@@ -68,10 +69,15 @@ class _Images:
                 return stamped.message
         raise FormatError(bag.path, f"an image on {self.topic} is not there any more")
 
-    def name(self, bag: Bag, index: int) -> Path:
+    def name(self, bag: AnyBag, index: int) -> Path:
         """What an image is called in messages: the topic and its stamp [s]."""
         seconds, rest = divmod(int(self.stamps[index]), 1_000_000_000)
         return bag.path / self.topic.lstrip("/") / f"{seconds}.{rest:09d}"
+
+
+Choice = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
+"""Which frames to take, by their stamps [n] int64 [ns], their poses [n, 4, 4], and the stamp up to
+which these are certain: indices [k], ascending."""
 
 
 def read_bag(path: Path | str, topics: Topics | None = None) -> PosedImages:
@@ -85,46 +91,106 @@ def read_bag(path: Path | str, topics: Topics | None = None) -> PosedImages:
         FormatError: rosbags is not installed; a damaged bag; no color, depth or camera_info; no
             transforms or odometry that say where the camera was; no image that has all of them.
     """
-    path, topics = Path(path), topics or Topics()
+    path = Path(path)
     bag = Bag(find_bag(path) or path)
-    check_topics(bag, topics)
-    topic, depth_topic = find_images(bag, topics)
-    lens = _lens(bag, topic, topics.info)
-    if lens is None:
-        raise FormatError(
-            bag.path,
-            f"there is no camera_info that belongs to {topic.name}: record it, or name it by "
-            "--topics info=TOPIC",
+    reading = BagReading(path, bag, topics or Topics())
+    reading.add(bag.messages(reading.names))
+    return reading.images()
+
+
+class BagReading:
+    """What is known of a bag but the pixels: cameras, transforms, and when images were taken."""
+
+    def __init__(self, path: Path, bag: AnyBag, topics: Topics):
+        """Finds the topics and the cameras; raises FormatError as `read_bag`."""
+        self._path, self._bag, self._topics = path, bag, topics
+        check_topics(bag, topics)
+        self._color, self._depth = find_images(bag, topics)
+        lens = _lens(bag, self._color, topics.info)
+        if lens is None:
+            raise FormatError(
+                bag.path,
+                f"there is no camera_info that belongs to {self._color.name}: record it, or name "
+                "it by --topics info=TOPIC",
+            )
+        self._lens, self._tree = lens, TransformTree()
+        self._found: dict[str, list[tuple[int, int]]] = {self._color.name: [], self._depth.name: []}
+        self._pose: PoseTopic | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """Topics whose messages are to be added."""
+        pose = [] if self._pose is None else [self._pose.name]
+        return [*self._bag.topics(*TF), *self._found, *pose]
+
+    def add(self, messages: Iterable[Stamped]) -> None:
+        """Takes note of messages."""
+        pose = self._pose
+        for one in messages:
+            if one.topic in self._found:
+                self._found[one.topic].append((stamp_of(one.message, one.time), one.time))
+            elif pose is not None and one.topic == pose.name:
+                pose.add(self._tree, one)
+            else:
+                add_transforms(self._tree, one, but=None if pose is None else pose.child)
+
+    def images(self, choose: Choice | None = None) -> PosedImages:
+        """The posed images of what was added so far; raises FormatError as `read_bag`.
+
+        Args:
+            choose: tells which of the images to take, in the order of time; None: all that have
+                a pose and depth.
+        """
+        bag, tree = self._bag, self._tree
+        frame = frame_of(self._color.first)
+        images, depths = (_images_of(bag, name, found) for name, found in self._found.items())
+        if self._pose is None:
+            self._choose_pose(frame)
+        chain = find_chain(bag, tree, self._topics, frame, self._pose)
+        source = "tf" if self._pose is None else self._pose.name
+        total = len(images)
+        _, has_pose = tree.poses(chain, images.stamps)
+        color, depth = _matched(bag, images, depths, has_pose, source)
+        poses, _ = tree.poses(chain, color.stamps)
+        if choose is not None:
+            until = min(int(depths.stamps.max()), tree.latest(chain))
+            chosen = choose(color.stamps, poses, until)
+            if not len(chosen):
+                raise FormatError(bag.path, "no frame has both of the transforms around it yet")
+            color, depth, poses = color.take(chosen), depth.take(chosen), poses[chosen]
+        camera = _depth_camera(
+            bag, tree, (self._color, self._depth), self._lens, self._topics.depth_info
         )
-    tree, images, depths = _scan(bag, (topic.name, depth_topic.name))
-    chain, source = find_chain(bag, tree, topics, frame_of(topic.first))
-    _, has_pose = tree.poses(chain, images.stamps)
-    color, depth = _matched(bag, images, depths, has_pose, source)
-    camera = _depth_camera(bag, tree, (topic, depth_topic), lens, topics.depth_info)
-    gone = len(images) - len(color)
-    lost = f" {gone} of {len(images)} frames lack depth or a pose and are left out." if gone else ""
-    return PosedImages(
-        path=path,
-        image_paths=tuple(color.name(bag, i) for i in range(len(color))),
-        lenses=(lens,) * len(color),
-        poses=np.stack(
-            [mend_pose(bag.path, "a pose", pose) for pose in tree.poses(chain, color.stamps)[0]]
-        ),
-        depth_paths=tuple(depth.name(bag, i) for i in range(len(color))),
-        pixels=Pixels(
-            lambda index: _rgb(bag, color, index, lens),
-            lambda index: _depth(bag, depth, index, lens, camera),
-        ),
-        depth_lenses=None if camera.own is None else (camera.own,) * len(color),
-        up=UP_Z if chain[-1] in _WORLDS else None,
-        remark=f"Color is {topic.name}, depth {depth_topic.name}, poses are those of {chain[0]} in "
-        f"{chain[-1]} by {source}.{camera.remark}{lost}",
-    )
+        gone = 0 if choose is not None else total - len(color)
+        lost = f" {gone} of {total} frames lack depth or a pose and are left out." if gone else ""
+        return PosedImages(
+            path=self._path,
+            image_paths=tuple(color.name(bag, i) for i in range(len(color))),
+            lenses=(self._lens,) * len(color),
+            poses=np.stack([mend_pose(bag.path, "a pose", pose) for pose in poses]),
+            depth_paths=tuple(depth.name(bag, i) for i in range(len(color))),
+            pixels=Pixels(
+                lambda index: _rgb(bag, color, index, self._lens),
+                lambda index: _depth(bag, depth, index, self._lens, camera),
+            ),
+            depth_lenses=None if camera.own is None else (camera.own,) * len(color),
+            up=UP_Z if chain[-1] in _WORLDS else None,
+            remark=f"Color is {color.topic}, depth {depth.topic}, poses are those of {chain[0]} in "
+            f"{chain[-1]} by {source}.{camera.remark}{lost}",
+        )
+
+    def _choose_pose(self, frame: str) -> None:
+        """Looks for a topic with poses where tf does not move, and adds what it holds."""
+        pose = find_pose_topic(self._bag, self._tree, self._topics, frame)
+        if pose is not None:
+            self._tree.edges.pop(pose.child, None)
+            self._pose = pose
+            self.add(self._bag.messages([pose.name]))
 
 
 def _matched(
-    bag: Bag, images: _Images, depths: _Images, has_pose: np.ndarray, source: str
-) -> tuple[_Images, _Images]:
+    bag: AnyBag, images: ImageTimes, depths: ImageTimes, has_pose: np.ndarray, source: str
+) -> tuple[ImageTimes, ImageTimes]:
     """Color images that have a pose and depth, and the depth image nearest in time to each.
 
     Raises:
@@ -143,7 +209,7 @@ def _matched(
     return images.take(chosen), depths.take(at[chosen])
 
 
-def _rgb(bag: Bag, images: _Images, index: int, lens: Lens) -> np.ndarray:
+def _rgb(bag: AnyBag, images: ImageTimes, index: int, lens: Lens) -> np.ndarray:
     """Colors [H, W, 3] uint8."""
     with naming(images.name(bag, index)):
         rgb = rgb_of(images.read(bag, index))
@@ -155,7 +221,9 @@ def _rgb(bag: Bag, images: _Images, index: int, lens: Lens) -> np.ndarray:
         return rgb
 
 
-def _depth(bag: Bag, depths: _Images, index: int, lens: Lens, camera: "_DepthCamera") -> np.ndarray:
+def _depth(
+    bag: AnyBag, depths: ImageTimes, index: int, lens: Lens, camera: "_DepthCamera"
+) -> np.ndarray:
     """z-depth [h, w] float32, registered where it is not."""
     with naming(depths.name(bag, index)):
         depth = depth_of(depths.read(bag, index))
@@ -165,23 +233,13 @@ def _depth(bag: Bag, depths: _Images, index: int, lens: Lens, camera: "_DepthCam
     return register_depth(depth, depth_lens, lens, T_color_depth)
 
 
-def _scan(bag: Bag, names: tuple[str, str]) -> tuple[TransformTree, _Images, _Images]:
-    """All of /tf and /tf_static and the times of the images of two topics, in one pass."""
-    tree = TransformTree()
-    found: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
-    for one in bag.messages([*bag.topics(*TF), *names]):
-        if one.topic in found:
-            found[one.topic].append((stamp_of(one.message, one.time), one.time))
-        else:
-            add_transforms(tree, one)
-    for name in names:
-        if not found[name]:
-            raise FormatError(bag.path, f"there is no message on {name}")
-    color, depth = (_Images(name, *np.array(found[name], np.int64).T) for name in names)
-    return tree, color, depth
+def _images_of(bag: AnyBag, name: str, found: list[tuple[int, int]]) -> ImageTimes:
+    if not found:
+        raise FormatError(bag.path, f"there is no message on {name}")
+    return ImageTimes(name, *np.array(found, np.int64).T)
 
 
-def _lens(bag: Bag, image: ImageTopic, named: str | None) -> Lens | None:
+def _lens(bag: AnyBag, image: ImageTopic, named: str | None) -> Lens | None:
     """The lens of a topic's images; None where no camera_info belongs to it."""
     name = find_info(bag, image, named)
     if name is None:
@@ -203,7 +261,7 @@ class _DepthCamera(NamedTuple):
 
 
 def _depth_camera(
-    bag: Bag,
+    bag: AnyBag,
     tree: TransformTree,
     images: tuple[ImageTopic, ImageTopic],
     lens: Lens,

@@ -8,12 +8,13 @@ import io
 import os
 import weakref
 from collections.abc import Collection, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from r3jax.formats.errors import FormatError, naming
+from r3jax.formats.ros.unpack import unpack_chunk
 from r3jax.formats.validation.files import check_regular
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -30,6 +31,29 @@ class Stamped(NamedTuple):
     """When it was recorded [ns]; its own stamp may be another."""
 
     message: Any
+
+
+@runtime_checkable
+class AnyBag(Protocol):
+    """What is read of a bag, whether it is whole or grows."""
+
+    path: Path
+    types: dict[str, str]
+    """Type of the messages of every topic that has some, such as sensor_msgs/msg/Image."""
+
+    def topics(self, *types: str) -> list[str]:
+        """Names of the topics of these types, sorted."""
+        ...
+
+    def messages(
+        self, topics: Collection[str], start: int | None = None, stop: int | None = None
+    ) -> Iterator[Stamped]:
+        """Messages of some topics, recorded from `start` until before `stop` [ns]."""
+        ...
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic."""
+        ...
 
 
 class _File(io.BufferedReader):
@@ -110,20 +134,74 @@ class Bag:
             return stamped.message
         raise FormatError(self.path, f"there is no message on {topic}")
 
-    @contextmanager
-    def _reading(self, what: str) -> Generator[None]:
-        """Names the bag in whatever goes wrong in rosbags, SQLite or a decompressor."""
-        try:
-            yield
-        except (FormatError, GeneratorExit):
-            raise
-        except Exception as error:
-            reason = f"{error!s:.200}" or type(error).__name__
-            raise FormatError(
-                self.path,
-                f"the bag cannot be {what} ({reason}): record or copy it again, or try "
-                "`ros2 bag reindex` or `rosbag reindex`",
-            ) from None
+    def _reading(self, what: str) -> AbstractContextManager[None]:
+        return reading(self.path, what)
+
+
+@contextmanager
+def reading(path: Path, what: str) -> Generator[None]:
+    """Names the bag in whatever goes wrong in rosbags, SQLite or a decompressor.
+
+    Raises:
+        FormatError: the block raised anything.
+    """
+    try:
+        yield
+    except (FormatError, GeneratorExit):
+        raise
+    except Exception as error:
+        reason = f"{error!s:.200}" or type(error).__name__
+        raise FormatError(
+            path,
+            f"the bag cannot be {what} ({reason}): record or copy it again, or try "
+            "`ros2 bag reindex` or `rosbag reindex`",
+        ) from None
+
+
+class MessageTypes:
+    """Types of messages by what bags say of them, for bags that rosbags does not open."""
+
+    def __init__(self, path: Path, *, is_ros1: bool):
+        """Knows none yet; raises FormatError where rosbags is not installed.
+
+        Args:
+            path: for what is wrong.
+            is_ros1: messages are stored as ROS 1 does it.
+        """
+        _, self._typesys = _load_rosbags(path)
+        self._store: Any = self._typesys.get_typestore(self._typesys.Stores.EMPTY)
+        self._known: set[str] = set()
+        self._is_ros1 = is_ros1
+
+    def read(self, data: bytes, kind: str, definition: str, language: str) -> Any:
+        """Makes a message of its data; raises what rosbags does.
+
+        Args:
+            data: as it is stored.
+            kind: its type, such as sensor_msgs/msg/Image.
+            definition: what messages of this type look like; empty: as in the latest ROS 2.
+            language: ros2msg, or one of the kinds of IDL.
+        """
+        if kind not in self._known:
+            self._register(kind, definition, language)
+        read = self._store.deserialize_ros1 if self._is_ros1 else self._store.deserialize_cdr
+        return read(data, kind)
+
+    def _register(self, kind: str, definition: str, language: str) -> None:
+        if not definition:
+            latest = self._typesys.get_typestore(self._typesys.Stores.LATEST)
+            new = dict(latest.fielddefs)
+        elif language == "ros2msg":
+            new = self._typesys.get_types_from_msg(definition, kind)
+        else:
+            line = "=" * 80 + "\n"
+            parts = [part.partition("\n")[2] for part in definition.split(line)[1:]]
+            new = {}
+            for part in parts or [definition]:
+                new |= self._typesys.get_types_from_idl(part)
+        known = self._store.fielddefs
+        self._store.register({name: fields for name, fields in new.items() if name not in known})
+        self._known.add(kind)
 
 
 def find_bag(path: Path) -> Path | None:
@@ -150,4 +228,20 @@ def _load_rosbags(path: Path) -> tuple[ModuleType, ModuleType]:
         raise FormatError(
             path, "ROS bags are read by rosbags, which is not installed: pip install 'r3jax[ros]'"
         ) from None
+    _limit_chunks()
     return highlevel, typesys
+
+
+def _limit_chunks() -> None:
+    """Makes rosbags unpack no more of a chunk than it says, and than a recorder puts into one."""
+    from rosbags.rosbag1 import reader
+    from rosbags.rosbag2 import storage_mcap
+
+    with suppress(AttributeError):  # another version: it keeps its own
+        for name in storage_mcap.DECOMPRESSORS:
+            storage_mcap.DECOMPRESSORS[name] = lambda data, size, name=name: unpack_chunk(
+                data, name, size
+            )
+    with suppress(AttributeError):
+        for name in reader.decompressors:
+            reader.decompressors[name] = lambda data, name=name: unpack_chunk(data, name)

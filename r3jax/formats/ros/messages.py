@@ -5,6 +5,7 @@ The functions take any object with a message's fields: of rclpy, of rospy, or of
 Shape symbols: H, W image size; h, w size of a depth image.
 """
 
+import dataclasses
 import struct
 from typing import Any
 
@@ -27,6 +28,20 @@ _CHANNELS = {
     "bgra8": (4, (2, 1, 0)),
 }
 """Channels of a color image, and where red, green and blue are among them."""
+
+_BAYER = {
+    "bayer_rggb8": (0, 1, 1, 2),
+    "bayer_bggr8": (2, 1, 1, 0),
+    "bayer_gbrg8": (1, 2, 0, 1),
+    "bayer_grbg8": (1, 0, 2, 1),
+}
+"""Channels of a block of 2 x 2 pixels, row by row."""
+
+_YUV = {"uyvy": 1, "yuv422": 1, "yuyv": 0, "yuv422_yuy2": 0}
+"""4:2:2 in four bytes for two pixels: where the first brightness is among them."""
+
+_GRAY = ("mono8", "8UC1")
+"""Whose gray becomes three equal colors, for those who name such a topic: infrared, thermal."""
 
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Whole millimeters, or meters (REP 118)."""
@@ -72,34 +87,75 @@ def is_color(message: Any) -> bool:
     if is_depth(message):
         return False
     stored = encoding_of(message)
+    if hasattr(message, "encoding"):
+        return stored in _CHANNELS or stored in _BAYER or stored in _YUV
     # Compressed images without a prefix say only "jpeg" or "png".
-    return stored in _CHANNELS or (not hasattr(message, "encoding") and not _is_gray(stored))
-
-
-def _is_gray(stored: str) -> bool:
-    return stored.startswith(("mono", "8UC1", "bayer"))
+    return not stored.startswith(("mono", *_GRAY))
 
 
 def rgb_of(message: Any) -> np.ndarray:
     """Colors of an image, [H, W, 3] uint8.
 
     Args:
-        message: sensor_msgs/Image in one of five encodings, or CompressedImage of JPEG or PNG.
+        message: sensor_msgs/Image of 8-bit RGB, Bayer, YUV 4:2:2 or gray, or CompressedImage of
+            JPEG or PNG.
 
     Raises:
         ForeignFileError: another encoding; data that are damaged or too few.
     """
+    encoding = encoding_of(message)
     if not hasattr(message, "encoding"):
         data = bytes(message.data)
-        return image_pixels(data, IMAGE_FORMATS, image_size(data, IMAGE_FORMATS))
-    encoding = encoding_of(message)
+        rgb = image_pixels(data, IMAGE_FORMATS, image_size(data, IMAGE_FORMATS))
+        # A raw sensor's pixels may be packed as they are, in one channel.
+        return _from_bayer(rgb[..., 0], _BAYER[encoding]) if encoding in _BAYER else rgb
+    if encoding in _GRAY:
+        return np.repeat(_rows(message, np.dtype("u1"), 1)[..., None], 3, axis=-1)
+    if encoding in _BAYER:
+        return _from_bayer(_rows(message, np.dtype("u1"), 1), _BAYER[encoding])
+    if encoding in _YUV:
+        return _from_yuv(_rows(message, np.dtype("u1"), 2), _YUV[encoding])
     if encoding not in _CHANNELS:
-        raise ForeignFileError(
-            f"images of the encoding {encoding[:40]!r} are not read, only {', '.join(_CHANNELS)}"
-        )
+        known = ", ".join((*_CHANNELS, *_BAYER, *_YUV, *_GRAY))
+        raise ForeignFileError(f"images of the encoding {encoding[:40]!r} are not read: {known}")
     channels, order = _CHANNELS[encoding]
     pixels = _rows(message, np.dtype("u1"), channels)
     return pixels.reshape(message.height, message.width, channels)[..., order]
+
+
+def _from_bayer(raw: np.ndarray, channels: tuple[int, ...]) -> np.ndarray:
+    """Interpolates a Bayer mosaic bilinearly, [H, W] uint8 to [H, W, 3] uint8."""
+    rgb = np.empty((*raw.shape, 3), np.uint8)
+    for color in range(3):
+        there = np.zeros(raw.shape, np.float32)
+        for at, channel in enumerate(channels):
+            if channel == color:
+                there[at // 2 :: 2, at % 2 :: 2] = 1.0
+        # Weights 1 2 1 both ways: of each color they reach exactly its nearest pixels.
+        total, weight = (_tent(one) for one in (there * raw, there))
+        rgb[..., color] = np.where(there > 0, raw, np.rint(total / np.maximum(weight, 1e-6)))
+    return rgb
+
+
+def _tent(image: np.ndarray) -> np.ndarray:
+    """The image [H, W] under the weights 1 2 1, up and down and to the sides; zero outside."""
+    for axis in (0, 1):
+        padded = np.pad(image, [(1, 1) if axis == one else (0, 0) for one in (0, 1)])
+        before, here, after = (np.moveaxis(padded, axis, 0)[i : i + image.shape[axis]] for i in
+                               range(3))  # fmt: skip
+        image = np.moveaxis(before + 2.0 * here + after, 0, axis)
+    return image
+
+
+def _from_yuv(rows: np.ndarray, first: int) -> np.ndarray:
+    """Colors [H, W, 3] uint8 of YUV 4:2:2, [H, 2 W] uint8, by BT.601 in its narrow range."""
+    if rows.shape[1] % 4:
+        raise ForeignFileError("an image of YUV 4:2:2 has an odd number of columns")
+    pairs = rows.reshape(len(rows), -1, 4).astype(np.float32)
+    y = 1.164 * (pairs[..., [first, first + 2]].reshape(len(rows), -1) - 16.0)
+    u, v = (np.repeat(pairs[..., 1 - first + i] - 128.0, 2, axis=1) for i in (0, 2))
+    rgb = np.stack([y + 1.596 * v, y - 0.392 * u - 0.813 * v, y + 2.017 * u], axis=-1)
+    return np.rint(rgb).clip(0.0, 255.0).astype(np.uint8)
 
 
 def depth_of(message: Any) -> np.ndarray:
@@ -184,13 +240,23 @@ def lens_of(info: Any, *, is_rectified: bool = False) -> Lens:
     matrix, distortion = field("p" if is_rectified else "k").ravel(), field("d")
     if len(matrix) != (12 if is_rectified else 9):
         raise ForeignFileError(f"a matrix of the camera has {len(matrix)} numbers")
+    lens = rectified_lens(matrix, (int(info.width), int(info.height)))
+    if is_rectified or not distortion.any():
+        return lens
+    model, bent = _distortion(str(info.distortion_model), distortion)
+    return dataclasses.replace(lens, model=model, params=(*lens.params, *map(float, bent)))
+
+
+def rectified_lens(matrix: np.ndarray, size: tuple[int, int]) -> Lens:
+    """The pinhole of a matrix [9] or [12] whose pixel centers lie at whole numbers.
+
+    Args:
+        matrix: K or P, row by row.
+        size: width and height [px].
+    """
     K = matrix.reshape(3, -1)
     values = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
-    model, bent = "PINHOLE", ()
-    if distortion.any() and not is_rectified:
-        model, bent = _distortion(str(info.distortion_model), distortion)
-    params = tuple(float(value) for value in (*values, *bent))
-    return Lens(model, int(info.width), int(info.height), params)
+    return Lens("PINHOLE", *size, tuple(float(value) for value in values))
 
 
 def _distortion(name: str, coefficients: np.ndarray) -> tuple[str, tuple[float, ...]]:

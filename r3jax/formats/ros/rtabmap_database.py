@@ -4,6 +4,7 @@
     Data.image          JPEG or PNG
     Data.depth          PNG of 16 bits [mm], PNG of four channels that are the bytes of float32 [m],
                         or RVL of 16 bits; a JPEG is the right image of a stereo camera
+    Data.depth_confidence  8 bits, 0 to 100, as PNG or by zlib; older versions have none
     Data.calibration    11 int32: version, kind, size, numbers of elements; then float64 K, D, R, P
                         and 12 float32: the camera, optical axes, on the robot
     Admin.opt_ids       ids and poses of the optimized graph, by zlib, with 12 bytes behind it;
@@ -13,6 +14,7 @@
 """
 
 import sqlite3
+import struct
 import zlib
 from collections.abc import Sequence
 from contextlib import closing
@@ -22,22 +24,29 @@ from urllib.parse import quote
 
 import numpy as np
 
+from r3jax.formats.depth_images import keep_confident
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.phones.shots import UP_Z
 from r3jax.formats.posed_images import DEPTH_MODES, IMAGE_FORMATS, Pixels, PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.ros.messages import clean_depth
-from r3jax.formats.ros.rtabmap_export import COMMAND, rectified_lens
+from r3jax.formats.ros.messages import clean_depth, rectified_lens
+from r3jax.formats.ros.rtabmap_export import COMMAND
 from r3jax.formats.ros.rvl import unpack_rvl
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.files import check_regular
-from r3jax.formats.validation.images import image_pixels, image_size
+from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size
 
 _HEADER = 11
 _RVL = b"DEPTHRVL"
+_PNG = b"\x89PNG"
 _MAX_GRAPH = 256 << 20
 """A pose takes 48 bytes [bytes]."""
+
+_SURE = 100
+"""Of 0 to 100."""
+
+_CONFIDENCE = "SELECT depth_confidence FROM Data WHERE id = ? AND length(depth_confidence) > 0"
 
 _NODES = (
     "SELECT Node.id, Node.pose, Data.calibration FROM Node JOIN Data ON Data.id = Node.id "
@@ -68,6 +77,8 @@ def read_rtabmap_database(path: Path | str) -> PosedImages:
     """
     path = Path(path)
     rows = _query(path, _NODES)
+    columns = {row[1] for row in _query(path, "PRAGMA table_info(Data)")}
+    has_confidence = "depth_confidence" in columns
     (total,) = _query(path, "SELECT count(*) FROM Data WHERE length(image) > 0")[0]
     with naming(path):
         optimized = _optimized(path)
@@ -88,7 +99,8 @@ def read_rtabmap_database(path: Path | str) -> PosedImages:
         poses=np.stack([node.pose for node in nodes]),
         depth_paths=tuple(path / "depth" / str(node.id) for node in nodes),
         pixels=Pixels(
-            lambda index: _rgb(path, nodes[index]), lambda index: _depth(path, nodes[index])
+            lambda index: _rgb(path, nodes[index]),
+            lambda index: _depth(path, nodes[index], has_confidence=has_confidence),
         ),
         up=UP_Z,
         remark=f"Poses are {which}.{lost}",
@@ -212,16 +224,43 @@ def _rgb(path: Path, node: _Node) -> np.ndarray:
         return image_pixels(data, IMAGE_FORMATS, (node.lens.width, node.lens.height))
 
 
-def _depth(path: Path, node: _Node) -> np.ndarray:
-    """z-depth [h, w] float32."""
+def _depth(path: Path, node: _Node, *, has_confidence: bool) -> np.ndarray:
+    """z-depth [h, w] float32, where the sensor was sure."""
     with naming(path / "depth" / str(node.id)):
-        data = _blob(path, "depth", node)
-        if data.startswith(_RVL):
-            return clean_depth(0.001 * unpack_rvl(data[len(_RVL) :]).astype(np.float64))
-        size = image_size(data, ("PNG",))
-        wanted = "depth must be a PNG of 16 bits or of four channels"
-        pixels = image_pixels(data, ("PNG",), size, (*DEPTH_MODES, "RGBA"), wanted)
-        if pixels.ndim == 2:
-            return clean_depth(0.001 * pixels.astype(np.float64))
-        stored = np.ascontiguousarray(pixels[..., [2, 1, 0, 3]])  # OpenCV's order
-        return clean_depth(stored.view("<f4")[..., 0])
+        depth = _all_depth(_blob(path, "depth", node))
+        rows = _query(path, _CONFIDENCE, (node.id,)) if has_confidence else []
+        if not rows:
+            return depth
+        if not isinstance(rows[0][0], bytes):
+            raise ForeignFileError("its confidence is no image")
+        return keep_confident(depth, _confidence(rows[0][0]), _SURE)
+
+
+def _confidence(data: bytes) -> np.ndarray:
+    """Confidence [h, w] uint8: a PNG, or rows by zlib with their number, length and type behind."""
+    if data.startswith(_PNG):
+        wanted = "confidence must be an 8-bit PNG"
+        return image_pixels(data, ("PNG",), image_size(data, ("PNG",)), ("L",), wanted)
+    rows, columns, kind = struct.unpack("<3i", data[-12:].rjust(12, b"\0"))
+    if rows <= 0 or columns <= 0 or kind != 0 or rows * columns > MAX_PIXELS:
+        raise ForeignFileError("its confidence is damaged")
+    try:
+        levels = zlib.decompressobj().decompress(data, rows * columns)
+    except zlib.error:
+        levels = b""
+    if len(levels) != rows * columns:
+        raise ForeignFileError("its confidence is damaged")
+    return np.frombuffer(levels, np.uint8).reshape(rows, columns)
+
+
+def _all_depth(data: bytes) -> np.ndarray:
+    """z-depth [h, w] float32 as it is stored."""
+    if data.startswith(_RVL):
+        return clean_depth(0.001 * unpack_rvl(data[len(_RVL) :]).astype(np.float64))
+    size = image_size(data, ("PNG",))
+    wanted = "depth must be a PNG of 16 bits or of four channels"
+    pixels = image_pixels(data, ("PNG",), size, (*DEPTH_MODES, "RGBA"), wanted)
+    if pixels.ndim == 2:
+        return clean_depth(0.001 * pixels.astype(np.float64))
+    stored = np.ascontiguousarray(pixels[..., [2, 1, 0, 3]])  # OpenCV's order
+    return clean_depth(stored.view("<f4")[..., 0])

@@ -22,6 +22,7 @@ from r3jax.formats.phones.shots import UP_Z, Shot, complete_shots, confident_dep
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import read_numbers
 from r3jax.formats.quaternion_poses import quaternion_pose
+from r3jax.formats.ros.messages import rectified_lens
 from r3jax.formats.validation.errors import ForeignFileError
 
 COMMAND = "rtabmap-export --images_id --poses_camera --poses_format 11 {}"
@@ -93,13 +94,6 @@ def _lens(text: str, size: tuple[int, int]) -> Lens:
     if matrix is None:
         raise ForeignFileError("there is no camera_matrix in it")
     return rectified_lens(matrix, size)
-
-
-def rectified_lens(matrix: np.ndarray, size: tuple[int, int]) -> Lens:
-    """The pinhole of a matrix [9] or [12] whose pixel centers lie at whole numbers."""
-    K = matrix.reshape(3, -1)
-    values = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
-    return Lens("PINHOLE", *size, tuple(float(value) for value in values))
 
 
 def _matrix(text: str, name: str, count: int) -> np.ndarray | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from r3jax.formats.errors import FormatError
-from r3jax.formats.ros.bags import Bag
+from r3jax.formats.ros.bags import AnyBag
 from r3jax.formats.ros.messages import (
     CAMERA_INFO,
     COMPRESSED,
@@ -32,7 +32,7 @@ _TRANSPORTS = ("/compressedDepth", "/compressed")
 """What image_transport adds to the name of a topic."""
 
 
-def check_topics(bag: Bag, topics: Topics) -> None:
+def check_topics(bag: AnyBag, topics: Topics) -> None:
     """Refuses names that the bag does not have.
 
     Raises:
@@ -53,7 +53,7 @@ class ImageTopic:
     """Its first message."""
 
 
-def find_images(bag: Bag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
+def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
     """Color and depth: the named ones, else those that look most like a registered pair.
 
     Raises:
@@ -105,7 +105,7 @@ def _parent(topic: str) -> str:
     return topic.rpartition("/")[0].lstrip("/")
 
 
-def find_info(bag: Bag, image: ImageTopic, named: str | None) -> str | None:
+def find_info(bag: AnyBag, image: ImageTopic, named: str | None) -> str | None:
     """Topic of an image's camera: its sibling, else the only one of the same frame."""
     if named is not None:
         return named
@@ -118,13 +118,13 @@ def find_info(bag: Bag, image: ImageTopic, named: str | None) -> str | None:
     return same[0] if len(same) == 1 else None
 
 
-def find_pose(bag: Bag) -> str | None:
+def find_pose(bag: AnyBag) -> str | None:
     """The topic that most likely says where the robot is."""
     found = [name for kind in POSES for name in bag.topics(kind)]
     return found[0] if found else None
 
 
-def _listed(bag: Bag) -> str:
+def _listed(bag: AnyBag) -> str:
     """Some topics and their types."""
     shown = [f"{name} ({kind.rpartition('/')[2]})" for name, kind in sorted(bag.types.items())]
     more = f" and {len(shown) - 12} more" if shown[12:] else ""

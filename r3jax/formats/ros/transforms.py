@@ -128,6 +128,11 @@ class TransformTree:
         samples = [part for edge in edges for part in (edge.positions, edge.rotations)]
         return any(np.ptp(np.stack(part), axis=0).max() > _STILL for part in samples)
 
+    def latest(self, chain: list[str]) -> int:
+        """Time up to which all edges of a chain have samples [ns]; later poses may yet change."""
+        times = [max(self.edges[frame].times) for frame in chain[:-1] if self.edges[frame].times]
+        return min(times, default=0)
+
     def poses(self, chain: list[str], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses of a chain's first frame in its last one, [n, 4, 4], and which are known [n].
 

@@ -8,6 +8,7 @@ resolution.
 Shape symbols: H, W image size; h, w blocks of an image; b blocks in a row.
 """
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,7 @@ class BlockImage:
         known = self.depth[np.isfinite(self.depth)]
         return float(np.median(known)) if len(known) else float("nan")
 
+    @functools.cached_property  # each image is compared with about ten others
     def points(self) -> np.ndarray:
         """What the middle of each block shows, [b, 3] float64 in the world; NaN without depth."""
         height, width = self.shape

@@ -113,7 +113,7 @@ def _noise(image: BlockImage) -> np.ndarray:
 
 def _directions(image: BlockImage, blocks: np.ndarray) -> np.ndarray:
     """Unit directions in which a frame sees some of its blocks, [m, 3]."""
-    offset = image.points()[blocks] - image.pose[:3, 3]
+    offset = image.points[blocks] - image.pose[:3, 3]
     return offset / np.linalg.norm(offset, axis=1, keepdims=True)
 
 

@@ -41,6 +41,9 @@ LIGHT = 0.05
 """Change of brightness or tint that a splat cannot explain: 5 % of a mid gray alone limits PSNR to
 32 dB. Frames of a rendered walk, with their highlights, differ by up to 1 %."""
 
+_LITTLE = 0.01
+"""Pairs that differ by less have the same exposure."""
+
 _PAIRS_OF_CHANCE = 2
 """The so many largest differences between two frames may be a mirror's, and are not believed."""
 
@@ -245,9 +248,14 @@ def _brightness(lit: Light, names: _Names) -> Finding | None:
     typical = float(np.median(np.abs(np.subtract(*lit.brightness[lit.pairs.T]))))
     change = lit.change(lit.brightness)
     numbers, captions = _beside(lit, lit.brightness, change, names)
+    many = (
+        f"half of the pairs: by more than {100 * np.expm1(typical):.0f} %"
+        if typical >= np.log1p(_LITTLE)
+        else "most pairs: hardly, so it changed now and then, and not all the time"
+    )
     what = (
         f"Brightness changes by up to {100 * np.expm1(largest):.0f} % between pictures of the same "
-        f"surface (half of the pairs: by more than {100 * np.expm1(typical):.0f} %)."
+        f"surface ({many})."
     )
     todo = (
         "Lock the exposure before you start (iPhone: hold a finger on the picture until AE/AF LOCK "
@@ -277,6 +285,12 @@ def _beside(
         captions += [f"{ratio:.2f} x as bright as {names.label(other)}"]
         if len(captions) < len(numbers):
             captions.append(f"{1 / ratio:.2f} x as bright as {names.label(i)}")
+    if not numbers:  # a step: on both of its sides most neighbors are alike
+        i, other = (int(number) for number in both[np.argmax(shown)])
+        ratio = np.exp(values[i] - values[other])
+        numbers = [i, other]
+        captions = [f"{ratio:.2f} x as bright as {names.label(other)}",
+                    f"{1 / ratio:.2f} x as bright as {names.label(i)}"]  # fmt: skip
     return numbers, captions
 
 

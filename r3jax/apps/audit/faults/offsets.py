@@ -97,7 +97,7 @@ def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
     """Aligns all frames by a small motion each."""
     count = len(images)
     unit = float(np.median([d for d in (image.median_depth for image in images) if d > 0.0] or [1]))
-    points = [image.points() / unit for image in images]
+    points = [image.points / unit for image in images]
     normals = [_normals(p, image.shape) for p, image in zip(points, images, strict=True)]
     centers = [image.pose[:3, 3] / unit for image in images]
     found = [_matched(pair, points, normals, centers) for pair in pairs]

@@ -90,7 +90,7 @@ def neighbor_pairs(images: Sequence[BlockImage]) -> np.ndarray:
 def overlap(images: Sequence[BlockImage], first: int, second: int) -> Overlap:
     """Looks the blocks of one frame up in another one."""
     seen = images[second]
-    local = (images[first].points() - seen.pose[:3, 3]) @ seen.pose[:3, :3]
+    local = (images[first].points - seen.pose[:3, 3]) @ seen.pose[:3, :3]
     z = local[:, 2]
     is_ahead = z > 0.0  # NaN is not
     safe = np.where(is_ahead, z, 1.0)

@@ -21,8 +21,10 @@ from r3jax.apps.audit.faults.faults import Kind, faults_of
 from r3jax.apps.audit.live.growing import Arrival, GrowingCapture
 from r3jax.apps.audit.live.page import GuidePage
 from r3jax.apps.audit.source import Source
+from r3jax.formats.ros.names import Topics
 from r3jax.frame import Frame
 from r3jax.mapping.config import MappingConfig
+from r3jax.planning.growth import GrowthAhead
 from r3jax.planning.planner import Planner, decide, observe, start
 from r3jax.planning.policy import Decision
 
@@ -48,7 +50,7 @@ _COMPARED = 8
 """Latest frames that a new one is compared with for blur and light."""
 
 _CAPACITY = 1 << 17
-"""Rows of the map: 200 square meters of surface before all is compiled anew for a larger one."""
+"""Rows of the map at first: 200 square meters of surface."""
 
 
 _WARNINGS: dict[Kind, str] = {
@@ -76,6 +78,7 @@ class Guide:
         """
         self._page, self._up_name, self._policy = page, up, policy
         self._planner: Planner | None = None
+        self._growth = GrowthAhead()
         self._alignment = Alignment(np.eye(3), 1.0, np.zeros(3))
         self._bounds = np.zeros((2, 3))
         self._recent: deque[tuple[str, BlockImage]] = deque(maxlen=_COMPARED)
@@ -108,6 +111,7 @@ class Guide:
         assert self._planner is not None
         frame = source.framed(arrival.picture, arrival.index, self._alignment)
         self._planner = observe(self._planner, frame)
+        self._growth.look(self._planner, frame)
         if not is_latest:
             self._page.passed(frame)
             return
@@ -192,6 +196,7 @@ class Guide:
         """Ends the thread once it has answered."""
         self._questions.put(None)
         self._thread.join()
+        self._growth.wait()
 
 
 def follow(
@@ -200,25 +205,27 @@ def follow(
     scratch: Path,
     *,
     up: str | None = None,
+    topics: Topics | None = None,
     stop: threading.Event | None = None,
 ) -> Source | None:
     """Follows a growing capture until Ctrl-C, or until it is told to stop.
 
     Args:
-        path: the folder, or a transforms.json; nothing in it is written.
+        path: the folder, a transforms.json, or a ROS bag; nothing in it is written.
         page: shows what is done and where to go next.
         scratch: an empty folder of our own, which stays as long as the result is read.
         up: axis of the capture that points up.
+        topics: names of a bag's topics and frames; None: all are guessed.
         stop: set by another thread.
 
     Returns:
         What came in, to be audited; None if nothing did.
 
     Raises:
-        ValueError: the capture has no depth images.
+        ValueError: the capture has no depth images, or is a bag that cannot be followed.
     """
     stop = threading.Event() if stop is None else stop
-    capture = GrowingCapture(path, scratch)
+    capture = GrowingCapture(path, scratch, topics)
     try:
         with Guide(page, up) as guide:
             while not stop.is_set():

@@ -18,6 +18,8 @@ import numpy as np
 from r3jax.apps.audit.live.staging import stage
 from r3jax.apps.audit.source import Picture, Source, source_of
 from r3jax.formats.captures import open_capture
+from r3jax.formats.ros.growing.bag import FollowedBag, growing_files
+from r3jax.formats.ros.names import Topics
 from r3jax.geometry.cameras import angle_between
 
 _MOVED, _TURNED = 0.02, 1.0
@@ -50,14 +52,16 @@ class Arrival:
 class GrowingCapture:
     """What has come in of a capture; reads it, and writes nothing into it."""
 
-    def __init__(self, path: Path, scratch: Path):
+    def __init__(self, path: Path, scratch: Path, topics: Topics | None = None):
         """Looks at nothing yet.
 
         Args:
             path: the capture, which may not be there yet.
             scratch: an empty folder of our own, which stays until the source is read no more.
+            topics: names of a ROS bag's topics and frames; None: all are guessed.
         """
-        self._path, self._scratch = path, scratch
+        self._path, self._scratch, self._topics = path, scratch, topics
+        self._bag: FollowedBag | None = None
         self._seen: object = None
         self._source: Source | None = None
         self._taken: dict[str, np.ndarray] = {}
@@ -81,18 +85,18 @@ class GrowingCapture:
             ones were corrected.
 
         Raises:
-            ValueError: the capture has no depth images.
+            ValueError: the capture has no depth images, or is a bag that cannot be followed.
         """
         now = _signature(self._path)
         is_late = time.monotonic() - self._when > _AGAIN
         if now == self._seen and not self._is_pending and not is_late:
             return self._source, [], False
         self._when = time.monotonic()
+        files = growing_files(self._path)
+        if files and self._bag is None:
+            self._bag = FollowedBag(self._path, files, self._topics)
         try:
-            staged = stage(self._path, self._scratch)
-            path = self._path.resolve()
-            name = (path.parent if path.is_file() else path).name
-            source = source_of(open_capture(staged, "z").source, name)
+            source = self._opened(files)
         except (ValueError, OSError) as error:  # half of it is written; or it is none
             self.waiting_for, self._is_pending = str(error), True
             return self._source, [], False
@@ -100,6 +104,15 @@ class GrowingCapture:
             raise ValueError("guidance needs depth images: this capture has none")
         self._seen, self._source = now, source
         return source, self._arrivals(source), self._has_moved(source)
+
+    def _opened(self, files: list[Path]) -> Source:
+        """The frames that are whole by now; raises ValueError, OSError where none is."""
+        path = self._path.resolve()
+        if self._bag is not None and files:
+            return source_of(self._bag.images(files), path.stem)
+        staged = stage(self._path, self._scratch)
+        images = open_capture(staged, "z", self._topics).source
+        return source_of(images, (path.parent if path.is_file() else path).name)
 
     def _arrivals(self, source: Source) -> list[Arrival]:
         """The first of the new frames that can be read."""

@@ -27,11 +27,9 @@ from r3jax.apps.audit.pages.steps import steps_between
 from r3jax.apps.audit.pages.thumbnails import png, small_png
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.network import LOOPBACK, check_free
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Decision
-
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-"""Addresses that no other machine can reach."""
 
 _LATEST = 480
 """Longer side of the latest picture [px]."""
@@ -162,8 +160,10 @@ def open_guide(host: str = "127.0.0.1", port: int = 8080) -> Generator[GuidePage
         port: 0 takes any free one.
 
     Raises:
+        ValueError: no number of a port.
         OSError: the port is in use or not permitted, or the address is not one of this machine.
     """
+    check_free(host, port)
     server = _Server((host, port), _Handler)
     address = f"[{host}]" if ":" in host else host
     page = GuidePage(f"http://{address}:{server.server_port}")

@@ -6,7 +6,6 @@ looked at: under which name it was sent (Host), and which page sent it (Origin).
 """
 
 import contextlib
-import errno
 import http
 import http.client
 import io
@@ -22,8 +21,7 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
-"""Addresses that no other machine can reach."""
+from r3jax.network import LOOPBACK, check_free, in_use
 
 
 class _PrivateServer(viser.ViserServer):
@@ -48,15 +46,13 @@ def open_server(host: str, port: int, allow: Collection[str] = ()) -> viser.Vise
         ValueError: no number of a port.
         OSError: the port is in use or not permitted, or the address is not one of this machine.
     """
-    if not 0 <= port <= 65535:
-        raise ValueError(f"--port must lie between 0 and 65535, got {port}")
-    _check_free(host, port)
+    check_free(host, port)  # viser tries a thousand ports, and any address for ever
     # It would print a box of its own.
     with contextlib.redirect_stdout(io.StringIO()), _guarded(_Guard(host, allow)):
         server = _PrivateServer(host=host, port=port, label="r3jax", verbose=False)
     if port not in (0, server.get_port()):  # taken meanwhile: it has gone on to the next one
         close_server(server)
-        raise OSError(_in_use(host, port))
+        raise OSError(in_use(host, port))
     if _answer(server, f"{_STRANGER}:1") != http.HTTPStatus.FORBIDDEN:
         close_server(server)
         raise OSError("this version of viser lets any web page in: another one is needed")
@@ -158,30 +154,6 @@ def close_server(server: viser.ViserServer) -> None:
     """Stops a server."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
-
-
-def _check_free(host: str, port: int) -> None:
-    """Refuses what the server would not: it tries a thousand ports, and any address for ever."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-    except OSError as error:
-        raise OSError(f"--host {host!r} is no address of a machine ({error})") from None
-    try:
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except PermissionError:
-        raise OSError(f"port {port} is reserved: give another one with --port") from None
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise OSError(_in_use(host, port)) from None
-        raise OSError(f"cannot listen at {host}:{port} ({error.strerror})") from None
-
-
-def _in_use(host: str, port: int) -> str:
-    return f"port {port} of {host} is in use: give another one with --port, or 0 for any"
 
 
 def url_of(server: viser.ViserServer) -> str:

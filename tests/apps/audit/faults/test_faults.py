@@ -94,6 +94,19 @@ def test_a_change_of_brightness_is_found_and_measured(gain):
     assert 1.0 + finding.value == pytest.approx(max(gain, 1.0 / gain), abs=0.015)
 
 
+def test_a_step_of_the_exposure_shows_the_pictures_beside_it():
+    pictures = [
+        (to_bytes((1.16 if i >= VIEWS // 2 else 1.0) * rgb.astype(np.float64)), depth, pose)
+        for i, (rgb, depth, pose) in enumerate(walk())
+    ]
+    found = {f.kind: f for f in faults(pictures).findings}
+    brightness = found["brightness"]
+    assert brightness.value == pytest.approx(0.16, abs=0.015)
+    sides = {frame >= VIEWS // 2 for frame in brightness.frames}
+    assert sides == {True, False}
+    assert len(brightness.captions) == len(brightness.frames)
+
+
 def test_a_change_of_white_balance_is_told_from_one_of_brightness():
     kinds = {f.kind: f for f in damaged(to_bytes([1.0, 1.0, 1.15] * own_rgb())).findings}
     assert kinds["tint"].frames[0] == DAMAGED

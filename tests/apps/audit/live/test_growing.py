@@ -11,6 +11,7 @@ from r3jax.apps.audit.live.growing import GrowingCapture
 from r3jax.apps.audit.live.staging import complete_lines
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from tests.apps.audit.room import picture, round_poses, write_nerfstudio, write_recording
+from tests.formats.bags import camera_poses, write_bag
 
 pytestmark = pytest.mark.full
 
@@ -179,3 +180,29 @@ def test_a_line_counts_once_it_has_an_end(tmp_path):
     path.write_text(f"{row}\n\n1 2 3\n{row}\n")
     assert complete_lines(path) == [row, row]
     assert complete_lines(tmp_path / "none") == []
+
+
+def test_a_bag_that_is_recorded_comes_in_by_and_by(tmp_path, monkeypatch):
+    monkeypatch.setattr("r3jax.formats.ros.growing.bag._SETTLE", 0)
+    content = next(write_bag(tmp_path / "whole").glob("*.mcap")).read_bytes()
+    path = tmp_path / "drive"
+    capture = GrowingCapture(path, tmp_path / "scratch")
+    assert names(capture) == []
+    path.mkdir()
+    found: list[str] = []
+    for end in np.linspace(0, len(content), 6).astype(int):
+        (path / "drive_0.mcap").write_bytes(content[:end])
+        source, arrivals, has_moved = capture.look()
+        found += [arrival.name for arrival in arrivals]
+        assert not has_moved
+    assert len(found) == len(set(found)) == len(camera_poses())
+    assert source.name == "drive"
+    before = state_of(path)
+    assert len(list(capture.again(source))) == len(found)
+    assert state_of(path) == before
+
+
+def test_a_bag_that_cannot_be_followed_ends_it(tmp_path):
+    (tmp_path / "drive.db3").touch()
+    with pytest.raises(ValueError, match="may stop the recorder"):
+        GrowingCapture(tmp_path, tmp_path / "scratch").look()

@@ -1,0 +1,1 @@
+"""Bags that are being recorded: what is in them already, record by record."""
