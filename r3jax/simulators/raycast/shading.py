@@ -277,12 +277,13 @@ def shade(
     require_threads()
     path_before = np.zeros(1, np.float32) if path_before is None else path_before
     mirror = np.zeros((1, 3), np.float32) if mirror is None else mirror
-    per_ray = (hits.face, hits.u, hits.v, hits.distance, directions, origins, mirror, path_before)
+    columns = (hits.face, hits.u, hits.v, hits.distance, directions, origins, mirror, path_before)
+    # One layout and writable, whatever the caller's are: each other one compiles anew.
+    per_ray = [np.require(column, requirements=("C", "W")) for column in columns]
     colors = np.empty((len(hits.face), 3), np.float32)
     _shade_all(
         tables.faces, tables.corner_colors, tables.materials, tables.texels, tables.sizes,
         tables.offsets, tables.lamps, tables.ambient,
-        # One layout and writable, whatever the caller's are: each other one compiles anew.
-        *(np.require(x, requirements=("C", "W")) for x in per_ray), pixel_steps, num_workers(), colors,
+        *per_ray, pixel_steps, num_workers(), colors,
     )  # fmt: skip
     return colors
