@@ -25,7 +25,11 @@ TITLES = {
 """Heading of each kind of finding."""
 
 _GRID = "display:grid;grid-template-columns:repeat(auto-fill,minmax(145px,1fr));gap:10px"
-_FIGURE = '<figure style="margin:0">{}<figcaption style="font-size:13px">{}</figcaption></figure>'
+# A bag's frames are named by time stamps, longer than their thumbnails are wide.
+_FIGURE = (
+    '<figure style="margin:0">{}'
+    '<figcaption style="font-size:13px;overflow-wrap:anywhere">{}</figcaption></figure>'
+)
 
 
 def faults_section(audit: Audit) -> str:
