@@ -102,8 +102,8 @@ def write_page(folder: Path, records: Records, source: Origin) -> None:
         rows = quality_rows(now)
         write_csv(folder / f"{snapshot.replace(':', '_')}.csv", rows, source)
         page += [
-            f"**After {snapshot.partition(':')[2]} s**: PSNR [dB] [5th percentile of the test "
-            f"views] / frames, means over seeds; and PSNR minus that of {REFERENCE} with key "
+            f"**After {snapshot.partition(':')[2]} s**: PSNR in dB, in brackets the 5th percentile of "
+            f"the test views, then frames, means over seeds; and PSNR minus that of {REFERENCE} with key "
             "frames only on the same test views, with its interval of 95 %",
             markdown_table(rows),
         ]

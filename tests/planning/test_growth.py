@@ -47,5 +47,5 @@ def test_the_next_size_is_prepared_once_before_it_is_needed(monkeypatch):
 def test_nothing_is_prepared_where_there_is_room_or_no_growth(monkeypatch):
     prepared = []
     monkeypatch.setattr(growth, "_compile", lambda *args: prepared.append(args))
-    mapped(1 << 16, growth.GrowthAhead())
+    mapped(1 << 18, growth.GrowthAhead())
     assert prepared == []

@@ -34,5 +34,6 @@ def short_name(name: str) -> str:
         return name.rpartition(":")[2]
     words = [word for word in words_of(name.removeprefix(COMMAND)) if not word.startswith("-")]
     # The script, not its interpreter, nor what the script is told.
-    scripts = [word for word in words if Path(word).suffix] or words[:1]
+    # A number is no suffix: `python3.11` is no script.
+    scripts = [word for word in words if Path(word).suffix.strip(".0123456789")] or words[:1]
     return Path(scripts[0]).stem
