@@ -102,9 +102,9 @@ def write_page(folder: Path, records: Records, source: Origin) -> None:
         rows = quality_rows(now)
         write_csv(folder / f"{snapshot.replace(':', '_')}.csv", rows, source)
         page += [
-            f"**After {snapshot.partition(':')[2]} s**: PSNR in dB, in brackets the 5th percentile of "
-            f"the test views, then frames, means over seeds; and PSNR minus that of {REFERENCE} with key "
-            "frames only on the same test views, with its interval of 95 %",
+            f"**After {snapshot.partition(':')[2]} s**: PSNR in dB, in brackets the 5th percentile "
+            "of the test views, then frames, means over seeds; and PSNR minus that of "
+            f"{REFERENCE} with key frames only on the same test views, with its interval of 95 %",
             markdown_table(rows),
         ]
     write_markdown(folder / f"{NAME}.md", page, source)

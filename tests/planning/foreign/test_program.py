@@ -144,6 +144,7 @@ def test_a_command_that_is_none_is_refused(command, says):
         ("my.module:Highest", "Highest"),
         ("exec:python -u some/where/mine.py --fast", "mine"),
         ("exec:python", "python"),
+        ("exec:/usr/bin/python3.11 mine.py", "mine"),
     ],
 )
 def test_a_command_has_a_short_name(name, short):
