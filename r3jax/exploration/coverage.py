@@ -28,7 +28,7 @@ _MAX_ELEVATION = np.deg2rad(45.0)
 def _renderability_of_views(
     map_state: MapState, camera: Camera, poses: Float[Array, "P 4 4"]
 ) -> Float[Array, " P"]:
-    return jax.lax.map(lambda T: renderability(map_state, camera, T), poses)
+    return jax.vmap(lambda T: renderability(map_state, camera, T))(poses)
 
 
 def view_renderability(

@@ -12,6 +12,7 @@ and nothing can wait for a thread of XLA's pool while it occupies the only one.
 
 import contextlib
 import fcntl
+import functools
 import inspect
 import os
 import tempfile
@@ -168,8 +169,9 @@ def _wake_up(x):
         x[i] = i
 
 
+@functools.cache
 def require_threads() -> None:
-    """Starts Numba's threads.
+    """Starts Numba's threads, the first time that it is called.
 
     Raises:
         RuntimeError: its threading layer cannot serve two callers at once.

@@ -214,8 +214,7 @@ class RaycastSimulator:
         """Colors [n, 3] and hits of rays `directions` [n, 3] from the camera."""
         steps = self._pixel_steps(T)
         origin = T[None, :3, 3].astype(np.float32)
-        origins = np.repeat(origin, len(directions), axis=0)
-        hits = self._scene.cast(origins, directions, cull_back_faces=self._cull)
+        hits = self._scene.cast(origin, directions, cull_back_faces=self._cull, neighbors=True)
         colors = shade(self._tables, hits, origin, directions, steps)
         if self._face_mirror is not None:
             share = np.where(hits.face >= 0, self._face_mirror[hits.face], np.float32(0.0))
@@ -266,10 +265,11 @@ class RaycastSimulator:
         if len(pixels) == 0:
             return
         shifts = (self._offsets @ self._pixel_steps(T)).astype(np.float32)  # [S, 3]
-        rays = (directions[pixels][None] + shifts[:, None]).reshape(-1, 3)
+        # The rays of a pixel beside each other: neighbors are traced together.
+        rays = (directions[pixels][:, None] + shifts).reshape(-1, 3)
         colors, _ = self._look(T, rays)
         flat = image.reshape(-1, 3)
-        extra = colors.reshape(len(shifts), -1, 3).sum(axis=0)
+        extra = colors.reshape(-1, len(shifts), 3).sum(axis=1)
         flat[pixels] = (flat[pixels] + extra) / np.float32(len(shifts) + 1)
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_MAX_LAYERS = 64
-"""Back faces that a ray may pass before it counts as a miss."""
+from r3jax.simulators.raycast.embree import MAX_LAYERS, PacketScene, library
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,13 @@ class TriangleScene:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         """Builds the search tree over `vertices` [V, 3] [m] and `faces` [F, 3]."""
+        embree = library()
+        self._packets = None if embree is None else PacketScene(embree, vertices, faces)
+        if self._packets is None:
+            self._build_single(vertices, faces)
+
+    def _build_single(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """The same through embreex, where its package does not hold embree as a library."""
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
@@ -48,21 +54,34 @@ class TriangleScene:
         )
 
     def cast(
-        self, origins: np.ndarray, directions: np.ndarray, *, cull_back_faces: bool = False
+        self,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        *,
+        cull_back_faces: bool = False,
+        neighbors: bool = False,
     ) -> Hits:
         """First hits of rays.
 
         Args:
-            origins: [n, 3] float32 [m].
-            directions: [n, 3] float32 of any length but 0.
+            origins: [n, 3], or [1, 3] if all start there [m].
+            directions: [n, 3] of any length but 0.
             cull_back_faces: rays pass through faces seen from behind (corners clockwise).
+            neighbors: rays that follow each other are neighbors, as in an image: faster. The
+                distances are the same; of two faces at one distance the other may be named.
 
         Returns:
             The hits; distances are in multiples of the direction's length.
         """
-        if len(origins) == 0:
+        if len(directions) == 0:
             none = np.zeros(0, np.float32)
             return Hits(none.astype(np.int32), none, none, none, none.astype(bool))
+        if self._packets is not None:
+            found = self._packets.cast(
+                origins, directions, cull=cull_back_faces, coherent=neighbors
+            )
+            return Hits(*found)
+        origins = np.broadcast_to(origins, directions.shape)
         hits = self._first(origins, directions)
         return self._past_back_faces(hits, origins, directions) if cull_back_faces else hits
 
@@ -80,7 +99,7 @@ class TriangleScene:
     def _past_back_faces(self, hits: Hits, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """Moves hits on back faces on to the next front face, in place."""
         rays = np.flatnonzero(hits.is_back)
-        for _ in range(_MAX_LAYERS):
+        for _ in range(MAX_LAYERS):
             if len(rays) == 0:
                 return hits
             start = hits.distance[rays] * np.float32(1.0 + 1e-6) + np.float32(1e-5)

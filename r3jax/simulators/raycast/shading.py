@@ -83,21 +83,24 @@ def _moved(step, mirror, normal, along, direction, path, gradients):
 @inlined_fused
 def _wrapped_pair(x, size):
     """The two texels next to x of a texture that repeats, and the second one's weight."""
-    low = np.float32(math.floor(x))
-    first = np.int32(low)
+    first = np.int32(x)
+    low = np.float32(first)
+    if low > x:  # towards zero is not down
+        first, low = np.int32(first - 1), low - _ONE
     # A branch that is foreseen nearly always: a remainder costs more than what is fetched.
     if (first < 0) | (first >= size):
-        first = first % size
-    second = first + np.int32(1)
+        first = np.int32(first % size)
+    second = np.int32(first + 1)
     return first, (second if second < size else np.int32(0)), x - low
 
 
 @inlined_fused
 def _add_texel(texel, weight, color):
+    packed = np.int32(texel)  # signed: processors convert that to float in one step
     return (
-        color[0] + weight * np.float32(texel & np.uint32(255)),
-        color[1] + weight * np.float32((texel >> np.uint32(8)) & np.uint32(255)),
-        color[2] + weight * np.float32((texel >> np.uint32(16)) & np.uint32(255)),
+        color[0] + weight * np.float32(np.int32(packed & 255)),
+        color[1] + weight * np.float32(np.int32((packed >> 8) & 255)),
+        color[2] + weight * np.float32(np.int32((packed >> 16) & 255)),
     )
 
 
@@ -132,12 +135,13 @@ def _texture_color(atlas, texture, x, y, moves):
             shift = ((np.float32(probe) + _HALF) / np.float32(PROBES) - _HALF) * spread
             i0, i1, fx = _wrapped_pair((x + shift * axis[0]) * scale_x - _HALF, columns)
             j0, j1, fy = _wrapped_pair((y + shift * axis[1]) * scale_y - _HALF, rows)
-            top, bottom = start + np.int64(j0) * columns, start + np.int64(j1) * columns
+            top = np.uint64(start + np.int64(j0) * columns)
+            bottom = np.uint64(start + np.int64(j1) * columns)
             upper, lower = share * (_ONE - fy), share * fy
-            color = _add_texel(texels[top + i0], upper * (_ONE - fx), color)
-            color = _add_texel(texels[top + i1], upper * fx, color)
-            color = _add_texel(texels[bottom + i0], lower * (_ONE - fx), color)
-            color = _add_texel(texels[bottom + i1], lower * fx, color)
+            color = _add_texel(texels[top + np.uint64(i0)], upper * (_ONE - fx), color)
+            color = _add_texel(texels[top + np.uint64(i1)], upper * fx, color)
+            color = _add_texel(texels[bottom + np.uint64(i0)], lower * (_ONE - fx), color)
+            color = _add_texel(texels[bottom + np.uint64(i1)], lower * fx, color)
     return color[0] / _BYTE, color[1] / _BYTE, color[2] / _BYTE
 
 

@@ -1,16 +1,31 @@
-"""Hits on a box, worked out on paper."""
+"""Hits on a box, worked out on paper; packets against single rays on triangle soups."""
 
+import hypothesis.strategies as st
 import numpy as np
 import pytest
+import trimesh
+from hypothesis import given
 
+from r3jax.simulators.raycast import rays as rays_module
+from r3jax.simulators.raycast.embree import library
 from r3jax.simulators.raycast.rays import TriangleScene
 from tests.simulators.rooms import box_quads, box_room, world_of
 
 
-@pytest.fixture(scope="module")
-def room():
+def single_rays(vertices, faces, monkeypatch):
+    """A scene that has no library to trace packets with."""
+    with monkeypatch.context() as patch:
+        patch.setattr(rays_module, "library", lambda: None)
+        return TriangleScene(vertices, faces)
+
+
+@pytest.fixture(scope="module", params=["packets", "single"])
+def room(request):
     world = box_room()
-    return TriangleScene(world.vertices, world.faces)
+    if request.param == "packets":
+        return TriangleScene(world.vertices, world.faces)
+    with pytest.MonkeyPatch.context() as patch:
+        return single_rays(world.vertices, world.faces, patch)
 
 
 def rays(*pairs):
@@ -78,3 +93,43 @@ def test_rays_do_not_depend_on_their_batch_and_there_may_be_none(room):
         np.testing.assert_array_equal(whole.distance[k : k + 1], alone.distance)
         np.testing.assert_array_equal(whole.face[k : k + 1], alone.face)
     assert len(room.cast(origins[:0], directions[:0]).face) == 0
+
+
+def test_the_package_brings_the_library_that_packets_need():
+    assert library() is not None
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1), num_faces=st.integers(1, 40), num_rays=st.integers(1, 70),
+    cull=st.booleans(), neighbors=st.booleans(), same_origin=st.booleans(),
+)  # fmt: skip
+def test_packets_hit_what_single_rays_hit(seed, num_faces, num_rays, cull, neighbors, same_origin):
+    rng = np.random.default_rng(seed)
+    vertices = rng.normal(size=(3 * num_faces, 3)).astype(np.float32)
+    faces = np.arange(3 * num_faces).reshape(-1, 3)
+    origins = 2 * rng.normal(size=(1 if same_origin else num_rays, 3)).astype(np.float32)
+    directions = (rng.normal(size=(num_rays, 3)) - origins).astype(np.float32)
+    with pytest.MonkeyPatch.context() as patch:
+        expected = single_rays(vertices, faces, patch).cast(
+            origins, directions, cull_back_faces=cull
+        )
+    found = TriangleScene(vertices, faces).cast(
+        origins, directions, cull_back_faces=cull, neighbors=neighbors
+    )
+    np.testing.assert_array_equal(found.face, expected.face)
+    np.testing.assert_allclose(found.distance, expected.distance, rtol=1e-4)
+    np.testing.assert_array_equal(found.is_back, expected.is_back)
+    is_hit = found.face >= 0
+    np.testing.assert_allclose(found.u[is_hit], expected.u[is_hit], atol=1e-3)
+    np.testing.assert_allclose(found.v[is_hit], expected.v[is_hit], atol=1e-3)
+
+
+@pytest.mark.parametrize("neighbors", [False, True])
+def test_neither_kind_of_packet_slips_through_the_edges_of_a_sphere(neighbors):
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    scene = TriangleScene(sphere.vertices, sphere.faces)
+    # Through every corner, and through the middle of every edge.
+    middles = sphere.vertices[sphere.edges_unique].mean(axis=1)
+    directions = np.concatenate([sphere.vertices, middles]).astype(np.float32)
+    hits = scene.cast(np.full((1, 3), 0.01, np.float32), directions, neighbors=neighbors)
+    assert np.isfinite(hits.distance).all()
