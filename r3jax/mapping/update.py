@@ -4,6 +4,7 @@ Shape symbols: P points of a frame; M observations that join at once; H W image 
 """
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,8 +26,9 @@ from r3jax.mapping.associate import (
     points_of_pixels,
 )
 from r3jax.mapping.join import CHUNK, Statistics, grow, join
-from r3jax.mapping.seen import evidence_of_view, mark_seen
+from r3jax.mapping.seen import evidence_of_view, mark_seen, rows_in_view
 from r3jax.mapping.state import MapState, a_map
+from r3jax.native.version import speaks_our_interface
 
 _MAX_LOAD = 0.7
 """The table grows before more than this share of its rows is in use."""
@@ -91,10 +93,23 @@ def integrate_groups(
     return jax.lax.fori_loop(0, (num_voxels + (size - 1)) // size, join_chunk, state)
 
 
-def integrate_pixels(
+class _Pixels(NamedTuple):
+    """What a frame measures."""
+
+    points: Float[Array, "3 P"]
+    """In the world [m]; anything where not valid."""
+
+    valid: Bool[Array, " P"]
+    """True for pixels that join the map."""
+
+    factor: Float[Array, ""]
+    """1; NaN where the pose is unsound."""
+
+
+def _measured(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
-) -> MapState:
-    """Adds the frame's measured pixels to the map: the part of `integrate` that counts colors."""
+) -> _Pixels:
+    """The points of a frame that join the map."""
     depth = frame.depth
     factor = sound(frame.camera, frame.T_world_camera)
     # An unsound pose makes the factor NaN, and NaN > 0 is False: the frame adds nothing.
@@ -107,17 +122,62 @@ def integrate_pixels(
     )
     # 1 m stands for what is not measured: inf would make NaN of the points.
     points = points_of_pixels(frame, jnp.where(is_measured, depth, 1.0))
-    groups = group_by_voxel(points, frame.rgb.reshape(-1, 3), valid.reshape(-1), state.voxel_size)
+    return _Pixels(points, valid.reshape(-1), factor)
+
+
+def integrate_pixels(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    """Adds the frame's measured pixels to the map: the part of `integrate` that counts colors."""
+    points, valid, factor = _measured(state, frame, max_range, drop_edges)
+    groups = group_by_voxel(points, frame.rgb.reshape(-1, 3), valid, state.voxel_size)
     after = integrate_groups(state, groups, frame.position, frame.camera.focal)
     # NaN in the edge reaches every later score, and no later frame can undo it.
     return eqx.tree_at(lambda m: m.voxel_size, after, factor * after.voxel_size)
 
 
-def _integrate(
+def _by_formulas(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     # Pixels first: new voxels hide what lies behind them in this very frame.
     return mark_seen(integrate_pixels(state, frame, max_range, drop_edges), frame, max_range)
+
+
+def _by_kernels(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    """The same in machine code."""
+    from r3jax.mapping.backends import numba
+
+    points, valid, factor = _measured(state, frame, max_range, drop_edges)
+    look = frame.position, frame.camera.focal
+    state = numba.join_points(state, points, frame.rgb.reshape(-1, 3), valid, *look)
+    state = eqx.tree_at(lambda m: m.voxel_size, state, factor * state.voxel_size)
+    codes, has_holes = numba.codes_of_rows(state, frame, max_range)
+    # A branch: what hides what must be known only where depth has failed.
+    shown_in_holes = jax.lax.cond(
+        has_holes,
+        lambda: rows_in_view(state, frame, max_range).astype(jnp.uint8),
+        lambda: jnp.zeros(state.capacity, dtype=jnp.uint8),
+    )
+    return numba.mark(state, codes, shown_in_holes, *look)
+
+
+@jax.custom_jvp
+def _integrate(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    """One frame joins the map, by kernels on CPUs and by the formulas elsewhere."""
+    if not speaks_our_interface():
+        return _by_formulas(state, frame, max_range, drop_edges)
+    return jax.lax.platform_dependent(
+        state, frame, max_range, drop_edges, cpu=_by_kernels, default=_by_formulas
+    )
+
+
+@_integrate.defjvp
+def _integrate_jvp(primals: Any, tangents: Any) -> Any:
+    return jax.jvp(_by_formulas, primals, tangents)
 
 
 # Two programs: whether an argument is donated is fixed when a function is jitted.

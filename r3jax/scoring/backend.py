@@ -8,7 +8,6 @@ and every cell; h w pixels of a depth buffer.
 """
 
 import functools
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.mapping.state import MapState
-from r3jax.native.version import WRITTEN_FOR, ffi_version
+from r3jax.native.version import speaks_our_interface
 from r3jax.scoring.backends import dense, reference
 from r3jax.scoring.backends.views import layout_of, over_views, row_of
 from r3jax.scoring.cells import Cells
@@ -28,25 +27,6 @@ from r3jax.visibility.views import View
 
 LARGEST_BUFFER = 2048
 """Edge [px] up to which the kernels' places in a buffer are exact in float32."""
-
-
-def speaks_our_interface() -> bool:
-    """Whether XLA can call the kernels; warns if its interface is another."""
-    if (version := ffi_version()) != WRITTEN_FOR:
-        _warn(version)
-        return False
-    return True
-
-
-@functools.cache
-def _warn(version: tuple[int, int]) -> None:
-    warnings.warn(
-        f"scoring's kernels read XLA's structs as they are in version "
-        f"{'.'.join(map(str, WRITTEN_FOR))} of its foreign function interface; this jaxlib has "
-        f"{'.'.join(map(str, version))}: scoring in plain JAX, which is slower",
-        RuntimeWarning,
-        stacklevel=2,
-    )
 
 
 def _by_platform(answer_by: Callable[[Any], Callable[..., Any]], edge: int = 1) -> Any:

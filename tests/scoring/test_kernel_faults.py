@@ -5,9 +5,6 @@ The kernels run as plain Python here: what they compile to is compared in `test_
 
 import dataclasses
 import functools
-import sys
-from types import ModuleType
-from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -21,62 +18,22 @@ from r3jax.scoring.cells import cells_of
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import wrap
 from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.plain_kernels import kernels_as_python
 from tests.scoring.test_backends import CAMERA, CONFIG, NUM_BINS, poses_of, view_at, world
 
 SIGHT, SCORES = numba.visibility_kernels.__name__, numba.__name__
+BINS = f"{numba.mapping_kernels.__name__}.bins"
 CHAIN = (
     *(f"{SIGHT}.{name}" for name in ("views", "picture", "splat", "limit", "seen", "bricks")),
+    BINS,
     *(f"{SCORES}.{name}" for name in ("voxels", "terms", "sums", "pixels", "rows")),
 )
 VIEWS = 5  # one more than `sums.FEW`, so that bricks are made
 
 
-def python_compiler() -> ModuleType:
-    """Stands for `compiled.py`: kernels stay Python, the counter needs no atomics."""
-    module = ModuleType("r3jax.native.compiled")
-    for name in ("kernel", "inlined", "inlined_fused", "parallel_kernel"):
-        setattr(module, name, lambda function: function)
-
-    def claim(counter):
-        counter[0] += 1
-        return int(counter[0]) - 1
-
-    module.__dict__.update(
-        claim=claim, in_wide_vectors=lambda: None, intrinsic=lambda function: plain_lowest_bit
-    )
-    return module
-
-
-def plain_lowest_bit(word) -> int:
-    return (int(word) & -int(word)).bit_length() - 1
-
-
-def numpy_arithmetic() -> ModuleType:
-    """Stands for `arithmetic.py`."""
-    single, module = np.float32, ModuleType("r3jax.native.arithmetic")
-    bits_of = lambda value: single(value).view(np.uint32)
-    module.__dict__.update(
-        floor=lambda x: single(np.floor(x)),
-        ceil_log2=lambda x: single(np.ceil(np.log2(x))),
-        power_of_two=np.exp2,
-        whole=np.int32,
-        count_bits=lambda word: int(word).bit_count(),
-        bits_of=bits_of,
-        float_of=lambda word: np.uint32(word).view(single),
-        key_of=lambda distance, row: np.int64(int(bits_of(distance)) << 32 | int(row)),
-        exp2=lambda power: np.exp2(max(power, single(-126.0))),
-        log2=np.log2,
-    )
-    return module
-
-
 @pytest.fixture(autouse=True, scope="module")
 def plain_python():
-    doubles = python_compiler(), numpy_arithmetic()
-    with (
-        mock.patch.dict(sys.modules, {double.__name__: double for double in doubles}),
-        np.errstate(all="ignore"),
-    ):
+    with kernels_as_python():
         yield
 
 
@@ -212,7 +169,7 @@ MUTANTS = [
     Mutant("terms", "cosine if is_one else cosine * cosine", "cosine", sums_agree),
     Mutant("terms", "_ONE - delta * bias", "_ONE - bias", sums_agree),
     Mutant("terms", "kappa * (_ONE - bias)", "(_ONE - bias)", terms_agree),
-    Mutant("sums", "is_better = cosine > best", "is_better = k == 0", sums_agree),
+    Mutant("bins", "is_better = cosine > best", "is_better = k == 0", sums_agree),
     Mutant("sums", "num += is_seen[i]", "num += 1", sums_agree),
     Mutant("pixels", "key_of(placed[DISTANCE + i], rows[first + i])",
            "key_of(placed[DISTANCE + i], first + i)", images_agree),

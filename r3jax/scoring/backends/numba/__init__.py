@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 import r3jax.visibility.backends.numba as visibility_kernels
 from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
+from r3jax.mapping.backends import numba as mapping_kernels
 from r3jax.mapping.state import MapState
 from r3jax.native.compiled import forget_outdated_code
 from r3jax.native.ffi import num_workers
@@ -22,7 +23,8 @@ from r3jax.scoring.backends.views import BufferLayout
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms
 
-forget_outdated_code(Path(__file__).parent, Path(visibility_kernels.__file__).parent)
+_INLINED = (mapping_kernels, visibility_kernels)
+forget_outdated_code(Path(__file__).parent, *(Path(p.__file__).parent for p in _INLINED))
 
 
 def _shared(voxels: MapState) -> tuple[Array, ...]:

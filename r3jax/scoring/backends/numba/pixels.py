@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numba import prange
 
+from r3jax.mapping.backends.numba.bins import center_of
 from r3jax.native.arithmetic import key_of
 from r3jax.native.compiled import (
     claim,
@@ -18,7 +19,7 @@ from r3jax.native.compiled import (
 )
 from r3jax.scoring.backends.numba.sums import FEW, sound_views
 from r3jax.scoring.backends.numba.terms import look_from, product_of_terms
-from r3jax.scoring.backends.numba.voxels import bins_of, center_of, consistency, log2_or_never
+from r3jax.scoring.backends.numba.voxels import bins_of, consistency, log2_or_never
 from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots
 from r3jax.visibility.backends.numba.picture import (
     begin_of,

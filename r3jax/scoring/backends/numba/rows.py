@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numba import prange
 
+from r3jax.mapping.backends.numba.bins import center_of
 from r3jax.native.arithmetic import exp2
 from r3jax.native.compiled import claim, inlined_fused, kernel, parallel_kernel
 from r3jax.scoring.backends.numba.terms import (
@@ -21,7 +22,7 @@ from r3jax.scoring.backends.numba.terms import (
     log_resolution,
     look_from,
 )
-from r3jax.scoring.backends.numba.voxels import bins_of, center_of, consistency, log2_or_never
+from r3jax.scoring.backends.numba.voxels import bins_of, consistency, log2_or_never
 from r3jax.visibility.backends.numba.views import CHUNK
 
 KAPPA, BIAS, DELTA, NOISE, RESOLUTION, VALUE = 0, 1, 2, 3, 4, 5

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import prange
 
-from r3jax.native.arithmetic import floor, whole
+from r3jax.mapping.backends.numba.bins import fold, nearest_bin
 from r3jax.native.compiled import (
     claim,
     in_wide_vectors,
@@ -117,33 +117,6 @@ def nearest_distance(view, wraps, shape, voxel_size, runs, voxels, chunk, pixels
     push_down(pixels, side, shape, wraps)
 
 
-@inlined_fused
-def _fold(x, y, z, size):
-    """Octahedral cell of a direction, row * size + column (`geometry.sphere.octahedral_cell`)."""
-    inverse = _ONE / max(abs(x) + abs(y) + abs(z), _TINY)
-    u, v = x * inverse, y * inverse
-    is_lower = z < _ZERO
-    a = (_ONE - abs(v)) * (_ONE if u >= _ZERO else -_ONE) if is_lower else u
-    b = (_ONE - abs(u)) * (_ONE if v >= _ZERO else -_ONE) if is_lower else v
-    last = size - _ONE
-    column = min(max(floor((a * _HALF + _HALF) * size), _ZERO), last)
-    row = min(max(floor((b * _HALF + _HALF) * size), _ZERO), last)
-    return whole(row * size + column)
-
-
-@inlined_fused
-def nearest_bin(x, y, z, cell, table, lattice):
-    """Bin of a direction (`geometry.sphere.nearest_bin`): the best of the few in its cell."""
-    chosen, best = np.int32(0), -_TWO
-    for k in range(table.shape[1]):
-        at = table[np.uint32(cell), k]
-        row = np.uint32(at)
-        cosine = lattice[row, 0] * x + lattice[row, 1] * y + lattice[row, 2] * z
-        is_better = cosine > best
-        chosen, best = at if is_better else chosen, cosine if is_better else best
-    return chosen
-
-
 @inlined
 def _compact(is_seen, count, chosen):
     """Writes the numbers of what is seen; returns how many they are."""
@@ -171,7 +144,7 @@ def _find_directions(position, points, first, chosen, num, size, angles, cells):
         dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
         angles[TO_X + j], angles[TO_Y + j], angles[TO_Z + j] = dx, dy, dz
         angles[RANGE + j] = distance
-        cells[j] = _fold(dx, dy, dz, size)
+        cells[j] = fold(dx, dy, dz, size)
 
 
 @inlined_fused

@@ -8,9 +8,9 @@ import math
 import numpy as np
 from numba import prange
 
+from r3jax.mapping.backends.numba.bins import center_of
 from r3jax.native.arithmetic import bits_of, count_bits, float_of, log2
 from r3jax.native.compiled import inlined, kernel, parallel_kernel
-from r3jax.visibility.backends.numba.bricks import voxel_of
 from r3jax.visibility.backends.numba.views import CHUNK
 
 X, Y, Z, DELTA, LOG_DELTA, RESOLUTION = 0, 1, 2, 3, 4, 5
@@ -30,17 +30,6 @@ NEVER = np.float32(-1e30)
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 _TWO_THIRDS_OF_TWO = np.float32(2.0 / 1.5)
-
-
-@inlined
-def center_of(key, row, voxel_size):
-    """Center of the voxel in a row of the map [m]."""
-    x, y, z = voxel_of(key, row)
-    return (
-        (np.float32(x) + _HALF) * voxel_size,
-        (np.float32(y) + _HALF) * voxel_size,
-        (np.float32(z) + _HALF) * voxel_size,
-    )
 
 
 @inlined

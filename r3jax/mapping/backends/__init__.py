@@ -1,0 +1,1 @@
+"""How frames are mapped fast on a platform; each backend is held to the plain formulas."""

@@ -1,0 +1,119 @@
+"""Which voxels a frame looked at, and their direction bins: `mapping.seen` in machine code."""
+
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
+import numpy as np
+from numba import prange
+
+from r3jax.geometry.voxels import EMPTY_WORD
+from r3jax.mapping.backends.numba.bins import center_of, evidence, is_sound
+from r3jax.native.compiled import inlined_fused, parallel_kernel
+
+SHOWS, HOLE = 1, 2
+"""Codes of rows: a measurement shows the voxel; the pixel where it lies has none."""
+
+_SIZE, _RANGE, _FX, _FY, _CX, _CY, _POSE = 0, 1, 2, 3, 4, 5, 6
+"""Places in the numbers of a look; the last begins [R | t] of `T_camera_world`, row by row."""
+
+_BLOCK = 1 << 12
+"""Rows that a worker looks at before it takes the next."""
+
+_EMPTY = np.uint32(EMPTY_WORD)
+_ZERO, _ONE, _NEAREST = np.float32(0.0), np.float32(1.0), np.float32(1e-3)
+
+
+@inlined_fused
+def _along(numbers, axis, center):
+    """One coordinate of a point in the camera's frame."""
+    row = np.uint32(_POSE + 4 * axis)
+    along = numbers[row] * center[0] + numbers[row + np.uint32(1)] * center[1]
+    return along + numbers[row + np.uint32(2)] * center[2] + numbers[row + np.uint32(3)]
+
+
+@inlined_fused
+def _farthest_around(depth, row, column):
+    """Largest depth of a pixel and its neighbors: on a slope it changes within a pixel."""
+    farthest = _ZERO
+    for i in range(max(row - 1, 0), min(row + 2, depth.shape[0])):
+        for j in range(max(column - 1, 0), min(column + 2, depth.shape[1])):
+            farthest = max(farthest, depth[i, j])
+    return farthest
+
+
+@inlined_fused
+def _code_of(key, row, numbers, depth):
+    """What a frame says of a row; see `codes_of_rows`."""
+    height, width = np.float32(depth.shape[0]), np.float32(depth.shape[1])
+    center = center_of(key, row, numbers[_SIZE])
+    z = _along(numbers, 2, center)
+    if not z > _NEAREST:
+        return 0
+    x, y = _along(numbers, 0, center), _along(numbers, 1, center)
+    per_z = _ONE / z
+    u = numbers[_FX] * x * per_z + numbers[_CX]
+    v = numbers[_FY] * y * per_z + numbers[_CY]
+    is_in = (u >= _ZERO) & (u < width) & (v >= _ZERO) & (v < height)
+    # Straight from the camera, as the grid and the scores have it; depth alone is along the axis.
+    if not (is_in & (x * x + y * y + z * z <= numbers[_RANGE] * numbers[_RANGE])):
+        return 0
+    i, j = min(np.int64(v), depth.shape[0] - 1), min(np.int64(u), depth.shape[1] - 1)
+    if depth[i, j] == _ZERO:
+        return HOLE
+    # One edge of slack: a surface may lie anywhere within its voxel.
+    if depth[i, j] > _ZERO and z <= _farthest_around(depth, i, j) + numbers[_SIZE]:
+        return SHOWS
+    return 0
+
+
+@parallel_kernel
+def look_pass(key, numbers, depth, workers, codes, has_holes):
+    """Codes of all rows.
+
+    Args:
+        key: of the map [2, N].
+        numbers: voxel size, range, camera, pose.
+        depth: the frame's [H, W].
+        workers: threads.
+        codes: written [N].
+        has_holes: written: 1 if any row is in a hole [1].
+    """
+    num, holes = key.shape[1], np.zeros(workers, np.int32)
+    sound = np.isfinite(numbers[_FX:]).all() and numbers[_SIZE] > _ZERO
+    blocks = (num + _BLOCK - 1) // _BLOCK
+    for worker in prange(workers):
+        for block in range(worker, blocks, workers):
+            for row in range(block * _BLOCK, min((block + 1) * _BLOCK, num)):
+                is_there = sound and key[1, row] != _EMPTY
+                code = _code_of(key, row, numbers, depth) if is_there else 0
+                codes[row] = code
+                if code == HOLE:
+                    holes[worker] = 1
+    has_holes[0] = holes.max()
+
+
+@parallel_kernel
+def mark_pass(visited, resolution, key, camera, codes, shown_in_holes, table, lattice, workers):
+    """Sets bins and resolutions of the rows that are shown, in place (`seen.mark_rows`).
+
+    Args:
+        visited: words of bins [W, N].
+        resolution: best so far [N].
+        key: of the map [2, N].
+        camera: voxel size, focal length and position.
+        codes: of `look_pass` [N].
+        shown_in_holes: 1 where a row in a hole is shown all the same [N].
+        table: candidates of each octahedral cell [S^2, K].
+        lattice: directions of the bins [B, 3].
+        workers: threads.
+    """
+    num = key.shape[1]
+    blocks = (num + _BLOCK - 1) // _BLOCK
+    sound = is_sound(camera)
+    for worker in prange(workers):
+        for block in range(worker, blocks if sound else 0, workers):
+            for row in range(block * _BLOCK, min((block + 1) * _BLOCK, num)):
+                if codes[row] == SHOWS or (codes[row] == HOLE and shown_in_holes[row] != 0):
+                    chosen, sharper = evidence(key, row, camera, table, lattice)
+                    visited[chosen >> 5, row] |= np.uint32(1) << np.uint32(chosen & 31)
+                    resolution[row] = max(resolution[row], sharper)

@@ -1,0 +1,220 @@
+"""The kernels that map a frame on a CPU, against the plain formulas."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera, look_at
+from r3jax.geometry.voxels import EMPTY_WORD, pack, voxel_index
+from r3jax.mapping import update
+from r3jax.mapping.backends import numba
+from r3jax.mapping.seen import mark_rows, rows_in_view
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.update import integrate
+from r3jax.visibility.selection import select
+from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.plain_kernels import kernels_as_python
+
+WIDTH, HEIGHT, CAPACITY = 24, 18, 1024  # one shape: one compile
+CAMERA = Camera(WIDTH, HEIGHT, 20.0, 22.0, 11.0, 9.5)
+REACH = jnp.float32(3.0)
+MAPS = numba.__name__
+CHAIN = tuple(f"{MAPS}.{name}" for name in ("bins", "look", "add"))
+
+formulas = jax.jit(update._by_formulas)
+kernels = jax.jit(update._by_kernels)
+
+
+def frame_of(seed: int, holes: float = 0.1) -> Frame:
+    """A noisy wall with a step, seen from somewhere near the origin; holes and far pixels."""
+    random = np.random.default_rng(seed)
+    depth = random.uniform(1.0, 1.5) + 0.02 * random.normal(size=(HEIGHT, WIDTH))
+    depth[:, WIDTH // 2 :] += random.uniform(0.0, 2.0)
+    depth[random.random(depth.shape) < holes] = 0.0
+    depth[random.random(depth.shape) < 0.1] = np.inf
+    eye, aim = random.normal(size=3) * 0.3, random.normal(size=3) * [1.0, 1.0, 0.3]
+    return Frame(
+        rgb=random.random((HEIGHT, WIDTH, 3)).astype(np.float32),
+        depth=depth.astype(np.float32),
+        T_world_camera=look_at(jnp.asarray(eye, jnp.float32), jnp.asarray(eye + aim, jnp.float32)),
+        camera=CAMERA,
+    )
+
+
+def assert_same_map(found: MapState, expected: MapState) -> None:
+    """The same rows; rounding may put a voxel on the other side of a pixel's edge, now and then."""
+    for name in ("key", "count", "dropped"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    np.testing.assert_allclose(found.mean, expected.mean, atol=1e-5)
+    np.testing.assert_allclose(found.m2, expected.m2, atol=1e-5)
+    same_bins = np.all(np.asarray(found.visited) == np.asarray(expected.visited), axis=0)
+    near = np.isclose(found.resolution, expected.resolution, rtol=1e-5)
+    assert (same_bins & near).mean() > 0.998
+
+
+@given(seed=st.integers(0, 10**6), holes=st.sampled_from([0.0, 0.2, 1.0]), edges=st.booleans())
+@settings(max_examples=15)
+def test_frames_join_as_the_formulas_say(seed, holes, edges):
+    found = expected = empty_map(CAPACITY, 0.05, 40)
+    for i in range(3):
+        frame = frame_of(seed + i, holes)
+        found = kernels(found, frame, REACH, jnp.asarray(edges))
+        expected = formulas(expected, frame, REACH, jnp.asarray(edges))
+    assert holes == 1.0 or int(expected.num_occupied) > 100
+    assert_same_map(found, expected)
+
+
+def test_a_full_table_drops_what_the_formulas_drop():
+    found = expected = empty_map(64, 0.05, 40)
+    for i in range(2):
+        found = kernels(found, frame_of(i), REACH, jnp.asarray(False))
+        expected = formulas(expected, frame_of(i), REACH, jnp.asarray(False))
+    assert int(expected.dropped) > 100
+    np.testing.assert_array_equal(found.dropped, expected.dropped)
+    np.testing.assert_array_equal(found.key, expected.key)
+
+
+def test_an_unsound_pose_adds_nothing_and_poisons_the_map():
+    before, frame = kernels(empty_map(CAPACITY), frame_of(0), REACH, jnp.asarray(True)), frame_of(1)
+    # A frame refuses such a pose, but not what happens to it under jit.
+    skewed = eqx.tree_at(lambda f: f.T_world_camera, frame, 2.0 * frame.T_world_camera)
+    after = kernels(before, skewed, REACH, jnp.asarray(True))
+    assert np.isnan(float(after.voxel_size))
+    np.testing.assert_array_equal(after.key, before.key)
+    np.testing.assert_array_equal(after.visited, before.visited)
+    again = kernels(after, frame, REACH, jnp.asarray(True))
+    np.testing.assert_array_equal(again.key, before.key)
+
+
+def test_the_public_verb_takes_them_mapped_and_differentiated_forward():
+    start, frames = empty_map(CAPACITY), [frame_of(i) for i in range(2)]
+    text = jax.jit(integrate).lower(start, frames[0]).as_text()
+    assert ("r3jax_mapping_add" in text) == (jax.default_backend() == "cpu")
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *frames)
+    together = jax.vmap(integrate, in_axes=(None, 0))(start, stacked)
+    for i, frame in enumerate(frames):
+        alone = integrate(start, frame)
+        assert_same_map(jax.tree.map(lambda x, i=i: x[i], together), alone)
+
+    def brightness(gain: jax.Array) -> jax.Array:
+        frame = frames[0]
+        brighter = Frame(frame.rgb * gain, frame.depth, frame.T_world_camera, CAMERA)
+        return jnp.sum(integrate(start, brighter).mean)
+
+    _, slope = jax.jvp(brightness, (jnp.float32(0.5),), (jnp.float32(1.0),))
+    expected = float(brightness(jnp.float32(1.0)))  # linear in the gain
+    np.testing.assert_allclose(slope, expected, rtol=1e-4)
+
+
+# ---------------------------------------------------------------------------------------- laws
+
+
+@functools.cache
+def asked():
+    """A map of two frames, a third one, and what the formulas make of it."""
+    state = empty_map(CAPACITY, 0.05, 40)
+    for i in range(2):
+        state = formulas(state, frame_of(i), REACH, jnp.asarray(True))
+    frame = frame_of(2)
+    pixels = jax.jit(update._measured)(state, frame, REACH, jnp.asarray(True))
+    added = jax.jit(update.integrate_pixels)(state, frame, REACH, jnp.asarray(True))
+    return state, frame, pixels, added
+
+
+def camera_of(state: MapState, frame: Frame) -> np.ndarray:
+    return np.array(numba._camera(state, frame.position, frame.camera.focal))
+
+
+def law_add(modules: Modules) -> None:
+    state, frame, pixels, expected = asked()
+    table = [np.array(getattr(state, name)) for name in ROWS]
+    low, high = pack(*voxel_index(pixels.points, state.voxel_size))
+    keys = jnp.where(pixels.valid, jnp.stack([low, high]), jnp.uint32(EMPTY_WORD))
+    lost = np.zeros(1, np.int32)
+    with kernels_as_python():
+        modules["add"].add_pass(
+            table, camera_of(state, frame), np.array(keys), np.array(frame.rgb).reshape(-1, 3),
+            *numba._tables(state.num_bins), 2, lost,
+        )  # fmt: skip
+    assert lost[0] == 0
+    for name, found in zip(ROWS, table, strict=True):
+        np.testing.assert_allclose(found, getattr(expected, name), rtol=1e-5, atol=1e-5)
+
+
+def law_look(modules: Modules) -> None:
+    _, frame, _, state = asked()
+    T = np.linalg.inv(np.asarray(frame.T_world_camera, np.float64))[:3].reshape(-1)
+    numbers = np.array([state.voxel_size, REACH, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
+    numbers = np.concatenate([numbers, T]).astype(np.float32)
+    codes, has_holes = np.zeros(CAPACITY, np.uint8), np.zeros(1, np.int32)
+    with kernels_as_python():
+        modules["look"].look_pass(
+            np.array(state.key), numbers, np.array(frame.depth), 2, codes, has_holes
+        )
+    assert has_holes[0] == 1
+    shown = np.asarray(jax.jit(rows_in_view)(state, frame, REACH))
+    no_holes = Frame(
+        frame.rgb, jnp.where(frame.depth > 0, frame.depth, jnp.inf), frame.T_world_camera, CAMERA
+    )
+    in_view = np.asarray(jax.jit(rows_in_view)(state, no_holes, REACH))
+    assert ((codes == 1) & shown).sum() > 100
+    # What a measurement shows is shown; a hole shows a part of what is in view.
+    assert np.mean((codes == 1) <= shown) > 0.998
+    assert np.mean(shown <= (codes > 0)) > 0.998
+    assert np.mean((codes == 2) <= in_view) > 0.998
+    assert 0 < (codes == 2).sum() < (codes == 1).sum()
+
+
+def law_mark(modules: Modules) -> None:
+    _, frame, _, state = asked()
+    codes = np.arange(CAPACITY).astype(np.uint8) % 3
+    codes[np.asarray(~state.occupied)] = 0
+    in_holes = (np.arange(CAPACITY) % 2).astype(np.uint8)
+    marked = (codes == 1) | ((codes == 2) & (in_holes == 1))
+    expected = mark_rows(state, select(jnp.asarray(marked)), frame.position, CAMERA.focal)
+    visited, resolution = np.array(state.visited), np.array(state.resolution)
+    with kernels_as_python():
+        modules["look"].mark_pass(
+            visited, resolution, np.array(state.key), camera_of(state, frame), codes, in_holes,
+            *numba._tables(state.num_bins), 2,
+        )  # fmt: skip
+    np.testing.assert_array_equal(visited, expected.visited)
+    np.testing.assert_allclose(resolution, expected.resolution, rtol=1e-5)
+
+
+ROWS = ("key", "visited", "count", "mean", "m2", "resolution")
+MUTANTS = [
+    Mutant("bins", "is_better = cosine > best", "is_better = k == 0", law_mark),
+    Mutant("bins", "-_ONE) if is_lower else u", "-_ONE) if not is_lower else u", law_mark),
+    Mutant("bins", "camera[1] / distance", "camera[1] * distance", law_mark),
+    Mutant("look", "resolution[row] = max(", "resolution[row] = min(", law_mark),
+    Mutant("look", "and shown_in_holes[row] != 0", "", law_mark),
+    Mutant("look", "<= _farthest_around(depth, i, j) + numbers[_SIZE]", "<= depth[i, j]", law_look),
+    Mutant("look", "    if depth[i, j] == _ZERO:\n        return HOLE\n", "", law_look),
+    Mutant("look", "numbers[_RANGE] * numbers[_RANGE]", "numbers[_RANGE]", law_look),
+    Mutant("add", "squared * before * weight", "squared * weight", law_add),
+    Mutant("add", "points = max(sums[group, 3], _ONE)", "points = _ONE", law_add),
+    Mutant("add", "last[np.uint32(group_of[i])] == i", "True", law_add),
+    Mutant("add", "bids[k] = slot if table[1, slot] == _EMPTY else -1", "bids[k] = slot", law_add),
+    Mutant("add", "if rows[i] == capacity:\n            wanting", "if True:\n            wanting",
+           law_add),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("law", [law_add, law_look, law_mark])
+def test_laws_hold_for_the_kernels_as_python(law):
+    with kernels_as_python():
+        law(load(CHAIN))
+
+
+@each(MUTANTS)
+def test_faults_are_noticed(mutant):
+    with kernels_as_python():
+        assert_caught(CHAIN, mutant)
