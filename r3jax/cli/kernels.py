@@ -55,6 +55,10 @@ def _note_in(cache: Path) -> Path:
 def main(note: Path) -> None:
     """Compiles all kernels, those of decisions first, and leaves a note."""
     # In the order in which a run needs them.
+    from r3jax.mapping.backends.numba import bridge as mapping
+
+    for name in (mapping.ADD, mapping.LOOK, mapping.MARK):
+        mapping.register(name)
     from r3jax.scoring.backends.numba import bridge as scoring
 
     scoring.register(scoring.SUMS)

@@ -79,7 +79,18 @@ def join_points(
         *table, _camera(state, position, focal), keys, rgb,
         *_tables(state.num_bins), _options(),
     )  # fmt: skip
-    return MapState(*after, state.voxel_size, state.dropped + dropped[0], state.num_bins)
+    key, visited, count, mean, m2, resolution = after
+    return MapState(
+        key=key,
+        visited=visited,
+        count=count,
+        mean=mean,
+        m2=m2,
+        resolution=resolution,
+        voxel_size=state.voxel_size,
+        dropped=state.dropped + dropped[0],
+        num_bins=state.num_bins,
+    )
 
 
 def codes_of_rows(

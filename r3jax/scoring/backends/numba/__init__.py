@@ -23,8 +23,11 @@ from r3jax.scoring.backends.views import BufferLayout
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms
 
-_INLINED = (mapping_kernels, visibility_kernels)
-forget_outdated_code(Path(__file__).parent, *(Path(p.__file__).parent for p in _INLINED))
+forget_outdated_code(
+    Path(__file__).parent,
+    Path(mapping_kernels.__file__).parent,
+    Path(visibility_kernels.__file__).parent,
+)
 
 
 def _shared(voxels: MapState) -> tuple[Array, ...]:
