@@ -24,7 +24,8 @@ import math
 import numpy as np
 from numba import prange
 
-from r3jax.native.compiled import called_from_python, inlined_fused
+from r3jax.native.arithmetic import exp2, log2
+from r3jax.native.compiled import called_from_python, in_wide_vectors, inlined_fused
 from r3jax.native.ffi import num_workers, require_threads
 from r3jax.simulators.raycast.rays import Hits
 from r3jax.simulators.raycast.shading_tables import MAX_LEVELS, ShadingTables
@@ -40,11 +41,15 @@ _BLOCK = 1 << 10
 """Rays that a thread colors at a time: rays beside each other cost alike, and the image as a whole
 does not."""
 
-_FAINTEST = np.float32(-25.0)
-"""log2 of a highlight that counts for nothing."""
+_POSITION, _NORMAL, _VIEW = 0 * _BLOCK, 3 * _BLOCK, 6 * _BLOCK
+_SPECULAR, _SHININESS, _EMISSION = 9 * _BLOCK, 10 * _BLOCK, 11 * _BLOCK
+_DIFFUSE, _HIGHLIGHT = 12 * _BLOCK, 15 * _BLOCK
+_COLUMNS = 18
+"""Columns of a block's table, one after the other, so that LLVM sees how far apart they are."""
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
-_LEAST, _TINY, _BYTE = np.float32(1e-6), np.float32(1e-12), np.float32(255.0)
+_LEAST, _TINY = np.float32(1e-6), np.float32(1e-12)
+_PER_SAMPLE = np.float32(1.0 / (255.0 * PROBES))
 
 
 @inlined_fused
@@ -64,7 +69,7 @@ def _three(table, i, begin):
 
 
 @inlined_fused
-def _moved(step, mirror, normal, along, direction, path, gradients):
+def _moved(step, mirror, normal, per_along, direction, path, gradients):
     """How far, in texels, a hit moves when the pixel moves by one column or row.
 
     With the plane's normal n and direction d, a change e of the direction moves the hit by
@@ -72,7 +77,7 @@ def _moved(step, mirror, normal, along, direction, path, gradients):
     """
     twice = _TWO * _dot(mirror, step)
     e = step[0] - twice * mirror[0], step[1] - twice * mirror[1], step[2] - twice * mirror[2]
-    slide = _dot(normal, e) / along
+    slide = _dot(normal, e) * per_along
     move = (
         path * (e[0] - direction[0] * slide), path * (e[1] - direction[1] * slide),
         path * (e[2] - direction[2] * slide),
@@ -110,27 +115,24 @@ def _texture_color(atlas, texture, x, y, moves):
     texels, sizes, offsets = atlas
     width, height = sizes[texture, 0], sizes[texture, 1]
     a, b = moves
-    length_a = math.sqrt(a[0] * a[0] + a[1] * a[1])
-    length_b = math.sqrt(b[0] * b[0] + b[1] * b[1])
-    axis = a if length_a >= length_b else b
-    longer, shorter = max(length_a, length_b), min(length_a, length_b)
-    level = math.log2(max(longer / np.float32(PROBES), shorter, _LEAST)) + LEVEL_BIAS
-    level = min(max(level, _ZERO), np.float32(MAX_LEVELS - 1))
-    fine = np.float32(math.floor(level))
-    blend = level - fine
+    squared_a, squared_b = a[0] * a[0] + a[1] * a[1], b[0] * b[0] + b[1] * b[1]
+    axis = a if squared_a >= squared_b else b
+    longer, shorter = max(squared_a, squared_b), min(squared_a, squared_b)
+    sampled = max(longer * np.float32(1.0 / PROBES**2), shorter, _TINY)
+    level = min(max(_HALF * log2(sampled) + LEVEL_BIAS, _ZERO), np.float32(MAX_LEVELS - 1))
+    fine = np.int32(level)
+    blend = level - np.float32(fine)
     # Probes spread only as far as the footprint is longer than wide.
-    spread = _ONE - min(shorter / max(longer, _LEAST), _ONE)
+    spread = _ONE - min(math.sqrt(shorter / max(longer, _TINY)), _ONE)
+    per_width, per_height = _ONE / np.float32(width), _ONE / np.float32(height)
     color = (_ZERO, _ZERO, _ZERO)
     # Between two levels; a magnified texture has but one.
     for coarser in range(2 if blend > _ZERO else 1):
         k = min(np.int64(fine) + coarser, MAX_LEVELS - 1)
         columns, rows = np.int32(max(width >> k, 1)), np.int32(max(height >> k, 1))
         start = np.int64(offsets[texture, k])
-        scale_x, scale_y = (
-            np.float32(columns) / np.float32(width),
-            np.float32(rows) / np.float32(height),
-        )
-        share = (blend if coarser == 1 else _ONE - blend) / np.float32(PROBES)
+        scale_x, scale_y = np.float32(columns) * per_width, np.float32(rows) * per_height
+        share = (blend if coarser == 1 else _ONE - blend) * _PER_SAMPLE
         for probe in range(PROBES):
             shift = ((np.float32(probe) + _HALF) / np.float32(PROBES) - _HALF) * spread
             i0, i1, fx = _wrapped_pair((x + shift * axis[0]) * scale_x - _HALF, columns)
@@ -142,74 +144,25 @@ def _texture_color(atlas, texture, x, y, moves):
             color = _add_texel(texels[top + np.uint64(i1)], upper * fx, color)
             color = _add_texel(texels[bottom + np.uint64(i0)], lower * (_ONE - fx), color)
             color = _add_texel(texels[bottom + np.uint64(i1)], lower * fx, color)
-    return color[0] / _BYTE, color[1] / _BYTE, color[2] / _BYTE
+    return color
 
 
 @inlined_fused
-def _light(lamps, position, normal, view, specular, shininess):
-    """Sums over the lamps of the module's formula: diffuse light and highlights, RGB each."""
-    diffuse, highlight = (_ZERO, _ZERO, _ZERO), (_ZERO, _ZERO, _ZERO)
-    # Farther off the mirror's direction a highlight is less than float32 can add to a color.
-    edge = math.exp2(_FAINTEST / max(shininess, _LEAST)) if specular > _ZERO else _TWO
-    for i in range(lamps.shape[0]):
-        x, y, z = lamps[i, 0] - position[0], lamps[i, 1] - position[1], lamps[i, 2] - position[2]
-        squared = x * x + y * y + z * z
-        towards = x * normal[0] + y * normal[1] + z * normal[2]
-        if towards > _ZERO:
-            scale = _ONE / math.sqrt(max(squared, _TINY))
-            reach = lamps[i, 6] * lamps[i, 6]
-            light = reach / (reach + squared)
-            r, g, b = lamps[i, 3] * light, lamps[i, 4] * light, lamps[i, 5] * light
-            incidence = towards * scale
-            diffuse = (
-                diffuse[0] + r * incidence, diffuse[1] + g * incidence, diffuse[2] + b * incidence,
-            )  # fmt: skip
-            half = x * scale + view[0], y * scale + view[1], z * scale + view[2]
-            along, length = _dot(normal, half), max(_dot(half, half), _TINY)
-            if (along > _ZERO) & (along * along > edge * edge * length):
-                gloss = math.exp2(shininess * math.log2(along / math.sqrt(length)))
-                highlight = (
-                    highlight[0] + r * gloss, highlight[1] + g * gloss, highlight[2] + b * gloss,
-                )  # fmt: skip
-    return diffuse, highlight
-
-
-@inlined_fused
-def _lit(lamps, ambient, albedo, look, position, normal, direction):
-    """The module's formula for a world with lamps; `look`: specular, shininess, emission."""
-    view = _unit((-direction[0], -direction[1], -direction[2]))
-    if _dot(normal, view) < _ZERO:
-        normal = -normal[0], -normal[1], -normal[2]
-    diffuse, highlight = _light(lamps, position, normal, view, look[0], look[1])
-    emission, dark = look[2], _ONE - ambient
-    shares = (
-        emission + (_ONE - emission) * (ambient + dark * diffuse[0]),
-        emission + (_ONE - emission) * (ambient + dark * diffuse[1]),
-        emission + (_ONE - emission) * (ambient + dark * diffuse[2]),
-    )
-    return (
-        albedo[0] * shares[0] + look[0] * highlight[0],
-        albedo[1] * shares[1] + look[0] * highlight[1],
-        albedo[2] * shares[2] + look[0] * highlight[2],
-    )
-
-
-@inlined_fused
-def _color_of_hit(world, face, u, v, distance, origin, direction, mirror, before, steps):
-    """Color of one hit."""
-    faces, corner_colors, materials, atlas, lamps, ambient = world
+def _surface(world, face, u, v, path, direction, mirror, steps):
+    """Color of a surface where a ray meets it, before any light."""
+    faces, corner_colors, materials, atlas = world
     material = np.int64(faces[face, 15])
     normal, albedo = _three(faces, face, 12), _three(materials, material, 0)
     texture = np.int64(materials[material, 6])
     if texture >= 0:
         x = faces[face, 0] + u * faces[face, 2] + v * faces[face, 4]
         y = faces[face, 1] + u * faces[face, 3] + v * faces[face, 5]
-        along, path = _dot(normal, direction), distance + before
-        along = _LEAST if abs(along) < _LEAST else along
+        along = _dot(normal, direction)
+        per_along = _ONE / (_LEAST if abs(along) < _LEAST else along)
         gradients = _three(faces, face, 6), _three(faces, face, 9)
         moves = (
-            _moved(_three(steps, 0, 0), mirror, normal, along, direction, path, gradients),
-            _moved(_three(steps, 1, 0), mirror, normal, along, direction, path, gradients),
+            _moved(_three(steps, 0, 0), mirror, normal, per_along, direction, path, gradients),
+            _moved(_three(steps, 1, 0), mirror, normal, per_along, direction, path, gradients),
         )
         c = _texture_color(atlas, texture, x, y, moves)
         albedo = albedo[0] * c[0], albedo[1] * c[1], albedo[2] * c[2]
@@ -220,14 +173,88 @@ def _color_of_hit(world, face, u, v, distance, origin, direction, mirror, before
             albedo[1] * (w * at[1] + u * at[4] + v * at[7]),
             albedo[2] * (w * at[2] + u * at[5] + v * at[8]),
         )
-    if lamps.shape[0] == 0:
-        return albedo
-    position = (
-        origin[0] + distance * direction[0], origin[1] + distance * direction[1],
-        origin[2] + distance * direction[2],
-    )  # fmt: skip
-    look = _three(materials, material, 3)
-    return _lit(lamps, ambient, albedo, look, position, normal, direction)
+    return albedo
+
+
+@inlined_fused
+def _place(block, i, world, face, origin, direction, distance):
+    """Writes what the light at a hit depends on: position, normal, view, and how it shines."""
+    faces, materials = world[0], world[2]
+    view, normal = _unit((-direction[0], -direction[1], -direction[2])), _three(faces, face, 12)
+    turned = -_ONE if _dot(normal, view) < _ZERO else _ONE
+    look = _three(materials, np.int64(faces[face, 15]), 3)
+    for axis in range(3):
+        block[_POSITION + axis * _BLOCK + i] = origin[axis] + distance * direction[axis]
+        block[_NORMAL + axis * _BLOCK + i] = turned * normal[axis]
+        block[_VIEW + axis * _BLOCK + i] = view[axis]
+    block[_SPECULAR + i], block[_SHININESS + i], block[_EMISSION + i] = look
+
+
+@inlined_fused
+def _towards(lamp, block, i):
+    """Vector from a hit to a lamp, its squared length, and its part along the normal."""
+    x = lamp[0] - block[_POSITION + i]
+    y = lamp[1] - block[_POSITION + _BLOCK + i]
+    z = lamp[2] - block[_POSITION + 2 * _BLOCK + i]
+    n = block[_NORMAL + i], block[_NORMAL + _BLOCK + i], block[_NORMAL + 2 * _BLOCK + i]
+    return (x, y, z), x * x + y * y + z * z, x * n[0] + y * n[1] + z * n[2], n
+
+
+@inlined_fused
+def _add_diffuse(lamp, block, num):
+    """Adds light_i max(0, n l_i) to the sums of a block."""
+    in_wide_vectors()
+    reach = lamp[6] * lamp[6]
+    for i in range(num):
+        _, squared, towards, _ = _towards(lamp, block, i)
+        incidence = max(towards, _ZERO) / math.sqrt(max(squared, _TINY))
+        light = incidence * reach / (reach + squared)
+        block[_DIFFUSE + i] += lamp[3] * light
+        block[_DIFFUSE + _BLOCK + i] += lamp[4] * light
+        block[_DIFFUSE + 2 * _BLOCK + i] += lamp[5] * light
+
+
+@inlined_fused
+def _add_highlights(lamp, block, num):
+    """Adds light_i max(0, n h_i)^shininess to the sums of a block."""
+    in_wide_vectors()
+    reach = lamp[6] * lamp[6]
+    for i in range(num):
+        to_lamp, squared, towards, n = _towards(lamp, block, i)
+        scale = _ONE / math.sqrt(max(squared, _TINY))
+        h = (
+            to_lamp[0] * scale + block[_VIEW + i],
+            to_lamp[1] * scale + block[_VIEW + _BLOCK + i],
+            to_lamp[2] * scale + block[_VIEW + 2 * _BLOCK + i],
+        )
+        along = _dot(n, h)
+        squared_cosine = along * along / max(_dot(h, h), _TINY)
+        power = _HALF * block[_SHININESS + i] * log2(max(squared_cosine, _TINY))
+        is_lit = (towards > _ZERO) & (along > _ZERO)
+        light = exp2(power) * reach / (reach + squared) if is_lit else _ZERO
+        block[_HIGHLIGHT + i] += lamp[3] * light
+        block[_HIGHLIGHT + _BLOCK + i] += lamp[4] * light
+        block[_HIGHLIGHT + 2 * _BLOCK + i] += lamp[5] * light
+
+
+@inlined_fused
+def _light_block(lamps, ambient, block, num, colors):
+    """The module's formula for a block of surface colors, in place."""
+    sums = block[_DIFFUSE:]
+    sums[:] = _ZERO
+    shines = (block[_SPECULAR : _SPECULAR + num] > _ZERO).any()
+    for i in range(lamps.shape[0]):
+        _add_diffuse(lamps[i], block, num)
+        if shines:
+            _add_highlights(lamps[i], block, num)
+    dark = _ONE - ambient
+    for i in range(num):
+        specular, emission = block[_SPECULAR + i], block[_EMISSION + i]
+        for channel in range(3):
+            at = channel * _BLOCK + i
+            light = ambient + dark * block[_DIFFUSE + at]
+            share = emission + (_ONE - emission) * light
+            colors[i, channel] = colors[i, channel] * share + specular * block[_HIGHLIGHT + at]
 
 
 @called_from_python(parallel=True)
@@ -239,21 +266,29 @@ def _shade_all(
     num = face.shape[0]
     blocks = (num + _BLOCK - 1) // _BLOCK
     for worker in prange(workers):
+        world = faces, corner_colors, materials, (texels, sizes, offsets)
+        lit = np.empty(_COLUMNS * _BLOCK, np.float32)
         # Every `workers`-th block, so that each thread gets of all parts of the image.
         for block in range(worker, blocks, workers):
-            for i in range(block * _BLOCK, min((block + 1) * _BLOCK, num)):
+            first, end = block * _BLOCK, min((block + 1) * _BLOCK, num)
+            lit[:] = _ZERO
+            for i in range(first, end):
                 if face[i] < 0:
                     colors[i, 0] = colors[i, 1] = colors[i, 2] = _ZERO
                 else:
-                    color = _color_of_hit(
-                        (faces, corner_colors, materials, (texels, sizes, offsets), lamps, ambient),
-                        face[i], u[i], v[i], distance[i],
-                        _three(origins, min(i, origins.shape[0] - 1), 0), _three(directions, i, 0),
-                        _three(mirrors, min(i, mirrors.shape[0] - 1), 0),
-                        before[min(i, before.shape[0] - 1)], steps,
-                    )  # fmt: skip
-                    for channel in range(3):
-                        colors[i, channel] = min(max(color[channel], _ZERO), _ONE)
+                    direction = _three(directions, i, 0)
+                    path = distance[i] + before[min(i, before.shape[0] - 1)]
+                    mirror = _three(mirrors, min(i, mirrors.shape[0] - 1), 0)
+                    color = _surface(world, face[i], u[i], v[i], path, direction, mirror, steps)
+                    colors[i, 0], colors[i, 1], colors[i, 2] = color
+                    if lamps.shape[0] > 0:
+                        origin = _three(origins, min(i, origins.shape[0] - 1), 0)
+                        _place(lit, i - first, world, face[i], origin, direction, distance[i])
+            if lamps.shape[0] > 0:
+                _light_block(lamps, ambient, lit, end - first, colors[first:end])
+            for i in range(first, end):
+                for channel in range(3):
+                    colors[i, channel] = min(max(colors[i, channel], _ZERO), _ONE)
 
 
 def shade(
