@@ -28,7 +28,7 @@ from r3jax.mapping.associate import (
 from r3jax.mapping.join import CHUNK, Statistics, grow, join
 from r3jax.mapping.seen import evidence_of_view, mark_seen, rows_in_view
 from r3jax.mapping.state import MapState, a_map
-from r3jax.native.version import speaks_our_interface
+from r3jax.native.platform import by_platform
 
 _MAX_LOAD = 0.7
 """The table grows before more than this share of its rows is in use."""
@@ -168,11 +168,8 @@ def _integrate(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     """One frame joins the map, by kernels on CPUs and by the formulas elsewhere."""
-    if not speaks_our_interface():
-        return _by_formulas(state, frame, max_range, drop_edges)
-    return jax.lax.platform_dependent(
-        state, frame, max_range, drop_edges, cpu=_by_kernels, default=_by_formulas
-    )
+    add = by_platform(cpu=_by_kernels, default=_by_formulas)
+    return add(state, frame, max_range, drop_edges)
 
 
 @_integrate.defjvp

@@ -2,7 +2,6 @@
 
 import functools
 import re
-import warnings
 from pathlib import Path
 
 import jax
@@ -26,22 +25,3 @@ def ffi_version() -> tuple[int, int]:
     ]
     major, minor = (-1 if match is None else int(match[1]) for match in found)
     return major, minor
-
-
-def speaks_our_interface() -> bool:
-    """Whether XLA can call the kernels; warns once if its interface is another."""
-    if (version := ffi_version()) != WRITTEN_FOR:
-        _warn(version)
-        return False
-    return True
-
-
-@functools.cache
-def _warn(version: tuple[int, int]) -> None:
-    warnings.warn(
-        f"the kernels for CPUs read XLA's structs as they are in version "
-        f"{'.'.join(map(str, WRITTEN_FOR))} of its foreign function interface; this jaxlib has "
-        f"{'.'.join(map(str, version))}: mapping and scoring in plain JAX, which is slower",
-        RuntimeWarning,
-        stacklevel=2,
-    )

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.mapping.state import MapState
-from r3jax.native.version import speaks_our_interface
+from r3jax.native.platform import by_platform
 from r3jax.scoring.backends import dense, reference
 from r3jax.scoring.backends.views import layout_of, over_views, row_of
 from r3jax.scoring.cells import Cells
@@ -36,13 +36,11 @@ def _by_platform(answer_by: Callable[[Any], Callable[..., Any]], edge: int = 1) 
         answer_by: from a backend's module to the function that asks it.
         edge: of the depth buffer [px].
     """
-    if edge > LARGEST_BUFFER or not speaks_our_interface():
+    if edge > LARGEST_BUFFER:
         return answer_by(dense)
     from r3jax.scoring.backends import numba
 
-    return functools.partial(
-        jax.lax.platform_dependent, cpu=answer_by(numba), default=answer_by(dense)
-    )
+    return by_platform(cpu=answer_by(numba), default=answer_by(dense))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(6,))

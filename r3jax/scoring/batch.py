@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from r3jax.geometry.cameras import Camera, is_traced
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.native.version import speaks_our_interface
+from r3jax.native.platform import speaks_our_interface
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import r3jax
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.native import version
+from r3jax.native import platform
 from r3jax.planning.candidates import poses_along
 from r3jax.scoring import backend
 from r3jax.scoring.backends import dense, reference
@@ -187,8 +187,8 @@ def test_renderability_is_that_of_the_reference(seed):
 
 
 def test_another_interface_of_xla_is_served_by_plain_jax(monkeypatch):
-    monkeypatch.setattr(version, "ffi_version", lambda: (0, 2))
-    version._warn.cache_clear()
+    monkeypatch.setattr(platform, "ffi_version", lambda: (0, 2))
+    platform._warn.cache_clear()
     state, grid = world(0)
     with pytest.warns(RuntimeWarning, match=r"version 0\.3 of its foreign function interface"):
         found = jax.jit(asked_of(backend, "pinhole"))(state, cells_of(grid), poses_of(0)[0])
