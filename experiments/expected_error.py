@@ -247,7 +247,7 @@ def rank(prediction: np.ndarray, quality: np.ndarray) -> float:
     """Spearman's coefficient; 0 where nothing is said."""
     if np.ptp(prediction) == 0.0 or np.ptp(quality) == 0.0:
         return 0.0
-    return float(spearmanr(prediction, quality).statistic)
+    return float(np.asarray(spearmanr(prediction, quality))[0])
 
 
 def model_rows(models: Sequence[Model]) -> list[dict[str, Any]]:
@@ -274,7 +274,9 @@ def model_rows(models: Sequence[Model]) -> list[dict[str, Any]]:
 
 
 def median(rows: Sequence[dict[str, Any]], column: str) -> str:
-    """Median over models, with the 95 % interval of a bootstrap over models."""
+    """Median over models, with the 95 % interval of a bootstrap over models; none: nothing."""
+    if not rows:
+        return ""
     values = np.array([row[column] for row in rows])
     drawn = np.random.default_rng(0).integers(0, len(values), (_RESAMPLES, len(values)))
     low, high = np.percentile(np.median(values[drawn], axis=1), [2.5, 97.5])

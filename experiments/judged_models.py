@@ -187,6 +187,7 @@ def _write(
     state, data = map_of(frames, max_range=MAX_RANGE), io.BytesIO()
     cameras, poses = tested
     K = [[float(x) for x in (c.fx, c.fy, c.cx, c.cy)] for c in cameras]
+    arrays: dict[str, Any] = {k: np.asarray(v, np.float32) for k, v in scores.items()}
     np.savez_compressed(
         data,
         scene=scene,
@@ -202,7 +203,7 @@ def _write(
         K=np.array(K),
         poses=np.asarray(poses, np.float32),
         texture=np.array([_texture(image) for image in np.asarray(truth.rgb)]),
-        **{name: np.asarray(values, np.float32) for name, values in scores.items()},
+        **arrays,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, data.getvalue())
