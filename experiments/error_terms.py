@@ -216,7 +216,7 @@ def _compute(root: Path, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
     sensing, slug = record["sensing"], snapshot_slug(record["snapshot"])
     run = read_run(root / record["run"])
     frames = [run.frame(step) for step in range(record["exploration"]["views"])]
-    reference = _reference_images(root, record)
+    reference = reference_images(root, record)
     state = map_of(frames, voxel_size=sensing["voxel_size"], max_range=sensing["max_range"])
     config = ScoringConfig(max_range=sensing["max_range"])
     columns = prediction_columns(state, run.camera, reference.poses, config)
@@ -224,7 +224,8 @@ def _compute(root: Path, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return columns | error_columns(scene, reference, frames, sensing)
 
 
-def _reference_images(root: Path, record: Mapping[str, Any]) -> ReferenceImages:
+def reference_images(root: Path, record: Mapping[str, Any]) -> ReferenceImages:
+    """The test images of a cell, by its record."""
     conditions = Conditions(
         resolution=record["resolution"],
         fov=record["sensing"]["fov"],

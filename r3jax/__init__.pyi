@@ -14,6 +14,13 @@ from .planning.planner import Planner, decide, observe, start
 from .planning.policy import Decision
 from .planning.registry import make_policy, register_policy
 from .scoring.config import ScoringConfig
+from .scoring.difficulty import voxel_difficulty
+from .scoring.expected_error import (
+    ErrorImages,
+    ExpectedError,
+    expected_error,
+    expected_error_images,
+)
 from .scoring.explain import Explanation, explain_view
 from .scoring.panorama import Panorama, panorama
 from .scoring.renderability import (
@@ -37,7 +44,9 @@ __version__: str
 __all__ = [
     "Camera",
     "Decision",
+    "ErrorImages",
     "Evaluation",
+    "ExpectedError",
     "Explanation",
     "FitResult",
     "Frame",
@@ -61,6 +70,8 @@ __all__ = [
     "empty_grid",
     "empty_map",
     "evaluate",
+    "expected_error",
+    "expected_error_images",
     "explain_view",
     "explore",
     "fit",
@@ -85,6 +96,7 @@ __all__ = [
     "renderability_image",
     "start",
     "view_utility",
+    "voxel_difficulty",
     "voxel_renderability",
     "write_scene",
 ]

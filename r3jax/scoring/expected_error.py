@@ -1,0 +1,204 @@
+"""The error to expect of a view, pixel by pixel: how well it was seen times how hard it is.
+
+R says how well a surface was looked at, not how hard it is to render. With the difficulty C of a
+voxel (`scoring.difficulty`) and D = 1 - R, a pixel is expected to be off by
+
+    e = a                        whatever is shown,
+      + b C + c D^2 + d C D      where it shows a voxel,
+      + f L                      where it shows none,
+
+L the mean square of the map's colors: what is not rendered is as wrong as it is bright. No
+coefficient is negative: the error never falls with difficulty, nor rises with R. The mean of e over
+a view is its expected squared error, and so its PSNR; with other coefficients it is 1 - SSIM. They
+were fitted on trained models by `python -m experiments.expected_error`.
+
+Shape symbols: N rows of the map; h w size of the depth buffer; T terms; p pixels.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from r3jax.geometry.arguments import a_camera, a_pose, checked
+from r3jax.geometry.cameras import Camera, sound
+from r3jax.mapping.state import MapState, a_map
+from r3jax.scoring.backend import rows_in_pixels
+from r3jax.scoring.backends.reference import voxels_of_rows
+from r3jax.scoring.config import ScoringConfig, scoring_settings
+from r3jax.scoring.difficulty import difficulty_of_rows
+from r3jax.scoring.terms import score_voxels
+from r3jax.visibility.views import pinhole_view
+
+REACH = 4.0
+"""Views show voxels up to so many times the sensor's range: what was measured from nearby is no
+hole when it is seen from afar."""
+
+TERMS = ("always", "unseen", "difficulty", "squared deficit", "difficulty x deficit")
+"""What the terms are called, in the order of the coefficients."""
+
+_PRIOR_BRIGHTNESS = 0.25
+"""Mean square color of a map that has seen nothing; counts as much as one voxel."""
+
+
+class Fit(NamedTuple):
+    """What was learned of one error."""
+
+    coefficients: tuple[float, ...]
+    """Of the terms, each at least 0."""
+
+    low: float
+    """Difference between truth and expectation that one view in ten falls below."""
+
+    high: float
+    """The same that one view in ten exceeds."""
+
+
+SQUARED = Fit((0.0, 0.141, 0.0377, 0.00696, 0.14), -5.41, 4.081)
+"""Squared error; the differences are of the PSNR [dB]."""
+
+DISSIMILARITY = Fit((0.189, 0.877, 0.0, 0.0, 6.03), -0.182, 0.15)
+"""1 - SSIM; the differences are of the SSIM."""
+
+_LEAST = 1e-5
+"""Squared error that no view falls below (50 dB): images have eight bits, and no model is exact."""
+
+
+class ErrorImages(eqx.Module):
+    """The error to expect in each pixel of one view."""
+
+    squared: Float[Array, "h w"]
+    """Squared error, averaged over the channels."""
+
+    dissimilarity: Float[Array, "h w"]
+    """1 - SSIM."""
+
+
+class ExpectedError(eqx.Module):
+    """The error to expect of one view, and where four of five views come out."""
+
+    psnr: Float[Array, ""]
+    """PSNR [dB]."""
+
+    psnr_low: Float[Array, ""]
+    """Nine of ten views are better [dB]."""
+
+    psnr_high: Float[Array, ""]
+    """One of ten views is better [dB]."""
+
+    ssim: Float[Array, ""]
+    """SSIM."""
+
+    ssim_low: Float[Array, ""]
+    """Nine of ten views are better."""
+
+    ssim_high: Float[Array, ""]
+    """One of ten views is better."""
+
+
+@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@jax.jit
+def error_terms(
+    state: MapState,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+    difficulty: Float[Array, " N"] | None = None,
+) -> Float[Array, "T h w"]:
+    """Computes the terms of the expected error in the pixels of one view, in the order of `TERMS`.
+
+    Differentiable with respect to the pose as `renderability_image` is: which voxel a pixel sees
+    is held fixed, its R varies.
+
+    Args:
+        state: the map.
+        camera: of the view.
+        T_world_camera: its pose.
+        config: range and size of the depth buffer.
+        difficulty: `voxel_difficulty` of the map, for who asks about many views of one map; None:
+            it is worked out for the voxels in view.
+    """
+    config = ScoringConfig() if config is None else config
+    far = eqx.tree_at(lambda c: c.max_range, config, REACH * config.max_range)
+    row = rows_in_pixels(state, pinhole_view(camera, T_world_camera, far), far)
+    shown = voxels_of_rows(state, row)
+    value = score_voxels(shown, T_world_camera[:3, 3], camera.focal, config.forms).value
+    contrast = _difficulty_in_pixels(state, row.reshape(-1), difficulty)
+    hit = shown.present
+    deficit = jnp.where(hit, 1.0 - value, 0.0)
+    unseen = jnp.where(hit, 0.0, mean_square_color(state))
+    terms = jnp.stack([jnp.ones_like(value), unseen, contrast, deficit**2, contrast * deficit])
+    return sound(camera, T_world_camera, state.voxel_size) * terms.reshape(-1, *row.shape)
+
+
+def _difficulty_in_pixels(
+    state: MapState, row: Int[Array, " p"], difficulty: Float[Array, " N"] | None
+) -> Float[Array, " p"]:
+    if difficulty is None:
+        return difficulty_of_rows(state, row)
+    return difficulty.at[row].get(mode="fill", fill_value=0.0)
+
+
+def mean_square_color(state: MapState) -> Float[Array, ""]:
+    """Averages the squared colors of all voxels: the brightness of what is not known."""
+    squares = jnp.where(state.present, jnp.mean(state.mean**2, axis=0), 0.0)
+    number = jnp.sum(state.present, dtype=jnp.float32)
+    return (jnp.sum(squares) + _PRIOR_BRIGHTNESS) / (number + 1.0)
+
+
+def expected_error_images(
+    state: MapState,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+    difficulty: Float[Array, " N"] | None = None,
+) -> ErrorImages:
+    """Expects an error of every pixel of one view, in the pixels of `renderability_image`.
+
+    Arguments as in `error_terms`.
+    """
+    terms = error_terms(state, camera, T_world_camera, config, difficulty)
+    return ErrorImages(_weighted(SQUARED, terms), _weighted(DISSIMILARITY, terms))
+
+
+def expected_error(
+    state: MapState,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+    difficulty: Float[Array, " N"] | None = None,
+) -> ExpectedError:
+    """Expects a PSNR and an SSIM of one view, by the means of `expected_error_images`.
+
+    What a model of the frames in the map would reach there, trained as the benchmark's are. It
+    ranks the views of a model; the level depends on the training. Written for one pose;
+    `jax.vmap` it over many:
+
+        hard = r3jax.voxel_difficulty(map_state)
+        expect = lambda T: r3jax.expected_error(map_state, camera, T, difficulty=hard)
+        jax.vmap(expect)(candidates).psnr
+
+    Arguments as in `error_terms`.
+    """
+    terms = jnp.mean(error_terms(state, camera, T_world_camera, config, difficulty), axis=(1, 2))
+    return expected_of_means(terms)
+
+
+def expected_of_means(terms: Float[Array, " T"]) -> ExpectedError:
+    """Expects a PSNR and an SSIM from the terms' means over a view."""
+    psnr = -10.0 * jnp.log10(_weighted(SQUARED, terms) + _LEAST)
+    ssim = 1.0 - _weighted(DISSIMILARITY, terms)
+    return ExpectedError(
+        psnr,
+        psnr + SQUARED.low,
+        psnr + SQUARED.high,
+        ssim,
+        ssim + DISSIMILARITY.low,
+        ssim + DISSIMILARITY.high,
+    )
+
+
+def _weighted(fit: Fit, terms: Float[Array, "T ..."]) -> Float[Array, "..."]:
+    return jnp.tensordot(jnp.asarray(fit.coefficients), terms, axes=1)
