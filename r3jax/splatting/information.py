@@ -99,12 +99,10 @@ def pixel_tallies(
 def with_room(
     function: Callable[..., tuple[Any, Int[Array, "..."]]], scene: GaussianScene, *args: Any
 ) -> Any:
-    """Calls `function(config, scene, *args)` with a budget that every view fits into, on the CPU.
+    """Calls `function(config, scene, *args)` with a budget that every view fits into.
 
     Not to be called under jit: a view that overflows is asked for again, with a larger budget.
     """
-    cpu = jax.devices("cpu")[0]
-    scene, args = jax.device_put((scene, args), cpu)
     config = RasterConfig()
     result, overflow = function(config, scene, *args)
     while (missing := int(jnp.max(overflow))) > 0:
