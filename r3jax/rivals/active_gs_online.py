@@ -24,7 +24,7 @@ from r3jax.geometry.numerics import safe_norm
 from r3jax.mapping.occupancy import OccupancyGrid, world_to_cell
 from r3jax.planning.candidates import Candidates
 from r3jax.planning.greedy import Drawn, draw_lots
-from r3jax.planning.policies.active_gs.policy import EXPLORATION_WEIGHT, ActiveGS, draw_views
+from r3jax.planning.policies.active_gs.policy import EXPLORATION_WEIGHT, draw_views
 from r3jax.planning.policies.active_gs.regions import LOW_CONFIDENCE
 from r3jax.planning.policy import Situation
 from r3jax.rivals.online_map import OnlineMap, Seen, colored
@@ -197,7 +197,3 @@ class ActiveGSOnline(OnlinePolicy):
             "rendering": rendering,
             "utility": EXPLORATION_WEIGHT * exploration + rendering,
         } | draw_lots(len(candidates.valid), key=key)
-
-    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """The share of the utility less that of the path; the lots where nothing is of use."""
-        return ActiveGS(self.config).weigh(utilities)

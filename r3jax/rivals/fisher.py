@@ -165,7 +165,7 @@ def scores(
         Scores [V]; the greatest is the view to take.
     """
     arguments = _on_cpu((scene, camera, jnp.asarray(poses, jnp.float32), known))
-    return np.asarray(with_room(partial(_scores, form=form), *arguments))
+    return np.array(with_room(partial(_scores, form=form), *arguments))
 
 
 def greedy_batch(

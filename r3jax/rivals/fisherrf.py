@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from r3jax.planning.candidates import Candidates
+from r3jax.planning.greedy import draw_lots
 from r3jax.planning.policy import Situation
 from r3jax.rivals.fisher import Criterion, Form, known_information, scores
 from r3jax.rivals.policy import OnlineConfig, OnlinePolicy, memory_of
@@ -73,13 +74,13 @@ class FisherRF(OnlinePolicy):
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """The information that each view adds to that of all frames so far."""
-        del key
         online, form = memory_of(situation), self.config.form
         camera = self.score_camera(situation.camera)
         # Anew for each decision: the model has moved since, and with it what is known of it.
         known = known_information(online.scene, camera, online.frames.T_world_camera, form)
         found = scores(online.scene, camera, candidates.poses_on_device(), known, form)
-        return candidates, {"utility": found.astype(np.float64)}
+        lots = draw_lots(len(candidates.valid), key=key)
+        return candidates, {"utility": found.astype(np.float64)} | lots
 
 
 @dataclass(frozen=True)

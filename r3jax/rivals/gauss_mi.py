@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.geometry.numerics import safe_norm
 from r3jax.planning.candidates import Candidates
+from r3jax.planning.greedy import draw_lots
 from r3jax.planning.policy import Situation
 from r3jax.rivals.online_map import OnlineMap, Seen, colored, show
 from r3jax.rivals.policy import OnlineConfig, OnlinePolicy, memory_of
@@ -177,7 +178,6 @@ class GaussMI(OnlinePolicy):
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """The utility of every view, as for images of the published size."""
-        del key
         online, camera = memory_of(situation), self.score_camera(situation.camera)
         poses = candidates.poses_on_device()
         sums = with_room(_scores, online.scene, camera, online.marks, poses)
@@ -185,4 +185,5 @@ class GaussMI(OnlinePolicy):
         whole = np.floor(scale * np.asarray(sums, np.float64))
         before = online.frames.T_world_camera.astype(np.float64)
         factor = [novelty(pose, before) for pose in np.asarray(poses, np.float64)]
-        return candidates, {"utility": whole / 1000.0 * np.asarray(factor)}
+        lots = draw_lots(len(candidates.valid), key=key)
+        return candidates, {"utility": whole / 1000.0 * np.asarray(factor)} | lots

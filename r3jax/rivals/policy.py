@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
+import numpy as np
 from jaxtyping import Array
 
 from r3jax.frame import Frame
@@ -70,6 +71,14 @@ class OnlinePolicy(GreedyPolicy):
         reach = float(self.config.scoring.max_range)
         online = add_frame(state.memory, frame, reach, self.map_settings)
         return replace(state, memory=self.note(online))
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """The share of the utility less that of the path; the lots where nothing is of use."""
+        is_reachable = np.isfinite(utilities["path"])
+        # A map without Gaussians: the first candidate would be as good as any, but always the same.
+        if not np.any(utilities["utility"][is_reachable]):
+            return np.where(is_reachable, utilities["lot"], -np.inf)
+        return super().weigh(utilities)
 
     def score_camera(self, camera: Camera) -> Camera:
         """The camera that candidates are scored with: the same field of view, fewer pixels."""
