@@ -33,7 +33,7 @@ from r3jax.rivals.settings import DISCS
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.config import RasterConfig
-from r3jax.splatting.information import pixel_tallies, with_room
+from r3jax.splatting.information import on_cpu, pixel_tallies, with_room
 from r3jax.splatting.projection import rotation_rows
 from r3jax.splatting.scene import GaussianScene
 
@@ -168,7 +168,9 @@ class ActiveGSOnline(OnlinePolicy):
         """Counts the latest frame for the Gaussians that it supports."""
         pose = jnp.asarray(online.frames.T_world_camera[-1])
         depth = jnp.asarray(online.frames.depth[-1])
-        is_supported = with_room(_supported, online.scene, online.camera, pose, depth)
+        arguments = on_cpu((online.scene, online.camera, pose, depth))
+        # Through the host, so that it may join arrays on an accelerator.
+        is_supported = jnp.asarray(np.asarray(with_room(_supported, *arguments)))
         reach = self.config.scoring.max_range
         marks = support(online.marks, online.scene, pose[:3, 3], is_supported, reach)
         return replace(online, marks=marks)

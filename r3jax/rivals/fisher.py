@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.config import RasterConfig
-from r3jax.splatting.information import pixel_squares, with_room
+from r3jax.splatting.information import on_cpu, pixel_squares, with_room
 from r3jax.splatting.scene import GaussianScene
 
 Criterion = Literal["ratio", "d-opt"]
@@ -134,7 +134,7 @@ def known_information(
     size = 1
     while size < len(poses):
         size *= 2
-    scene, camera, poses = _on_cpu((scene, camera, jnp.asarray(poses, jnp.float32)))
+    scene, camera, poses = on_cpu((scene, camera, jnp.asarray(poses, jnp.float32)))
     # In blocks of powers of two: another number of views must not compile anew.
     total = jax.tree.map(jnp.zeros_like, scene)
     begin = 0
@@ -164,7 +164,7 @@ def scores(
     Returns:
         Scores [V]; the greatest is the view to take.
     """
-    arguments = _on_cpu((scene, camera, jnp.asarray(poses, jnp.float32), known))
+    arguments = on_cpu((scene, camera, jnp.asarray(poses, jnp.float32), known))
     return np.array(with_room(partial(_scores, form=form), *arguments))
 
 
@@ -197,8 +197,3 @@ def greedy_batch(
         more = known_information(scene, camera, pool[chosen[-1:]], form)
         known = jax.tree.map(jnp.add, known, more)
     return chosen
-
-
-def _on_cpu(tree: Any) -> Any:
-    """Moves arrays to where the kernel is: `information` says why."""
-    return jax.device_put(tree, jax.devices("cpu")[0])

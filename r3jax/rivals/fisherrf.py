@@ -1,8 +1,8 @@
 """FisherRF: the view whose pixels would move the parameters that are known least.
 
 Its rule for choosing among photos (JiangWenPL/FisherRF), here among the hundred candidates that
-all policies draw: arg max of the score, no path, no unknown space. Which of the four H's parts and
-forms is in `fisher`. The map has no harmonics beyond the constant one, so neither has theta.
+all policies draw: arg max of the score, no path, no unknown space. Formulas are in `fisher`. The
+map has no harmonics beyond the constant one, so neither has theta.
 """
 
 from dataclasses import dataclass, field

@@ -34,7 +34,7 @@ from r3jax.rivals.policy import OnlineConfig, OnlinePolicy, memory_of
 from r3jax.rivals.settings import GAUSS_MI
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.config import RasterConfig
-from r3jax.splatting.information import pixel_tallies, with_room
+from r3jax.splatting.information import on_cpu, pixel_tallies, with_room
 from r3jax.splatting.scene import GaussianScene
 
 LIMIT = 10.0
@@ -170,7 +170,9 @@ class GaussMI(OnlinePolicy):
         pose = jnp.asarray(frames.T_world_camera[-1])
         rgb = jnp.asarray(frames.rgb[-1], jnp.float32) / 255.0
         value = evidence(show(scene, online.camera, pose), rgb, jnp.asarray(frames.depth[-1]))
-        tallies = with_room(_tallied, scene, online.camera, pose, value)
+        arguments = on_cpu((scene, online.camera, pose, value))
+        # Through the host, so that they may join arrays on an accelerator.
+        tallies = jnp.asarray(np.asarray(with_room(_tallied, *arguments)))
         marks = believe(online.marks, side_weights(scene, pose[:3, 3]), tallies)
         return replace(online, marks=marks)
 

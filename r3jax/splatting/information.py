@@ -112,6 +112,11 @@ def with_room(
     return result
 
 
+def on_cpu(tree: Any) -> Any:
+    """Moves arrays to where the kernel is; a no-op where there is nothing but a CPU."""
+    return jax.device_put(tree, jax.devices("cpu")[0])
+
+
 def _is_compiled(source: Source) -> bool:
     if source == "auto":
         # As for rendering: the bridge must know XLA's interface.
