@@ -95,7 +95,9 @@ def test_unexplored_cells_can_be_left_out(flat, poses, monkeypatch):
 
 def test_what_has_no_score_is_refused():
     turning = {"ours-pano", "ours-ahead", "r3con"}
-    assert set(policy_names()) - set(SCORED) == turning | {"frontier"}
+    # A map of their own, which no pool has trained.
+    online = {"active-gs-online", "fisherrf", "fisherrf-d-opt", "gauss-mi"}
+    assert set(policy_names()) - set(SCORED) == turning | online | {"frontier"}
     with pytest.raises(ValueError, match=r"frontier cannot choose.*unseen-depth"):
         Options(policies=("ours", "frontier"))
     with pytest.raises(ValueError, match="none given"):

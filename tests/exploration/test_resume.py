@@ -87,11 +87,14 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize(
     "name",
     quick_and_full(
-        ["wander", "ours-pano", "active-gs", "uniform", "frontier"],
+        [
+            "wander", "ours-pano", "active-gs", "uniform", "frontier",
+            "active-gs-online", "fisherrf", "gauss-mi",
+        ],
         ["wander"],
-        slow=["uniform", "frontier"],
+        slow=["uniform", "frontier", "fisherrf", "gauss-mi"],
     ),
-)
+)  # fmt: skip
 def test_a_run_in_two_parts_is_the_run_in_one(tmp_path, whole, name):
     run_in(tmp_path / "run", name, CUT)
     simulator = BoxRoom()

@@ -33,6 +33,15 @@ HOMES = {
         "uniform": "uniform:Uniform",
         "random": "random:Random",
     }.items()
+} | {
+    # These keep a radiance field, which nothing in `r3jax.planning` may.
+    name: f"r3jax.rivals.{home}"
+    for name, home in {
+        "active-gs-online": "active_gs_online:ActiveGSOnline",
+        "fisherrf": "fisherrf:FisherRF",
+        "fisherrf-d-opt": "fisherrf:FisherRFDOpt",
+        "gauss-mi": "gauss_mi:GaussMI",
+    }.items()
 }
 """Module and class of every policy of this package."""
 

@@ -18,6 +18,7 @@ from r3jax.geometry.cameras import invert_pose
 from r3jax.splatting.backends import reference
 from r3jax.splatting.backends.numba import records
 from r3jax.splatting.config import ALPHA_MIN, TILE, RasterConfig
+from r3jax.splatting.information import pixel_squares, pixel_tallies
 from r3jax.splatting.projection import project_gaussians
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.splatting.clouds import random_cloud, safe_pixels, view
@@ -26,10 +27,12 @@ PACKAGE = "r3jax.splatting.backends.numba"
 CHAIN = tuple(
     f"{PACKAGE}.{name}"
     for name in (
-        "harmonics", "project", "bins", "compositing", "gradient", "passes",
+        "harmonics", "project", "bins", "compositing", "gradient", "passes", "squares", "tallies",
     )
 )  # fmt: skip
 COUNT, SIZE, BUDGET = 70, (40, 24), 1024
+BEHIND = np.array([0.2, 0.7, 0.4], np.float32)
+LEAST = (0.3, 0.02)
 
 
 def python_compiler() -> ModuleType:
@@ -110,6 +113,10 @@ class Case:
         (_, self.images), (by_scene, by_view, by_offsets) = step(*arguments)
         self.by_cloud = (*jax.tree.leaves(by_scene), by_offsets)
         self.by_pose, self.by_camera = by_view
+        squares, _ = pixel_squares(
+            self.scene, self.camera, self.pose, jnp.asarray(BEHIND), RasterConfig(), "reference"
+        )
+        self.squares = [*jax.tree.leaves(squares)[:4], squares.sh.reshape(COUNT, -1)]
 
     def reference_images(self, scene, view_numbers, offsets):
         pose, (fx, fy, cx, cy) = view_numbers
@@ -208,6 +215,34 @@ def gradients_agree(modules: Modules) -> None:
     assert_near(by_camera, _case.by_camera, 1e-3)
 
 
+def squares_agree(modules: Modules) -> None:
+    images, _, table, lists = forward(modules)
+    cloud, numbers = arguments()
+    squares = tuple(dirty(x.shape, np.float32) for x in cloud[:5])
+    with mock.patch.object(np, "empty", dirty):
+        modules["squares"].squares_pass(
+            cloud, numbers, 2, images, table, lists, np.float32(BEHIND.sum()), squares
+        )
+    for found, expected in zip(squares, _case.squares, strict=True):
+        # Of roots: the few Gaussians next to the camera must not outweigh all others.
+        assert_near(np.sqrt(np.abs(found)), np.sqrt(expected), 1e-4)
+
+
+def tallies_agree(modules: Modules) -> None:
+    _, _, table, lists = forward(modules)
+    value, found = np.abs(_case.weights[1]), dirty((COUNT, 2), np.float32)
+    counts = (_case.safe & (value > 0.5)).astype(np.float32)
+    with mock.patch.object(np, "empty", dirty):
+        modules["tallies"].tallies_pass(table, lists, 2, value, counts, np.array(LEAST), found)
+    value, counts = jnp.asarray(value), jnp.asarray(counts)
+    expected, _ = pixel_tallies(
+        _case.scene, _case.camera, _case.pose, value, counts, RasterConfig(),
+        least_through=LEAST[0], least_weight=LEAST[1], source="reference",
+    )  # fmt: skip
+    assert_near(found[:, 0], expected[:, 0], 1e-3)
+    assert_near(found[:, 1], expected[:, 1], 1e-3)
+
+
 def lists_are_tight(modules: Modules) -> None:
     """No row in which a pixel sees the Gaussian is left out, and hardly another is listed."""
     _, totals, _, lists = forward(modules)
@@ -276,11 +311,51 @@ MUTANTS = [
         "blue = g_color[2]",
         gradients_agree,
     ),
+    Mutant("squares", "color - alpha[v, u] * background", "color", squares_agree),
+    Mutant("squares", "record[at.BLUE] - background)", "record[at.BLUE])", squares_agree),
+    Mutant("squares", "vv, vw = v * v, v * weight", "vv, vw = v * v, v", squares_agree),
+    Mutant("squares", "vv_dy3 = vv_dy2 * dy", "vv_dy3 = vv_dy2", squares_agree),
+    Mutant("squares", "dx3, dx4 = dx2 * dx, dx2 * dx2", "dx3, dx4 = dx2, dx2 * dx2", squares_agree),
+    Mutant(
+        "squares", "v = keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)", "pass", squares_agree
+    ),
+    Mutant("squares", "slots[slot : slot + MOMENTS] = _ZERO", "pass", squares_agree),
+    Mutant("squares", "9 if k == 6 else k + 1", "k + 1", squares_agree),
+    Mutant("squares", "matrix[k, 6], matrix[6, k] = moment, moment", "pass", squares_agree),
+    Mutant(
+        "squares",
+        "by_dy, crossed = (0, 5, 9, 12, 14)",
+        "by_dy, crossed = (0, 5, 9, 12, 13)",
+        squares_agree,
+    ),
+    Mutant(
+        "squares",
+        "g_sh[0, k] * g_sh[0, k] * matrix[6, 6]",
+        "g_sh[0, k] * matrix[6, 6]",
+        squares_agree,
+    ),
+    Mutant("tallies", "keep_gt(weight, before, least[0])", "weight", tallies_agree),
+    Mutant("tallies", "weight, least[1])", "weight, _ZERO)", tallies_agree),
+    Mutant(
+        "tallies",
+        "load(state, 2 * PIXELS + k), weight, _ZERO",
+        "_ONE, weight, _ZERO",
+        tallies_agree,
+    ),
+    Mutant(
+        "tallies",
+        "store12(slots, list_slots[place] * at.GRADIENT_SIZE, splat(_ZERO))",
+        "pass",
+        tallies_agree,
+    ),
+    Mutant("tallies", "        number += slots", "        number = slots", tallies_agree),
 ]
 
 
 @pytest.mark.mutant
-@pytest.mark.parametrize("law", [images_agree, gradients_agree, lists_are_tight])
+@pytest.mark.parametrize(
+    "law", [images_agree, gradients_agree, squares_agree, tallies_agree, lists_are_tight]
+)
 def test_the_laws_hold(law):
     law(load(CHAIN))
 

@@ -26,6 +26,7 @@ from r3jax.planning.candidates import (
     local_random,
     random_directions,
 )
+from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decision import PlannerState
 from r3jax.planning.greedy import (
     Drawn,
@@ -65,6 +66,37 @@ def _doubt(view: PixelView) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     return doubt, jnp.where(view.hit, view.depth, 0.5 * view.max_range)
 
 
+def draw_views(
+    situation: Situation,
+    config: PlannerConfig,
+    count: np.ndarray,
+    normal_sum: np.ndarray,
+    *,
+    key: Array,
+) -> Candidates:
+    """Draws up to `num_frontier` views of regions of interest; the others local, turned anyhow.
+
+    Args:
+        situation: where the robot can go, and what is unexplored.
+        config: how many views.
+        count: primitives of low confidence per cell, [X, Y, Z].
+        normal_sum: sum of their normals, [3, X, Y, Z].
+        key: source of randomness.
+
+    Returns:
+        `num_candidates` views; none if the robot can stop nowhere.
+    """
+    aim_key, local_key, direction_key = jax.random.split(key, 3)
+    travel, unexplored = situation.travel, np.asarray(situation.scoring_grid.unexplored)
+    regions = regions_of(travel.free, unexplored, count, normal_sum)
+    places, aims = aimed_views(travel, regions, config.num_frontier, key=aim_key)
+    local = local_random(travel, config.num_candidates - len(places), config.radius, key=local_key)
+    positions = np.concatenate([places, local])
+    directions = random_directions(len(local), key=direction_key)
+    drawn = candidates_along(positions, np.concatenate([aims - places, directions]))
+    return drawn.padded(config.num_candidates) if len(positions) else drawn
+
+
 @dataclass(frozen=True)
 class ActiveGS(GreedyPolicy):
     """Views of unexplored space and of far surfaces seen too rarely, too slanted or from afar."""
@@ -90,21 +122,12 @@ class ActiveGS(GreedyPolicy):
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """Up to `num_frontier` views of regions of interest; the others local, turned anyhow."""
-        aim_key, local_key, direction_key = jax.random.split(key, 3)
-        config, travel, grid = self.config, situation.travel, situation.scoring_grid
         seen = aligned(situation.memory, situation.map_state)
-        count, normal_sum = low_confidence(situation.map_state, seen, grid)
-        regions = regions_of(
-            travel.free, np.asarray(grid.unexplored), np.asarray(count), np.asarray(normal_sum)
+        count, normal_sum = low_confidence(situation.map_state, seen, situation.scoring_grid)
+        drawn = draw_views(
+            situation, self.config, np.asarray(count), np.asarray(normal_sum), key=key
         )
-        places, aims = aimed_views(travel, regions, config.num_frontier, key=aim_key)
-        local = local_random(
-            travel, config.num_candidates - len(places), config.radius, key=local_key
-        )
-        positions = np.concatenate([places, local])
-        directions = random_directions(len(local), key=direction_key)
-        drawn = candidates_along(positions, np.concatenate([aims - places, directions]))
-        return Drawn(drawn.padded(config.num_candidates) if len(positions) else drawn, seen)
+        return Drawn(drawn, seen)
 
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array

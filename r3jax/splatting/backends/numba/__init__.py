@@ -6,14 +6,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera, invert_pose
 from r3jax.native.compiled import forget_outdated_code
 from r3jax.native.ffi import num_workers
 from r3jax.splatting.backend import Composite
 from r3jax.splatting.backends.numba import records
-from r3jax.splatting.backends.numba.bridge import BACKWARD, FORWARD, register
+from r3jax.splatting.backends.numba.bridge import (
+    BACKWARD,
+    FORWARD,
+    SQUARES,
+    TALLIES,
+    register,
+    register_per_gaussian,
+)
 from r3jax.splatting.config import TILE, RasterConfig
 from r3jax.splatting.scene import GaussianScene
 
@@ -49,6 +56,65 @@ def rasterize(
         RuntimeError: Numba has no threading layer that serves two renderings at once.
     """
     register()
+    size, cloud, view = _arguments(scene, camera, T_world_camera, center_offsets, config)
+    rgb, depth, alpha, totals = _composite(size, cloud, view)
+    return Composite(
+        rgb=rgb,
+        depth_sum=depth,
+        alpha=alpha,
+        num_intersections=totals[0],
+        overflow=totals[1],
+    )
+
+
+def squared_gradients(
+    scene: GaussianScene,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    background: Float[Array, " 3"],
+    config: RasterConfig,
+) -> tuple[GaussianScene, Int[Array, ""]]:
+    """Sums over pixels of squared gradients (`information.pixel_squares`), and the overflow."""
+    register_per_gaussian()
+    zeros = jnp.zeros((scene.capacity, 2))
+    size, cloud, view = _arguments(scene, camera, T_world_camera, zeros, config)
+    (*_, totals), (_, _, images, kept) = _composite_forward(size, cloud, view)
+    shapes = [jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in cloud[:5]]
+    workers = np.array([num_workers()], dtype=np.int32)
+    call = jax.ffi.ffi_call(SQUARES, shapes, vmap_method="sequential")
+    behind = jnp.sum(background).reshape(1).astype(jnp.float32)
+    *geometry, sh = call(*cloud, view, workers, *images, *kept, behind)
+    return GaussianScene(*geometry, sh=sh.reshape(scene.sh.shape)), totals[1]
+
+
+def tallies(
+    scene: GaussianScene,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    value: Float[Array, "H W"],
+    counts: Float[Array, "H W"],
+    least: Float[Array, " 2"],
+    config: RasterConfig,
+) -> tuple[Float[Array, "n 2"], Int[Array, ""]]:
+    """Sums over pixels of single weights (`information.pixel_tallies`), and the overflow."""
+    register_per_gaussian()
+    zeros = jnp.zeros((scene.capacity, 2))
+    size, cloud, view = _arguments(scene, camera, T_world_camera, zeros, config)
+    (*_, totals), (_, _, _, kept) = _composite_forward(size, cloud, view)
+    shape = jax.ShapeDtypeStruct((scene.capacity, 2), jnp.float32)
+    workers = np.array([num_workers()], dtype=np.int32)
+    call = jax.ffi.ffi_call(TALLIES, shape, vmap_method="sequential")
+    return call(*kept, workers, value, counts, least), totals[1]
+
+
+def _arguments(
+    scene: GaussianScene,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    center_offsets: Float[Array, "n 2"],
+    config: RasterConfig,
+) -> tuple[_Size, _Cloud, Float[Array, " 19"]]:
+    """Sizes, cloud and view, as the passes take them."""
     T_camera_world = invert_pose(T_world_camera)
     intrinsics = jnp.stack([camera.fx, camera.fy, camera.cx, camera.cy])
     view = jnp.concatenate(
@@ -62,15 +128,7 @@ def rasterize(
         scene.sh.reshape(scene.capacity, -1),
         center_offsets,
     )
-    size = (camera.width, camera.height, config.budget(scene.capacity))
-    rgb, depth, alpha, totals = _composite(size, cloud, view)
-    return Composite(
-        rgb=rgb,
-        depth_sum=depth,
-        alpha=alpha,
-        num_intersections=totals[0],
-        overflow=totals[1],
-    )
+    return (camera.width, camera.height, config.budget(scene.capacity)), cloud, view
 
 
 def _images_and_totals(size: _Size, cloud: _Cloud, view: Float[Array, " 19"]) -> _Images:

@@ -22,8 +22,11 @@ from r3jax.native.ffi import (
     register_handlers,
 )
 from r3jax.splatting.backends.numba.passes import backward_pass, forward_pass
+from r3jax.splatting.backends.numba.squares import squares_pass
+from r3jax.splatting.backends.numba.tallies import tallies_pass
 
 FORWARD, BACKWARD = "r3jax_splatting_forward", "r3jax_splatting_backward"
+SQUARES, TALLIES = "r3jax_splatting_squares", "r3jax_splatting_tallies"
 
 
 @inlined
@@ -84,15 +87,60 @@ def _backward(frame):
     return 0
 
 
+def _squares(frame):
+    """Arguments: forward's, its results but the totals, the background's sum.
+
+    Results: squares by means, quats, log_scales, logits, harmonics.
+    """
+    if answers_metadata(frame):
+        return 0
+    squares_pass(
+        _cloud(frame, ARGUMENTS), floats1(frame, ARGUMENTS, 6),
+        np.int64(ints1(frame, ARGUMENTS, 7)[0]),
+        _images(frame, ARGUMENTS, 8), floats2(frame, ARGUMENTS, 11),
+        _lists(frame, ARGUMENTS, 12), floats1(frame, ARGUMENTS, 17)[0],
+        (
+            floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1), floats2(frame, RESULTS, 2),
+            floats1(frame, RESULTS, 3), floats2(frame, RESULTS, 4),
+        ),
+    )  # fmt: skip
+    return 0
+
+
+def _tallies(frame):
+    """Arguments: records, lists (5), workers, value, counts, least. Result: the tallies."""
+    if answers_metadata(frame):
+        return 0
+    tallies_pass(
+        floats2(frame, ARGUMENTS, 0), _lists(frame, ARGUMENTS, 1),
+        np.int64(ints1(frame, ARGUMENTS, 6)[0]),
+        floats2(frame, ARGUMENTS, 7), floats2(frame, ARGUMENTS, 8), floats1(frame, ARGUMENTS, 9),
+        floats2(frame, RESULTS, 0),
+    )  # fmt: skip
+    return 0
+
+
 _lock = threading.Lock()
 
 
 def register() -> None:
-    """Compiles the handlers (or takes them from the disk) and tells XLA of them, once."""
+    """Compiles the handlers of rendering (or takes them from the disk) and tells XLA, once."""
     with _lock:
         _register()
+
+
+def register_per_gaussian() -> None:
+    """The same for what is summed up per Gaussian: who only renders does not wait for it."""
+    with _lock:
+        _register()
+        _register_per_gaussian()
 
 
 @functools.cache
 def _register() -> tuple[Any, ...]:
     return register_handlers({FORWARD: _forward, BACKWARD: _backward})
+
+
+@functools.cache
+def _register_per_gaussian() -> tuple[Any, ...]:
+    return register_handlers({SQUARES: _squares, TALLIES: _tallies})

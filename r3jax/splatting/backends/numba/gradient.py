@@ -143,7 +143,7 @@ def _color_gradient(mean, sh, view, record, g_color, basis, g_basis, g_sh):
 
 
 @kernel
-def _gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
+def gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
     """Gradients of one Gaussian that was drawn; adds its share of the view's gradient."""
     means, quats, log_scales, logits, sh, _ = cloud
     g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
@@ -189,7 +189,7 @@ def _gradient_of_block(block, cloud, records, slots, view, size, g_cloud, g_view
     for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
         count, start = integers[i, at.COUNT], integers[i, at.START]
         if count > 0 and _sum_slots(start, count, slots, sums):
-            _gradient_of_one(i, cloud, records[i], sums, view, size, room, g_cloud, g_view)
+            gradient_of_one(i, cloud, records[i], sums, view, size, room, g_cloud, g_view)
         else:
             g_means[i], g_quats[i], g_scales[i] = ZERO, ZERO, ZERO
             g_logits[i], g_sh[i], g_offsets[i] = ZERO, ZERO, ZERO

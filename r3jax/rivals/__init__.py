@@ -1,0 +1,1 @@
+"""Policies of others that keep a radiance field while they plan: theirs, never ours."""

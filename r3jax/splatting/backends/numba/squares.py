@@ -1,0 +1,262 @@
+"""Squared gradients of single pixels, summed over the image: the Hessian diagonal of FisherRF.
+
+Of one pixel's color, summed over its channels, the gradient by a Gaussian's parameters is linear
+in seven numbers: v, v dx, v dx^2, v dy, v dx dy, v dy^2 with v = alpha dC/dalpha (see
+`compositing.py`), and the weight w. With A the matrix of that map, which depends on the Gaussian
+and the view alone,
+
+    sum over pixels of (A s)^2 = diagonal of A M A^T,    M = sum over pixels of s s^T.
+
+So the tiles sum up M, 22 numbers, and A is applied once per Gaussian. Its columns come from the
+backward pass itself, given one of the seven numbers at a time.
+"""
+
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
+import numpy as np
+from numba import prange
+
+from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel
+from r3jax.splatting.backends.numba import records as at
+from r3jax.splatting.backends.numba.compositing import (
+    AHEAD,
+    ALPHA_MAX,
+    PIXELS,
+    TRANSMITTANCE_MIN,
+    alpha_in_row,
+)
+from r3jax.splatting.backends.numba.gradient import gradient_of_one
+from r3jax.splatting.backends.numba.lanes import (
+    fma,
+    keep_ge,
+    keep_gt,
+    lane_numbers,
+    load,
+    prefetch,
+    quotient,
+    smaller,
+    splat,
+    store,
+    store12,
+    sums_of_10,
+)
+from r3jax.splatting.backends.numba.passes import expect_writes
+from r3jax.splatting.config import TILE
+
+MOMENTS = 22
+"""Different numbers in M: v^2 by the 15 monomials of dx, dy up to degree 4, v w by the 6 up to
+degree 2, w^2. Powers of dx rise first."""
+
+SLOT = 32
+"""Floats of an intersection: `MOMENTS`, and what the last vector that is stored writes beyond."""
+
+_HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
+
+
+@inlined
+def _read_tile(left, top, images, background, state):
+    """Lays out a tile: transmittance 1, and the pixel's color over black less alpha background."""
+    rgb, _, alpha = images
+    state[:PIXELS] = _ONE
+    state[PIXELS:] = _ZERO
+    for y in range(min(TILE, alpha.shape[0] - top)):
+        for x in range(min(TILE, alpha.shape[1] - left)):
+            v, u = top + y, left + x
+            color = rgb[v, u, 0] + rgb[v, u, 1] + rgb[v, u, 2]
+            state[PIXELS + TILE * y + x] = color - alpha[v, u] * background
+    # Pixels beside the image have no gradient.
+    for y in range(TILE):
+        for x in range(TILE):
+            if top + y >= alpha.shape[0] or left + x >= alpha.shape[1]:
+                state[TILE * y + x] = _ZERO
+
+
+@kernel
+def _squares_of_tile(
+    first, last, left, top, records, list_ids, list_slots, list_rows, background, state, slots
+):
+    """Writes the moments of a tile's intersections to their slots."""
+    flat = records.reshape(-1)
+    lanes = lane_numbers()
+    zero = splat(_ZERO)
+    for place in range(first, last):
+        if place + AHEAD < last:
+            prefetch(flat, list_ids[place + AHEAD] * at.SIZE)
+        record = records[list_ids[place]]
+        dx = (record[at.CENTER_X] - (np.float32(left) + _HALF)) - lanes
+        slant = record[at.B] * dx
+        across = record[at.A] * dx * dx
+        y = record[at.CENTER_Y] - (np.float32(top) + _HALF)
+        q = splat(record[at.RED] + record[at.GREEN] + record[at.BLUE] - background)
+        vv0, vv1, vv2, vv3, vv4 = zero, zero, zero, zero, zero
+        vw0, vw1, vw2, ww = zero, zero, zero, zero
+        rows = list_rows[place]
+        for row in range(rows & 15, (rows >> 4) + 1):
+            k = TILE * row
+            dy = y - np.float32(row)
+            free = alpha_in_row(record, dx, across, slant, dy)
+            alpha = smaller(free, splat(ALPHA_MAX))
+            before = load(state, k)
+            behind = before - before * alpha
+            weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)
+            store(state, k, keep_gt(behind, behind, TRANSMITTANCE_MIN))
+            passed = weight * q
+            rest = load(state, PIXELS + k) - passed
+            store(state, PIXELS + k, rest)
+            v = passed - quotient(alpha * rest, _ONE - alpha)
+            # Nothing flows where compositing has stopped, nor through the cut-off at 0.99.
+            v = keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)
+            vv, vw = v * v, v * weight
+            vv_dy, vw_dy = vv * dy, vw * dy
+            vv_dy2 = vv_dy * dy
+            vv_dy3 = vv_dy2 * dy
+            vv0, vv1, vv2 = vv0 + vv, vv1 + vv_dy, vv2 + vv_dy2
+            vv3, vv4 = vv3 + vv_dy3, fma(vv_dy3, dy, vv4)
+            vw0, vw1, vw2 = vw0 + vw, vw1 + vw_dy, fma(vw_dy, dy, vw2)
+            ww = fma(weight, weight, ww)
+        dx2 = dx * dx
+        dx3, dx4 = dx2 * dx, dx2 * dx2
+        a = sums_of_10(
+            vv0, vv0 * dx, vv0 * dx2, vv0 * dx3, vv0 * dx4,
+            vv1, vv1 * dx, vv1 * dx2, vv1 * dx3, vv2,
+        )  # fmt: skip
+        b = sums_of_10(
+            vv2 * dx, vv2 * dx2, vv3, vv3 * dx, vv4, vw0, vw0 * dx, vw0 * dx2, vw1, vw1 * dx
+        )
+        c = sums_of_10(vw2, ww, zero, zero, zero, zero, zero, zero, zero, zero)
+        # In this order: each vector has twelve lanes, of which ten count.
+        slot = list_slots[place] * SLOT
+        store12(slots, slot, a)
+        store12(slots, slot + 10, b)
+        store12(slots, slot + 20, c)
+
+
+@parallel_kernel
+def squares_of_all(lists, records, images, background, workers, slots):
+    """Moments of all intersections, those of a Gaussian side by side (`SLOT` floats each)."""
+    list_ids, list_slots, list_rows, tile_starts, tile_ends = lists
+    columns = -(-images[2].shape[1] // TILE)
+    next_tile = np.zeros(1, np.int64)
+    for _ in prange(workers):
+        state = np.empty(2 * PIXELS, np.float32)
+        tile = claim(next_tile)
+        while tile < tile_ends.shape[0]:
+            left, top = tile % columns * TILE, tile // columns * TILE
+            _read_tile(left, top, images, background, state)
+            end = tile_ends[tile]
+            _squares_of_tile(
+                tile_starts[tile], end, left, top,
+                records, list_ids, list_slots, list_rows, background, state, slots,
+            )  # fmt: skip
+            for place in range(end, tile_starts[tile + 1]):  # hidden behind the rest
+                slot = list_slots[place] * SLOT
+                slots[slot : slot + MOMENTS] = _ZERO
+            tile = claim(next_tile)
+
+
+@inlined
+def _moment_matrix(start, count, slots, sums, matrix):
+    """Sums the moments of a Gaussian's intersections up to M [7, 7]; is there any but 0?"""
+    sums[:] = _ZERO
+    for slot in range(start, start + count):
+        for k in range(MOMENTS):
+            sums[k] += slots[slot * SLOT + k]
+    # Powers of dx and dy of the first six numbers, and where each power of dy begins.
+    powers = ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (0, 2))
+    by_dy, crossed = (0, 5, 9, 12, 14), (15, 18, 20)
+    for k in range(6):
+        for j in range(6):
+            dx, dy = powers[k][0] + powers[j][0], powers[k][1] + powers[j][1]
+            matrix[k, j] = sums[by_dy[dy] + dx]
+        moment = sums[crossed[powers[k][1]] + powers[k][0]]
+        matrix[k, 6], matrix[6, k] = moment, moment
+    matrix[6, 6] = sums[MOMENTS - 1]
+    return matrix[0, 0] != _ZERO or matrix[6, 6] != _ZERO
+
+
+@inlined
+def _quadratic(columns, matrix, parameter):
+    """a^T M a for one parameter, a being its row of A; rounding takes none below 0."""
+    total = _ZERO
+    for k in range(7):
+        inner = _ZERO
+        for j in range(7):
+            inner += matrix[k, j] * columns[j, parameter]
+        total += columns[k, parameter] * inner
+    return _ZERO if total < _ZERO else total
+
+
+@kernel
+def _squares_of_block(block, cloud, records, slots, view, size, squares):
+    """Squares of a block of Gaussians; 0 for those that were not drawn."""
+    integers = records.view(np.int32)
+    room, unit, sums = np.empty(68, np.float32), np.empty(10, np.float32), np.empty(22, np.float32)
+    matrix, columns = np.empty((7, 7), np.float32), np.empty((7, 11), np.float32)
+    means, quats, log_scales, logits, sh, offsets = cloud
+    # One row each: what the backward pass writes for one of the seven numbers.
+    g_means, g_quats = np.empty((1, 3), np.float32), np.empty((1, 4), np.float32)
+    g_scales, g_logits = np.empty((1, 3), np.float32), np.empty(1, np.float32)
+    g_sh, g_offsets = np.empty((1, sh.shape[1]), np.float32), np.empty((1, 2), np.float32)
+    g_cloud, g_view = (g_means, g_quats, g_scales, g_logits, g_sh, g_offsets), np.zeros(19)
+    s_means, s_quats, s_scales, s_logits, s_sh = squares
+    for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
+        count, start = integers[i, at.COUNT], integers[i, at.START]
+        if count == 0 or not _moment_matrix(start, count, slots, sums, matrix):
+            s_means[i], s_quats[i], s_scales[i] = _ZERO, _ZERO, _ZERO
+            s_logits[i], s_sh[i] = _ZERO, _ZERO
+            continue
+        one = (
+            means[i : i + 1], quats[i : i + 1], log_scales[i : i + 1], logits[i : i + 1],
+            sh[i : i + 1], offsets[i : i + 1],
+        )  # fmt: skip
+        for k in range(7):
+            unit[:] = _ZERO
+            # The weight moves all three channels, which are summed before they are squared.
+            unit[k : 9 if k == 6 else k + 1] = _ONE
+            gradient_of_one(0, one, records[i], unit, view, size, room, g_cloud, g_view)
+            columns[k, 0:3], columns[k, 3:7] = g_means[0], g_quats[0]
+            columns[k, 7:10], columns[k, 10] = g_scales[0], g_logits[0]
+        for k in range(3):
+            s_means[i, k] = _quadratic(columns, matrix, k)
+            s_scales[i, k] = _quadratic(columns, matrix, 7 + k)
+        for k in range(4):
+            s_quats[i, k] = _quadratic(columns, matrix, 3 + k)
+        s_logits[i] = _quadratic(columns, matrix, 10)
+        # A coefficient moves its own channel alone.
+        for k in range(sh.shape[1]):
+            s_sh[i, k] = g_sh[0, k] * g_sh[0, k] * matrix[6, 6]
+
+
+@parallel_kernel
+def _squares_of_cloud(cloud, records, slots, view, size, workers, squares):
+    """Squares by all parameters, block by block."""
+    blocks = -(-records.shape[0] // at.BLOCK)
+    next_block = np.zeros(1, np.int64)
+    for _ in prange(workers):
+        block = claim(next_block)
+        while block < blocks:
+            _squares_of_block(block, cloud, records, slots, view, size, squares)
+            block = claim(next_block)
+
+
+@kernel
+def squares_pass(cloud, view, workers, images, records, lists, background, squares):
+    """Sums over pixels of squared gradients; takes what the forward pass wrote.
+
+    Args:
+        cloud: as `forward_pass` takes it.
+        view: see `VIEW_SIZE`.
+        workers: threads to share the work.
+        images: rgb [H, W, 3], depth [H, W], alpha [H, W].
+        records: [n, 16].
+        lists: ids, slots, rows [budget], starts [tiles + 1], ends [tiles].
+        background: the sum of its three channels.
+        squares: written; by means, quats, log_scales, opacity logits, harmonics.
+    """
+    tile_starts, alpha = lists[3], images[2]
+    size = alpha.shape[1], alpha.shape[0]
+    slots = np.empty(np.int64(tile_starts[-1]) * SLOT + SLOT, np.float32)
+    expect_writes(slots)
+    squares_of_all(lists, records, images, background, workers, slots)
+    _squares_of_cloud(cloud, records, slots, view, size, workers, squares)
