@@ -41,6 +41,7 @@ SCORED = (
     "active-gs-no-depth",
     "active-gamer",
     "cover",
+    "gavis",
     "unseen",
     "unseen-depth",
     "uniform",

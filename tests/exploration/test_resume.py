@@ -87,7 +87,7 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize(
     "name",
     quick_and_full(
-        ["wander", "ours-pano", "active-gs", "uniform", "frontier"],
+        ["wander", "ours-pano", "active-gs", "gavis", "uniform", "frontier"],
         ["wander"],
         slow=["uniform", "frontier"],
     ),
