@@ -5,7 +5,7 @@ Shape symbols: K candidates.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -35,6 +35,7 @@ SCORED = (
 """Policies that give a pose a score."""
 
 
+@runtime_checkable
 class Chooser(Protocol):
     """Scores photos that were not chosen by their poses; it never gets their pixels."""
 
@@ -62,8 +63,8 @@ class Chooser(Protocol):
 
 
 MODEL_CHOOSERS: dict[str, Callable[[], Chooser]] = {}
-"""Choosers that look at the model, by name: rivals with a radiance field of their own, which is here
-the one in training."""
+"""Choosers that look at the model, by name: rivals that need a radiance field, which is here the
+one in training."""
 
 
 @dataclass(frozen=True)
