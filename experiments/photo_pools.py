@@ -43,8 +43,8 @@ SIZES: dict[SizeName, Size] = {
     "smoke": Size((0,), 64, PhotoTerms(choose=4, every=50, iterations=200, gaussians=3_000)),
     "small": Size(
         (0, 1, 2),
-        128,
-        PhotoTerms(choose=12, iterations=1000, gaussians=10_000, capacity=20_000),
+        96,
+        PhotoTerms(choose=10, iterations=500, gaussians=6_000, capacity=12_000),
     ),
     "paper": Size(
         (0, 1, 2),
@@ -68,6 +68,9 @@ class Options:
     choosers: tuple[str, ...] = ("ours", "cover", "gavis", "random")
     """Who chooses."""
 
+    seeds: tuple[int, ...] = ()
+    """By default those of the size."""
+
     out: Path = Path("experiments/results")
     """Folder of the results; they go into a folder named after the experiment and the size."""
 
@@ -79,10 +82,11 @@ def main(options: Options) -> Path:
     """Chooses, trains and judges, writes the results, and returns their folder."""
     size = SIZES[options.size]
     records: list[dict[str, Any]] = []
-    for path in options.photos:
-        pool = open_pool(path, size.resolution)
-        # Seeds outside: what is cut short has compared all choosers on the same seeds.
-        for seed in size.seeds:
+    seeds = options.seeds or size.seeds
+    pools = [open_pool(path, size.resolution) for path in options.photos]
+    # Seeds outside: what is cut short has compared all choosers on the same seeds.
+    for seed in seeds:
+        for pool in pools:
             for chooser in options.choosers:
                 record = kept_or_made(options.work, pool, chooser, size.terms, seed)
                 records.append(record)
@@ -106,13 +110,14 @@ def main(options: Options) -> Path:
 
 def _page(size: Size, records: list[dict[str, Any]]) -> list[str]:
     """The tables: each capture, and all."""
+    num_seeds = len({record["seed"] for record in records})
     terms, captures = size.terms, list(dict.fromkeys(record["capture"] for record in records))
     page = [
         f"# Photo pools ({', '.join(captures)})",
         f"{terms.first} photos at first, {terms.choose} chosen among the {terms.nearest} nearest, "
         f"one every {terms.every} steps, {terms.iterations} steps after the last; images of "
         f"{size.resolution} px, {terms.gaussians} Gaussians from the photos. PSNR with its 95 % "
-        f"interval over the photos that judge and {len(size.seeds)} seeds; `minus random` pairs "
+        f"interval over the photos that judge and {num_seeds} seeds; `minus random` pairs "
         "photos and seeds.",
     ]
     for capture in captures:

@@ -89,6 +89,17 @@ class PolicyChooser:
         return totals_of(self.policy, known.situation(memory.memory), poses, key=key)
 
 
+def check_chooser(name: str) -> None:
+    """Refuses who cannot choose among photos.
+
+    Raises:
+        ValueError: nobody of that name scores poses; names those who do.
+    """
+    if name not in SCORED and name not in MODEL_CHOOSERS:
+        known = ", ".join((*SCORED, *MODEL_CHOOSERS))
+        raise ValueError(f"{name} cannot choose among photos; known: {known}")
+
+
 def make_chooser(name: str, num_candidates: int, max_range: float) -> Chooser:
     """Makes a chooser by name.
 
@@ -98,13 +109,11 @@ def make_chooser(name: str, num_candidates: int, max_range: float) -> Chooser:
         max_range: of the sensor [m].
 
     Raises:
-        ValueError: nobody of that name scores poses; names those who do.
+        ValueError: as `check_chooser`.
     """
+    check_chooser(name)
     if name in MODEL_CHOOSERS:
         return MODEL_CHOOSERS[name]()
-    if name not in SCORED:
-        known = ", ".join((*SCORED, *MODEL_CHOOSERS))
-        raise ValueError(f"{name} cannot choose among photos; known: {known}")
     scoring = ScoringConfig(max_range=max_range)
     return PolicyChooser(
         make_policy(name, num_candidates=num_candidates, num_frontier=0, scoring=scoring)
