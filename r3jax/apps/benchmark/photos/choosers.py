@@ -34,6 +34,10 @@ SCORED = (
 )
 """Policies that give a pose a score."""
 
+_WITHOUT_CELLS = ("cover",)
+"""Policies whose published rule knows no unexplored cells: they have them here to be able to explore,
+and photos that are there need no exploring."""
+
 
 @runtime_checkable
 class Chooser(Protocol):
@@ -73,6 +77,9 @@ class PolicyChooser:
 
     policy: Any
 
+    known_cells: bool = False
+    """True tells the policy that no cell is unexplored."""
+
     def begin(self, known: Known) -> Any:
         """The policy's state; nothing in it is random."""
         return self.policy.init(known.camera, known.grid, key=jax.random.key(0))
@@ -86,7 +93,8 @@ class PolicyChooser:
     ) -> np.ndarray:
         """Totals where no path costs anything."""
         del model
-        return totals_of(self.policy, known.situation(memory.memory), poses, key=key)
+        where = known.situation(memory.memory, known_cells=self.known_cells)
+        return totals_of(self.policy, where, poses, key=key)
 
 
 def check_chooser(name: str) -> None:
@@ -115,9 +123,8 @@ def make_chooser(name: str, num_candidates: int, max_range: float) -> Chooser:
     if name in MODEL_CHOOSERS:
         return MODEL_CHOOSERS[name]()
     scoring = ScoringConfig(max_range=max_range)
-    return PolicyChooser(
-        make_policy(name, num_candidates=num_candidates, num_frontier=0, scoring=scoring)
-    )
+    policy = make_policy(name, num_candidates=num_candidates, num_frontier=0, scoring=scoring)
+    return PolicyChooser(policy, known_cells=name in _WITHOUT_CELLS)
 
 
 def totals_of(policy: Any, where: Situation, poses: np.ndarray, *, key: jax.Array) -> np.ndarray:

@@ -21,7 +21,7 @@ from r3jax.apps.benchmark.photos.pool import PhotoPool, PhotosError, first_photo
 from r3jax.evaluation.evaluate import ImageMetric, evaluate
 from r3jax.evaluation.scores import ViewRow
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.config import Backend, RasterConfig
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.growth import Addition, Growth, where_new
@@ -63,7 +63,7 @@ class PhotoTerms:
     voxel_size: float = 0.05
     """Edge of a voxel of the map [m]."""
 
-    backend: str = "auto"
+    backend: Backend = "auto"
     """Rasterizer."""
 
     def __post_init__(self) -> None:

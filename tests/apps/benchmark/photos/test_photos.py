@@ -128,6 +128,20 @@ def test_nobody_sees_the_pixels_that_were_not_chosen(pool, monkeypatch):
         assert opened == outcome.chosen
 
 
+def test_cover_is_the_published_rule(pool, monkeypatch):
+    """Without unexplored cells, which the others count."""
+    unexplored = {}
+
+    def totals(policy, where, poses, *, key):
+        unexplored[policy.name] = bool(np.asarray(where.scoring_grid.unexplored).any())
+        return np.zeros(len(poses))
+
+    monkeypatch.setattr(choosers, "totals_of", totals)
+    for name in ("cover", "ours", "gavis"):
+        run_photos(pool, make_chooser(name, 3, 5.0), TERMS, seed=0)
+    assert unexplored == {"cover": False, "ours": True, "gavis": True}
+
+
 def test_the_same_run_gives_the_same_bits_and_another_seed_another_choice(pool, spied):
     again = run_photos(pool, Spy(), TERMS, seed=1)
     assert again.chosen == spied[1].chosen
