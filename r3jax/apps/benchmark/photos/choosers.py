@@ -35,8 +35,8 @@ SCORED = (
 """Policies that give a pose a score."""
 
 _WITHOUT_CELLS = ("cover",)
-"""Policies whose published rule knows no unexplored cells: they have them here to be able to explore,
-and photos that are there need no exploring."""
+"""Policies whose published rule knows no unexplored cells: in a flight they have them to be able to
+explore, but photos that are there need no exploring."""
 
 
 @runtime_checkable
