@@ -1,17 +1,17 @@
 """The photo-pool protocol: who chooses the better photos of a real capture.
 
-    python -m experiments.photo_pools --size smoke --photos LOUNGE runs/flat-walk
+    python -m experiments.photo_pools --size smoke --photos LOUNGE runs/flat-uniform
 
 The captures are named by the user. A walk through an embedded scene is one, too:
 
-    r3jax explore --scene flat --policy frontier --budget views:30 --capture-every 0.4 \
-        --clock model --resolution 256 --name flat-walk
+    r3jax explore --scene flat --policy uniform --budget frames:100 --capture-every 0.5 \
+        --clock model --resolution 256 --name flat-uniform
 """
 
 import csv
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -98,11 +98,11 @@ def main(options: Options) -> Path:
     origin = joint_origin(f"experiments.{NAME}", [record["machine"] for record in records], commits)
     # The places of captures are this machine's business.
     command = origin.command
-    for path in options.photos:
+    for path in (*options.photos, options.work):
         command = command.replace(str(path), path.name)
     write_atomic(folder / "records.json", (json.dumps(records, indent=1) + "\n").encode())
     _write_csv(folder / "photo_pools.csv", records)
-    origin = type(origin)(command, origin.machine, origin.commit)
+    origin = replace(origin, command=command)
     write_markdown(folder / "photo_pools.md", _page(size, records), origin)
     print(f"results  {folder}")
     return folder
