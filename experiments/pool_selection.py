@@ -32,7 +32,8 @@ from experiments.pages.artifacts import (
 )
 from experiments.pages.pool_figure import pool_figure
 from experiments.pages.pool_table import gain_rows, mean_rows, result_rows
-from experiments.pool_choice import SCORED, choose, pool_of
+from experiments.pool_choice import choose, pool_of
+from r3jax.apps.benchmark.photos.choosers import SCORED
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.scores import summarize

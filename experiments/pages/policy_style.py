@@ -53,6 +53,7 @@ _POLICIES = {
     "gauss-mi": ("#CC79A7", "s", "-."),
     "active-gamer": ("#56B4E9", "v", "-"),
     "cover": ("#CC79A7", "D", "-"),
+    "gavis": ("#882255", "H", "-"),
     "unseen": ("#009E73", "P", "--"),
     "unseen-depth": ("#009E73", "p", "-"),
     "frontier": (style.INK, "X", "-"),

@@ -52,6 +52,11 @@ _WITH_SUBMISSION = (
     "submission", "check", "scenes", "snapshots", "out", "train_resolution", "iterations",
     "gaussians", "capacity", "test_views", "lpips", "backend", "engine", "jobs", "slurm",
 )  # fmt: skip
+_WITH_PHOTOS = (
+    "photos", "choose", "first", "nearest", "every", "policies", "seeds", "out", "up",
+    "max_range", "voxel_size", "train_resolution", "iterations", "gaussians", "capacity", "lpips",
+    "backend",
+)  # fmt: skip
 """Options that make sense beside these; all others are fixed by what was recorded."""
 
 
@@ -145,6 +150,11 @@ def _(options: BenchmarkOptions) -> None:
             raise ValueError("--scenes tells where the mesh of a submission lies: mesh:<file>")
     elif options.check:
         raise ValueError("--check belongs to --submission FILE")
+    if options.photos:
+        _refuse_others(options, "--photos", _WITH_PHOTOS)
+        check_resolution(options.train_resolution)
+        for path in options.photos:
+            check_capture(path)
     for scene in words(options.scenes):
         check_scene(scene, options.scale)
     for policy in words(options.policies):
@@ -269,7 +279,8 @@ def _refuse_others(
     given = [field.name for field in fields if getattr(options, field.name) != field.default]
     if given:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-        source = {"--submission": "submission", "--site": "records"}.get(flag, "recorded run")
+        sources = {"--submission": "submission", "--site": "records", "--photos": "captures"}
+        source = sources.get(flag, "recorded run")
         raise ValueError(f"{flag} takes these from the {source}, leave them out: {names}")
 
 

@@ -14,7 +14,7 @@ Cell = Mapping[str, Any]
 """One record: the parsed JSON object."""
 
 POLICIES = (
-    "random", "uniform", "frontier", "unseen", "unseen-depth", "cover", "active-gamer",
+    "random", "uniform", "frontier", "unseen", "unseen-depth", "cover", "gavis", "active-gamer",
     "active-gs-no-depth", "active-gs", "ours", "ours-pano", "ours-ahead",
 )  # fmt: skip
 """Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""

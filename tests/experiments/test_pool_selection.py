@@ -8,8 +8,9 @@ import pytest
 
 from experiments import pool_choice, pool_selection
 from experiments.pages.pool_table import gain_rows, mean_rows, result_rows
-from experiments.pool_choice import SCORED, choose, pool_of
+from experiments.pool_choice import choose, pool_of
 from experiments.pool_selection import Options
+from r3jax.apps.benchmark.photos.choosers import SCORED
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.registry import policy_names
 from r3jax.simulators.scenes.registry import open_scene

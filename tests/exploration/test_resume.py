@@ -88,7 +88,7 @@ def whole(tmp_path_factory):
     "name",
     quick_and_full(
         [
-            "wander", "ours-pano", "active-gs", "uniform", "frontier",
+            "wander", "ours-pano", "active-gs", "gavis", "uniform", "frontier",
             "active-gs-online", "fisherrf", "gauss-mi",
         ],
         ["wander"],

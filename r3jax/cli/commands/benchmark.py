@@ -25,6 +25,7 @@ from r3jax.apps.benchmark.site import write_site
 from r3jax.apps.benchmark.submitted import plan_submission, problems_of
 from r3jax.apps.benchmark.tables import Entry, Table, quality_table
 from r3jax.cli.checks import seeds_of, words
+from r3jax.cli.commands.benchmark_photos import run_photos_of
 from r3jax.cli.console import (
     BarColumn,
     Console,
@@ -62,6 +63,8 @@ def run_benchmark(options: BenchmarkOptions) -> int:
         return _check_submissions(console, options)
     if options.site is not None:
         return _write_site(console, options.out, options.site)
+    if options.photos:
+        return run_photos_of(console, options)
     try:
         parameters = _settings("slurm", options.slurm)
         if options.jobs > 0 and visible_gpus():

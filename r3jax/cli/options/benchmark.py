@@ -82,7 +82,8 @@ class MeshOptions:
     TITLE: ClassVar[str] = "mesh files"
 
     up: Literal["y", "z"] | None = None
-    """Vertical axis of mesh files; by default y for GLB and glTF, z for the others."""
+    """Vertical axis of mesh files; by default y for GLB and glTF, z for the others. Of recordings
+    (--photos) y by default."""
 
     scale: float = 1.0
     """Metres in a unit of the mesh files: 0.001 for files in millimeters."""
@@ -135,9 +136,39 @@ class SiteOptions:
     intervals, pictures of the worst views, how fast this machine is."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class PhotoOptions:
+    """Choice among the photos of a capture (COVER's protocol)."""
+
+    TITLE: ClassVar[str] = "photos"
+
+    photos: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PATH")] = ()
+    """Choose among the photos of these captures with depth, while a model trains on those chosen;
+    every eighth photo judges. Policies by default: ours,cover,gavis,random; --iterations count
+    after the last photo."""
+
+    choose: int = 20
+    """Photos that are chosen."""
+
+    first: int = 10
+    """Photos that every choice begins with, drawn by the seed."""
+
+    nearest: int = 5
+    """Candidates of a choice: the photos nearest to the last one."""
+
+    every: int = 200
+    """Steps of training between two choices."""
+
+
 @dataclass(frozen=True)
 class BenchmarkOptions(
-    SubmissionOptions, SiteOptions, ExplorationOptions, TrainingOptions, MeshOptions, MachineOptions
+    SubmissionOptions,
+    SiteOptions,
+    PhotoOptions,
+    ExplorationOptions,
+    TrainingOptions,
+    MeshOptions,
+    MachineOptions,
 ):
     """Compare policies on equal terms: explore, train and judge scenes x policies x seeds."""
 
@@ -145,6 +176,7 @@ class BenchmarkOptions(
         "r3jax benchmark --scenes flat,office --policies ours,random --seeds 0,1",
         "r3jax benchmark --budget views:60 --snapshots views:30,views:60 --jobs 2",
         "r3jax benchmark --submission theirs.jsonl --check",
+        "r3jax benchmark --photos captures/lounge --choose 12 --seeds 0,1,2",
     )
 
     scenes: Annotated[str, tyro.conf.arg(metavar="A,B")] = "flat,office"

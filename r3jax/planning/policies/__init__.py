@@ -27,6 +27,7 @@ HOMES = {
         "active-gs-no-depth": "active_gs:ActiveGSNoDepth",
         "active-gamer": "active_gamer:ActiveGamer",
         "cover": "cover:Cover",
+        "gavis": "gavis:Gavis",
         "unseen": "unseen:Unseen",
         "unseen-depth": "unseen:UnseenDepth",
         "frontier": "frontier:Frontier",

@@ -27,6 +27,7 @@ from r3jax.splatting.training.checkpoints import (
     settings_record,
 )
 from r3jax.splatting.training.config import Schedule, TrainConfig
+from r3jax.splatting.training.growth import Growth, with_newborn
 from r3jax.splatting.training.initialize import initialize
 from r3jax.splatting.training.memory import check_memory
 from r3jax.splatting.training.train_step import (
@@ -130,6 +131,7 @@ def fit(
     resume: bool = False,
     overwrite: bool = False,
     checkpoint_every: int = 1000,
+    growth: Growth | None = None,
     on_progress: OnProgress | None = None,
 ) -> FitResult:
     """Fits 3D Gaussians to views (Kerbl et al. 2023, or Kheradmand et al. 2024).
@@ -146,6 +148,8 @@ def fit(
         overwrite: delete the checkpoints of an earlier training in `folder`, just before the
             first step.
         checkpoint_every: steps between two checkpoints; there is always one at the end.
+        growth: views and Gaussians that join on the way; not with a folder, which holds the views
+            of the beginning alone.
         on_progress: called every few steps.
 
     Returns:
@@ -169,6 +173,8 @@ def fit(
         raise ValueError("resume needs the folder with the checkpoints")
     if resume and overwrite:
         raise ValueError("resume goes on with the checkpoints, overwrite deletes them: choose one")
+    if growth is not None and folder is not None:
+        raise ValueError("growth leaves no checkpoints: give no folder")
     extent = scene_extent(views)
     settings = settings_record(config, views, extent)
     run = _Run(views, jnp.asarray(extent, dtype=jnp.float32), config, config.schedule())
@@ -180,7 +186,7 @@ def fit(
             state = start_state(_first_scene(views, config, scene))
             if folder is not None:
                 begin_checkpoints(folder, settings, overwrite=overwrite)
-        return _Loop(run, state, folder, checkpoint_every, on_progress).result()
+        return _Loop(run, state, folder, checkpoint_every, growth, on_progress).result()
 
 
 def scene_extent(views: Views) -> float:
@@ -227,10 +233,11 @@ class _Loop:
         state: TrainState,
         folder: Path | None,
         checkpoint_every: int,
+        growth: Growth | None,
         on_progress: OnProgress | None,
     ):
         self.run, self.state, self.folder = run, state, folder
-        self.every, self.on_progress = checkpoint_every, on_progress
+        self.every, self.growth, self.on_progress = checkpoint_every, growth, on_progress
         self.step = int(state.step)
         self.first_step = self.step + 1
         self.saved_step = self.step if self.step else None
@@ -257,6 +264,7 @@ class _Loop:
         config = self.run.config
         periods = [IN_FLIGHT, self.run.schedule.refine_every, self.run.schedule.reset_every]
         periods += [self.every] if self.folder is not None else []
+        periods += [self.growth.every] if self.growth is not None else []
         ends = [(self.step // period + 1) * period for period in periods]
         return min(*ends, config.iterations)
 
@@ -303,8 +311,18 @@ class _Loop:
             self.state, _ = refine_step(self.state, run.extent, run.config, run.schedule)
         if run.config.strategy == "vanilla" and run.schedule.resets_after(self.step):
             self.state = reset_step(self.state, run.config)
+        if self.growth is not None and self.step % self.growth.every == 0:
+            self._grow(self.growth)
         if self.step % self.every == 0:
             self._save()
+
+    def _grow(self, growth: Growth) -> None:
+        """Other views from here on, and Gaussians for what they show."""
+        if self.step < self.run.config.iterations:
+            views, newborn = growth.add(self.step, self.state.scene)
+            self.run = dataclasses.replace(self.run, views=views)
+            if newborn is not None:
+                self.state = with_newborn(self.state, newborn)
 
     def _save(self) -> None:
         if self.folder is not None and self.step != self.saved_step:

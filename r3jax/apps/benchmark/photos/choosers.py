@@ -1,0 +1,140 @@
+"""Who chooses among photos: a policy by its utility, or whoever looks at the model that is trained.
+
+Shape symbols: K candidates.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import numpy as np
+
+from r3jax.apps.benchmark.photos.known import Known
+from r3jax.frame import Frame
+from r3jax.planning.candidates import candidates_along
+from r3jax.planning.policies.active_gamer.policy import ActiveGamer, empty_share
+from r3jax.planning.policy import Situation
+from r3jax.planning.registry import make_policy
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.pixels import score_pixels
+from r3jax.splatting.scene import GaussianScene
+
+SCORED = (
+    "ours",
+    "active-gs",
+    "active-gs-no-depth",
+    "active-gamer",
+    "cover",
+    "gavis",
+    "unseen",
+    "unseen-depth",
+    "uniform",
+    "random",
+)
+"""Policies that give a pose a score."""
+
+_WITHOUT_CELLS = ("cover",)
+"""Policies whose published rule knows no unexplored cells: in a flight they have them to be able to
+explore, but photos that are there need no exploring."""
+
+
+@runtime_checkable
+class Chooser(Protocol):
+    """Scores photos that were not chosen by their poses; it never gets their pixels."""
+
+    def begin(self, known: Known) -> Any:
+        """What it remembers before the first photo."""
+        ...
+
+    def observe(self, memory: Any, known: Known, frame: Frame) -> Any:
+        """Takes note of a photo that has just been chosen; `known` holds it already."""
+        ...
+
+    def score(
+        self, memory: Any, known: Known, model: GaussianScene, poses: np.ndarray, *, key: jax.Array
+    ) -> np.ndarray:
+        """Scores candidates, [K]; the greatest wins, the first of them if several do.
+
+        Args:
+            memory: what `observe` returned.
+            known: map, grid and frames of the photos chosen so far.
+            model: the radiance field in training, as it is now; not to be kept.
+            poses: of the candidates, [K, 4, 4].
+            key: randomness of this choice.
+        """
+        ...
+
+
+MODEL_CHOOSERS: dict[str, Callable[[], Chooser]] = {}
+"""Choosers that look at the model, by name: rivals that need a radiance field, which is here the
+one in training."""
+
+
+@dataclass(frozen=True)
+class PolicyChooser:
+    """A policy by its utility alone, without paths and without the model."""
+
+    policy: Any
+
+    known_cells: bool = False
+    """True tells the policy that no cell is unexplored."""
+
+    def begin(self, known: Known) -> Any:
+        """The policy's state; nothing in it is random."""
+        return self.policy.init(known.camera, known.grid, key=jax.random.key(0))
+
+    def observe(self, memory: Any, known: Known, frame: Frame) -> Any:
+        """As in the loop: the map holds the frame."""
+        return self.policy.observe(memory, known.map_state, frame)
+
+    def score(
+        self, memory: Any, known: Known, model: GaussianScene, poses: np.ndarray, *, key: jax.Array
+    ) -> np.ndarray:
+        """Totals where no path costs anything."""
+        del model
+        where = known.situation(memory.memory, known_cells=self.known_cells)
+        return totals_of(self.policy, where, poses, key=key)
+
+
+def check_chooser(name: str) -> None:
+    """Refuses who cannot choose among photos.
+
+    Raises:
+        ValueError: nobody of that name scores poses; names those who do.
+    """
+    if name not in SCORED and name not in MODEL_CHOOSERS:
+        known = ", ".join((*SCORED, *MODEL_CHOOSERS))
+        raise ValueError(f"{name} cannot choose among photos; known: {known}")
+
+
+def make_chooser(name: str, num_candidates: int, max_range: float) -> Chooser:
+    """Makes a chooser by name.
+
+    Args:
+        name: one of `SCORED` or `MODEL_CHOOSERS`.
+        num_candidates: photos that are scored at once.
+        max_range: of the sensor [m].
+
+    Raises:
+        ValueError: as `check_chooser`.
+    """
+    check_chooser(name)
+    if name in MODEL_CHOOSERS:
+        return MODEL_CHOOSERS[name]()
+    scoring = ScoringConfig(max_range=max_range)
+    policy = make_policy(name, num_candidates=num_candidates, num_frontier=0, scoring=scoring)
+    return PolicyChooser(policy, known_cells=name in _WITHOUT_CELLS)
+
+
+def totals_of(policy: Any, where: Situation, poses: np.ndarray, *, key: jax.Array) -> np.ndarray:
+    """What a policy gives each pose if no path costs anything, [K] float64."""
+    if isinstance(policy, ActiveGamer):
+        state, grid, scoring = where.map_state, where.grid, policy.scoring_for(where.grid)
+        flat = poses.astype(np.float32)
+        return np.array(
+            score_pixels(empty_share, state, grid, where.camera, flat, scoring), np.float64
+        )
+    candidates = candidates_along(poses[:, :3, 3], poses[:, :3, 2])
+    _, utilities = policy.score(where, candidates, key=key)
+    return np.array(policy.weigh(utilities | {"path": np.zeros(len(poses))}), np.float64)

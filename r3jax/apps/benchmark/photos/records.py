@@ -1,0 +1,152 @@
+"""Records of the photo-pool protocol: one JSON file for a capture, a chooser and a seed."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.apps.benchmark.photos.choosers import make_chooser
+from r3jax.apps.benchmark.photos.pool import PhotoPool
+from r3jax.apps.benchmark.photos.protocol import OnStage, Outcome, PhotoTerms, run_photos
+from r3jax.apps.benchmark.record import machine, source_commit
+from r3jax.evaluation.evaluate import ImageMetric
+from r3jax.evaluation.scores import summarize
+from r3jax.evaluation.statistics import Estimate, mean_over_scenes, paired_difference
+from r3jax.files import write_atomic
+
+FORMAT = 1
+"""Format version of a record."""
+
+Record = dict[str, Any]
+
+
+def record_path(root: Path, pool: PhotoPool, chooser: str, seed: int) -> Path:
+    """Where the record of a run is kept."""
+    return root / "photos" / f"{pool.name}-{chooser}-seed{seed}.json"
+
+
+def kept_or_made(
+    root: Path,
+    pool: PhotoPool,
+    chooser: str,
+    terms: PhotoTerms,
+    seed: int,
+    *,
+    lpips: ImageMetric | None = None,
+    on_stage: OnStage = lambda stage: None,
+) -> Record:
+    """The record on equal terms that is there; otherwise runs the protocol and writes it.
+
+    Args:
+        root: folder of the benchmark.
+        pool: the photos.
+        chooser: name of who chooses.
+        terms: how many, how long.
+        seed: of the run.
+        lpips: the perceptual metric; left out by default.
+        on_stage: told what happens now.
+
+    Raises:
+        ValueError: nobody of that name chooses among photos, or the pool is too small.
+        OSError: the record cannot be written.
+    """
+    path = record_path(root, pool, chooser, seed)
+    asked = {
+        "format": FORMAT,
+        "capture": pool.name,
+        "photos": len(pool.poses),
+        "resolution": [pool.views.width, pool.views.height],
+        "test": pool.test.tolist(),
+        "chooser": chooser,
+        "seed": seed,
+        "terms": dataclasses.asdict(terms),
+    }
+    if path.exists():
+        try:
+            kept = json.loads(path.read_text())
+        except ValueError:  # damaged: made again
+            kept = {}
+        if isinstance(kept, dict) and all(kept.get(name) == asked[name] for name in asked):
+            return kept
+    made = make_chooser(chooser, terms.nearest, terms.max_range)
+    outcome = run_photos(pool, made, terms, seed, lpips=lpips, on_stage=on_stage)
+    record = asked | _fields(outcome) | {"machine": machine(), "commit": source_commit()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, (json.dumps(record) + "\n").encode())
+    return record
+
+
+def _fields(outcome: Outcome) -> Record:
+    """What a run has come to, as plain numbers."""
+    found = {summary.metric.name: summary for summary in summarize(outcome.rows)}
+    return {
+        "chosen": outcome.chosen,
+        "choice_seconds": outcome.seconds,
+        "gaussians": outcome.num_gaussians,
+        "metrics": {
+            name: {"mean": summary.mean, "percentile_5": summary.percentile_5}
+            for name, summary in found.items()
+        },
+        "psnr": [row.psnr for row in outcome.rows],
+        "ssim": [row.ssim for row in outcome.rows],
+        "lpips": [row.lpips for row in outcome.rows],
+    }
+
+
+def table_rows(records: Sequence[Record]) -> list[dict[str, str]]:
+    """A line per chooser, the best first: means with intervals, and what it has over `random`.
+
+    Args:
+        records: of the same captures and seeds for all choosers.
+    """
+    choosers = list(dict.fromkeys(record["chooser"] for record in records))
+    lines: list[tuple[float, dict[str, str]]] = []
+    for chooser in choosers:
+        own = [record for record in records if record["chooser"] == chooser]
+        psnr = mean_over_scenes(_scores(own, "psnr"))
+        line = {
+            "chooser": chooser,
+            "PSNR [dB]": _text(psnr),
+            "5th percentile": f"{np.mean([r['metrics']['psnr']['percentile_5'] for r in own]):.2f}",
+            "SSIM": f"{mean_over_scenes(_scores(own, 'ssim')).value:.3f}",
+        }
+        if all(value is not None for record in own for value in record["lpips"]):
+            line["LPIPS"] = f"{mean_over_scenes(_scores(own, 'lpips')).value:.3f}"
+        line["minus random"] = _lead(own, records) if chooser != "random" else ""
+        # The first choice compiles, and is not what a choice takes.
+        later = [s for record in own for s in record["choice_seconds"][1:]]
+        line["seconds a choice"] = f"{np.median(later):.3f}" if later else ""
+        lines.append((psnr.value, line))
+    return [line for _, line in sorted(lines, key=lambda entry: -entry[0])]
+
+
+def _lead(own: Sequence[Record], records: Sequence[Record]) -> str:
+    """What a chooser has over `random` on the same photos that judge [dB]."""
+    floor = [record for record in records if record["chooser"] == "random"]
+    runs = lambda part: sorted((record["capture"], record["seed"]) for record in part)
+    if runs(floor) != runs(own):
+        return ""
+    return _text(paired_difference(_scores(own, "psnr"), _scores(floor, "psnr")), "+")
+
+
+def _scores(records: Sequence[Record], metric: str) -> dict[str, np.ndarray]:
+    """One metric by capture, [seeds, photos that judge]."""
+    captures = dict.fromkeys(record["capture"] for record in records)
+    return {
+        capture: np.array(
+            [
+                record[metric]
+                for record in sorted(records, key=lambda record: record["seed"])
+                if record["capture"] == capture
+            ],
+            dtype=np.float64,
+        )
+        for capture in captures
+    }
+
+
+def _text(found: Estimate, sign: str = "") -> str:
+    return f"{found.value:{sign}.2f} [{found.low:{sign}.2f}, {found.high:{sign}.2f}]"

@@ -1,0 +1,86 @@
+"""`r3jax benchmark --photos`: choice among the photos of captures while a model trains."""
+
+from typing import Any
+
+from r3jax.apps.benchmark.photos.choosers import check_chooser
+from r3jax.apps.benchmark.photos.pool import open_pool
+from r3jax.apps.benchmark.photos.protocol import PhotoTerms
+from r3jax.apps.benchmark.photos.records import kept_or_made, record_path, table_rows
+from r3jax.cli.checks import seeds_of, words
+from r3jax.cli.console import Console
+from r3jax.cli.console import Table as ConsoleTable
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options import BenchmarkOptions
+from r3jax.evaluation.image_metrics import load_lpips
+
+DEFAULT_POLICIES = ("ours", "cover", "gavis", "random")
+
+
+def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
+    """Runs what is left of all captures, seeds and policies, and prints their tables.
+
+    Returns:
+        0 all is done, 130 interrupted (start it again to go on).
+
+    Raises:
+        UserError: a policy that cannot choose among photos, a capture without depth or with too
+            few photos, terms that cannot work.
+    """
+    is_default = options.policies == BenchmarkOptions.policies
+    policies = DEFAULT_POLICIES if is_default else words(options.policies)
+    records: list[dict[str, Any]] = []
+    try:
+        for name in policies:
+            check_chooser(name)
+        terms = _terms(options)
+        lpips = None if options.lpips == "none" else load_lpips(options.lpips)
+        for path in options.photos:
+            with console.status(f"reading {path} ..."):
+                pool = open_pool(path, options.train_resolution, up=options.up or "y")
+            for seed in seeds_of(options):
+                for name in policies:
+                    title = f"{pool.name}, {name}, seed {seed}"
+                    with console.status(f"{title} ...") as status:
+                        show = lambda what, status=status, title=title: status.update(
+                            f"{title}: {what} ..."
+                        )
+                        record = kept_or_made(
+                            options.out, pool, name, terms, seed, lpips=lpips, on_stage=show
+                        )
+                    records.append(record)
+                    console.say(f"{title}: {record['metrics']['psnr']['mean']:.2f} dB")
+            console.say(f"records  {record_path(options.out, pool, policies[0], 0).parent}")
+    except (ValueError, OSError, ImportError) as error:
+        raise UserError(one_line(error)) from error
+    except KeyboardInterrupt:
+        console.say("interrupted: the same command goes on from here")
+        return 130
+    for capture in dict.fromkeys(record["capture"] for record in records):
+        own = [record for record in records if record["capture"] == capture]
+        _print_table(capture, table_rows(own))
+    return 0
+
+
+def _terms(options: BenchmarkOptions) -> PhotoTerms:
+    return PhotoTerms(
+        choose=options.choose,
+        first=options.first,
+        nearest=options.nearest,
+        every=options.every,
+        iterations=options.iterations,
+        gaussians=options.gaussians,
+        capacity=options.capacity,
+        max_range=options.max_range,
+        voxel_size=options.voxel_size,
+        backend=options.backend,
+    )
+
+
+def _print_table(capture: str, rows: list[dict[str, str]]) -> None:
+    shown = ConsoleTable(title=capture, box=None, title_justify="left")
+    for column in rows[0]:
+        left = column == "chooser"
+        shown.add_column(column, justify="left" if left else "right", no_wrap=True)
+    for row in rows:
+        shown.add_row(*row.values())
+    Console().print(shown)
