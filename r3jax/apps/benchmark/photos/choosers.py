@@ -16,9 +16,11 @@ from r3jax.planning.candidates import candidates_along
 from r3jax.planning.policies.active_gamer.policy import ActiveGamer, empty_share
 from r3jax.planning.policy import Situation
 from r3jax.planning.registry import make_policy
+from r3jax.rivals.fisher import Form, known_information, scores
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.pixels import score_pixels
 from r3jax.splatting.scene import GaussianScene
+from r3jax.splatting.views import fitted_size
 
 SCORED = (
     "ours",
@@ -66,7 +68,39 @@ class Chooser(Protocol):
         ...
 
 
-MODEL_CHOOSERS: dict[str, Callable[[], Chooser]] = {}
+@dataclass(frozen=True)
+class FisherChooser:
+    """Fisher information of the model in training, of the photos chosen and of those on offer."""
+
+    form: Form
+
+    def begin(self, known: Known) -> Any:
+        """Nothing: information is that of the model as it is."""
+        return None
+
+    def observe(self, memory: Any, known: Known, frame: Frame) -> Any:
+        """Nothing."""
+        return memory
+
+    def score(
+        self, memory: Any, known: Known, model: GaussianScene, poses: np.ndarray, *, key: jax.Array
+    ) -> np.ndarray:
+        """Scores of `rivals.fisher`, at `_FISHER_WIDTH`."""
+        del memory, key
+        camera = known.camera
+        camera = camera.resized(*fitted_size(camera.width, camera.height, _FISHER_WIDTH))
+        trained = np.stack([np.asarray(frame.T_world_camera) for frame in known.chosen])
+        information = known_information(model, camera, trained, self.form)
+        return np.float64(scores(model, camera, poses, information, self.form))
+
+
+_FISHER_WIDTH = 128
+"""Longer side of the images whose pixels are summed over [px]; never more than the photos'."""
+
+MODEL_CHOOSERS: dict[str, Callable[[], Chooser]] = {
+    "fisherrf": lambda: FisherChooser(Form()),
+    "fisherrf-d-opt": lambda: FisherChooser(Form("d-opt", quirk=False)),
+}
 """Choosers that look at the model, by name: rivals that need a radiance field, which is here the
 one in training."""
 

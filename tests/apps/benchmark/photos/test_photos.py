@@ -158,6 +158,22 @@ def test_who_looks_at_the_model_joins_by_name(pool, monkeypatch, tmp_path):
     assert json.loads(record_path(tmp_path, pool, "spy", 0).read_text()) == record
 
 
+def test_fisherrf_is_asked_of_the_model_and_of_the_chosen_photos(pool, monkeypatch):
+    asked = []
+    honest = choosers.known_information
+
+    def known_information(model, camera, poses, form):
+        asked.append(poses)
+        return honest(model, camera, poses, form)
+
+    monkeypatch.setattr(choosers, "known_information", known_information)
+    outcome = run_photos(pool, make_chooser("fisherrf", 3, 5.0), TERMS, seed=0)
+    before = [pool.poses[outcome.chosen[:n]] for n in range(TERMS.first, len(outcome.chosen))]
+    assert len(asked) == len(before) == TERMS.choose
+    for poses, expected in zip(asked, before, strict=True):
+        np.testing.assert_allclose(poses, expected, atol=1e-6)
+
+
 def test_a_record_is_made_once_on_equal_terms(pool, tmp_path, monkeypatch):
     made = []
     outcome = run_photos(pool, make_chooser("random", 3, 5.0), TERMS, seed=0)
