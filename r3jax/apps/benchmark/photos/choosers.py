@@ -91,7 +91,7 @@ class FisherChooser:
         camera = camera.resized(*fitted_size(camera.width, camera.height, _FISHER_WIDTH))
         trained = np.stack([np.asarray(frame.T_world_camera) for frame in known.chosen])
         information = known_information(model, camera, trained, self.form)
-        return np.float64(scores(model, camera, poses, information, self.form))
+        return scores(model, camera, poses, information, self.form).astype(np.float64)
 
 
 _FISHER_WIDTH = 128
