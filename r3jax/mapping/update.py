@@ -150,8 +150,8 @@ def _by_kernels(
     from r3jax.mapping.backends import numba
 
     points, valid, factor = _measured(state, frame, max_range, drop_edges)
-    look = frame.position, frame.camera.focal
-    state = numba.join_points(state, points, frame.rgb.reshape(-1, 3), valid, *look)
+    position, focal = frame.position, frame.camera.focal
+    state = numba.join_points(state, points, frame.rgb.reshape(-1, 3), valid, position, focal)
     state = eqx.tree_at(lambda m: m.voxel_size, state, factor * state.voxel_size)
     codes, has_holes = numba.codes_of_rows(state, frame, max_range)
     # A branch: what hides what must be known only where depth has failed.
@@ -160,7 +160,7 @@ def _by_kernels(
         lambda: rows_in_view(state, frame, max_range).astype(jnp.uint8),
         lambda: jnp.zeros(state.capacity, dtype=jnp.uint8),
     )
-    return numba.mark(state, codes, shown_in_holes, *look)
+    return numba.mark(state, codes, shown_in_holes, position, focal)
 
 
 @jax.custom_jvp

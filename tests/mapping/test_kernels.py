@@ -18,6 +18,7 @@ from r3jax.mapping.backends import numba
 from r3jax.mapping.seen import mark_rows, rows_in_view
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate
+from r3jax.visibility.backends import numba as visibility_kernels
 from r3jax.visibility.selection import select
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.plain_kernels import kernels_as_python
@@ -26,7 +27,11 @@ WIDTH, HEIGHT, CAPACITY = 24, 18, 1024  # one shape: one compile
 CAMERA = Camera(WIDTH, HEIGHT, 20.0, 22.0, 11.0, 9.5)
 REACH = jnp.float32(3.0)
 MAPS = numba.__name__
-CHAIN = tuple(f"{MAPS}.{name}" for name in ("bins", "look", "add"))
+SIGHT = visibility_kernels.__name__
+CHAIN = (
+    *(f"{SIGHT}.{name}" for name in ("views", "bricks")),
+    *(f"{MAPS}.{name}" for name in ("bins", "look", "add")),
+)
 
 formulas = jax.jit(update._by_formulas)
 kernels = jax.jit(update._by_kernels)

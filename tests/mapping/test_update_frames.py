@@ -234,10 +234,10 @@ MUTANTS = [
     Mutant("associate", "v[:, None] * depth", "v[:, None]", law_frames),
     Mutant("update", "        drop_edges,\n", "        ~drop_edges,\n", law_frames),
     Mutant("update", "valid.reshape(-1)", "valid.T.reshape(-1)", law_frames),
-    Mutant("update", "frame.position, frame.camera.focal",
-           "frame.position, frame.camera.fx", law_frames),
-    Mutant("update", "frame.position, frame.camera.focal",
-           "frame.T_world_camera[3, :3], frame.camera.focal", law_frames),
+    Mutant("update", "groups, frame.position, frame.camera.focal",
+           "groups, frame.position, frame.camera.fx", law_frames),
+    Mutant("update", "groups, frame.position, frame.camera.focal",
+           "groups, frame.T_world_camera[3, :3], frame.camera.focal", law_frames),
 ]  # fmt: skip
 
 
