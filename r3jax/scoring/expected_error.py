@@ -148,6 +148,8 @@ def mean_square_color(state: MapState) -> Float[Array, ""]:
     return (jnp.sum(squares) + _PRIOR_BRIGHTNESS) / (number + 1.0)
 
 
+@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@jax.jit
 def expected_error_images(
     state: MapState,
     camera: Camera,
@@ -163,6 +165,8 @@ def expected_error_images(
     return ErrorImages(_weighted(SQUARED, terms), _weighted(DISSIMILARITY, terms))
 
 
+@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@jax.jit
 def expected_error(
     state: MapState,
     camera: Camera,

@@ -25,6 +25,7 @@ from r3jax.cli import kernels
 from r3jax.cli.commands import audit, benchmark, explore, replay, train
 from r3jax.cli.main import _COMMANDS, main
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.mapping.backends.numba import bridge as mapping
 from r3jax.mapping.join import merge
 from r3jax.simulators.meshes import load_world
 from r3jax.trace.header import header_to_json
@@ -100,6 +101,9 @@ class Begun(Exception):
 
 
 def seeds() -> list[Files]:
+    # Numba unpickles its own machine code, which the guard would lay at a command's door.
+    for name in (mapping.ADD, mapping.LOOK, mapping.MARK):
+        mapping.register(name)
     files: dict[str, Entry] = {}
     for name, data in (test_runs.seeds()[0] | test_models.seeds()[0]).items():
         files[f"run/{name}"] = data
