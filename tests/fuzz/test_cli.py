@@ -25,9 +25,11 @@ from r3jax.cli import kernels
 from r3jax.cli.commands import audit, benchmark, explore, replay, train
 from r3jax.cli.main import _COMMANDS, main
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.geometry.cameras import Camera
 from r3jax.mapping.backends.numba import bridge as mapping
 from r3jax.mapping.join import merge
 from r3jax.simulators.meshes import load_world
+from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.trace.header import header_to_json
 from tests.fuzz import test_models, test_recordings, test_runs, test_splats
 from tests.fuzz.harness import CASES_SLOW
@@ -35,6 +37,7 @@ from tests.fuzz.mutate import mutate
 from tests.fuzz.numbers import NUMBER_TEXTS
 from tests.fuzz.tree import Entry, Files
 from tests.fuzz.worker import Reader
+from tests.simulators.rooms import box_quads, world_of
 from tests.trace.runs import make_header
 
 pytestmark = pytest.mark.full
@@ -104,6 +107,8 @@ def seeds() -> list[Files]:
     # Numba unpickles its own machine code, which the guard would lay at a command's door.
     for name in (mapping.ADD, mapping.LOOK, mapping.MARK):
         mapping.register(name)
+    walls = world_of(box_quads((-2, -2, -1.5), (2, 2, 1.5), inward=True))
+    _ = RaycastSimulator(walls, Camera.from_fov(6, 4, 90.0)).start_pose
     files: dict[str, Entry] = {}
     for name, data in (test_runs.seeds()[0] | test_models.seeds()[0]).items():
         files[f"run/{name}"] = data
