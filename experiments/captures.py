@@ -64,11 +64,14 @@ def requests_of(options: Options) -> list[Request]:
     """What the benchmark is asked for, mode by mode.
 
     Raises:
-        ValueError: a mode that is none.
+        ValueError: a mode that is none, or without the one that all are compared with.
     """
     unknown = sorted(set(options.modes) - set(MODES))
     if unknown:
         raise ValueError(f"--modes {unknown[0]!r} is none of {list(MODES)}")
+    if "" not in options.modes:
+        # Else a policy that looks on the way would pass for the one as published.
+        raise ValueError("--modes must contain '', key frames only: the others are compared with it")
     common = request_of(options, "seconds")
     # The model clock: the same run on every machine, whatever else it does meanwhile.
     conditions = [
