@@ -71,7 +71,7 @@ def requests_of(options: Options) -> list[Request]:
         raise ValueError(f"--modes {unknown[0]!r} is none of {list(MODES)}")
     if "" not in options.modes:
         # Else a policy that looks on the way would pass for the one as published.
-        raise ValueError("--modes must contain '', key frames only: the others are compared with it")
+        raise ValueError("--modes must contain '', key frames only: all are compared with it")
     common = request_of(options, "seconds")
     # The model clock: the same run on every machine, whatever else it does meanwhile.
     conditions = [

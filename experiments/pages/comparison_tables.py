@@ -22,7 +22,7 @@ from r3jax.apps.benchmark.tables import (
     with_bounds,
     with_name,
 )
-from r3jax.evaluation.areas import area_under, common_range
+from r3jax.evaluation.areas import area_under, common_range, sparsification
 from r3jax.evaluation.comparison import (
     EXPLORATION,
     Cell,
@@ -34,6 +34,7 @@ from r3jax.evaluation.comparison import (
     seeds_by_method,
     snapshot_kind,
     values_by_seed,
+    view_values,
     with_short_names,
 )
 from r3jax.evaluation.scores import POOR_PSNR, Metric
@@ -98,6 +99,10 @@ def tail_table(
         shares = [tails[m].poor if m in tails else None for m in methods]
         share = Metric("", "", 1, lower_is_better=True)
         columns[f"views < {POOR_PSNR:g} dB [%]"] = ranked(shares, share)
+    areas = {m: _ause_of_renderability(cells, m, scenes, shown) for m in complete}
+    if any(area is not None for area in areas.values()):
+        ause = Metric("", "", 2, lower_is_better=True)
+        columns["AUSE of R"] = ranked([areas.get(m) for m in methods], ause)
     lines = zip(methods, zip(*columns.values(), strict=True), strict=True)
     return Table(
         title=title or f"{cells[0]['snapshot']}, {full_title(shown)}",
@@ -106,6 +111,30 @@ def tail_table(
         rows=tuple(Row((method,), seeds[method], entries) for method, entries in lines),
         notes=told,
     )
+
+
+def _ause_of_renderability(
+    cells: Sequence[Cell], method: str, scenes: Sequence[str], metric: Metric
+) -> float | None:
+    """Relative AUSE of R within a model: mean over seeds, then over scenes.
+
+    None where a scene has no model with both columns, or where all errors of its models are equal.
+    """
+    sign = 1.0 if metric.lower_is_better else -1.0
+    by_scene: dict[str, list[float]] = {scene: [] for scene in scenes}
+    for cell in cells:
+        if method_name(cell) != method:
+            continue
+        quality, score = (view_values(cell, name) for name in ("renderability", metric.name))
+        if quality is None or score is None:
+            continue
+        known = np.isfinite(quality) & np.isfinite(score)
+        if known.any():
+            found = sparsification(quality[known], sign * score[known]).relative
+            by_scene[cell["scene"]].extend([found] if np.isfinite(found) else [])
+    if not all(by_scene.values()):
+        return None
+    return float(np.mean([np.mean(found) for found in by_scene.values()]))
 
 
 @dataclass(frozen=True)

@@ -126,6 +126,37 @@ def law_tails(modules) -> None:
     assert not any("20 dB" in column for _, column in lpips)
 
 
+def law_ause(modules) -> None:
+    """0 where R orders the views as their errors do, 1 by chance; within a model, then the mean."""
+    tail = modules["comparison_tables"].tail_table
+
+    def column(*cells, metric="psnr"):
+        found = fields(tail(list(cells), metric=metric, resamples=10))
+        return {key[0]: entry.value for key, entry in found.items() if key[1] == "AUSE of R"}
+
+    psnr = np.array([12.0, 17.0, 21.0, 30.0])
+
+    def known(seed, renderability, scene="flat"):
+        cell = record(scene=scene, seed=seed, psnr=psnr)
+        cell["views"]["renderability"] = renderability
+        return cell
+
+    right, wrong, none = [0.1, 0.2, 0.3, 0.4], [0.4, 0.3, 0.2, 0.1], [0.5] * 4
+    assert column(known(0, right)) == {"ours": pytest.approx(0.0)}
+    assert column(known(0, none)) == {"ours": pytest.approx(1.0)}
+    worst = column(known(0, wrong))["ours"]
+    assert worst > 1.5
+    assert column(known(0, right), known(1, none)) == {"ours": pytest.approx(0.5)}
+    # Seeds first, then scenes: a scene with two seeds has no more weight than one with one.
+    three = [known(0, right), known(1, right), known(0, none, "house")]
+    assert column(*three) == {"ours": pytest.approx(0.5)}
+    # The order of LPIPS is the other way round.
+    assert column(known(0, right), metric="lpips") == {"ours": pytest.approx(0.0)}
+    # A view without R is left out; a table without any R has no such column.
+    assert column(known(0, [None, *right[1:]])) == {"ours": pytest.approx(0.0)}
+    assert column(known(0, None)) == {}
+
+
 def law_difference(modules) -> None:
     """The reference minus the others, on the seeds that both have."""
     difference = modules["comparison_tables"].difference_table
@@ -205,6 +236,14 @@ MUTANTS = [
     Mutant("comparison_tables", "95 if metric.lower_is_better else 5)", "5)", law_tails),
     Mutant("comparison_tables", "max if metric.lower_is_better else min", "min", law_tails),
     Mutant("comparison_tables", "views < POOR_PSNR)", "views <= POOR_PSNR)", law_tails),
+    Mutant("comparison_tables", "1.0 if metric.lower_is_better else -1.0", "-1.0", law_ause),
+    Mutant("comparison_tables", "np.mean([np.mean(found)", "np.mean([found[0]", law_ause),
+    Mutant(
+        "comparison_tables",
+        "found in by_scene.values()])",
+        "found in [sum(by_scene.values(), [])]])",
+        law_ause,
+    ),
     Mutant("comparison_tables", "np.median(views)", "np.mean(scores['flat'])", law_tails),
     Mutant(
         "comparison_tables", "{*seeds[reference][s]} & {*seeds[method][s]}", "{0}", law_difference
@@ -216,7 +255,7 @@ MUTANTS = [
         "comparison_tables", "if not found or len(found) < len(pairs)", "if not found", law_gaps
     ),
 ]
-LAWS = [law_quality, law_marks, law_ties, law_gaps, law_tails, law_difference]
+LAWS = [law_quality, law_marks, law_ties, law_gaps, law_tails, law_ause, law_difference]
 
 
 @pytest.mark.parametrize("law", LAWS)
