@@ -97,6 +97,36 @@ def whole(typingctx, value):
 
 
 @intrinsic
+def middle_of(typingctx, word, other):
+    """The middle bits of two words: bits 21 to 31 of the first, then 0 to 9 of the second."""
+
+    def codegen(context, builder, sig, args):
+        low = builder.lshr(args[0], _int(21))
+        return builder.or_(low, builder.shl(builder.and_(args[1], _int(1023)), _int(11)))
+
+    return types.uint32(types.uint32, types.uint32), codegen
+
+
+@intrinsic
+def end_of(typingctx, word):
+    """Bits 10 to 30 of a word."""
+    return types.uint32(types.uint32), lambda context, builder, sig, args: builder.lshr(
+        args[0], _int(10)
+    )
+
+
+@intrinsic
+def signed_of(typingctx, word):
+    """The lowest 21 bits of a word as a number from -2^20 on, in a float."""
+
+    def codegen(context, builder, sig, args):
+        bits = builder.and_(args[0], _int((1 << 21) - 1))
+        return builder.sitofp(builder.sub(bits, _int(1 << 20)), _FLOAT)
+
+    return types.float32(types.uint32), codegen
+
+
+@intrinsic
 def count_bits(typingctx, word):
     """How many bits of a word of 32 are set."""
 

@@ -175,7 +175,7 @@ def terms_of_rows(
         return lambda voxels, points: over_views(score, voxels, points)
 
     point = jnp.concatenate([position, focal[None]])
-    return Renderability(*_by_platform(score_by)(voxels, point[None])[0])
+    return Renderability(*(term[0] for term in _by_platform(score_by)(voxels, point[None])))
 
 
 @terms_of_rows.defjvp

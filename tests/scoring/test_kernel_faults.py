@@ -26,7 +26,10 @@ BINS = f"{numba.mapping_kernels.__name__}.bins"
 CHAIN = (
     *(f"{SIGHT}.{name}" for name in ("views", "picture", "splat", "limit", "seen", "bricks")),
     BINS,
-    *(f"{SCORES}.{name}" for name in ("voxels", "terms", "sums", "pixels", "rows")),
+    *(
+        f"{SCORES}.{name}"
+        for name in ("voxels", "near", "terms", "shown", "few", "sums", "pixels", "rows")
+    ),
 )
 VIEWS = 5  # one more than `sums.FEW`, so that bricks are made
 
@@ -77,18 +80,23 @@ def bins_of(state) -> np.ndarray:
     return fibonacci_lattice(state.num_bins).astype(np.float32)
 
 
-def sums_agree(modules: Modules, kind: str = "panorama") -> None:
+def sums_agree(modules: Modules, kind: str = "panorama", num: int = VIEWS) -> None:
     state, _, known, space = asked()
     _, frame, rows = frame_and_rows(kind)
     bins = NUM_BINS[kind]
     table = np.ascontiguousarray(nearest_bin_table(bins).T)
     tables = bins_of(state), table, fibonacci_lattice(bins).astype(np.float32)
-    none = np.empty((VIEWS, 0), np.uint8)
-    results = (*np.empty((2, VIEWS, bins), np.float32), none, none)
-    modules["sums"].sums_pass(known, space, rows, frame, (False, False), tables, 2, results)
-    deficits, unexplored, _ = expected(kind)
+    none = np.empty((num, 0), np.uint8)
+    results = (*np.empty((2, num, bins), np.float32), none, none)
+    modules["sums"].sums_pass(known, space, rows[:num], frame, (False, False), tables, 2, results)
+    deficits, unexplored = (part[:num] for part in expected(kind)[:2])
     np.testing.assert_allclose(results[0], deficits, atol=1e-4 * deficits.max())
     np.testing.assert_array_equal(results[1], unexplored)
+
+
+def few_agree(modules: Modules) -> None:
+    """Without an index, by two threads that share the views' work."""
+    sums_agree(modules, num=2)
 
 
 def images_agree(modules: Modules, kind: str = "pinhole") -> None:
@@ -124,11 +132,11 @@ def terms_agree(modules: Modules) -> None:
     state, _, known, _ = asked()
     position = poses_of(2)[0, :3, 3]
     points = np.append(np.array(position), CAMERA.focal).astype(np.float32)[None]
-    results = np.empty((1, modules["rows"].NUM_TERMS, state.capacity), np.float32)
+    results = tuple(np.empty((modules["rows"].NUM_TERMS, 1, state.capacity), np.float32))
     modules["rows"].rows_pass(known, points, (False, False), bins_of(state), 2, results)
     terms = jax.jit(score_voxels)(state, position, CAMERA.focal)
-    for found, (name, term) in zip(results[0], vars(terms).items(), strict=True):
-        np.testing.assert_allclose(found, term, atol=1e-4, err_msg=name)
+    for found, (name, term) in zip(results, vars(terms).items(), strict=True):
+        np.testing.assert_allclose(found[0], term, atol=1e-4, err_msg=name)
 
 
 MUTANTS = [
@@ -155,9 +163,14 @@ MUTANTS = [
     Mutant("limit", ", _MAX_STRETCH)", ", _ONE)", sums_agree),
     Mutant("seen", "first = max(limit", "first = min(limit", sums_agree),
     Mutant("seen", "(distance <= nearest[pixel])", "(distance <= 2 * nearest[pixel])", sums_agree),
-    Mutant("bricks", "reach = view[RANGE] + sphere[3]", "reach = view[RANGE]", sums_agree),
-    Mutant("bricks", "_is_inside(y, z, -cy / fy, margin, 1.0)",
-           "_is_inside(y, z, -cy / fy, -margin, 1.0)", in_images),
+    Mutant("bricks", "reach, wide = far + radius", "reach, wide = far", sums_agree),
+    Mutant("bricks", "(down - slopes[2] * ahead >= -wide * slants[2])",
+           "(down - slopes[2] * ahead >= wide * slants[2])", in_images),
+    Mutant("near", "& (count[i] > _ZERO)", "& (count[i] >= _ZERO)", few_agree),
+    Mutant("near", "MARGIN = np.float32(4.0)", "MARGIN = np.float32(-2.0)", few_agree),
+    Mutant("few", "least[i] = min(least[i], own[i])", "least[i] = own[i]", few_agree),
+    Mutant("few", "sums[:, bin].sum()", "sums[0, bin]", few_agree),
+    Mutant("few", "numbers.shape[0] * share // workers", "0 * share", few_agree),
     Mutant("voxels", "math.sqrt(_TWO_THIRDS_OF_TWO * variance)", "math.sqrt(variance)",
            sums_agree),
     Mutant("voxels", "max(count - _ONE, _ONE)", "count", terms_agree),
@@ -170,7 +183,7 @@ MUTANTS = [
     Mutant("terms", "_ONE - delta * bias", "_ONE - bias", sums_agree),
     Mutant("terms", "kappa * (_ONE - bias)", "(_ONE - bias)", terms_agree),
     Mutant("bins", "is_better = cosine > best", "is_better = k == 0", sums_agree),
-    Mutant("sums", "num += is_seen[i]", "num += 1", sums_agree),
+    Mutant("shown", "num += is_seen[i]", "num += 1", sums_agree),
     Mutant("pixels", "key_of(placed[DISTANCE + i], rows[first + i])",
            "key_of(placed[DISTANCE + i], first + i)", images_agree),
     Mutant("pixels", "if row != last:", "if last < 0:", images_agree),
@@ -179,7 +192,7 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-LAWS = borders_agree, sums_agree, in_images, images_agree, images_all_round, terms_agree
+LAWS = borders_agree, sums_agree, few_agree, in_images, images_agree, images_all_round, terms_agree
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -76,10 +76,10 @@ def rows_in_pixels(
 
 def terms_of_rows(
     voxels: MapState, points: Float[Array, "P 4"], forms: Forms
-) -> Float[Array, "P 6 n"]:
+) -> tuple[Float[Array, "P n"], ...]:
     """`score_voxels` from many points (position, focal length), field by field."""
 
-    def one(point: Float[Array, " 4"]) -> Float[Array, "6 n"]:
-        return jnp.stack(jax.tree.leaves(score_voxels(voxels, point[:3], point[3], forms)))
+    def one(point: Float[Array, " 4"]) -> tuple[Float[Array, " n"], ...]:
+        return tuple(jax.tree.leaves(score_voxels(voxels, point[:3], point[3], forms)))
 
     return jax.lax.map(one, points, batch_size=batch_size(voxels.capacity))

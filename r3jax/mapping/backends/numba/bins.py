@@ -7,11 +7,10 @@ import math
 
 import numpy as np
 
-from r3jax.native.arithmetic import floor, whole
+from r3jax.native.arithmetic import end_of, floor, middle_of, signed_of, whole
 from r3jax.native.compiled import inlined, inlined_fused
-from r3jax.visibility.backends.numba.bricks import voxel_of
 
-_ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _LEAST, _TINY = np.float32(1e-6), np.float32(1e-20)
 
 
@@ -30,27 +29,42 @@ def fold(x, y, z, size):
 
 
 @inlined_fused
+def _cosine(x, y, z, bin, lattice):
+    row = np.uint32(bin)
+    return lattice[row, 0] * x + lattice[row, 1] * y + lattice[row, 2] * z
+
+
+@inlined_fused
 def nearest_bin(x, y, z, cell, table, lattice):
     """Bin of a direction (`geometry.sphere.nearest_bin`): the best of the few in its cell."""
-    chosen, best = np.int32(0), -_TWO
-    for k in range(table.shape[1]):
-        at = table[np.uint32(cell), k]
-        row = np.uint32(at)
-        cosine = lattice[row, 0] * x + lattice[row, 1] * y + lattice[row, 2] * z
-        is_better = cosine > best
-        chosen, best = at if is_better else chosen, cosine if is_better else best
+    cell, width = np.uint32(cell), table.shape[1]
+    # Two without a question: most cells have one candidate or two, and none guesses which.
+    chosen, second = table[cell, 0], table[cell, min(width - 1, 1)]
+    best, cosine = _cosine(x, y, z, chosen, lattice), _cosine(x, y, z, second, lattice)
+    is_padded = width < 3 or table[cell, 2] == chosen
+    chosen, best = second if cosine > best else chosen, max(best, cosine)
+    if not is_padded:
+        for k in range(2, width):
+            cosine = _cosine(x, y, z, table[cell, k], lattice)
+            is_better = cosine > best
+            chosen, best = table[cell, k] if is_better else chosen, max(best, cosine)
     return chosen
+
+
+@inlined
+def center_of_words(low, high, voxel_size):
+    """Center [m] of the voxel whose key has these words (`geometry.voxels.unpack`)."""
+    return (
+        (signed_of(low) + _HALF) * voxel_size,
+        (signed_of(middle_of(low, high)) + _HALF) * voxel_size,
+        (signed_of(end_of(high)) + _HALF) * voxel_size,
+    )
 
 
 @inlined
 def center_of(key, row, voxel_size):
     """Center of the voxel in a row of the map [m]."""
-    x, y, z = voxel_of(key, row)
-    return (
-        (np.float32(x) + _HALF) * voxel_size,
-        (np.float32(y) + _HALF) * voxel_size,
-        (np.float32(z) + _HALF) * voxel_size,
-    )
+    return center_of_words(key[0, row], key[1, row], voxel_size)
 
 
 @inlined_fused

@@ -116,13 +116,13 @@ def _look(
 
 def terms_of_rows(
     voxels: MapState, points: Float[Array, "P 4"], forms: Forms
-) -> Float[Array, "P 6 n"]:
+) -> tuple[Float[Array, "P n"], ...]:
     """`terms.score_voxels` from many points (position, focal length), field by field."""
     register(ROWS)
-    shape = (points.shape[0], NUM_TERMS, voxels.capacity)
+    # An array for each field: none is copied out of one for all.
+    field = jax.ShapeDtypeStruct((points.shape[0], voxels.capacity), jnp.float32)
     options = np.array([*_choices(forms), num_workers()], dtype=np.int32)
     directions = fibonacci_lattice(voxels.num_bins).astype(np.float32)
-    (terms,) = jax.ffi.ffi_call(ROWS, [jax.ShapeDtypeStruct(shape, jnp.float32)])(
-        *_shared(voxels), points, options, directions
+    return tuple(
+        jax.ffi.ffi_call(ROWS, [field] * NUM_TERMS)(*_shared(voxels), points, options, directions)
     )
-    return terms

@@ -18,7 +18,6 @@ from r3jax.native.ffi import (
     bytes2,
     floats1,
     floats2,
-    floats3,
     ints1,
     ints2,
     register_handlers,
@@ -104,8 +103,11 @@ def _rows(frame):
         (options[0] != 0, options[1] != 0),
         floats2(frame, ARGUMENTS, 8),
         np.int64(options[2]),
-        floats3(frame, RESULTS, 0),
-    )
+        (
+            floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1), floats2(frame, RESULTS, 2),
+            floats2(frame, RESULTS, 3), floats2(frame, RESULTS, 4), floats2(frame, RESULTS, 5),
+        ),
+    )  # fmt: skip
     return 0
 
 

@@ -35,6 +35,7 @@ _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np
 _INFINITE, _POLE, _LEAST = np.float32(np.inf), np.float32(1e-12), np.float32(1e-6)
 _EDGE = np.float32(directions.ON_EDGE)
 _NO_BITS, _ONE_BIT = np.uint64(0), np.uint64(1)
+_NEARLY_ONE = np.float32(0.999)  # 2.6 degrees: far outside of a box as large as `_EDGE`
 
 
 @intrinsic
@@ -62,6 +63,15 @@ def look_from(visited, at, lattice, direction):
         The cosine, in [0, 1], and whether the direction lies in the box.
     """
     x, y, z = direction
+    word = visited[0, at]
+    if visited.shape[0] == 1 and word & (word - _ONE_BIT) == _NO_BITS:
+        if word == _NO_BITS:
+            return _ZERO, False
+        # A box of one direction is a point, in which only that very direction lies.
+        k = np.uint64(lowest_bit(word))
+        cosine = lattice[k, 0] * x + lattice[k, 1] * y + lattice[k, 2] * z
+        if cosine < _NEARLY_ONE:
+            return max(cosine, _ZERO), False
     is_pole = x * x + y * y < _POLE
     a_x, a_y = (_ONE if is_pole else -y), (_ZERO if is_pole else x)
     b_x, b_y, b_z = -z * a_y, z * a_x, x * a_y - y * a_x

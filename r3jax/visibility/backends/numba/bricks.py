@@ -23,7 +23,7 @@ MOST = 1 << 19
 
 _LIMIT = np.int64(INDEX_LIMIT)
 _LOW = np.int64((1 << 21) - 1)
-_HALF = np.float32(0.5)
+_HALF, _ONE = np.float32(0.5), np.float32(1.0)
 
 
 @inlined
@@ -166,36 +166,54 @@ def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
 
 
 @inlined
-def may_see(view, wraps, shape, sphere, voxel_size):
-    """False only if no voxel whose center lies in a sphere can appear in the view."""
-    dx, dy, dz = (
-        sphere[0] - view[POSITION],
-        sphere[1] - view[POSITION + 1],
-        sphere[2] - view[POSITION + 2],
-    )
-    reach = view[RANGE] + sphere[3]
-    if dx * dx + dy * dy + dz * dz > reach * reach:
-        return False
-    if wraps:
-        return True
-    r, margin = ROTATION, sphere[3] + voxel_size
-    x = view[r] * dx + view[r + 3] * dy + view[r + 6] * dz
-    y = view[r + 1] * dx + view[r + 4] * dy + view[r + 7] * dz
-    z = view[r + 2] * dx + view[r + 5] * dy + view[r + 8] * dz
+def bounds_of(view, wraps, shape):
+    """The range of a view [m] and the planes that bound it, as `may_see` takes them.
+
+    Each plane by its slope, `along = slope z`, and by how far along a margin reaches.
+    """
     fx, fy, cx, cy = view[LENS], view[LENS + 1], view[LENS + 2], view[LENS + 3]
+    left, right = -cx / fx, (np.float32(shape[1]) - cx) / fx
+    top, bottom = -cy / fy, (np.float32(shape[0]) - cy) / fy
+    r = ROTATION
     return (
-        (z > -margin)
-        & _is_inside(x, z, -cx / fx, margin, 1.0)
-        & _is_inside(x, z, (shape[1] - cx) / fx, margin, -1.0)
-        & _is_inside(y, z, -cy / fy, margin, 1.0)
-        & _is_inside(y, z, (shape[0] - cy) / fy, margin, -1.0)
-    )
+        wraps, view[RANGE], (view[POSITION], view[POSITION + 1], view[POSITION + 2]),
+        (view[r], view[r + 3], view[r + 6]), (view[r + 1], view[r + 4], view[r + 7]),
+        (view[r + 2], view[r + 5], view[r + 8]), (left, right, top, bottom),
+        (_slant(left), _slant(right), _slant(top), _slant(bottom)),
+    )  # fmt: skip
 
 
 @inlined
-def _is_inside(along, z, slope, margin, side):
-    """Whether a point lies within `margin` of the inner side of the plane `along = slope z`."""
-    return side * (along - slope * z) >= -margin * math.sqrt(1.0 + slope * slope)
+def _slant(slope):
+    return math.sqrt(_ONE + slope * slope)
+
+
+@inlined
+def may_see(bounds, x, y, z, radius, margin):
+    """False only if no voxel whose center lies in a sphere can appear in a view.
+
+    Args:
+        bounds: of the view.
+        x: of the sphere's middle, like the next two [m].
+        y: see x.
+        z: see x.
+        radius: of the sphere [m].
+        margin: how far outside of an image a voxel appears in it at that distance [m].
+    """
+    wraps, far, position, along_x, along_y, along_z, slopes, slants = bounds
+    dx, dy, dz = x - position[0], y - position[1], z - position[2]
+    reach, wide = far + radius, radius + margin
+    is_in_range = dx * dx + dy * dy + dz * dz <= reach * reach
+    right = along_x[0] * dx + along_x[1] * dy + along_x[2] * dz
+    down = along_y[0] * dx + along_y[1] * dy + along_y[2] * dz
+    ahead = along_z[0] * dx + along_z[1] * dy + along_z[2] * dz
+    is_between = (right - slopes[0] * ahead >= -wide * slants[0]) & (
+        slopes[1] * ahead - right >= -wide * slants[1]
+    )
+    is_between = is_between & (down - slopes[2] * ahead >= -wide * slants[2])
+    is_between = is_between & (slopes[3] * ahead - down >= -wide * slants[3])
+    # No branch: loops over voxels become vectors.
+    return is_in_range & (wraps | (is_between & (ahead > -wide)))
 
 
 @kernel
@@ -214,9 +232,10 @@ def find_runs(view, wraps, shape, voxel_size, starts, spheres, runs):
     Returns:
         How many runs there are.
     """
-    num = 0
+    num, bounds = 0, bounds_of(view, wraps, shape)
     for brick in range(spheres.shape[0]):
-        if may_see(view, wraps, shape, spheres[brick], voxel_size):
+        x, y, z, radius = spheres[brick]
+        if may_see(bounds, x, y, z, radius, voxel_size):
             if num > 0 and runs[num - 1, 1] == starts[brick]:
                 runs[num - 1, 1] = starts[brick + 1]
             else:
