@@ -201,7 +201,7 @@ MUTANTS = [
     Mutant("bins", "camera[1] / distance", "camera[1] * distance", law_mark),
     Mutant("look", "resolution[row] = max(", "resolution[row] = min(", law_mark),
     Mutant("look", "and shown_in_holes[row] != 0", "", law_mark),
-    Mutant("look", "<= _farthest_around(depth, i, j) + numbers[_SIZE]", "<= depth[i, j]", law_look),
+    Mutant("look", "<= _farthest_around(depth, i, j) + slack", "<= depth[i, j]", law_look),
     Mutant("look", "    if depth[i, j] == _ZERO:\n        return HOLE\n", "", law_look),
     Mutant("look", "numbers[_RANGE] * numbers[_RANGE]", "numbers[_RANGE]", law_look),
     Mutant("add", "squared * before * weight", "squared * weight", law_add),
