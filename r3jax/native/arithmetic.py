@@ -127,6 +127,16 @@ def signed_of(typingctx, word):
 
 
 @intrinsic
+def fused(typingctx, a, b, c):
+    """Product of two floats plus a third with one rounding, whatever LLVM fuses by itself."""
+
+    def codegen(context, builder, sig, args):
+        return builder.fma(*args)
+
+    return types.float32(types.float32, types.float32, types.float32), codegen
+
+
+@intrinsic
 def count_bits(typingctx, word):
     """How many bits of a word of 32 are set."""
 

@@ -4,6 +4,7 @@ import contextlib
 import datetime
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -173,7 +174,10 @@ class RunWriter:
             RecordingStopped: the disk refused; the views before stay readable.
         """
         rgb, depth = to_integers(frame)
-        self._store(row, encode_png(rgb), encode_png(depth))
+        # Beside each other: the compressor lets other threads run, and the loop waits for both.
+        with ThreadPoolExecutor(1) as other:
+            depth_png = other.submit(encode_png, depth)
+            self._store(row, encode_png(rgb), depth_png.result())
 
     def adopt(self, row: StepRow, run: Run, step: int) -> None:
         """Stores a view of another run as the next one of this run; its pixels stay as they are.

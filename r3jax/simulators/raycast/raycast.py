@@ -23,6 +23,7 @@ from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.native.compiled import called_from_python, inlined
 from r3jax.simulators import start
 from r3jax.simulators.clearance import SurfaceDistance
+from r3jax.simulators.raycast.directions import average, inside, turned
 from r3jax.simulators.raycast.rays import Hits, TriangleScene
 from r3jax.simulators.raycast.shading import shade
 from r3jax.simulators.raycast.shading_tables import build_shading_tables
@@ -155,7 +156,7 @@ class RaycastSimulator:
         if problem is not None:
             raise ValueError(f"cannot render: {problem}")
         height, width = self._camera.height, self._camera.width
-        directions = self._pixels @ T[:3, :3].T.astype(np.float32)
+        directions = turned(self._pixels, T[:3, :3].astype(np.float32))
         colors, hits = self._look(T, directions)
         image = colors.reshape(height, width, 3)
         depth = np.where(hits.distance <= self._max_depth, hits.distance, np.float32(np.inf))
@@ -272,11 +273,8 @@ class RaycastSimulator:
             return
         shifts = (self._offsets @ self._pixel_steps(T)).astype(np.float32)  # [S, 3]
         # The rays of a pixel beside each other: neighbors are traced together.
-        rays = (directions[pixels][:, None] + shifts).reshape(-1, 3)
-        colors, _ = self._look(T, rays)
-        flat = image.reshape(-1, 3)
-        extra = colors.reshape(-1, len(shifts), 3).sum(axis=1)
-        flat[pixels] = (flat[pixels] + extra) / np.float32(len(shifts) + 1)
+        colors, _ = self._look(T, inside(directions, pixels, shifts))
+        average(image.reshape(-1, 3), pixels, colors)
 
 
 def _depth_limit(max_range: float | int | None) -> np.float32:

@@ -8,7 +8,8 @@ from numba import prange
 
 from r3jax.geometry.voxels import EMPTY_WORD
 from r3jax.mapping.backends.numba.bins import center_of, evidence, is_sound
-from r3jax.native.compiled import inlined_fused, parallel_kernel
+from r3jax.native.arithmetic import whole
+from r3jax.native.compiled import in_wide_vectors, inlined_fused, parallel_kernel
 
 SHOWS, HOLE = 1, 2
 """Codes of rows: a measurement shows the voxel; the pixel where it lies has none."""
@@ -42,26 +43,44 @@ def _farthest_around(depth, row, column):
 
 
 @inlined_fused
-def _code_of(key, row, numbers, depth):
-    """What a frame says of a row; see `codes_of_rows`."""
-    height, width = np.float32(depth.shape[0]), np.float32(depth.shape[1])
-    center = center_of(key, row, numbers[_SIZE])
-    z = _along(numbers, 2, center)
-    if not z > _NEAREST:
-        return 0
-    x, y = _along(numbers, 0, center), _along(numbers, 1, center)
-    per_z = _ONE / z
-    u = numbers[_FX] * x * per_z + numbers[_CX]
-    v = numbers[_FY] * y * per_z + numbers[_CY]
-    is_in = (u >= _ZERO) & (u < width) & (v >= _ZERO) & (v < height)
-    # Straight from the camera, as the grid and the scores have it; depth alone is along the axis.
-    if not (is_in & (x * x + y * y + z * z <= numbers[_RANGE] * numbers[_RANGE])):
-        return 0
-    i, j = min(np.int64(v), depth.shape[0] - 1), min(np.int64(u), depth.shape[1] - 1)
+def _project(key, first, num, numbers, shape, pixels, depths):
+    """Pixel and z-depth of each row from `first` on; -1 for rows out of the image or of range.
+
+    Without a branch, so that LLVM turns the loop into vectors: most rows end here.
+    """
+    in_wide_vectors()
+    height, width = np.float32(shape[0]), np.float32(shape[1])
+    last_row, last_column = height - _ONE, width - _ONE
+    reach = numbers[_RANGE] * numbers[_RANGE]
+    for i in range(num):
+        center = center_of(key, first + i, numbers[_SIZE])
+        z = _along(numbers, 2, center)
+        x, y = _along(numbers, 0, center), _along(numbers, 1, center)
+        per_z = _ONE / z
+        u = numbers[_FX] * x * per_z + numbers[_CX]
+        v = numbers[_FY] * y * per_z + numbers[_CY]
+        is_in = (z > _NEAREST) & (u >= _ZERO) & (u < width) & (v >= _ZERO) & (v < height)
+        # Straight from the camera, as the grid and the scores have it; depth alone is along the
+        # axis.
+        is_in &= x * x + y * y + z * z <= reach
+        is_in &= key[1, first + i] != _EMPTY
+        # Into the image before they become whole, whatever they are: masked where they are not in.
+        row, column = whole(min(max(v, _ZERO), last_row)), whole(min(max(u, _ZERO), last_column))
+        pixels[i] = np.int32(np.int32(row * np.int32(shape[1])) + column) if is_in else np.int32(-1)
+        depths[i] = z
+
+
+@inlined_fused
+def _code_of(pixel, z, depth, slack):
+    """What a frame says of a row that lies in one of its pixels; see `codes_of_rows`."""
+    i, j = pixel // depth.shape[1], pixel % depth.shape[1]
     if depth[i, j] == _ZERO:
         return HOLE
-    # One edge of slack: a surface may lie anywhere within its voxel.
-    if depth[i, j] > _ZERO and z <= _farthest_around(depth, i, j) + numbers[_SIZE]:
+    if not depth[i, j] > _ZERO:
+        return 0
+    # One edge of slack: a surface may lie anywhere within its voxel. Mostly the pixel itself says
+    # so, which is farther than none of those around it.
+    if z <= depth[i, j] + slack or z <= _farthest_around(depth, i, j) + slack:
         return SHOWS
     return 0
 
@@ -82,11 +101,17 @@ def look_pass(key, numbers, depth, workers, codes, has_holes):
     sound = np.isfinite(numbers[_FX:]).all() and numbers[_SIZE] > _ZERO
     blocks = (num + _BLOCK - 1) // _BLOCK
     for worker in prange(workers):
+        pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
         for block in range(worker, blocks, workers):
-            for row in range(block * _BLOCK, min((block + 1) * _BLOCK, num)):
-                is_there = sound and key[1, row] != _EMPTY
-                code = _code_of(key, row, numbers, depth) if is_there else 0
-                codes[row] = code
+            first, size = block * _BLOCK, min(_BLOCK, num - block * _BLOCK)
+            pixels[:] = -1
+            if sound:
+                _project(key, first, size, numbers, depth.shape, pixels, depths)
+            for i in range(size):
+                code = 0
+                if pixels[i] >= 0:
+                    code = _code_of(np.int64(pixels[i]), depths[i], depth, numbers[_SIZE])
+                codes[first + i] = code
                 if code == HOLE:
                     holes[worker] = 1
     has_holes[0] = holes.max()
