@@ -2,12 +2,14 @@
 
 import contextlib
 import inspect
+import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from llvmlite import ir
 from numba import extending, njit, types
+from numba.core import cgutils
 
 _Function = Callable[..., Any]
 
@@ -123,3 +125,33 @@ def in_wide_vectors(typingctx: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(), codegen
+
+
+_FLUSH = 0x8040
+"""In the control word of SSE: numbers below 1e-38 are 0, read or written."""
+
+
+@intrinsic
+def flush_denormals(typingctx: Any) -> Any:
+    """Lets this thread take numbers below 1e-38 for 0, as XLA lets its own threads.
+
+    Numba's threads do not: what a kernel computes would depend on which thread computed it. To be
+    called by every worker of a kernel that XLA calls. Other processors than x86 are left alone.
+    """
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if platform.machine() in ("x86_64", "AMD64"):
+            word = cgutils.alloca_once(builder, ir.IntType(32))
+            kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer()])
+            address = builder.bitcast(word, kind.args[0])
+            builder.call(_declared(builder, kind, "llvm.x86.sse.stmxcsr"), [address])
+            flushing = builder.or_(builder.load(word), ir.Constant(ir.IntType(32), _FLUSH))
+            builder.store(flushing, word)
+            builder.call(_declared(builder, kind, "llvm.x86.sse.ldmxcsr"), [address])
+        return context.get_dummy_value()
+
+    return types.void(), codegen
+
+
+def _declared(builder: Any, kind: Any, name: str) -> Any:
+    return builder.module.globals.get(name) or ir.Function(builder.module, kind, name)

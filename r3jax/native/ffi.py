@@ -33,7 +33,7 @@ from r3jax.native.compiled import called_from_python, inlined, intrinsic
 _EXTENSION, _API = 8, 16
 _API_MINOR = 36  # in XLA_FFI_Api
 ARGUMENTS, RESULTS = 72, 112  # in XLA_FFI_CallFrame: arrays of pointers to buffers
-_DATA, _DIMENSIONS = 24, 40  # in XLA_FFI_Buffer
+_DATA, _RANK, _DIMENSIONS = 24, 32, 40  # in XLA_FFI_Buffer
 _EXTENSION_TYPE, _EXTENSION_METADATA = 8, 24
 _METADATA_MAJOR, _METADATA_MINOR = 24, 28  # in XLA_FFI_Metadata
 _IS_METADATA = 1
@@ -107,6 +107,16 @@ def floats1(frame, kind, index):
     """Views the index-th argument or result as float32 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_floats(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
+
+
+@inlined
+def floats_flat(frame, kind, index):
+    """Views the index-th argument or result, of any shape, as float32 with one axis."""
+    buffer = _buffer(frame, kind, index)
+    size = 1
+    for axis in range(_int64_at(buffer + _RANK)):
+        size *= _length(buffer, axis)
+    return carray(_floats(_int64_at(buffer + _DATA)), (size,))
 
 
 @inlined

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r3jax.native.platform import by_platform
+
 RADIUS = 5
 """The window of SSIM has 2 x 5 + 1 pixels a side."""
 
@@ -18,7 +20,38 @@ C1, C2 = 0.01**2, 0.03**2
 """Stabilizers of SSIM for colors in [0, 1] (Wang et al. 2004)."""
 
 _exponents = -0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2
-_TAPS = [float(w) for w in np.exp(_exponents) / np.exp(_exponents).sum()]
+TAPS = [float(w) for w in np.exp(_exponents) / np.exp(_exponents).sum()]
+
+
+def loss_and_error(
+    rgb: Float[Array, "H W 3"],
+    target: Float[Array, "H W 3"],
+    lambda_dssim: Float[Array, ""] | float,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The loss of an image, and the mean squared error of its colors clipped to [0, 1].
+
+    The loss can be differentiated by `rgb`.
+    """
+    return by_platform(cpu=_by_kernels, default=_by_formulas)(rgb, target, lambda_dssim)
+
+
+def _by_formulas(
+    rgb: Float[Array, "H W 3"],
+    target: Float[Array, "H W 3"],
+    lambda_dssim: Float[Array, ""] | float,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    error = jnp.mean((jnp.clip(rgb, 0.0, 1.0) - target) ** 2)
+    return photometric_loss(rgb, target, lambda_dssim), error
+
+
+def _by_kernels(
+    rgb: Float[Array, "H W 3"],
+    target: Float[Array, "H W 3"],
+    lambda_dssim: Float[Array, ""] | float,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    from r3jax.splatting.training.backends.numba import image_loss
+
+    return image_loss(rgb, target, lambda_dssim)
 
 
 def photometric_loss(
@@ -56,8 +89,8 @@ def blur(planes: Float[Array, "c H W"]) -> Float[Array, "c H W"]:
     """
     height, width = planes.shape[1:]
     padded = jnp.pad(planes, [(0, 0), (RADIUS, RADIUS), (RADIUS, RADIUS)])
-    rows = jnp.asarray(sum(w * padded[:, :, i : i + width] for i, w in enumerate(_TAPS)))
-    return jnp.asarray(sum(w * rows[:, i : i + height] for i, w in enumerate(_TAPS)))
+    rows = jnp.asarray(sum(w * padded[:, :, i : i + width] for i, w in enumerate(TAPS)))
+    return jnp.asarray(sum(w * rows[:, i : i + height] for i, w in enumerate(TAPS)))
 
 
 # The window is symmetric, so the blur is its own transpose; autodiff of the shifts is slower.

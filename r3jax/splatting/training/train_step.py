@@ -18,8 +18,8 @@ from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training import density, mcmc
 from r3jax.splatting.training.config import Schedule, TrainConfig
 from r3jax.splatting.training.density import DensityStatistics, empty_statistics
-from r3jax.splatting.training.loss import photometric_loss, psnr_of
-from r3jax.splatting.training.optimizer import Moments, adam_update, empty_moments, mean_rate
+from r3jax.splatting.training.loss import loss_and_error, psnr_of
+from r3jax.splatting.training.optimizer import Moments, empty_moments, guarded_update, mean_rate
 from r3jax.splatting.views import PosedImage, Views
 
 DONE, OVERFLOWN, DIVERGED = 0, 1, 2
@@ -128,31 +128,31 @@ def train_step(
     if config.strategy == "mcmc":
         extra, slope = jax.value_and_grad(mcmc.regularization)(state.scene, config)
         loss, gradient = loss + extra, jax.tree.map(jnp.add, gradient, slope)
-    is_finite = jnp.isfinite(loss + _squared_size(gradient) + _squared_size(state.scene))
-    bad = jnp.where(report.overflow > 0, OVERFLOWN, DIVERGED)
-    outcome = jnp.where((report.overflow == 0) & is_finite, DONE, bad)
-    gradient = _up_to_degree(gradient, state.step // schedule.sh_every)
     rate = mean_rate(config, extent, state.step + 1)
-    scene, moments = adam_update(
-        state.scene, gradient, state.moments, rate, config, outcome == DONE
+    scene, moments, is_done = guarded_update(
+        state.scene,
+        gradient,
+        state.moments,
+        rate,
+        state.step // schedule.sh_every,
+        config,
+        (report.overflow == 0) & jnp.isfinite(loss),
     )
+    keep: Callable[[Array, Array], Array] = lambda new, old: jnp.where(is_done, new, old)
     if config.strategy == "mcmc":
-        scene = mcmc.perturbed(scene, rate, config, key=_key(config, _NOISE, state.step))
-    after = TrainState(scene, moments, statistics, state.step + 1, state.dropped)
+        noisy = mcmc.perturbed(scene, rate, config, key=_key(config, _NOISE, state.step))
+        scene = jax.tree.map(keep, noisy, scene)
+    bad = jnp.where(report.overflow > 0, OVERFLOWN, DIVERGED)
     info = StepInfo(
-        outcome=outcome,
+        outcome=jnp.where(is_done, DONE, bad),
         loss=loss,
         psnr=psnr_of(report.mse),
         num_gaussians=jnp.sum(state.scene.is_alive, dtype=jnp.int32),
         num_intersections=report.num_intersections,
     )
-    keep: Callable[[Array, Array], Array] = lambda new, old: jnp.where(outcome == DONE, new, old)
-    return jax.tree.map(keep, after, state), info
-
-
-def _squared_size(scene: GaussianScene) -> Float[Array, ""]:
-    """Sum of all squares: not finite if any entry is not, or would overflow Adam's moments."""
-    return jnp.asarray(sum(jnp.vdot(x, x) for x in jax.tree.leaves(scene)))
+    statistics = jax.tree.map(keep, statistics, state.statistics)
+    step = keep(state.step + 1, state.step)
+    return TrainState(scene, moments, statistics, step, state.dropped), info
 
 
 def _gradients(
@@ -206,16 +206,8 @@ def _view_loss(
         config.raster,
         center_offsets=center_offsets,
     )
-    loss = photometric_loss(rendering.rgb, view.rgb, config.lambda_dssim)
-    mse = jnp.mean((jnp.clip(rendering.rgb, 0.0, 1.0) - view.rgb) ** 2)
+    loss, mse = loss_and_error(rendering.rgb, view.rgb, config.lambda_dssim)
     return loss, _ViewReport(mse, rendering.num_intersections, rendering.overflow)
-
-
-def _up_to_degree(gradient: GaussianScene, degree: Int[Array, ""]) -> GaussianScene:
-    """No gradient for harmonics above the degree: they stay as they are, 0 at first."""
-    k = jnp.arange(gradient.sh.shape[1])
-    sh = jnp.where((k < (degree + 1) ** 2)[None, :, None], gradient.sh, 0.0)
-    return eqx.tree_at(lambda s: s.sh, gradient, sh)
 
 
 def _in_view(scene: GaussianScene, view: PosedImage) -> Bool[Array, " n"]:
