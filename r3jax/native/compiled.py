@@ -51,13 +51,14 @@ def intrinsic(function: _Function) -> _Function:
 
 
 def kernel(function: _Function) -> _Function:
-    """Compiles a kernel to machine code; the disk keeps it for the next process.
+    """Compiles a kernel to machine code, together with the handler that calls it.
 
+    The disk keeps the handler, in which the kernel is: `ffi.register_handlers`.
     Floating-point operations stay as written: two passes that must take the same decisions
     (counting and listing intersections, blending and its gradient) then do.
     """
     # A type checker hooked into the import may have wrapped the function; Numba needs the bare one.
-    return njit(cache=True, error_model="numpy", **_BARE)(inspect.unwrap(function))
+    return njit(error_model="numpy", **_BARE)(inspect.unwrap(function))
 
 
 def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Function]:
@@ -72,9 +73,7 @@ def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Func
 
 def inlined(function: _Function) -> _Function:
     """Compiles a small function into its callers."""
-    return njit(cache=True, error_model="numpy", **_BARE, forceinline=True)(
-        inspect.unwrap(function)
-    )
+    return njit(error_model="numpy", **_BARE, forceinline=True)(inspect.unwrap(function))
 
 
 def inlined_fast(function: _Function) -> _Function:
@@ -82,21 +81,19 @@ def inlined_fast(function: _Function) -> _Function:
 
     NaN and infinity keep their meaning.
     """
-    compiler = njit(cache=True, error_model="numpy", **_BARE, forceinline=True, fastmath=_FAST)
+    compiler = njit(error_model="numpy", **_BARE, forceinline=True, fastmath=_FAST)
     return compiler(inspect.unwrap(function))
 
 
 def inlined_fused(function: _Function) -> _Function:
     """The same where LLVM may do no more than fuse a product with a sum."""
-    compiler = njit(
-        cache=True, error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"}
-    )
+    compiler = njit(error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"})
     return compiler(inspect.unwrap(function))
 
 
 def parallel_kernel(function: _Function) -> _Function:
     """Compiles a kernel whose `prange` loops share the cores that the process may use."""
-    return njit(cache=True, error_model="numpy", **_BARE, parallel=True)(inspect.unwrap(function))
+    return njit(error_model="numpy", **_BARE, parallel=True)(inspect.unwrap(function))
 
 
 @intrinsic

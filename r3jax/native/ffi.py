@@ -28,6 +28,7 @@ from numba.np.numpy_support import carray
 from numba.np.ufunc.parallel import threading_layer
 
 from r3jax.native.compiled import called_from_python, inlined, intrinsic
+from r3jax.native.one_piece import in_one_piece
 
 # Offsets in bytes in the structs of XLA's FFI, API version `version.WRITTEN_FOR`.
 _EXTENSION, _API = 8, 16
@@ -212,8 +213,14 @@ def _one_process_at_a_time(name: str) -> Generator[None]:
         yield
 
 
-def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> tuple[Any, ...]:
+def register_handlers(
+    handlers: dict[str, Callable[[Any], int]], *, part_by_part: bool = False
+) -> tuple[Any, ...]:
     """Compiles handlers (or takes them from the disk) and tells XLA of them by their names.
+
+    Args:
+        handlers: by their names.
+        part_by_part: see `in_one_piece`.
 
     Returns:
         What the caller must keep alive: XLA holds the addresses.
@@ -223,7 +230,7 @@ def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> tuple[Any, .
     """
     require_threads()
     compiler = cfunc(types.int64(types.int64), cache=True)
-    with _one_process_at_a_time("-".join(handlers)):
+    with _one_process_at_a_time("-".join(handlers)), in_one_piece(part_by_part=part_by_part):
         compiled = tuple(compiler(inspect.unwrap(handler)) for handler in handlers.values())
     for name, handler in zip(handlers, compiled, strict=True):
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler.address), platform="cpu")
