@@ -12,7 +12,7 @@ import numpy as np
 @contextlib.contextmanager
 def kernels_as_python() -> Generator[None]:
     """Modules of kernels that are loaded meanwhile stay Python."""
-    doubles = _python_compiler(), _numpy_arithmetic()
+    doubles = _python_compiler(), _numpy_arithmetic(), _numpy_lanes()
     with (
         mock.patch.dict(sys.modules, {double.__name__: double for double in doubles}),
         np.errstate(all="ignore"),
@@ -23,7 +23,7 @@ def kernels_as_python() -> Generator[None]:
 def _python_compiler() -> ModuleType:
     """Stands for `compiled.py`: kernels stay Python, the counter needs no atomics."""
     module = ModuleType("r3jax.native.compiled")
-    for name in ("kernel", "inlined", "inlined_fused", "parallel_kernel"):
+    for name in ("kernel", "inlined", "inlined_fast", "inlined_fused", "parallel_kernel"):
         setattr(module, name, lambda function: function)
 
     def claim(counter):
@@ -31,7 +31,10 @@ def _python_compiler() -> ModuleType:
         return int(counter[0]) - 1
 
     module.__dict__.update(
-        claim=claim, in_wide_vectors=lambda: None, intrinsic=lambda function: _plain_lowest_bit
+        claim=claim,
+        in_wide_vectors=lambda: None,
+        flush_denormals=lambda: None,
+        intrinsic=lambda function: _plain_lowest_bit,
     )
     return module
 
@@ -58,5 +61,33 @@ def _numpy_arithmetic() -> ModuleType:
         key_of=lambda distance, row: np.int64(int(bits_of(distance)) << 32 | int(row)),
         exp2=lambda power: np.exp2(max(power, single(-126.0))),
         log2=np.log2,
+    )
+    return module
+
+
+def _numpy_lanes() -> ModuleType:
+    """Stands for `lanes.py`: vectors of 16 floats are arrays."""
+    single, module = np.float32, ModuleType("r3jax.splatting.backends.numba.lanes")
+
+    def store(array, index, value, count=16):
+        array[index : index + count] = value[:count]
+
+    module.__dict__.update(
+        load=lambda array, index: array[index : index + 16].copy(),
+        store=store,
+        store12=lambda array, index, value: store(array, index, value, 12),
+        splat=lambda value: np.full(16, value, single),
+        lane_numbers=lambda: np.arange(16, dtype=single),
+        prefetch=lambda array, index: None,
+        any_above=lambda vector, level: bool((vector > level).any()),
+        fma=lambda a, b, c: single(1) * a * b + c,
+        quotient=lambda a, b: a / b,
+        root=np.sqrt,
+        keep_gt=lambda x, a, b: np.where(a > b, x, single(0)),
+        keep_ge=lambda x, a, b: np.where(a >= b, x, single(0)),
+        larger=lambda a, b: np.where(a > b, a, b),
+        smaller=lambda a, b: np.where(a < b, a, b),
+        exp2=np.exp2,
+        sums_of_10=lambda *v: np.array([x.sum() for x in v] + [0.0] * 6, single),
     )
     return module

@@ -65,6 +65,10 @@ def main(note: Path) -> None:
     from r3jax.splatting.backends.numba import bridge as splatting
 
     splatting.register()
+    from r3jax.splatting.training.backends.numba import bridge as training
+
+    for name in (training.LOSS, training.ADAM):
+        training.register(name)
     for name in (scoring.PIXELS, scoring.ROWS):
         scoring.register(name)
     note.parent.mkdir(parents=True, exist_ok=True)

@@ -2,12 +2,14 @@
 
 import contextlib
 import inspect
+import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from llvmlite import ir
 from numba import extending, njit, types
+from numba.core import cgutils
 
 _Function = Callable[..., Any]
 
@@ -49,13 +51,14 @@ def intrinsic(function: _Function) -> _Function:
 
 
 def kernel(function: _Function) -> _Function:
-    """Compiles a kernel to machine code; the disk keeps it for the next process.
+    """Compiles a kernel to machine code, together with the handler that calls it.
 
+    The disk keeps the handler, in which the kernel is: `ffi.register_handlers`.
     Floating-point operations stay as written: two passes that must take the same decisions
     (counting and listing intersections, blending and its gradient) then do.
     """
     # A type checker hooked into the import may have wrapped the function; Numba needs the bare one.
-    return njit(cache=True, error_model="numpy", **_BARE)(inspect.unwrap(function))
+    return njit(error_model="numpy", **_BARE)(inspect.unwrap(function))
 
 
 def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Function]:
@@ -70,9 +73,7 @@ def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Func
 
 def inlined(function: _Function) -> _Function:
     """Compiles a small function into its callers."""
-    return njit(cache=True, error_model="numpy", **_BARE, forceinline=True)(
-        inspect.unwrap(function)
-    )
+    return njit(error_model="numpy", **_BARE, forceinline=True)(inspect.unwrap(function))
 
 
 def inlined_fast(function: _Function) -> _Function:
@@ -80,21 +81,19 @@ def inlined_fast(function: _Function) -> _Function:
 
     NaN and infinity keep their meaning.
     """
-    compiler = njit(cache=True, error_model="numpy", **_BARE, forceinline=True, fastmath=_FAST)
+    compiler = njit(error_model="numpy", **_BARE, forceinline=True, fastmath=_FAST)
     return compiler(inspect.unwrap(function))
 
 
 def inlined_fused(function: _Function) -> _Function:
     """The same where LLVM may do no more than fuse a product with a sum."""
-    compiler = njit(
-        cache=True, error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"}
-    )
+    compiler = njit(error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"})
     return compiler(inspect.unwrap(function))
 
 
 def parallel_kernel(function: _Function) -> _Function:
     """Compiles a kernel whose `prange` loops share the cores that the process may use."""
-    return njit(cache=True, error_model="numpy", **_BARE, parallel=True)(inspect.unwrap(function))
+    return njit(error_model="numpy", **_BARE, parallel=True)(inspect.unwrap(function))
 
 
 @intrinsic
@@ -123,3 +122,33 @@ def in_wide_vectors(typingctx: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(), codegen
+
+
+_FLUSH = 0x8040
+"""In the control word of SSE: numbers below 1e-38 are 0, read or written."""
+
+
+@intrinsic
+def flush_denormals(typingctx: Any) -> Any:
+    """Lets this thread take numbers below 1e-38 for 0, as XLA lets its own threads.
+
+    Numba's threads do not: what a kernel computes would depend on which thread computed it. To be
+    called by every worker of a kernel that XLA calls. Other processors than x86 are left alone.
+    """
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if platform.machine() in ("x86_64", "AMD64"):
+            word = cgutils.alloca_once(builder, ir.IntType(32))
+            kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer()])
+            address = builder.bitcast(word, kind.args[0])
+            builder.call(_declared(builder, kind, "llvm.x86.sse.stmxcsr"), [address])
+            flushing = builder.or_(builder.load(word), ir.Constant(ir.IntType(32), _FLUSH))
+            builder.store(flushing, word)
+            builder.call(_declared(builder, kind, "llvm.x86.sse.ldmxcsr"), [address])
+        return context.get_dummy_value()
+
+    return types.void(), codegen
+
+
+def _declared(builder: Any, kind: Any, name: str) -> Any:
+    return builder.module.globals.get(name) or ir.Function(builder.module, kind, name)

@@ -28,12 +28,13 @@ from numba.np.numpy_support import carray
 from numba.np.ufunc.parallel import threading_layer
 
 from r3jax.native.compiled import called_from_python, inlined, intrinsic
+from r3jax.native.one_piece import in_one_piece
 
 # Offsets in bytes in the structs of XLA's FFI, API version `version.WRITTEN_FOR`.
 _EXTENSION, _API = 8, 16
 _API_MINOR = 36  # in XLA_FFI_Api
 ARGUMENTS, RESULTS = 72, 112  # in XLA_FFI_CallFrame: arrays of pointers to buffers
-_DATA, _DIMENSIONS = 24, 40  # in XLA_FFI_Buffer
+_DATA, _RANK, _DIMENSIONS = 24, 32, 40  # in XLA_FFI_Buffer
 _EXTENSION_TYPE, _EXTENSION_METADATA = 8, 24
 _METADATA_MAJOR, _METADATA_MINOR = 24, 28  # in XLA_FFI_Metadata
 _IS_METADATA = 1
@@ -107,6 +108,16 @@ def floats1(frame, kind, index):
     """Views the index-th argument or result as float32 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_floats(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
+
+
+@inlined
+def floats_flat(frame, kind, index):
+    """Views the index-th argument or result, of any shape, as float32 with one axis."""
+    buffer = _buffer(frame, kind, index)
+    size = 1
+    for axis in range(_int64_at(buffer + _RANK)):
+        size *= _length(buffer, axis)
+    return carray(_floats(_int64_at(buffer + _DATA)), (size,))
 
 
 @inlined
@@ -202,8 +213,14 @@ def _one_process_at_a_time(name: str) -> Generator[None]:
         yield
 
 
-def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> tuple[Any, ...]:
+def register_handlers(
+    handlers: dict[str, Callable[[Any], int]], *, part_by_part: bool = False
+) -> tuple[Any, ...]:
     """Compiles handlers (or takes them from the disk) and tells XLA of them by their names.
+
+    Args:
+        handlers: by their names.
+        part_by_part: see `in_one_piece`.
 
     Returns:
         What the caller must keep alive: XLA holds the addresses.
@@ -213,7 +230,7 @@ def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> tuple[Any, .
     """
     require_threads()
     compiler = cfunc(types.int64(types.int64), cache=True)
-    with _one_process_at_a_time("-".join(handlers)):
+    with _one_process_at_a_time("-".join(handlers)), in_one_piece(part_by_part=part_by_part):
         compiled = tuple(compiler(inspect.unwrap(handler)) for handler in handlers.values())
     for name, handler in zip(handlers, compiled, strict=True):
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler.address), platform="cpu")

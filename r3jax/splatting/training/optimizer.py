@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
+from r3jax.native.platform import by_platform
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
 
-_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 # Optax types any tree as its own union of arrays and mappings.
 _optax: Any = optax
@@ -53,6 +54,78 @@ def mean_rate(
     return extent * config.rate_means * jnp.asarray(ratio) ** done
 
 
+def guarded_update(
+    scene: GaussianScene,
+    gradient: GaussianScene,
+    moments: Moments,
+    rate_of_means: Float[Array, ""],
+    degree: Int[Array, ""],
+    config: TrainConfig,
+    is_wanted: Bool[Array, ""],
+) -> tuple[GaussianScene, Moments, Bool[Array, ""]]:
+    """One step of Adam, unless a parameter or a gradient is not finite.
+
+    Args:
+        scene: before.
+        gradient: by its parameters.
+        moments: before.
+        rate_of_means: learning rate of the centers [m].
+        degree: harmonics above it have no gradient: they stay as they are, 0 at first.
+        config: the other learning rates.
+        is_wanted: if not, nothing changes.
+
+    Returns:
+        Scene and moments after, and whether the step was done.
+    """
+    step = by_platform(cpu=_by_kernels, default=_by_formulas)
+    return step(scene, gradient, moments, rate_of_means, degree, config, is_wanted)
+
+
+def _by_formulas(
+    scene: GaussianScene,
+    gradient: GaussianScene,
+    moments: Moments,
+    rate_of_means: Float[Array, ""],
+    degree: Int[Array, ""],
+    config: TrainConfig,
+    is_wanted: Bool[Array, ""],
+) -> tuple[GaussianScene, Moments, Bool[Array, ""]]:
+    is_done = is_wanted & jnp.isfinite(_squared_size(gradient) + _squared_size(scene))
+    k = jnp.arange(gradient.sh.shape[1])
+    sh = jnp.where((k < (degree + 1) ** 2)[None, :, None], gradient.sh, 0.0)
+    gradient = eqx.tree_at(lambda s: s.sh, gradient, sh)
+    return *adam_update(scene, gradient, moments, rate_of_means, config, is_done), is_done
+
+
+def _squared_size(scene: GaussianScene) -> Float[Array, ""]:
+    """Sum of all squares: not finite if any entry is not, or would overflow Adam's moments."""
+    return jnp.asarray(sum(jnp.vdot(x, x) for x in jax.tree.leaves(scene)))
+
+
+def _by_kernels(
+    scene: GaussianScene,
+    gradient: GaussianScene,
+    moments: Moments,
+    rate_of_means: Float[Array, ""],
+    degree: Int[Array, ""],
+    config: TrainConfig,
+    is_wanted: Bool[Array, ""],
+) -> tuple[GaussianScene, Moments, Bool[Array, ""]]:
+    from r3jax.splatting.training.backends.numba import adam_step
+
+    rates = [rate_of_means, config.rate_quats, config.rate_log_scales, config.rate_opacities]
+    rates += [config.rate_sh, config.rate_sh * _HIGHER_HARMONICS]
+    count = (moments.count + 1).astype(jnp.float32)
+    (scene, mean, square), is_done = adam_step(
+        (scene, moments.mean, moments.square, gradient),
+        jnp.stack([jnp.float32(rate) for rate in rates]),
+        jnp.stack([1.0 / (1.0 - BETA1**count), 1.0 / (1.0 - BETA2**count)]),
+        (degree + 1) ** 2,
+        is_wanted,
+    )
+    return scene, Moments(mean, square, moments.count + is_done.astype(jnp.int32)), is_done
+
+
 def adam_update(
     scene: GaussianScene,
     gradient: GaussianScene,
@@ -68,12 +141,12 @@ def adam_update(
     tree = _optax.tree
     keep: Callable[[Array, Array], Array] = lambda new, old: jnp.where(is_applied, new, old)
     count = moments.count + 1
-    mean = tree.update_moment(gradient, moments.mean, _BETA1, 1)
-    square = tree.update_moment_per_elem_norm(gradient, moments.square, _BETA2, 2)
+    mean = tree.update_moment(gradient, moments.mean, BETA1, 1)
+    square = tree.update_moment_per_elem_norm(gradient, moments.square, BETA2, 2)
     mean = jax.tree.map(keep, mean, moments.mean)
     square = jax.tree.map(keep, square, moments.square)
-    mean_hat = tree.bias_correction(mean, _BETA1, count.astype(jnp.float32))
-    square_hat = tree.bias_correction(square, _BETA2, count.astype(jnp.float32))
+    mean_hat = tree.bias_correction(mean, BETA1, count.astype(jnp.float32))
+    square_hat = tree.bias_correction(square, BETA2, count.astype(jnp.float32))
     higher = jnp.ones((scene.sh.shape[1], 1)).at[1:].set(_HIGHER_HARMONICS)
     rates = {
         "means": rate_of_means,
@@ -85,7 +158,7 @@ def adam_update(
 
     def moved(name: str) -> Array:
         x, m, v = (getattr(tree, name) for tree in (scene, mean_hat, square_hat))
-        return keep(x - rates[name] * m / (jnp.sqrt(v) + _EPSILON), x)
+        return keep(x - rates[name] * m / (jnp.sqrt(v) + EPSILON), x)
 
     count = keep(count, moments.count)
     return GaussianScene(**{name: moved(name) for name in rates}), Moments(mean, square, count)

@@ -1,6 +1,4 @@
-"""One step of training, its loss, and one refinement: pure functions of the state, jitted.
-
-What is minimized is 0.8 L1 + 0.2 D-SSIM (Kerbl et al. 2023, eq. 7).
+"""One step of training, and one refinement: pure functions of the state, jitted.
 
 Shape symbols: n rows of the scene, v views, b views per step; H, W image size.
 """
@@ -11,7 +9,6 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from r3jax.geometry.cameras import invert_pose, project, transform
@@ -21,69 +18,9 @@ from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training import density, mcmc
 from r3jax.splatting.training.config import Schedule, TrainConfig
 from r3jax.splatting.training.density import DensityStatistics, empty_statistics
-from r3jax.splatting.training.optimizer import Moments, adam_update, empty_moments, mean_rate
+from r3jax.splatting.training.loss import loss_and_error, psnr_of
+from r3jax.splatting.training.optimizer import Moments, empty_moments, guarded_update, mean_rate
 from r3jax.splatting.views import PosedImage, Views
-
-RADIUS = 5
-"""The window of SSIM has 2 x 5 + 1 pixels a side."""
-
-SIGMA = 1.5
-"""Standard deviation of the window [px]."""
-
-C1, C2 = 0.01**2, 0.03**2
-"""Stabilizers of SSIM for colors in [0, 1] (Wang et al. 2004)."""
-
-_exponents = -0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2
-_TAPS = [float(w) for w in np.exp(_exponents) / np.exp(_exponents).sum()]
-
-
-def photometric_loss(
-    rgb: Float[Array, "H W 3"],
-    target: Float[Array, "H W 3"],
-    lambda_dssim: Float[Array, ""] | float,
-) -> Float[Array, ""]:
-    """(1 - lambda) L1 + lambda (1 - SSIM)."""
-    l1 = jnp.mean(jnp.abs(rgb - target))
-    return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - structural_similarity(rgb, target))
-
-
-def structural_similarity(
-    rgb: Float[Array, "H W 3"], target: Float[Array, "H W 3"]
-) -> Float[Array, ""]:
-    """Mean SSIM in [-1, 1] with an 11 x 11 Gaussian window, both images continued by zeros.
-
-    The zeros beyond the edge and the biased variances are those of the 3DGS trainer; the SSIM
-    that evaluates (evaluation) follows scikit-image instead.
-    """
-    x, y = jnp.moveaxis(rgb, -1, 0), jnp.moveaxis(target, -1, 0)
-    blurred = blur(jnp.concatenate([x, y, x * x, y * y, x * y]))
-    mean_x, mean_y, xx, yy, xy = (blurred[3 * i : 3 * i + 3] for i in range(5))
-    variances = (xx - mean_x * mean_x) + (yy - mean_y * mean_y)
-    covariance = xy - mean_x * mean_y
-    luminance = (2.0 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
-    return jnp.mean(luminance * (2.0 * covariance + C2) / (variances + C2))
-
-
-@jax.custom_vjp
-def blur(planes: Float[Array, "c H W"]) -> Float[Array, "c H W"]:
-    """Each plane under the Gaussian window, zeros beyond the edges.
-
-    Separable, as shifted sums: XLA's convolutions are 60 times slower on CPUs.
-    """
-    height, width = planes.shape[1:]
-    padded = jnp.pad(planes, [(0, 0), (RADIUS, RADIUS), (RADIUS, RADIUS)])
-    rows = jnp.asarray(sum(w * padded[:, :, i : i + width] for i, w in enumerate(_TAPS)))
-    return jnp.asarray(sum(w * rows[:, i : i + height] for i, w in enumerate(_TAPS)))
-
-
-# The window is symmetric, so the blur is its own transpose; autodiff of the shifts is slower.
-blur.defvjp(lambda planes: (blur(planes), None), lambda _, gradient: (blur(gradient),))
-
-
-def psnr_of(mse: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Peak signal-to-noise ratio [dB] of a mean squared error of colors in [0, 1]."""
-    return -10.0 * jnp.log10(jnp.maximum(mse, 1e-10))
-
 
 DONE, OVERFLOWN, DIVERGED = 0, 1, 2
 """Outcomes of a step. The state only advances with the first."""
@@ -191,31 +128,31 @@ def train_step(
     if config.strategy == "mcmc":
         extra, slope = jax.value_and_grad(mcmc.regularization)(state.scene, config)
         loss, gradient = loss + extra, jax.tree.map(jnp.add, gradient, slope)
-    is_finite = jnp.isfinite(loss + _squared_size(gradient) + _squared_size(state.scene))
-    bad = jnp.where(report.overflow > 0, OVERFLOWN, DIVERGED)
-    outcome = jnp.where((report.overflow == 0) & is_finite, DONE, bad)
-    gradient = _up_to_degree(gradient, state.step // schedule.sh_every)
     rate = mean_rate(config, extent, state.step + 1)
-    scene, moments = adam_update(
-        state.scene, gradient, state.moments, rate, config, outcome == DONE
+    scene, moments, is_done = guarded_update(
+        state.scene,
+        gradient,
+        state.moments,
+        rate,
+        state.step // schedule.sh_every,
+        config,
+        (report.overflow == 0) & jnp.isfinite(loss),
     )
+    keep: Callable[[Array, Array], Array] = lambda new, old: jnp.where(is_done, new, old)
     if config.strategy == "mcmc":
-        scene = mcmc.perturbed(scene, rate, config, key=_key(config, _NOISE, state.step))
-    after = TrainState(scene, moments, statistics, state.step + 1, state.dropped)
+        noisy = mcmc.perturbed(scene, rate, config, key=_key(config, _NOISE, state.step))
+        scene = jax.tree.map(keep, noisy, scene)
+    bad = jnp.where(report.overflow > 0, OVERFLOWN, DIVERGED)
     info = StepInfo(
-        outcome=outcome,
+        outcome=jnp.where(is_done, DONE, bad),
         loss=loss,
         psnr=psnr_of(report.mse),
         num_gaussians=jnp.sum(state.scene.is_alive, dtype=jnp.int32),
         num_intersections=report.num_intersections,
     )
-    keep: Callable[[Array, Array], Array] = lambda new, old: jnp.where(outcome == DONE, new, old)
-    return jax.tree.map(keep, after, state), info
-
-
-def _squared_size(scene: GaussianScene) -> Float[Array, ""]:
-    """Sum of all squares: not finite if any entry is not, or would overflow Adam's moments."""
-    return jnp.asarray(sum(jnp.vdot(x, x) for x in jax.tree.leaves(scene)))
+    statistics = jax.tree.map(keep, statistics, state.statistics)
+    step = keep(state.step + 1, state.step)
+    return TrainState(scene, moments, statistics, step, state.dropped), info
 
 
 def _gradients(
@@ -269,16 +206,8 @@ def _view_loss(
         config.raster,
         center_offsets=center_offsets,
     )
-    loss = photometric_loss(rendering.rgb, view.rgb, config.lambda_dssim)
-    mse = jnp.mean((jnp.clip(rendering.rgb, 0.0, 1.0) - view.rgb) ** 2)
+    loss, mse = loss_and_error(rendering.rgb, view.rgb, config.lambda_dssim)
     return loss, _ViewReport(mse, rendering.num_intersections, rendering.overflow)
-
-
-def _up_to_degree(gradient: GaussianScene, degree: Int[Array, ""]) -> GaussianScene:
-    """No gradient for harmonics above the degree: they stay as they are, 0 at first."""
-    k = jnp.arange(gradient.sh.shape[1])
-    sh = jnp.where((k < (degree + 1) ** 2)[None, :, None], gradient.sh, 0.0)
-    return eqx.tree_at(lambda s: s.sh, gradient, sh)
 
 
 def _in_view(scene: GaussianScene, view: PosedImage) -> Bool[Array, " n"]:

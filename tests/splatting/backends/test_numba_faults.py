@@ -1,12 +1,9 @@
 """Faults put into the kernels on purpose; every one must show in images, gradients or lists.
 
-The kernels run here as plain Python over NumPy, so that a fault costs no compilation; vectors of
-16 floats are arrays.
+The kernels run here as plain Python over NumPy, so that a fault costs no compilation.
 """
 
 import dataclasses
-import sys
-from types import ModuleType
 from unittest import mock
 
 import jax
@@ -21,6 +18,7 @@ from r3jax.splatting.config import ALPHA_MIN, TILE, RasterConfig
 from r3jax.splatting.information import pixel_squares, pixel_tallies
 from r3jax.splatting.projection import project_gaussians
 from tests.mutants import Modules, Mutant, assert_caught, each, load
+from tests.plain_kernels import kernels_as_python
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
 PACKAGE = "r3jax.splatting.backends.numba"
@@ -35,51 +33,9 @@ BEHIND = np.array([0.2, 0.7, 0.4], np.float32)
 LEAST = (0.3, 0.02)
 
 
-def python_compiler() -> ModuleType:
-    """Stands for `compiled.py`: kernels stay Python, the counter needs no atomics."""
-    module = ModuleType("r3jax.native.compiled")
-    for name in ("kernel", "inlined", "inlined_fast", "parallel_kernel"):
-        setattr(module, name, lambda function: function)
-
-    def claim(counter):
-        counter[0] += 1
-        return int(counter[0]) - 1
-
-    module.__dict__["claim"] = claim
-    return module
-
-
-def numpy_lanes() -> ModuleType:
-    """Stands for `lanes.py`."""
-    single, module = np.float32, ModuleType(f"{PACKAGE}.lanes")
-
-    def store(array, index, value, count=TILE):
-        array[index : index + count] = value[:count]
-
-    module.__dict__.update(
-        load=lambda array, index: array[index : index + TILE].copy(),
-        store=store,
-        store12=lambda array, index, value: store(array, index, value, 12),
-        splat=lambda value: np.full(TILE, value, single),
-        lane_numbers=lambda: np.arange(TILE, dtype=single),
-        prefetch=lambda array, index: None,
-        any_above=lambda vector, level: bool((vector > level).any()),
-        fma=lambda a, b, c: single(1) * a * b + c,
-        quotient=lambda a, b: a / b,
-        keep_gt=lambda x, a, b: np.where(a > b, x, single(0)),
-        keep_ge=lambda x, a, b: np.where(a >= b, x, single(0)),
-        larger=lambda a, b: np.where(a > b, a, b),
-        smaller=lambda a, b: np.where(a < b, a, b),
-        exp2=np.exp2,
-        sums_of_10=lambda *v: np.array([x.sum() for x in v] + [0.0] * 6, single),
-    )
-    return module
-
-
 @pytest.fixture(autouse=True, scope="module")
 def plain_python():
-    doubles = python_compiler(), numpy_lanes()
-    with mock.patch.dict(sys.modules, {double.__name__: double for double in doubles}):
+    with kernels_as_python():
         yield
 
 

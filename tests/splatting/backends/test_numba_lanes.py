@@ -26,6 +26,7 @@ def _operate(a, b, c, out):
         lanes.smaller(x, y),
         2.0 * x - np.float32(3.0),
         lanes.splat(a[3]) + lanes.lane_numbers(),
+        lanes.root(x * x),
         lanes.exp2(lanes.larger(x, lanes.splat(-30.0))),
     )
     k = 0
@@ -37,7 +38,7 @@ def _operate(a, b, c, out):
 
 @given(rows, rows, rows)
 def test_lanes_are_numpy(a, b, c):
-    out = np.empty((12, 16), np.float32)
+    out = np.empty((13, 16), np.float32)
     above = _operate(a, b, c, out.reshape(-1))
     expected = [
         a + b,
@@ -51,6 +52,7 @@ def test_lanes_are_numpy(a, b, c):
         np.minimum(a, b),
         2 * a - 3,
         a[3] + np.arange(16),
+        np.abs(a),
         np.exp2(np.maximum(a, -30).astype(np.float64)),
     ]
     scale = np.abs(a * b) + np.abs(c) + np.abs(a).max() + 16.0  # of the terms that may cancel
@@ -89,11 +91,11 @@ def test_sums_of_ten_vectors(values):
 
 def test_what_is_not_a_number_is_not_kept():
     a = np.where(np.arange(16) % 2 == 0, np.nan, 1.0).astype(np.float32)
-    out = np.empty((12, 16), np.float32)
+    out = np.empty((13, 16), np.float32)
     zero, one = np.zeros(16, np.float32), np.ones(16, np.float32)
     _operate(a, zero, one, out.reshape(-1))
     kept = np.where(np.isnan(a), 0.0, 1.0)
     np.testing.assert_array_equal(out[5], kept)  # greater
     np.testing.assert_array_equal(out[6], kept)  # greater or equal
     np.testing.assert_array_equal(out[7], np.where(np.isnan(a), 0.0, 1.0))  # the second, 0
-    np.testing.assert_allclose(out[11][np.isnan(a)], 2.0**-30, rtol=1e-6)
+    np.testing.assert_allclose(out[12][np.isnan(a)], 2.0**-30, rtol=1e-6)

@@ -74,6 +74,14 @@ def _call(builder, name, *vectors):
     return builder.call(function, vectors)
 
 
+def _unary(emit):
+    @intrinsic
+    def operation(typingctx, a):
+        return LANES(a), _code(emit)
+
+    return operation
+
+
 def _binary(emit):
     @intrinsic
     def operation(typingctx, a, b):
@@ -110,6 +118,8 @@ _mul = _binary(lambda builder, a, b: builder.fmul(a, b))
 quotient = _binary(lambda builder, a, b: builder.fdiv(a, b, flags=("arcp",)))
 fma = _ternary(lambda builder, a, b, c: _call(builder, "fmuladd", a, b, c))
 """a b + c, in one instruction where the machine has it."""
+root = _unary(lambda builder, a: _call(builder, "sqrt", a))
+"""Square root."""
 keep_gt = _ternary(_keep(">"))
 """x where a > b, else 0: also where one of them is NaN."""
 keep_ge = _ternary(_keep(">="))

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy.ndimage import convolve
 from skimage.metrics import structural_similarity as skimage_ssim
 
-from r3jax.splatting.training import train_step
+from r3jax.splatting.training import loss
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 HEIGHT, WIDTH = 24, 20
-CHAIN = ("r3jax.splatting.training.train_step",)
+CHAIN = ("r3jax.splatting.training.loss",)
 
 
 def images(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -65,14 +65,14 @@ def test_the_oracle_is_scikit_image_away_from_the_edges():
 def law_loss_equals_the_oracle(modules: Modules) -> None:
     for seed, weight in ((1, 0.2), (2, 0.0), (3, 1.0)):
         x, y = images(seed)
-        ours = modules["train_step"].photometric_loss(float32(x), float32(y), weight)
+        ours = modules["loss"].photometric_loss(float32(x), float32(y), weight)
         assert abs(float(ours) - loss64(x, y, weight)) < 2e-6
 
 
 def law_gradient_equals_finite_differences(modules: Modules) -> None:
     x, y = images(4)
-    loss = modules["train_step"].photometric_loss
-    gradient = jax.jit(jax.grad(lambda image: loss(image, float32(y), 0.2)))(float32(x))
+    objective = modules["loss"].photometric_loss
+    gradient = jax.jit(jax.grad(lambda image: objective(image, float32(y), 0.2)))(float32(x))
     # Corner, edge and middle; the step stays on one side of |x - y| = 0.
     for pixel in ((0, 0, 0), (0, 7, 1), (12, 10, 2), (23, 19, 0), (5, 18, 1)):
         step = np.zeros_like(x)
@@ -90,14 +90,12 @@ def test_law(law):
 
 
 MUTANTS = [
-    Mutant("train_step", "SIGMA = 1.5", "SIGMA = 1.6", law_loss_equals_the_oracle),
-    Mutant("train_step", "RADIUS = 5", "RADIUS = 4", law_loss_equals_the_oracle),
-    Mutant("train_step", "0.01**2, 0.03**2", "0.03**2, 0.01**2", law_loss_equals_the_oracle),
-    Mutant("train_step", "* (2.0 * covariance", "* (covariance", law_loss_equals_the_oracle),
-    Mutant("train_step", "(1.0 - lambda_dssim) * l1", "l1", law_loss_equals_the_oracle),
-    Mutant(
-        "train_step", "(blur(gradient),)", "(gradient,)", law_gradient_equals_finite_differences
-    ),
+    Mutant("loss", "SIGMA = 1.5", "SIGMA = 1.6", law_loss_equals_the_oracle),
+    Mutant("loss", "RADIUS = 5", "RADIUS = 4", law_loss_equals_the_oracle),
+    Mutant("loss", "0.01**2, 0.03**2", "0.03**2, 0.01**2", law_loss_equals_the_oracle),
+    Mutant("loss", "* (2.0 * covariance", "* (covariance", law_loss_equals_the_oracle),
+    Mutant("loss", "(1.0 - lambda_dssim) * l1", "l1", law_loss_equals_the_oracle),
+    Mutant("loss", "(blur(gradient),)", "(gradient,)", law_gradient_equals_finite_differences),
 ]
 
 
@@ -109,20 +107,20 @@ def test_mutant_is_caught(mutant):
 @given(st.integers(0, 2**31))
 def test_equal_images_have_no_loss_and_others_have_some(seed):
     x, y = (float32(image) for image in images(seed))
-    loss = jax.jit(train_step.photometric_loss)
-    assert abs(float(loss(x, x, 0.2))) < 1e-6
-    assert float(loss(x, y, 0.2)) > 0.01
+    objective = jax.jit(loss.photometric_loss)
+    assert abs(float(objective(x, x, 0.2))) < 1e-6
+    assert float(objective(x, y, 0.2)) > 0.01
 
 
 @given(st.integers(0, 2**31))
 def test_the_blur_is_its_own_transpose(seed):
     a, b = np.random.default_rng(seed).normal(size=(2, 3, HEIGHT, WIDTH))
     a, b = float32(a), float32(b)
-    blur = jax.jit(train_step.blur)
+    blur = jax.jit(loss.blur)
     left, right = jnp.vdot(blur(a), b), jnp.vdot(a, blur(b))
     np.testing.assert_allclose(left, right, atol=1e-3)
 
 
 def test_psnr_of_known_errors():
     mse = jnp.array([1.0, 0.1, 0.01, 0.0])
-    np.testing.assert_allclose(train_step.psnr_of(mse), [0.0, 10.0, 20.0, 100.0], atol=1e-4)
+    np.testing.assert_allclose(loss.psnr_of(mse), [0.0, 10.0, 20.0, 100.0], atol=1e-4)
