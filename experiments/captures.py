@@ -63,8 +63,8 @@ REFERENCE = "active-gs"
 
 POLICIES = (REFERENCE, "r3con", "ours-pano", "ours-ahead")
 
-CAPTURES = {"capture_every": 0.3}
-ON_THE_WAY = {"capture_every": 0.3, "plan_while_moving": True}
+CAPTURES: dict[str, Any] = {"capture_every": 0.3}
+ON_THE_WAY: dict[str, Any] = {"capture_every": 0.3, "plan_while_moving": True}
 
 MODES: dict[str, dict[str, Any]] = {
     "": {},
@@ -81,7 +81,7 @@ LENGTHS: dict[str, dict[str, Any]] = {
 """Trainings: the suite's, a longer one, and one that may also grow further."""
 
 
-def _gaze(loop: Mapping[str, Any]) -> Row:
+def _gaze(loop: dict[str, Any]) -> Row:
     return Row("ours-ahead", "panorama, every 0.3 m", loop=ON_THE_WAY | loop)
 
 
