@@ -157,6 +157,8 @@ def main(options: Options) -> Path:
         as_line(record, label, rows)
         for label, own in cells.items()
         for record in read_records(root, own)
+        # A cell may have been judged at other times, too, when another table asked for it.
+        if record["snapshot"] in own[0].conditions.snapshots
     ]
     folder = options.out / NAME / options.size
     write_page(folder, options.table, rows, records, origin(f"experiments.{NAME}", records))

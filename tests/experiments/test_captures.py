@@ -107,3 +107,24 @@ def test_what_differs_in_its_training_only_takes_over_the_flight(tmp_path, monke
     copied = paths_of(tmp_path, long).run
     assert (copied / "frame.png").read_text() == short.identity_hash
     assert not (copied / "models").exists()  # those are of the other training
+
+
+def test_a_table_holds_the_times_that_were_asked_for(tmp_path, monkeypatch):
+    """Another table may have asked for more of the same cell."""
+    conditions = Conditions(budget="seconds:60", snapshots=("seconds:60",))
+    cell = Cell("flat", "a", "ours-ahead", 0, conditions, "b", 9)
+    found = [
+        record("", 0, [1.0], 1, snapshot=snapshot, sensing={}, training={})
+        for snapshot in ("seconds:30", "seconds:60")
+    ]
+    written = []
+    monkeypatch.setattr(captures, "cells_of", lambda options, row, root: [cell])
+    monkeypatch.setattr(captures, "run_in_turn", lambda cells, root, options: None)
+    monkeypatch.setattr(captures, "read_records", lambda root, cells: found)
+    monkeypatch.setattr(captures, "origin", lambda name, records: None)
+    monkeypatch.setattr(
+        captures, "write_page", lambda folder, table, rows, records, source: written.extend(records)
+    )
+    captures.main(Options(table="gaze", rows=("blend, every 0.3 m",), work=tmp_path, out=tmp_path))
+    assert [line["snapshot"] for line in written] == ["seconds:60"]
+    assert written[0]["policy"] == "blend, every 0.3 m"
