@@ -81,8 +81,9 @@ LENGTHS: dict[str, dict[str, Any]] = {
 """Trainings: the suite's, a longer one, and one that may also grow further."""
 
 
-def _gaze(loop: dict[str, Any]) -> Row:
-    return Row("ours-ahead", "panorama, every 0.3 m", loop=ON_THE_WAY | loop)
+def _gaze(loop: dict[str, Any], length: str = "1500 iterations") -> Row:
+    against = f"panorama, every 0.3 m, {length}"
+    return Row("ours-ahead", against, loop=ON_THE_WAY | loop, training=LENGTHS[length])
 
 
 TABLES: dict[TableName, dict[str, Row]] = {
@@ -94,11 +95,16 @@ TABLES: dict[TableName, dict[str, Row]] = {
     },
     # Where the camera looks on the way, and how often.
     "gaze": {
-        "panorama, every 0.3 m": _gaze({}),
-        "planned, every 0.3 m": _gaze({"gaze": "planned"}),
-        "blend, every 0.3 m": _gaze({"gaze": "blend"}),
-        "ahead, every 0.3 m": _gaze({"gaze": "ahead"}),
-        "panorama, every 0.15 m": _gaze({"capture_every": 0.15}),
+        "panorama, every 0.3 m, 1500 iterations": _gaze({}),
+        "planned, every 0.3 m, 1500 iterations": _gaze({"gaze": "planned"}),
+        "blend, every 0.3 m, 1500 iterations": _gaze({"gaze": "blend"}),
+        "ahead, every 0.3 m, 1500 iterations": _gaze({"gaze": "ahead"}),
+        "panorama, every 0.15 m, 1500 iterations": _gaze({"capture_every": 0.15}),
+        # More frames need longer trainings.
+        "panorama, every 0.3 m, 6000 iterations": _gaze({}, "6000 iterations"),
+        "panorama, every 0.15 m, 6000 iterations": _gaze(
+            {"capture_every": 0.15}, "6000 iterations"
+        ),
     },
     # A camera that turns at most 90 degrees a second, instead of in no time.
     "turning": {
