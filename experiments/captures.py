@@ -1,24 +1,30 @@
-"""At equal time: every policy blind between its views, with captures, and planning while it moves.
+"""At equal time: what looking on the way, gaze, spacing, turning, and longer trainings are worth.
 
-    python -m experiments.captures --size small --scenes flat office --seeds 0
+    python -m experiments.captures modes --size small --scenes flat office --seeds 0
+    python -m experiments.captures gaze --size small --scenes flat office --seeds 0
 
-The mission clock is the model's: a decision 0.3 s, one reconsidered on arrival 0.05 s, a frame
-0.02 s, a gaze 0.01 s, 1 m/s, turns for nothing. Whoever does not look or plan on the way flies as
-published. What is done in `--work` is not done again.
+A table is a list of rows, each a policy under settings that differ from the suite's, and each is
+compared on the same test views with the row that it changes. The mission clock is the model's: a
+decision 0.3 s, one reconsidered on arrival 0.05 s, a frame 0.02 s, a gaze 0.01 s, 1 m/s, turns for
+nothing. Whoever does not look or plan on the way flies as published. What is done in `--work` is
+not done again, and what differs in its training only is not flown again.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
 from experiments.pages.artifacts import Origin, markdown_table, write_csv, write_markdown
 from experiments.suite import Options as SuiteOptions
-from experiments.suite import Records, by_method_and_scene, origin, request_of, run_requests
-from r3jax.apps.benchmark.plan import Request
+from experiments.suite import Records, origin, request_of, run_cells
+from r3jax.apps.benchmark.cells import Cell, paths_of
+from r3jax.apps.benchmark.plan import make_plan
+from r3jax.apps.benchmark.record import read_records
 from r3jax.evaluation.comparison import (
     check_equal_terms,
     scores_by_method,
@@ -29,112 +35,257 @@ from r3jax.evaluation.statistics import paired_difference
 
 NAME = "captures"
 
+TableName = Literal["modes", "gaze", "turning", "r3con", "training"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table: who flies, how, and what it is compared with."""
+
+    policy: str
+    """Who chooses the views."""
+
+    against: str = ""
+    """The row whose scores are subtracted; empty: none."""
+
+    planner: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Settings of the policy that differ from its defaults (`Request.settings`)."""
+
+    loop: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Settings of the mission that differ from the suite's (`Conditions.loop`)."""
+
+    training: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Fields of `Conditions` that concern the training, where they differ from the suite's."""
+
+
 REFERENCE = "active-gs"
-"""As published: key frames only. The others are compared with it on the same test views."""
+"""As published: key frames only."""
+
+POLICIES = (REFERENCE, "r3con", "ours-pano", "ours-ahead")
+
+CAPTURES: dict[str, Any] = {"capture_every": 0.3}
+ON_THE_WAY: dict[str, Any] = {"capture_every": 0.3, "plan_while_moving": True}
 
 MODES: dict[str, dict[str, Any]] = {
     "": {},
-    "captures": {"capture_every": 0.3},
-    "captures, plans on the way": {"capture_every": 0.3, "plan_while_moving": True},
+    ", captures": CAPTURES,
+    ", captures, plans on the way": ON_THE_WAY,
 }
 """What a policy does on the way, and the settings of the loop for it."""
+
+LENGTHS: dict[str, dict[str, Any]] = {
+    "1500 iterations": {},
+    "6000 iterations": {"iterations": 6000},
+    "6000 iterations, 80,000 Gaussians": {"iterations": 6000, "capacity": 80_000},
+}
+"""Trainings: the suite's, a longer one, and one that may also grow further."""
+
+
+def _gaze(loop: dict[str, Any], length: str = "1500 iterations") -> Row:
+    against = f"panorama, every 0.3 m, {length}"
+    return Row("ours-ahead", against, loop=ON_THE_WAY | loop, training=LENGTHS[length])
+
+
+TABLES: dict[TableName, dict[str, Row]] = {
+    # Every policy blind between its views, with captures, and planning while it moves.
+    "modes": {
+        policy + mode: Row(policy, REFERENCE, loop=loop)
+        for policy in POLICIES
+        for mode, loop in MODES.items()
+    },
+    # Where the camera looks on the way, and how often.
+    "gaze": {
+        "panorama, every 0.3 m, 1500 iterations": _gaze({}),
+        "planned, every 0.3 m, 1500 iterations": _gaze({"gaze": "planned"}),
+        "blend, every 0.3 m, 1500 iterations": _gaze({"gaze": "blend"}),
+        "ahead, every 0.3 m, 1500 iterations": _gaze({"gaze": "ahead"}),
+        "panorama, every 0.15 m, 1500 iterations": _gaze({"capture_every": 0.15}),
+        # More frames need longer trainings.
+        "panorama, every 0.3 m, 6000 iterations": _gaze({}, "6000 iterations"),
+        "panorama, every 0.15 m, 6000 iterations": _gaze(
+            {"capture_every": 0.15}, "6000 iterations"
+        ),
+    },
+    # A camera that turns at most 90 degrees a second, instead of in no time.
+    "turning": {
+        policy + mode: Row(
+            policy, REFERENCE, {"motion": {"speed": 1.0, "turn_rate": 90.0}}, MODES[mode]
+        )
+        for policy in (REFERENCE, "ours-ahead")
+        for mode in ("", ", captures, plans on the way")
+    },
+    # The rule of the paper's own code, and each of its parts exchanged for that of `ours-pano`.
+    "r3con": {
+        "r3con": Row("r3con", "ours-pano"),
+        "r3con, 16 for a cell instead of 1000": Row("r3con", "r3con", {"cell_weight": 16.0}),
+        "r3con, path weight 0.5 instead of adaptive": Row("r3con", "r3con", {"path_weight": 0.5}),
+        "r3con, utility of the view instead of all round": Row(
+            "r3con", "r3con", {"all_round": False}
+        ),
+        "ours-pano": Row("ours-pano"),
+        "ours-pano, candidates of r3con": Row(
+            "ours-pano", "ours-pano", {"num_candidates": 50, "radius": 2.0, "num_frontier": 0}
+        ),
+    },
+    # The same flights, trained for longer.
+    "training": {
+        f"{policy}{mode}, {length}": Row(
+            policy, f"{REFERENCE}, {length}", loop=MODES[mode], training=training
+        )
+        for length, training in LENGTHS.items()
+        for policy, mode in ((REFERENCE, ""), ("ours-ahead", ", captures, plans on the way"))
+    },
+}
 
 
 @dataclass(frozen=True)
 class Options(SuiteOptions):
     """What is compared."""
 
-    policies: tuple[str, ...] = ("active-gs", "r3con", "ours-pano", "ours-ahead")
-    """Who chooses the views."""
+    table: Annotated[TableName, tyro.conf.Positional] = "modes"
+    """Which table."""
 
-    modes: tuple[str, ...] = tuple(MODES)
-    """What they do on the way."""
+    rows: tuple[str, ...] = ()
+    """Rows of it other than all; `--policies` leaves those of others out, too."""
+
+    seconds: tuple[int, ...] = ()
+    """Times at which models are trained and judged, other than the size's; the flight stays."""
 
 
 def main(options: Options) -> Path:
     """Runs what is left of the cells, writes the page, and returns the folder of the results."""
-    records = run_modes(options)
+    rows = rows_of(options)
+    root = options.work / f"{options.size}-seconds"
+    root.mkdir(parents=True, exist_ok=True)
+    cells = {label: cells_of(options, row, root) for label, row in rows.items()}
+    run_in_turn([cell for own in cells.values() for cell in own], root, options)
+    records = [
+        as_line(record, label, rows)
+        for label, own in cells.items()
+        for record in read_records(root, own)
+        # A cell may have been judged at other times, too, when another table asked for it.
+        if record["snapshot"] in own[0].conditions.snapshots
+    ]
     folder = options.out / NAME / options.size
-    write_page(folder, records, origin(f"experiments.{NAME}", records))
+    write_page(folder, options.table, rows, records, origin(f"experiments.{NAME}", records))
     print(f"results  {folder}")
     return folder
 
 
-def requests_of(options: Options) -> list[Request]:
-    """What the benchmark is asked for, mode by mode.
+def rows_of(options: Options) -> dict[str, Row]:
+    """The rows of the table that are asked for.
 
     Raises:
-        ValueError: a mode that is none, or without the one that all are compared with.
+        ValueError: a row that is none of the table's, or none is left.
     """
-    unknown = sorted(set(options.modes) - set(MODES))
+    table = TABLES[options.table]
+    unknown = sorted(set(options.rows) - set(table))
     if unknown:
-        raise ValueError(f"--modes {unknown[0]!r} is none of {list(MODES)}")
-    if "" not in options.modes:
-        # Else a policy that looks on the way would pass for the one as published.
-        raise ValueError("--modes must contain '', key frames only: all are compared with it")
-    common = request_of(options, "seconds")
+        raise ValueError(f"--rows {unknown[0]!r} is none of {list(table)}")
+    chosen = {
+        label: row
+        for label, row in table.items()
+        if label in (options.rows or table) and row.policy in (options.policies or [row.policy])
+    }
+    if not chosen:
+        raise ValueError(f"the table {options.table!r} has no row of {options.policies}")
+    return chosen
+
+
+def cells_of(options: Options, row: Row, root: Path) -> list[Cell]:
+    """A row's cells: every scene and seed."""
+    request = request_of(replace(options, policies=(row.policy,)), "seconds")
     # The model clock: the same run on every machine, whatever else it does meanwhile.
-    conditions = [
-        replace(common.conditions, clock="model", loop=common.conditions.loop | MODES[mode])
-        for mode in options.modes
-    ]
-    return [replace(common, conditions=each) for each in conditions]
+    conditions = replace(request.conditions, clock="model", loop=dict(row.loop), **row.training)
+    if options.seconds:
+        snapshots = tuple(f"seconds:{amount}" for amount in options.seconds)
+        conditions = replace(conditions, snapshots=snapshots)
+    asked = replace(request, conditions=conditions, settings=dict(row.planner))
+    return list(make_plan(asked, root))
 
 
-def run_modes(options: Options) -> Records:
-    """Runs what is left; the mode stands among the settings of the policy, for its name."""
-    # What is compared here is no unequal term: the tables' own check would refuse it.
-    compared = {name for settings in MODES.values() for name in settings}
-    found: list[Mapping[str, Any]] = []
-    for mode, request in zip(options.modes, requests_of(options), strict=True):
-        _, _, records = run_requests(options, "seconds", [request])
-        for record in records:
-            settings = record["settings"] | ({"on the way": mode} if mode else {})
-            sensing = {k: v for k, v in record["sensing"].items() if k not in compared}
-            found.append({**record, "settings": settings, "sensing": sensing})
-    return with_short_names(found)
+def run_in_turn(cells: Sequence[Cell], root: Path, options: Options) -> None:
+    """Runs cells; one that differs in its training only from another takes over its flight."""
+    unique = {cell.identity_hash: cell for cell in cells}
+    flown: dict[str, Cell] = {}
+    for cell in unique.values():
+        first = flown.setdefault(_flight(cell), cell)
+        run, other = paths_of(root, cell).run, paths_of(root, first).run
+        if first is not cell and not run.exists():
+            run_cells([first], root, engine=options.engine, jobs=options.jobs)
+            # Under another name first: whatever has its right name is whole.
+            half = run.with_name("run-copied")
+            shutil.rmtree(half, ignore_errors=True)
+            shutil.copytree(other, half, ignore=shutil.ignore_patterns("models"))
+            half.rename(run)
+    run_cells(list(unique.values()), root, engine=options.engine, jobs=options.jobs)
 
 
-def write_page(folder: Path, records: Records, source: Origin) -> None:
-    """Writes a table for every snapshot, and the differences from the reference."""
+def _flight(cell: Cell) -> str:
+    """What the exploration depends on: the same for cells that differ in their training only."""
+    conditions = replace(cell.conditions, iterations=1, gaussians=1, capacity=1, trainer={})
+    return replace(cell, conditions=conditions).identity_hash
+
+
+def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> dict[str, Any]:
+    """A record under its row's name; what rows differ in on purpose is no unequal term."""
+    compared = {name for row in rows.values() for name in (*row.loop, *row.training)}
+    parts = {
+        part: {name: value for name, value in record[part].items() if name not in compared}
+        for part in ("sensing", "training")
+    }
+    return {**record, **parts, "policy": label, "settings": {}}
+
+
+def write_page(
+    folder: Path, table: TableName, rows: Mapping[str, Row], records: Records, source: Origin
+) -> None:
+    """Writes a table for every snapshot, and the differences from the rows' references."""
     folder.mkdir(parents=True, exist_ok=True)
+    records = with_short_names(records)
     page: list[str] = []
     for snapshot in snapshots_of(records):
         now = [record for record in records if record["snapshot"] == snapshot]
         check_equal_terms(now)
-        rows = quality_rows(now)
-        write_csv(folder / f"{snapshot.replace(':', '_')}.csv", rows, source)
+        lines = quality_rows(rows, now)
+        write_csv(folder / f"{table}_{snapshot.replace(':', '_')}.csv", lines, source)
         page += [
             f"**After {snapshot.partition(':')[2]} s**: PSNR in dB, in brackets the 5th percentile "
-            "of the test views, then frames, means over seeds; and PSNR minus that of "
-            f"{REFERENCE} with key frames only on the same test views, with its interval of 95 %",
-            markdown_table(rows),
+            "of the test views, then frames, means over seeds; and PSNR minus that of another row "
+            "on the same test views, with its interval of 95 %",
+            markdown_table(lines),
         ]
-    write_markdown(folder / f"{NAME}.md", page, source)
+    write_markdown(folder / f"{table}.md", page, source)
 
 
-def quality_rows(records: Records) -> list[dict[str, str]]:
-    """A line per method: every scene, the mean over them, and the difference from the reference."""
+def quality_rows(rows: Mapping[str, Row], records: Records) -> list[dict[str, str]]:
+    """A line per row: every scene, the mean over them, and the difference from another row."""
     scores = scores_by_method(records, "psnr")
-    rows: dict[str, dict[str, str]] = {}
-    frames = [record["exploration"]["views"] for record in records]
-    for method, scene, mine in by_method_and_scene(records, frames):
-        values = scores[method][scene]
-        low = float(np.mean(np.percentile(values, 5, axis=1)))
-        row = rows.setdefault(method, {"method": method})
-        row[scene] = f"{values.mean():.2f} [{low:.1f}] / {np.mean(mine):.0f}"
-    for method, row in rows.items():
-        mine = scores[method]
-        row["mean"] = f"{np.mean([values.mean() for values in mine.values()]):.2f}"
-        row[f"minus {REFERENCE}"] = _difference(mine, scores.get(REFERENCE))
-    return list(rows.values())
+    lines: list[dict[str, str]] = []
+    for label, row in rows.items():
+        mine = scores[label]
+        line = {"row": label}
+        for scene, values in mine.items():
+            frames = [
+                record["exploration"]["views"]
+                for record in records
+                if (record["policy"], record["scene"]) == (label, scene)
+            ]
+            low = float(np.mean(np.percentile(values, 5, axis=1)))
+            line[scene] = f"{values.mean():.2f} [{low:.1f}] / {np.mean(frames):.0f}"
+        line["mean"] = f"{np.mean([values.mean() for values in mine.values()]):.2f}"
+        line["difference"] = _difference(mine, row.against, scores, label)
+        lines.append(line)
+    return lines
 
 
-def _difference(mine: dict[str, np.ndarray], reference: dict[str, np.ndarray] | None) -> str:
-    if reference is None or mine is reference:
+def _difference(
+    mine: dict[str, np.ndarray], against: str, scores: Mapping[str, Any], label: str
+) -> str:
+    if against not in scores or against == label:
         return ""
-    found = paired_difference(mine, reference)
-    return f"{found.value:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
+    found = paired_difference(mine, scores[against])
+    return f"{found.value:+.2f} [{found.low:+.2f}, {found.high:+.2f}] to {against}"
 
 
 if __name__ == "__main__":

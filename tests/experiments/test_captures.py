@@ -1,43 +1,134 @@
-"""The table of frames on the way: modes apart, numbers by hand."""
+"""The tables of frames on the way: what each row flies, and the numbers of a table by hand."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.captures import MODES, Options, quality_rows, requests_of
+from experiments import captures
+from experiments.captures import TABLES, Options, Row, as_line, quality_rows, rows_of, run_in_turn
+from experiments.suite import request_of
+from r3jax.apps.benchmark.cells import Cell, paths_of
+from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.planning.registry import make_policy
+
+ROWS = {
+    "blind": Row("active-gs"),
+    "seeing": Row("active-gs", "blind", loop={"capture_every": 0.3}),
+}
 
 
-def record(policy, seed, psnr, views, **settings):
+def record(label, seed, psnr, views, **more):
     return {
-        "policy": policy, "settings": settings, "scene": "flat", "seed": seed,
+        "policy": label, "settings": {}, "scene": "flat", "seed": seed,
         "views": {"psnr": psnr}, "exploration": {"views": views},
+    } | more  # fmt: skip
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_each_row_can_be_flown_and_is_compared_with_a_row_of_its_table(table):
+    base = request_of(Options(size="small"), "seconds").conditions
+    cells = set()
+    for row in TABLES[table].values():
+        conditions = replace(base, clock="model", loop=dict(row.loop), **row.training)
+        policy = conditions.policy(row.policy, dict(row.planner))  # refuses what cannot work
+        assert row.against in ("", *TABLES[table])
+        cells.add((conditions.loop.get("gaze"), str(conditions), str(policy)))
+    assert len(cells) == len(TABLES[table])  # no two rows are the same mission
+
+
+def test_rows_are_chosen_by_name_and_by_policy():
+    assert set(rows_of(Options(table="turning", policies=("active-gs",)))) == {
+        "active-gs", "active-gs, captures, plans on the way",
     }  # fmt: skip
-
-
-def test_each_mode_is_a_request_of_its_own_under_the_model_clock():
-    requests = requests_of(Options(policies=("active-gs",)))
-    assert [request.conditions.loop.get("capture_every") for request in requests] == [
-        None,
-        0.3,
-        0.3,
+    assert list(rows_of(Options(table="gaze", rows=("blend, every 0.3 m, 1500 iterations",)))) == [
+        "blend, every 0.3 m, 1500 iterations"
     ]
-    assert [bool(r.conditions.loop.get("plan_while_moving")) for r in requests] == [0, 0, 1]
-    assert {request.conditions.clock for request in requests} == {"model"}
-    assert len(requests) == len(MODES)
     with pytest.raises(ValueError, match="'asleep' is none of"):
-        requests_of(Options(modes=("asleep",)))
+        rows_of(Options(table="gaze", rows=("asleep",)))
+    with pytest.raises(ValueError, match="has no row of"):
+        rows_of(Options(table="gaze", policies=("random",)))
 
 
-def test_a_line_per_method_by_hand():
+def test_the_cells_of_ours_pano_are_the_weight_that_its_swap_takes_over():
+    """The part that `r3con` is measured without is the one that `ours-pano` has."""
+    swapped = TABLES["r3con"]["r3con, 16 for a cell instead of 1000"].planner["cell_weight"]
+    assert swapped == float(make_policy("ours-pano").config.scoring.lambda1)
+    fixed = TABLES["r3con"]["r3con, path weight 0.5 instead of adaptive"].planner["path_weight"]
+    assert fixed == make_policy("ours-pano").config.lambda2
+    theirs = make_policy("r3con").config
+    candidates = TABLES["r3con"]["ours-pano, candidates of r3con"].planner
+    assert candidates == {name: getattr(theirs, name) for name in candidates}
+
+
+def test_a_line_per_row_by_hand():
     records = [
-        record("active-gs", 0, [10.0, 20.0], 40),
-        record("active-gs", 1, [12.0, 22.0], 50),
-        record("active-gs", 0, [18.0, 22.0], 90, **{"on the way": "captures"}),
-        record("active-gs", 1, [20.0, 24.0], 110, **{"on the way": "captures"}),
+        record("blind", 0, [10.0, 20.0], 40),
+        record("blind", 1, [12.0, 22.0], 50),
+        record("seeing", 0, [18.0, 22.0], 90),
+        record("seeing", 1, [20.0, 24.0], 110),
     ]
-    blind, seen = quality_rows(records)
+    blind, seeing = quality_rows(ROWS, records)
     assert blind == {
-        "method": "active-gs", "flat": "16.00 [11.5] / 45", "mean": "16.00", "minus active-gs": "",
+        "row": "blind", "flat": "16.00 [11.5] / 45", "mean": "16.00", "difference": "",
     }  # fmt: skip
-    assert seen["method"] == "active-gs (on the way=captures)"
-    assert seen["flat"] == f"21.00 [{np.mean([18.2, 20.2]):.1f}] / 100"
-    assert seen["minus active-gs"].startswith("+5.00 [")
+    assert seeing["flat"] == f"21.00 [{np.mean([18.2, 20.2]):.1f}] / 100"
+    assert seeing["difference"].startswith("+5.00 [")
+    assert seeing["difference"].endswith("] to blind")
+
+
+def test_what_rows_differ_in_on_purpose_is_no_unequal_term():
+    plain = record("", 0, [1.0], 1, sensing={"fov": 60.0, "capture_every": 0.3}, training={"x": 1})
+    line = as_line(plain, "seeing", ROWS)
+    assert line["policy"] == "seeing"
+    assert line["sensing"] == {"fov": 60.0}  # what they do not differ in stays to be checked
+    assert line["training"] == {"x": 1}
+
+
+def test_what_differs_in_its_training_only_takes_over_the_flight(tmp_path, monkeypatch):
+    short, long, other = (
+        Cell("flat", "a", "ours", seed, Conditions(iterations=iterations), "b", 9)
+        for seed, iterations in ((0, 1500), (0, 6000), (1, 1500))
+    )
+    flown = []
+
+    def fly(cells, root, **kwargs):
+        for cell in cells:
+            run = paths_of(root, cell).run
+            if not run.exists():
+                flown.append(cell)
+                (run / "models").mkdir(parents=True)
+                (run / "frame.png").write_bytes(cell.identity_hash.encode())
+
+    monkeypatch.setattr(captures, "run_cells", fly)
+    run_in_turn([short, long, other], Path(tmp_path), Options())
+    assert flown == [short, other]
+    copied = paths_of(tmp_path, long).run
+    assert (copied / "frame.png").read_text() == short.identity_hash
+    assert not (copied / "models").exists()  # those are of the other training
+
+
+def test_a_table_holds_the_times_that_were_asked_for(tmp_path, monkeypatch):
+    """Another table may have asked for more of the same cell."""
+    conditions = Conditions(budget="seconds:60", snapshots=("seconds:60",))
+    cell = Cell("flat", "a", "ours-ahead", 0, conditions, "b", 9)
+    found = [
+        record("", 0, [1.0], 1, snapshot=snapshot, sensing={}, training={})
+        for snapshot in ("seconds:30", "seconds:60")
+    ]
+    written = []
+    monkeypatch.setattr(captures, "cells_of", lambda options, row, root: [cell])
+    monkeypatch.setattr(captures, "run_in_turn", lambda cells, root, options: None)
+    monkeypatch.setattr(captures, "read_records", lambda root, cells: found)
+    monkeypatch.setattr(captures, "origin", lambda name, records: None)
+    monkeypatch.setattr(
+        captures, "write_page", lambda folder, table, rows, records, source: written.extend(records)
+    )
+    captures.main(
+        Options(
+            table="gaze", rows=("blend, every 0.3 m, 1500 iterations",), work=tmp_path, out=tmp_path
+        )
+    )
+    assert [line["snapshot"] for line in written] == ["seconds:60"]
+    assert written[0]["policy"] == "blend, every 0.3 m, 1500 iterations"

@@ -95,3 +95,25 @@ def test_utility_is_all_round_and_the_direction_comes_after(decided):
         assert best == pytest.approx(sums.max(), rel=1e-4)
         seen = decision.utilities["mean_lack"][k]
         assert 0.0 < seen <= 1.0
+
+
+def test_parts_can_be_exchanged_one_by_one(decided):
+    """A path weight given replaces the adaptive one; the cone's sum replaces that of all round."""
+    total = R3con(R3conConfig(path_weight=0.5)).weigh(candidates())
+    np.testing.assert_allclose(total[1], 2100 / 3200 - 0.5 * 0.5)
+    with pytest.raises(ValueError, match="path_weight must be"):
+        R3conConfig(path_weight=-1.0)
+    state, grid = known()
+    policy = make_policy("r3con", num_candidates=60, all_round=False, scoring=SCORING)
+    first = policy.init(CAMERA, grid, key=KEY)
+    narrow, _, _ = policy.decide(first, state, grid, pose_at(here()), key=KEY)
+    wide = decided[1]
+    np.testing.assert_array_equal(narrow.candidates, wide.candidates)  # it looks no other way
+    lattice = fibonacci_lattice(526)
+    weighted = ScoringConfig(zbuffer_size=32, panorama_size=32, max_range=4.0, lambda1=1000.0)
+    for k in (0, 7):
+        place = jnp.asarray(narrow.candidates[k, :3, 3], jnp.float32)
+        bins = np.asarray(panorama(state, grid, CAMERA, place, weighted).bin_scores, np.float64)
+        cone = lattice @ narrow.candidates[k, :3, 2] >= np.cos(np.radians(35.0))
+        assert narrow.utilities["utility"][k] == pytest.approx(bins[cone].sum(), rel=2e-2)
+        assert narrow.utilities["utility"][k] < wide.utilities["utility"][k]

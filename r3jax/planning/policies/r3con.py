@@ -55,11 +55,20 @@ class R3conConfig(PlannerConfig):
     cell_weight: float = 1000.0
     """Weight of a visible unexplored cell against a voxel that renders badly."""
 
+    path_weight: float | None = None
+    """Weight of the path's share; None: adaptive, the greatest mean of (1 - R)."""
+
+    all_round: bool = True
+    """Whether the utility is that of all directions; else that of the cone it will look into."""
+
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""
         super().__post_init__()
         if not (math.isfinite(self.cell_weight) and self.cell_weight >= 0.0):
             raise ValueError(f"cell_weight must be a finite number >= 0, got {self.cell_weight}")
+        weight = self.path_weight
+        if weight is not None and not (math.isfinite(weight) and weight >= 0.0):
+            raise ValueError(f"path_weight must be a finite number >= 0 or none, got {weight}")
 
 
 @dataclass(frozen=True)
@@ -95,17 +104,20 @@ class R3con(GreedyPolicy):
         allowed = situation.limits.allowed_axes(positions, scoring.panorama_bins)
         weight = jnp.asarray(self.config.cell_weight, dtype=jnp.float32)
         look = functools.partial(_look_round, *at_hand[:2], situation.camera, scoring, weight)
-        axis, cells, lack, voxels = map_over_devices(
+        axis, in_cone, cells, lack, voxels = map_over_devices(
             look, (places, jnp.asarray(allowed)), threads=1
         )
         turned = candidates_along(positions, np.asarray(axis, dtype=np.float64))
         turned = eqx.tree_at(lambda c: c.valid, turned, candidates.valid)
-        cells, lack, voxels = (np.asarray(x, dtype=np.float64) for x in (cells, lack, voxels))
+        in_cone, cells, lack, voxels = (
+            np.asarray(x, dtype=np.float64) for x in (in_cone, cells, lack, voxels)
+        )
+        all_round = self.config.cell_weight * cells + lack
         return turned, {
             "exploration": cells,
             "rendering": lack,
             "mean_lack": np.where(voxels > 0.0, lack / np.maximum(voxels, 1.0), 1.0),
-            "utility": self.config.cell_weight * cells + lack,
+            "utility": all_round if self.config.all_round else in_cone,
         }
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
@@ -113,6 +125,8 @@ class R3con(GreedyPolicy):
         path = utilities["path"]  # inf for padding, too
         counts = np.isfinite(path)
         weight = utilities["mean_lack"][counts].max() if counts.any() else 0.0
+        if self.config.path_weight is not None:
+            weight = self.config.path_weight
         return net_utility(utilities["utility"], path, float(weight))
 
 
@@ -124,22 +138,25 @@ def _look_round(
     config: ScoringConfig,
     cell_weight: Float[Array, ""],
     places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
-) -> tuple[Float[Array, "C 3"], Float[Array, " C"], Float[Array, " C"], Float[Array, " C"]]:
-    """Best axis, visible unexplored cells, sum of (1 - R) and visible voxels of each position."""
+) -> tuple[Float[Array, "C 3"], *tuple[Float[Array, " C"], ...]]:
+    """Of each position: best axis, its cone's sum, visible cells, sum of (1 - R), visible voxels.
+
+    Cells are the unexplored ones, and all but the second are of all directions.
+    """
     num_bins = config.panorama_bins
     lattice = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)
     cone = (lattice @ lattice.T >= jnp.cos(_cone_angle(camera))).astype(jnp.float32)
 
     def look(
         place: tuple[Float[Array, " 3"], Bool[Array, " B"]],
-    ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    ) -> tuple[Float[Array, " 3"], *tuple[Float[Array, ""], ...]]:
         position, allowed = place
         view = panorama_view(position, config)
         lack, empty, seen, _ = sums_and_seen(voxels, cells, view, camera.focal, config, num_bins)
         sums = cone @ (lack + cell_weight * empty)
         best = jnp.argmax(jnp.where(allowed, sums, -jnp.inf))
         num_voxels = jnp.sum(jax.lax.population_count(seen), dtype=jnp.float32)
-        return lattice[best], empty.sum(), lack.sum(), num_voxels
+        return lattice[best], sums[best], empty.sum(), lack.sum(), num_voxels
 
     return jax.vmap(look)(places)
 
