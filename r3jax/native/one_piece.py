@@ -14,8 +14,12 @@ import contextlib
 from collections.abc import Generator
 from typing import Any, ClassVar
 
+import numba
 from numba.core.codegen import JITCodeLibrary
 from numba.core.registry import cpu_target
+
+WRITTEN_FOR = "0.68."
+"""Versions of Numba whose compiler this relies on; others compile as they always do, slower."""
 
 
 class _Library(JITCodeLibrary):
@@ -86,6 +90,9 @@ def in_one_piece(*, part_by_part: bool = False) -> Generator[None]:
         part_by_part: optimizes every function before its callers take it in, as Numba does by
             itself. Takes longer, and rounds as it always has.
     """
+    if not numba.__version__.startswith(WRITTEN_FOR):
+        yield
+        return
     codegen = cpu_target.target_context.codegen()
 
     def set_environment(name: str, environment: Any) -> None:

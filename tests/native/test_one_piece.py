@@ -1,10 +1,17 @@
 """What is compiled in one piece computes what it computes otherwise, and can be called from all."""
 
+import numba
 import numpy as np
+import pytest
 from numba import cfunc, njit, types
 
 from r3jax.native.compiled import kernel
-from r3jax.native.one_piece import in_one_piece
+from r3jax.native.one_piece import WRITTEN_FOR, in_one_piece
+
+pytestmark = pytest.mark.skipif(
+    not numba.__version__.startswith(WRITTEN_FOR),
+    reason="another Numba compiles its own way",
+)
 
 INTEGER = types.int64(types.int64)
 
@@ -61,3 +68,15 @@ def test_afterwards_numba_compiles_as_always():
     assert alone(3) == 2
     (overload,) = alone.overloads.values()
     assert not hasattr(overload.library, "_is_native")
+
+
+def test_another_numba_compiles_its_own_way(monkeypatch):
+    monkeypatch.setattr(numba, "__version__", "0.99.0")
+
+    def handler(x):
+        return x + 2
+
+    with in_one_piece():
+        compiled = cfunc(INTEGER)(handler)
+    assert compiled.ctypes(1) == 3
+    assert not hasattr(compiled._library, "_is_native")
