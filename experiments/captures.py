@@ -61,7 +61,7 @@ class Row:
 REFERENCE = "active-gs"
 """As published: key frames only."""
 
-POLICIES = (REFERENCE, "r3con", "ours-pano", "ours-ahead")
+POLICIES = (REFERENCE, "r3con", "ours-pano", "ours-ahead", "frontier", "random")
 
 CAPTURES: dict[str, Any] = {"capture_every": 0.3}
 ON_THE_WAY: dict[str, Any] = {"capture_every": 0.3, "plan_while_moving": True}
@@ -73,9 +73,12 @@ MODES: dict[str, dict[str, Any]] = {
 }
 """What a policy does on the way, and the settings of the loop for it."""
 
+LONG: dict[str, Any] = {"iterations": 6000}
+"""A training that does not punish a policy for its many frames, as the suite's does."""
+
 LENGTHS: dict[str, dict[str, Any]] = {
     "1500 iterations": {},
-    "6000 iterations": {"iterations": 6000},
+    "6000 iterations": LONG,
     "6000 iterations, 80,000 Gaussians": {"iterations": 6000, "capacity": 80_000},
 }
 """Trainings: the suite's, a longer one, and one that may also grow further."""
@@ -89,7 +92,7 @@ def _gaze(loop: dict[str, Any], length: str = "1500 iterations") -> Row:
 TABLES: dict[TableName, dict[str, Row]] = {
     # Every policy blind between its views, with captures, and planning while it moves.
     "modes": {
-        policy + mode: Row(policy, REFERENCE, loop=loop)
+        policy + mode: Row(policy, REFERENCE, loop=loop, training=LONG)
         for policy in POLICIES
         for mode, loop in MODES.items()
     },
@@ -109,7 +112,7 @@ TABLES: dict[TableName, dict[str, Row]] = {
     # A camera that turns at most 90 degrees a second, instead of in no time.
     "turning": {
         policy + mode: Row(
-            policy, REFERENCE, {"motion": {"speed": 1.0, "turn_rate": 90.0}}, MODES[mode]
+            policy, REFERENCE, {"motion": {"speed": 1.0, "turn_rate": 90.0}}, MODES[mode], LONG
         )
         for policy in (REFERENCE, "ours-ahead")
         for mode in ("", ", captures, plans on the way")
