@@ -105,15 +105,19 @@ def nearest_bin_table(num: int) -> np.ndarray:
     cosines = np.stack([np.sum(center * c, axis=1) for c in corners])
     # The margin covers float32 directions that land in the cell beside their own, and rounding.
     radius = np.arccos(np.clip(cosines.min(axis=0), -1.0, 1.0)) + 1e-4
-    angle = np.arccos(np.clip(center @ fibonacci_lattice(num).T, -1.0, 1.0))
-    is_candidate = angle <= (angle.min(axis=1) + 2.0 * radius)[:, None]
-    # Padding repeats the nearest, so that every row of the table may be tried.
-    order = np.argsort(np.where(is_candidate, angle, np.inf), axis=1)
-    width = int(is_candidate.sum(axis=1).max())
-    best = order[:, :1]
-    table = np.where(np.take_along_axis(is_candidate, order, axis=1), order, best)[:, :width]
-    # Candidates first: `nearest_bin` reads one row of the table at a time.
-    return np.ascontiguousarray(table.T.astype(np.int32))
+    cosine = center @ fibonacci_lattice(num).T
+    nearest = np.arccos(np.clip(cosine.max(axis=1), -1.0, 1.0))
+    # Cosines are compared, not angles: of the few million, none is turned into an angle.
+    cell, bin = np.nonzero(cosine >= np.cos(np.minimum(nearest + 2.0 * radius, np.pi))[:, None])
+    order = np.lexsort((-cosine[cell, bin], cell))  # cell by cell, the nearest first
+    cell, bin = cell[order], bin[order]
+    first = np.searchsorted(cell, np.arange(len(center)))
+    place = np.arange(len(cell)) - first[cell]
+    # Padding repeats the nearest, so that every row of the table may be tried. Candidates first:
+    # `nearest_bin` reads one row of the table at a time.
+    table = np.tile(bin[first].astype(np.int32), (int(place.max()) + 1, 1))
+    table[place, cell] = bin
+    return table
 
 
 def nearest_bin(directions: Float[Array, "3 n"], num: int) -> Int[Array, " n"]:

@@ -11,18 +11,23 @@ Real = float | int
 """A number as people write it: 2 as well as 2.0."""
 
 
+@functools.lru_cache(maxsize=8)
+def _spectrum(height: int, width: int, seed: int) -> np.ndarray:
+    """Fourier transform of white noise, [h, w // 2 + 1]: many fields are shaped from one."""
+    noise = np.random.default_rng(seed).standard_normal((height, width), dtype=np.float32)
+    return np.fft.rfft2(noise)
+
+
 @functools.lru_cache(maxsize=64)
 def _field(
     height: int, width: int, seed: int, slope: Real, stretch_x: Real, lowest: Real
 ) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    spectrum = np.fft.rfft2(rng.standard_normal((height, width), dtype=np.float32))
     fy = np.fft.fftfreq(height, 1.0 / height)[:, None] * (width / height)
     fx = np.fft.rfftfreq(width, 1.0 / width)[None, :]
     squared = ((fx * stretch_x) ** 2 + fy**2).astype(np.float32)
     gain = np.maximum(squared, 1.0) ** np.float32(-0.5 * slope)
     gain[squared < lowest**2] = 0.0
-    field = np.fft.irfft2(spectrum * gain, s=(height, width))
+    field = np.fft.irfft2(_spectrum(height, width, seed) * gain, s=(height, width))
     field = (field - field.mean()) / field.std()
     field.flags.writeable = False
     return field
