@@ -110,7 +110,7 @@ MUTANTS = [
     Mutant("voxels", "astype(jnp.float32) + 0.5", "astype(jnp.float32)", law_index),
     Mutant("sphere", "2.0 * (k + 0.5) / num", "2.0 * k / num", law_nearest),
     Mutant("sphere", "np.pi * k / GOLDEN_RATIO", "np.pi * k * GOLDEN_RATIO * 1.01", law_nearest),
-    Mutant("sphere", "angle.min(axis=1) + 2.0 * radius", "angle.min(axis=1)", law_nearest),
+    Mutant("sphere", "nearest + 2.0 * radius", "nearest", law_nearest),
     Mutant("sphere", "is_better = cosine > best", "is_better = cosine < best", law_nearest),
     Mutant("sphere", "math.radians(angle_deg)))", "math.radians(2 * angle_deg)))", law_angle),
     Mutant("sphere", "math.pi / cap - 1e-9)", "math.pi / cap + 1e-9)", law_angle),
