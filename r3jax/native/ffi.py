@@ -16,6 +16,7 @@ import functools
 import inspect
 import os
 import tempfile
+import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
@@ -213,25 +214,34 @@ def _one_process_at_a_time(name: str) -> Generator[None]:
         yield
 
 
+_lock = threading.Lock()
+_compiled: dict[str, Any] = {}
+"""Handlers by name, kept alive: XLA holds their addresses."""
+
+
 def register_handlers(
     handlers: dict[str, Callable[[Any], int]], *, part_by_part: bool = False
-) -> tuple[Any, ...]:
-    """Compiles handlers (or takes them from the disk) and tells XLA of them by their names.
+) -> None:
+    """Compiles handlers (or takes them from the disk) and tells XLA of them by their names, once.
 
     Args:
         handlers: by their names.
         part_by_part: see `in_one_piece`.
 
-    Returns:
-        What the caller must keep alive: XLA holds the addresses.
-
     Raises:
         RuntimeError: Numba has no threading layer that serves two callers at once.
     """
+    with _lock:
+        missing = {name: handlers[name] for name in handlers if name not in _compiled}
+        if missing:
+            _register(missing, part_by_part)
+
+
+def _register(handlers: dict[str, Callable[[Any], int]], part_by_part: bool) -> None:
     require_threads()
     compiler = cfunc(types.int64(types.int64), cache=True)
     with _one_process_at_a_time("-".join(handlers)), in_one_piece(part_by_part=part_by_part):
         compiled = tuple(compiler(inspect.unwrap(handler)) for handler in handlers.values())
     for name, handler in zip(handlers, compiled, strict=True):
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler.address), platform="cpu")
-    return compiled
+        _compiled[name] = handler

@@ -3,10 +3,6 @@
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
-import functools
-import threading
-from typing import Any
-
 import numpy as np
 
 from r3jax.mapping.backends.numba.add import add_pass
@@ -87,15 +83,8 @@ def _mark(frame):
 
 
 _HANDLERS = {ADD: _add, LOOK: _look, MARK: _mark}
-_lock = threading.Lock()
 
 
 def register(name: str) -> None:
     """Compiles a handler (or takes it from the disk) and tells XLA of it, once."""
-    with _lock:
-        _register(name)
-
-
-@functools.cache
-def _register(name: str) -> tuple[Any, ...]:
-    return register_handlers({name: _HANDLERS[name]})
+    register_handlers({name: _HANDLERS[name]})

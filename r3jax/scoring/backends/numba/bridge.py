@@ -3,10 +3,6 @@
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
-import functools
-import threading
-from typing import Any
-
 import numpy as np
 
 from r3jax.native.compiled import inlined
@@ -112,17 +108,10 @@ def _rows(frame):
 
 
 _HANDLERS = {SUMS: _sums, PIXELS: _pixels, ROWS: _rows}
-_lock = threading.Lock()
 
 
 def register(name: str) -> None:
     """Compiles a handler (or takes it from the disk) and tells XLA of it, once."""
-    with _lock:
-        _register(name)
-
-
-@functools.cache
-def _register(name: str) -> tuple[Any, ...]:
     # A score does not depend on what else is scored, bit by bit: optimized as a whole, loops would
     # round their last elements otherwise.
-    return register_handlers({name: _HANDLERS[name]}, part_by_part=True)
+    register_handlers({name: _HANDLERS[name]}, part_by_part=True)

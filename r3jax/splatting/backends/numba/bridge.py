@@ -3,10 +3,6 @@
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
-import functools
-import threading
-from typing import Any
-
 import numpy as np
 
 from r3jax.native.compiled import inlined
@@ -120,27 +116,12 @@ def _tallies(frame):
     return 0
 
 
-_lock = threading.Lock()
-
-
 def register() -> None:
     """Compiles the handlers of rendering (or takes them from the disk) and tells XLA, once."""
-    with _lock:
-        _register()
+    register_handlers({FORWARD: _forward, BACKWARD: _backward})
 
 
 def register_per_gaussian() -> None:
     """The same for what is summed up per Gaussian: who only renders does not wait for it."""
-    with _lock:
-        _register()
-        _register_per_gaussian()
-
-
-@functools.cache
-def _register() -> tuple[Any, ...]:
-    return register_handlers({FORWARD: _forward, BACKWARD: _backward})
-
-
-@functools.cache
-def _register_per_gaussian() -> tuple[Any, ...]:
-    return register_handlers({SQUARES: _squares, TALLIES: _tallies})
+    register()
+    register_handlers({SQUARES: _squares, TALLIES: _tallies})
