@@ -80,8 +80,13 @@ LENGTHS: dict[str, dict[str, Any]] = {
     "1500 iterations": {},
     "6000 iterations": LONG,
     "6000 iterations, 80,000 Gaussians": {"iterations": 6000, "capacity": 80_000},
+    "MCMC, 7000 iterations at 256 px": {
+        "iterations": 7000,
+        "train_resolution": 256,
+        "trainer": {"strategy": "mcmc"},
+    },
 }
-"""Trainings: the suite's, a longer one, and one that may also grow further."""
+"""Trainings: the suite's, a longer one, one that may also grow further, and another trainer's."""
 
 
 def _gaze(loop: dict[str, Any], length: str = "1500 iterations") -> Row:
@@ -226,7 +231,9 @@ def run_in_turn(cells: Sequence[Cell], root: Path, options: Options) -> None:
 
 def _flight(cell: Cell) -> str:
     """What the exploration depends on: the same for cells that differ in their training only."""
-    conditions = replace(cell.conditions, iterations=1, gaussians=1, capacity=1, trainer={})
+    conditions = replace(
+        cell.conditions, train_resolution=16, iterations=1, gaussians=1, capacity=1, trainer={}
+    )
     return replace(cell, conditions=conditions).identity_hash
 
 
