@@ -138,11 +138,16 @@ def score_cached_near(
     positions: Float[Array, "C 3"],
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
+    threads: int | None = None,
 ) -> Panorama:
-    """`score_positions_near` after imagined views, from what was kept before them."""
+    """`score_positions_near` after imagined views, from what was kept before them.
+
+    `threads` is that of `map_over_devices`: 1 for who calls from threads.
+    """
     changes = _changes_between(before, after)
     score = functools.partial(_score_cached, changes, camera, config)
-    return map_over_devices(score, (kept, positions, _all_if_none(allowed, positions, config)))
+    places = (kept, positions, _all_if_none(allowed, positions, config))
+    return map_over_devices(score, places, threads=threads)
 
 
 def _all_if_none(

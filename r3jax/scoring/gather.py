@@ -20,7 +20,7 @@ from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.visibility.views import Coordinates
 
-SMALLEST = 1 << 14
+SMALLEST = 1 << 16
 """Voxels at hand are padded to this or 4, 16, ... times as many: a run compiles once for each pair
 of sizes, of voxels and of cells, that it meets, which takes seconds and keeps some 40 MB for good.
 Absent ones cost little."""

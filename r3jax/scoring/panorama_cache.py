@@ -8,6 +8,7 @@ Shape symbols: n voxels; c cells; p and q their bits, packed in bytes; B bins of
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
@@ -34,6 +35,7 @@ class PanoramaCache(eqx.Module):
     cells: UInt8[Array, "*positions q"]
     """Which unexplored cells it sees."""
 
+    @jax.jit
     def at(self, index: Int[Array, " k"]) -> "PanoramaCache":
         """Those of some of many positions."""
         return PanoramaCache(self.bin_scores[index], self.voxels[index], self.cells[index])

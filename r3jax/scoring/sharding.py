@@ -28,6 +28,8 @@ def padded_to(multiple: int, candidates: Candidates) -> Candidates:
 
     def pad(rows: Array) -> Array:
         missing = -rows.shape[0] % multiple
+        if missing == 0:
+            return rows  # not copied: the bits of a hundred panoramas are megabytes
         last = jnp.broadcast_to(rows[-1:], (missing, *rows.shape[1:]))
         return jnp.concatenate([rows, last])
 

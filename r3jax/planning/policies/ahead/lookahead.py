@@ -17,7 +17,9 @@ Shape symbols: C places.
 """
 
 import math
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
@@ -163,10 +165,12 @@ def search(problem: BeamProblem) -> list[Path]:
         )
         for i in _apart(ranked.tolist(), views, (), config.beam)
     ]
-    for _ in range(config.horizon - 1):
-        # Parents leave the beam: only paths of as many views compare their rates.
-        children = [child for path in beam for child in _expanded(path, problem)]
-        beam = _best(children, config.beam)
+    # A path by each core: what is worth a few milliseconds is not dealt out further.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        for _ in range(config.horizon - 1):
+            # Parents leave the beam: only paths of as many views compare their rates.
+            children = pool.map(lambda path: _expanded(path, problem), beam)
+            beam = _best([child for some in children for child in some], config.beam)
     return beam
 
 
@@ -218,7 +222,7 @@ def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
     rows = jnp.asarray([tried[i % len(tried)] for i in range(config.branching)])
     kept, now = problem.kept.at(rows), (voxels, cells)
     panorama = score_cached_near(
-        kept, problem.start, now, problem.camera, places, config.scoring, allowed
+        kept, problem.start, now, problem.camera, places, config.scoring, allowed, threads=1
     )
     turned, gains = best_views(offered, panorama)
     turned = limits.project_to_feasible(turned)
