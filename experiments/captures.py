@@ -256,7 +256,10 @@ def write_page(
     page: list[str] = []
     for snapshot in snapshots_of(records):
         now = [record for record in records if record["snapshot"] == snapshot]
-        check_equal_terms(now)
+        # Rows are compared with rows of the same training only; another may ask for other images.
+        trainings = {str(row.training): row.training for row in rows.values()}
+        for training in trainings.values():
+            check_equal_terms([r for r in now if rows[r["policy"]].training == training])
         lines = quality_rows(rows, now)
         write_csv(folder / f"{table}_{snapshot.replace(':', '_')}.csv", lines, source)
         page += [

@@ -9,7 +9,7 @@ Shape symbols: N rows of the map; V test views.
 
 import io
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,17 +81,21 @@ class Judged:
 def judged_cells(root: Path, folder: Path) -> Iterator[Path]:
     """The models of a benchmark, from its records, runs and test images."""
     for line in (root / "cells.jsonl").read_text().splitlines():
-        record = json.loads(line)
-        slug = snapshot_slug(record["snapshot"])
-        path = folder / f"{Path(record['run']).parent.name}-{slug}.npz"
-        if not path.exists():
-            run = read_run(root / record["run"])
-            frames = [run.frame(step) for step in range(record["exploration"]["views"])]
-            images = reference_images(root, record)
-            scores = {name: record["views"][name] for name in SCORES}
-            tested = [run.camera] * len(images.poses), images.poses
-            _write(path, record["scene"], "explored", frames, tested, images.views, scores)
-        yield path
+        yield judged_cell(root, json.loads(line), folder)
+
+
+def judged_cell(root: Path, record: Mapping[str, Any], folder: Path) -> Path:
+    """One model of a benchmark."""
+    slug = snapshot_slug(record["snapshot"])
+    path = folder / f"{Path(record['run']).parent.name}-{slug}.npz"
+    if not path.exists():
+        run = read_run(root / record["run"])
+        frames = [run.frame(step) for step in range(record["exploration"]["views"])]
+        images = reference_images(root, record)
+        scores = {name: record["views"][name] for name in SCORES}
+        tested = [run.camera] * len(images.poses), images.poses
+        _write(path, record["scene"], "explored", frames, tested, images.views, scores)
+    return path
 
 
 def judged_capture(scene: str, num: int, seed: int, folder: Path) -> Path:

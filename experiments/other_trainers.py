@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from experiments.expected_error import Model, expected, median, model_of, rank
-from experiments.judged_models import SCORES, judged_cells
+from experiments.judged_models import SCORES, judged_cell
 from experiments.pages.artifacts import markdown_table, write_csv, write_markdown
 from experiments.suite import origin
 from r3jax.scoring.expected_error import DISSIMILARITY, SQUARED
@@ -47,19 +47,18 @@ def main(options: Options) -> Path:
     """Compares, writes the page, and returns the folder of the results."""
     lines = (options.cells / "cells.jsonl").read_text().splitlines()
     records = [json.loads(line) for line in lines]
-    models = zip(records, judged_cells(options.cells, options.work), strict=True)
-    trained: dict[str, dict[str, tuple[Mapping[str, Any], Path]]] = {}
-    for record, path in models:
-        trained.setdefault(flight_of(record), {})[training_of(record)] = record, path
-    several = {flight: own for flight, own in trained.items() if len(own) > 1}
+    trained: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for record in records:
+        trained.setdefault(flight_of(record), {})[training_of(record)] = record
+    several = [own for own in trained.values() if len(own) > 1]
     if not several:
         raise SystemExit(f"no flight in {options.cells} was trained more than once")
     rows = [
-        model_row(record, training, model_of(path))
-        for own in several.values()
-        for training, (record, path) in own.items()
+        model_row(record, training, model_of(judged_cell(options.cells, record, options.work)))
+        for own in several
+        for training, record in own.items()
     ]
-    used = [record for own in several.values() for record, _ in own.values()]
+    used = [record for own in several for record in own.values()]
     folder, source = options.out / NAME, origin(f"experiments.{NAME}", used)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "models.csv", rows, source)

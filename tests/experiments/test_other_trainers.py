@@ -63,8 +63,7 @@ def folder(tmp_path, monkeypatch):
     def write(records):
         text = "".join(json.dumps(record) + "\n" for record in records)
         (tmp_path / "cells.jsonl").write_text(text)
-        paths = [tmp_path / f"{i}.npz" for i in range(len(records))]
-        monkeypatch.setattr(other_trainers, "judged_cells", lambda root, work: iter(paths))
+        monkeypatch.setattr(other_trainers, "judged_cell", lambda root, record, work: tmp_path)
         monkeypatch.setattr(other_trainers, "model_of", lambda path: model([30, 25, 20, 10]))
         return Options(tmp_path, out=tmp_path / "out", work=tmp_path)
 
