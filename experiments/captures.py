@@ -1,4 +1,4 @@
-"""At equal time: what looking on the way, gaze, turning, difficulty and longer trainings are worth.
+"""At equal time: what looking on the way, gaze, spacing, turning, and longer trainings are worth.
 
     python -m experiments.captures modes --size small --scenes flat office --seeds 0
     python -m experiments.captures gaze --size small --scenes flat office --seeds 0
@@ -35,7 +35,7 @@ from r3jax.evaluation.statistics import paired_difference
 
 NAME = "captures"
 
-TableName = Literal["modes", "gaze", "turning", "r3con", "training", "difficulty"]
+TableName = Literal["modes", "gaze", "turning", "r3con", "training"]
 
 
 @dataclass(frozen=True)
@@ -134,18 +134,6 @@ TABLES: dict[TableName, dict[str, Row]] = {
         "ours-pano, candidates of r3con": Row(
             "ours-pano", "ours-pano", {"num_candidates": 50, "radius": 2.0, "num_frontier": 0}
         ),
-    },
-    # 1 - R weighed by how hard the voxel is to render.
-    "difficulty": {
-        f"{policy}{mode}, difficulty {share}": Row(
-            policy,
-            f"{policy}{mode}, difficulty 0",
-            {"difficulty": share} if share else {},
-            MODES[mode],
-            LONG,
-        )
-        for policy, mode in (("ours-pano", ""), ("ours-ahead", ", captures, plans on the way"))
-        for share in (0, 0.5, 1.0)
     },
     # The same flights, trained for longer.
     "training": {

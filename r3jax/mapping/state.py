@@ -52,9 +52,6 @@ class MapState(eqx.Module):
     num_bins: int = eqx.field(static=True)
     """Direction bins B."""
 
-    weight: Float[Array, " N"] | None = None
-    """Weight of 1 - R of each voxel in U_R; None: 1, as in every map that is kept."""
-
     @property
     def capacity(self) -> int:
         """Number of rows N."""
@@ -96,12 +93,7 @@ class MapState(eqx.Module):
             mean=self.mean[:, row],
             m2=self.m2[row],
             resolution=self.resolution[row],
-            weight=None if self.weight is None else self.weight[row],
         )
-
-    def weigh(self, deficit: Float[Array, " N"]) -> Float[Array, " N"]:
-        """1 - R of every row times its weight, if rows have any."""
-        return deficit if self.weight is None else self.weight * deficit
 
     @property
     def num_occupied(self) -> Int[Array, ""]:

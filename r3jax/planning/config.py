@@ -41,11 +41,6 @@ class PlannerConfig:
     lambda2: float = 0.5
     """Weight of a candidate's share of the path lengths against its share of the utility."""
 
-    difficulty: float = 0.0
-    """Share of a voxel's weight in U_R that follows how hard it is to render
-    (`scoring.difficulty`), in the utility of `ours`, `ours-pano`, `ours-ahead` and `r3con`; 0: all
-    weigh the same."""
-
     safety_margin: float = 0.3
     """A path keeps its cells' centers this far from anything not known to be free [m]."""
 
@@ -79,8 +74,6 @@ class PlannerConfig:
                 f"refine must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.refine}"
             )
-        if not 0.0 <= self.difficulty <= 1.0:
-            raise ValueError(f"difficulty must lie between 0 and 1, got {self.difficulty}")
         # An infinite lambda2, times a path of no length, would be NaN.
         for name in ("radius", "refine_radius", "lambda2", "safety_margin"):
             value = getattr(self, name)

@@ -40,7 +40,6 @@ from r3jax.planning.refinement.refine import refine_best
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.travel import Travel
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.difficulty import weigh_by_difficulty
 from r3jax.scoring.pixels import Value, score_pixels
 
 RECONSIDERED = 8
@@ -217,9 +216,6 @@ class GreedyPolicy(ABC):
                 state, map_state, grid, T_world_camera, self.config
             )
         limits = self._limits(T_world_camera, travel)
-        if self.config.difficulty > 0.0:
-            with stopwatch.part("scoring"):
-                map_state = weigh_by_difficulty(map_state, self.config.difficulty)
         with stopwatch.part("candidates"):
             situation = Situation(
                 map_state, grid, masked, travel, state.camera, state.memory, limits

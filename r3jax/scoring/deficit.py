@@ -76,7 +76,7 @@ def _deficit(
     forms: Forms,
     num_bins: int,
 ) -> Float[Array, " B"]:
-    lack = voxels.weigh(1.0 - score_voxels(voxels, position, focal, forms).value)
+    lack = 1.0 - score_voxels(voxels, position, focal, forms).value
     # Absent voxels have R = 0: each would count as a whole voxel that renders badly.
     lack = jnp.where(visible & voxels.present, lack, 0.0)
     return sum_by_direction(voxels.center, lack, position, num_bins)

@@ -6,8 +6,6 @@ which: its voxels are about as large as the pixels that saw them, and hold mean 
 Shape symbols: N rows of the map; n of them.
 """
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,29 +40,6 @@ def voxel_difficulty(state: MapState) -> Float[Array, " N"]:
     describe no voxel, and voxels without a neighbor, have 0.
     """
     return difficulty_of_rows(state, jnp.arange(state.capacity, dtype=jnp.int32))
-
-
-@jax.jit
-def weigh_by_difficulty(state: MapState, share: float | Float[Array, ""]) -> MapState:
-    """Weighs 1 - R of each voxel by its difficulty, in the utilities.
-
-    The weight is (1 - share) + share C / mean C: 1 on average, so that U_R keeps its measure
-    against unexplored space.
-
-    Args:
-        state: the map.
-        share: how much of the weight follows the difficulty, from 0 (none) to 1 (a plain wall
-            counts for nothing).
-
-    Returns:
-        The same map, to be scored and not to be kept.
-    """
-    difficulty, present = voxel_difficulty(state), state.present
-    num = jnp.maximum(jnp.sum(present, dtype=jnp.float32), 1.0)
-    mean = jnp.sum(jnp.where(present, difficulty, 0.0)) / num
-    # A map without contrast has no voxel that is harder than the others.
-    relative = jnp.where(mean > 0.0, difficulty / jnp.where(mean > 0.0, mean, 1.0), 1.0)
-    return replace(state, weight=1.0 + share * (relative - 1.0))
 
 
 def difficulty_of_rows(state: MapState, row: Int[Array, " n"]) -> Float[Array, " n"]:

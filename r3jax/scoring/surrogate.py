@@ -166,7 +166,7 @@ def surrogate_of(
     def worth(node: tuple[Array, Array, Array]) -> Float[Array, " m"]:
         position, limit, distance = node
         view = view_from(position)
-        lack = part.weigh(1.0 - score_voxels(part, position, camera.focal, config.forms).value)
+        lack = 1.0 - score_voxels(part, position, camera.focal, config.forms).value
         place = view.place(center)
         margin = corner_margin(view, place, voxels.voxel_size, limit)
         shown = _softly_seen(view, place, margin, is_row, soft)

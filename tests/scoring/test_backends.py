@@ -1,7 +1,6 @@
 """Every backend says what the reference says, however it is asked: one by one or many at once."""
 
 import functools
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -102,22 +101,6 @@ def test_sums_are_those_of_the_reference(kind, seed):
     assert float(expected[0].sum()) > 1.0
     assert_same(mapped(*arguments), expected)
     assert_same(looped(*arguments), expected)
-
-
-@pytest.mark.parametrize("num", [1, NUM])
-@pytest.mark.parametrize("kind", NUM_BINS)
-def test_weighted_sums_are_those_of_the_reference(kind, num):
-    """Few views and many: each has a kernel of its own."""
-    state, grid = world(0)
-    weight = np.random.default_rng(5).uniform(0.0, 3.0, CAPACITY)
-    weighted = replace(state, weight=jnp.asarray(weight, jnp.float32))
-    exact, mapped, _ = programs(kind)
-    cells, poses = cells_of(grid), poses_of(0)[:num]
-    expected = exact(weighted, cells, poses)
-    assert_same(mapped(weighted, cells, poses), expected)
-    plain = exact(state, cells, poses)
-    assert float(jnp.max(jnp.abs(expected[0] - plain[0]))) > 0.1 * float(jnp.max(plain[0]))
-    np.testing.assert_array_equal(expected[1], plain[1])  # cells have no weight
 
 
 @pytest.mark.parametrize("kind", NUM_BINS)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 import r3jax
 from r3jax.geometry.voxels import unpack
-from r3jax.scoring.difficulty import weigh_by_difficulty
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.strategies import VOXEL_SIZE, Sighting, sightings
 
@@ -140,20 +139,3 @@ def test_a_difficulty_has_a_gradient_even_where_it_is_0():
     total = lambda m: jnp.sum(r3jax.voxel_difficulty(m))
     gradient = jax.grad(total, allow_int=True)(state)
     assert np.isfinite(np.asarray(gradient.mean)).all()
-
-
-def test_weights_keep_their_mean_and_the_order_of_the_difficulties():
-    state = map_of_colors(random_colors(3))
-    value, there = np.asarray(r3jax.voxel_difficulty(state)), np.asarray(state.present)
-    for share in (0.25, 1.0):
-        weight = np.asarray(weigh_by_difficulty(state, share).weight)[there]
-        np.testing.assert_allclose(weight.mean(), 1.0, rtol=1e-5)
-        expected = 1.0 - share + share * value[there] / value[there].mean()
-        np.testing.assert_allclose(weight, expected, rtol=1e-5)
-    np.testing.assert_array_equal(np.asarray(weigh_by_difficulty(state, 0.0).weight)[there], 1.0)
-
-
-def test_in_a_map_without_contrast_all_weigh_the_same():
-    plain = {at: np.full(3, 0.5) for at in random_colors(1)}
-    weighted = weigh_by_difficulty(map_of_colors(plain), 1.0)
-    np.testing.assert_array_equal(np.asarray(weighted.weight)[np.asarray(weighted.present)], 1.0)

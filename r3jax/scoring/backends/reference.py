@@ -39,7 +39,7 @@ def sums_in_view(
         num_bins: bins of the Fibonacci lattice; 1 sums over all directions.
     """
     seen, empty = seen_in_view(voxels, cells, view, config)
-    deficit = voxels.weigh(1.0 - score_voxels(voxels, position, focal, config.forms).value)
+    deficit = 1.0 - score_voxels(voxels, position, focal, config.forms).value
     deficit, unexplored = jnp.where(seen, deficit, 0.0), empty.astype(jnp.float32)
     points = jnp.stack([cells.x, cells.y, cells.z])
     return (

@@ -77,11 +77,9 @@ def sums_in_views(
     bits = [jax.ShapeDtypeStruct((num, size), jnp.uint8) for size in sizes]
     directions = fibonacci_lattice(voxels.num_bins).astype(np.float32)
     space = (cells.x, cells.y, cells.z, cells.unexplored.astype(jnp.uint8))
-    weight = jnp.zeros(0, jnp.float32) if voxels.weight is None else voxels.weight
     results = jax.ffi.ffi_call(SUMS, [sums, sums, *bits])(
-        *_shared(voxels), weight, views, _options(layout, forms), directions, *_tables(num_bins),
-        *space,
-    )  # fmt: skip
+        *_shared(voxels), views, _options(layout, forms), directions, *_tables(num_bins), *space
+    )
     return tuple(results) if keep else tuple(results[:2])
 
 

@@ -38,25 +38,24 @@ def _state(frame):
 
 
 def _sums(frame):
-    """Arguments: state (6), weight, views, options, directions, table, lattice, cells (4).
+    """Arguments: state (6), views, options, directions, table, lattice, cells (4).
 
     Options: wraps, height, width, whether kappa is 1, whether delta is that of pairs, workers.
     Results: sums of 1 - R, numbers of unexplored cells, bits of rows and of cells seen.
     """
     if answers_metadata(frame):
         return 0
-    key, words, count, m2, resolution, voxel_size = _state(frame)
-    options = ints1(frame, ARGUMENTS, 8)
+    options = ints1(frame, ARGUMENTS, 7)
     sums_pass(
-        (key, words, count, m2, resolution, floats1(frame, ARGUMENTS, 6), voxel_size),
+        _state(frame),
         (
-            floats1(frame, ARGUMENTS, 12), floats1(frame, ARGUMENTS, 13),
-            floats1(frame, ARGUMENTS, 14), bytes1(frame, ARGUMENTS, 15),
+            floats1(frame, ARGUMENTS, 11), floats1(frame, ARGUMENTS, 12),
+            floats1(frame, ARGUMENTS, 13), bytes1(frame, ARGUMENTS, 14),
         ),
-        floats2(frame, ARGUMENTS, 7),
+        floats2(frame, ARGUMENTS, 6),
         (options[0] != 0, (np.int64(options[1]), np.int64(options[2]))),
         (options[3] != 0, options[4] != 0),
-        (floats2(frame, ARGUMENTS, 9), ints2(frame, ARGUMENTS, 10), floats2(frame, ARGUMENTS, 11)),
+        (floats2(frame, ARGUMENTS, 8), ints2(frame, ARGUMENTS, 9), floats2(frame, ARGUMENTS, 10)),
         np.int64(options[5]),
         (
             floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1),

@@ -12,14 +12,12 @@ from r3jax.scoring.backends.numba.voxels import (
     DELTA,
     LOG_DELTA,
     RESOLUTION,
-    WEIGHT,
     X,
     Y,
     Z,
     bins_of,
     consistency,
     log2_or_never,
-    weight_of,
 )
 from r3jax.visibility.backends.numba.bricks import bounds_of, may_see
 from r3jax.visibility.backends.numba.views import CHUNK
@@ -64,7 +62,7 @@ def _compact(is_near, first, count, chosen):
 
 @inlined
 def _gather(
-    key, words, count, m2, resolution, weight, voxel_size, num, chosen, begin, voxels, visited, rows
+    key, words, count, m2, resolution, voxel_size, num, chosen, begin, voxels, visited, rows
 ):
     """Gathers what is known of chosen rows to where they belong."""
     for j in range(num):
@@ -78,8 +76,6 @@ def _gather(
         voxels[LOG_DELTA, begin + j] = m2[np.int64(chosen[j])]
     for j in range(num):
         voxels[RESOLUTION, begin + j] = resolution[np.int64(chosen[j])]
-    for j in range(num):
-        voxels[WEIGHT, begin + j] = weight_of(weight, np.int64(chosen[j]))
     for word in range(0, words.shape[0], 2):
         for j in range(num):
             visited[word >> 1, begin + j] = bins_of(words, word, np.int64(chosen[j]))
@@ -96,8 +92,8 @@ def _find_consistency(counts, spreads, is_pairwise):
 
 @parallel_kernel
 def gather_near(
-    views, is_sound, wraps, height, width, key, words, count, m2, resolution, weight,
-    voxel_size, is_pairwise, workers, voxels, visited, rows, runs,
+    views, is_sound, wraps, height, width, key, words, count, m2, resolution, voxel_size,
+    is_pairwise, workers, voxels, visited, rows, runs,
 ):  # fmt: skip
     """Gathers what is known of the voxels that some view may see.
 
@@ -107,12 +103,11 @@ def gather_near(
         wraps: True for octahedral maps.
         height: of the images [px].
         width: of the images [px].
-        key: of the map, like the next six.
+        key: of the map, like the next five.
         words: its visited bins, 32 in a word.
         count: observations; 0 where there is no voxel.
         m2: spread of the colors.
         resolution: best resolution [px/m].
-        weight: of 1 - R; of length 0: 1.
         voxel_size: edge [m].
         is_pairwise: form of delta.
         workers: threads; each writes from where its share of the rows begins.
@@ -136,8 +131,8 @@ def gather_near(
             )  # fmt: skip
             num = _compact(is_near, first, last - first, chosen)
             _gather(
-                key, words, count, m2, resolution, weight, voxel_size, num, chosen, to, voxels,
-                visited, rows,
+                key, words, count, m2, resolution, voxel_size, num, chosen, to, voxels, visited,
+                rows,
             )  # fmt: skip
             _find_consistency(
                 voxels[DELTA, to : to + num], voxels[LOG_DELTA, to : to + num], is_pairwise

@@ -30,7 +30,6 @@ from r3jax.scoring.backends.numba.voxels import (
     DELTA,
     LOG_DELTA,
     RESOLUTION,
-    WEIGHT,
     X,
     Y,
     Z,
@@ -160,7 +159,7 @@ def _add_by_direction(angles, cells, weights, num, table, lattice, sums):
 
 @inlined_fused
 def _find_deficits(known, first, chosen, num, settings, directions, angles, weights):
-    """Finds 1 - R of chosen voxels, times their weights."""
+    """Finds 1 - R of chosen voxels."""
     in_wide_vectors()
     voxels, visited = known
     is_always_one, focal = settings
@@ -176,8 +175,6 @@ def _find_deficits(known, first, chosen, num, settings, directions, angles, weig
             weights[j], angles[INSIDE + j] > _ZERO, angles[RANGE + j], angles[DELTAS + j],
             angles[LOG_DELTAS + j], angles[SHARPNESS + j], focal,
         )  # fmt: skip
-    for j in range(num):
-        weights[j] *= voxels[WEIGHT, first + np.int64(chosen[j])]
 
 
 @inlined

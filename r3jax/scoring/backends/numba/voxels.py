@@ -13,13 +13,13 @@ from r3jax.native.arithmetic import bits_of, count_bits, float_of, log2
 from r3jax.native.compiled import inlined, kernel, parallel_kernel
 from r3jax.visibility.backends.numba.views import CHUNK
 
-X, Y, Z, DELTA, LOG_DELTA, RESOLUTION, WEIGHT = 0, 1, 2, 3, 4, 5, 6
+X, Y, Z, DELTA, LOG_DELTA, RESOLUTION = 0, 1, 2, 3, 4, 5
 """Rows of the array that `gather_voxels` writes: center [m], color consistency and log2 of it,
-best resolution [px/m], weight of 1 - R."""
+best resolution [px/m]."""
 
-SIZE = 7
+SIZE = 6
 
-_ROW, _WORDS = 7, 8
+_ROW, _WORDS = 6, 7
 """Parts of a record beside those: the row of the map, and where the words of bins begin."""
 
 _CLASSES = 8
@@ -36,12 +36,6 @@ _TWO_THIRDS_OF_TWO = np.float32(2.0 / 1.5)
 def log2_or_never(x):
     """log2 x; `NEVER` where x is 0."""
     return log2(x) if x > _ZERO else NEVER
-
-
-@inlined
-def weight_of(weights, row):
-    """Weight of 1 - R of a voxel; 1 where there are none."""
-    return weights[row] if weights.shape[0] > 0 else _ONE
 
 
 @inlined
@@ -97,19 +91,18 @@ def _unpack_sorted(records, begin, end, words, counts, voxels, visited, rows):
 
 
 @parallel_kernel
-def gather_voxels(slots, starts, key, words, count, m2, resolution, weight, voxel_size,
-                  is_pairwise, workers, voxels, visited, rows):  # fmt: skip
+def gather_voxels(slots, starts, key, words, count, m2, resolution, voxel_size, is_pairwise,
+                  workers, voxels, visited, rows):  # fmt: skip
     """Gathers what is known of voxels in the order of the bricks.
 
     Args:
         slots: of every row of the map, -1: none [N].
         starts: of the bricks among the slots [b + 1].
-        key: of the map, like the next six.
+        key: of the map, like the next five.
         words: its visited bins, 32 in a word.
         count: observations.
         m2: spread of the colors.
         resolution: best resolution [px/m].
-        weight: of 1 - R; of length 0: 1.
         voxel_size: edge [m].
         is_pairwise: form of delta.
         workers: threads.
@@ -129,7 +122,6 @@ def gather_voxels(slots, starts, key, words, count, m2, resolution, weight, voxe
                 record[X], record[Y], record[Z] = bits_of(x), bits_of(y), bits_of(z)
                 record[DELTA], record[LOG_DELTA] = bits_of(delta), bits_of(log2_or_never(delta))
                 record[RESOLUTION], record[_ROW] = bits_of(resolution[row]), row
-                record[WEIGHT] = bits_of(weight_of(weight, row))
                 for word in range(num_words):
                     record[_WORDS + word] = words[word, row]
     for share in prange(workers):
