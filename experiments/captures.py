@@ -35,7 +35,7 @@ from r3jax.evaluation.statistics import paired_difference
 
 NAME = "captures"
 
-TableName = Literal["modes", "gaze", "turning", "r3con", "training"]
+TableName = Literal["modes", "rivals", "gaze", "turning", "r3con", "training"]
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,13 @@ MODES: dict[str, dict[str, Any]] = {
 }
 """What a policy does on the way, and the settings of the loop for it."""
 
+COSTS = {
+    "active-gs-online": {"planning_seconds": 1.4, "mapping_seconds": 2.9},
+    "fisherrf": {"planning_seconds": 5.0, "mapping_seconds": 2.8},
+    "gauss-mi": {"planning_seconds": 1.8, "mapping_seconds": 8.4},
+}
+"""What rivals with a map of their own take on two CPU cores, as docs/comparison.md has it."""
+
 LONG: dict[str, Any] = {"iterations": 6000}
 """A training that does not punish a policy for its many frames, as the suite's does."""
 
@@ -100,6 +107,20 @@ TABLES: dict[TableName, dict[str, Row]] = {
         policy + mode: Row(policy, REFERENCE, loop=loop, training=LONG)
         for policy in POLICIES
         for mode, loop in MODES.items()
+    },
+    # Rivals that keep a map of their own, as if it cost no more than ours, and at its cost here.
+    "rivals": {
+        "ours-ahead": Row("ours-ahead", training=LONG),
+        "ours-ahead, captures, plans on the way": Row(
+            "ours-ahead", "ours-ahead", loop=ON_THE_WAY, training=LONG
+        ),
+        "gavis": Row("gavis", "ours-ahead", training=LONG),
+        REFERENCE: Row(REFERENCE, "ours-ahead", training=LONG),
+        **{
+            policy + how: Row(policy, "ours-ahead", loop=loop, training=LONG)
+            for policy, cost in COSTS.items()
+            for how, loop in ((", as fast as ours", {}), (", at its cost", cost))
+        },
     },
     # Where the camera looks on the way, and how often.
     "gaze": {

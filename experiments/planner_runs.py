@@ -20,7 +20,7 @@ import jax
 
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.clock import make_clock
+from r3jax.exploration.clock import WallClock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.state import LoopState, Mission, Stop, TakenView
@@ -155,7 +155,7 @@ def fly(flight: Flight) -> dict[str, Any]:
         parse_budget(f"views:{flight.views}"),
         key,
         ExplorationConfig(),
-        make_clock("wall"),
+        WallClock(),
     )
     state = start_state(mission, init_key)
     before = process_memory()

@@ -2,12 +2,12 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 
-from r3jax.exploration.config import ClockName
+from r3jax.exploration.config import ExplorationConfig
 
 T = TypeVar("T")
 
@@ -41,15 +41,7 @@ class WallClock:
 class ModelClock:
     """Charges a fixed cost per stage, so that the same run twice is the same run."""
 
-    costs: dict[str, float] = field(
-        default_factory=lambda: {
-            "planning": 0.3,
-            "reconsidering": 0.05,
-            "mapping": 0.02,
-            "gaze": 0.01,
-            "gaze plan": 0.1,
-        }
-    )
+    costs: dict[str, float]
     """Seconds per call, by stage; `reconsidering` a decision that was made on the way, `gaze` per
     frame that is captured on the way, `gaze plan` per frame of a path whose directions are planned
     together."""
@@ -61,9 +53,22 @@ class ModelClock:
         return self.costs[stage]
 
 
-def make_clock(name: ClockName) -> Clock:
-    """`wall` or `model`."""
-    return WallClock() if name == "wall" else ModelClock()
+def model_clock(config: ExplorationConfig) -> ModelClock:
+    """The clock of fixed costs; a decision's and a frame's are settings."""
+    return ModelClock(
+        {
+            "planning": config.planning_seconds,
+            "reconsidering": 0.05,
+            "mapping": config.mapping_seconds,
+            "gaze": 0.01,
+            "gaze plan": 0.1,
+        }
+    )
+
+
+def make_clock(config: ExplorationConfig) -> Clock:
+    """The clock that the settings name: `wall` or `model`."""
+    return WallClock() if config.clock == "wall" else model_clock(config)
 
 
 class _Compilations:

@@ -47,6 +47,12 @@ class ExplorationConfig(MappingConfig):
     clock: ClockName = "wall"
     """`wall`: measured planning and mapping. `model`: fixed costs, the same run every time."""
 
+    planning_seconds: float = 0.3
+    """What the clock `model` charges for a decision [s]."""
+
+    mapping_seconds: float = 0.02
+    """What the clock `model` charges for a frame that the policy takes in [s]."""
+
     num_probes: int = 16
     """Views that mean renderability is averaged over."""
 
@@ -122,6 +128,11 @@ class ExplorationConfig(MappingConfig):
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.clock not in ("wall", "model"):
             raise ValueError(f"clock must be `wall` or `model`, got {self.clock!r}")
+        for name in ("planning_seconds", "mapping_seconds"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name} must be a finite time >= 0 [s], got {getattr(self, name)}"
+                )
         self._check_captures()
 
     def _check_captures(self) -> None:

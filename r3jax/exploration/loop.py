@@ -97,7 +97,7 @@ def explore(
         budget,
         key,
         config,
-        make_clock(config.clock),
+        make_clock(config),
         is_enough,
         on_stage=on_stage or (lambda stage: None),
     )

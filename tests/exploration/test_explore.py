@@ -12,7 +12,6 @@ import pytest
 
 from r3jax.exploration import clock, explore
 from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.clock import ModelClock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import StopReason
 from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball
@@ -131,7 +130,7 @@ def test_the_last_view_arrives_within_the_budget(budget):
     limit = parse_budget(budget)
     assert result.reason is StopReason.BUDGET
     assert len(result.rows) > 1
-    mapping = ModelClock().costs["mapping"]  # the last picture is taken in time, mapped after
+    mapping = CONFIG.mapping_seconds  # the last picture is taken in time, mapped after
     assert getattr(result.state, limit.unit) <= limit.amount + mapping
     assert str(limit) in result.message
 

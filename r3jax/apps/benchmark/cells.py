@@ -22,7 +22,7 @@ _LONGEST_NAME = 150
 _LATER = {
     "drop_edges": True,
     "capture_every": None, "capture_rate": None, "gaze": "panorama", "exposure": 0.0, "blur": 1.0,
-    "plan_while_moving": False,
+    "plan_while_moving": False, "planning_seconds": 0.3, "mapping_seconds": 0.02,
 }  # fmt: skip
 """Settings of the loop that came after the first cells, with the values that these had: they count
 only where they differ, so that what was done before stays done."""

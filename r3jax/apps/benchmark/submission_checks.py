@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from r3jax.exploration.budget import Budget, parse_budget
-from r3jax.exploration.clock import ModelClock
+from r3jax.exploration.clock import model_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.formats.submissions import Submission, SubmittedFrame
 from r3jax.geometry.cameras import angle_between
@@ -66,7 +66,7 @@ class _Terms:
 
     def cost(self, stage: str) -> float:
         """The least that a stage takes on the mission clock [s]."""
-        return ModelClock().costs[stage] if self.config.clock == "model" else 0.0
+        return model_clock(self.config).costs[stage] if self.config.clock == "model" else 0.0
 
 
 @dataclass(frozen=True)

@@ -205,7 +205,7 @@ def _set_out(
         budget,
         key,
         config,
-        make_clock(config.clock),
+        make_clock(config),
         on_stage=on_stage or (lambda stage: None),
     )
     others = [m.simulator.start_pose for i, m in enumerate(members) if i != number]

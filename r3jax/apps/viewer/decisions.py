@@ -13,7 +13,7 @@ import numpy as np
 from r3jax.apps.viewer.color_maps import UTILITY_MAP, paint, spread
 from r3jax.apps.viewer.overlays import frustum_segments
 from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.clock import make_clock
+from r3jax.exploration.clock import model_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.replay import check_decided_alone
@@ -112,7 +112,7 @@ def decide_again(
         parse_budget(run.header.budget),
         key,
         config,
-        make_clock("model"),
+        model_clock(config),
     )
     try:
         state = start_state(mission, init_key)
