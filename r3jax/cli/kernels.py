@@ -61,7 +61,8 @@ def main(note: Path) -> None:
         mapping.register(name)
     from r3jax.scoring.backends.numba import bridge as scoring
 
-    scoring.register(scoring.SUMS)
+    for name in (scoring.SUMS, scoring.CHANGES):
+        scoring.register(name)
     from r3jax.splatting.backends.numba import bridge as splatting
 
     splatting.register()

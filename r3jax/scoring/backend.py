@@ -77,6 +77,29 @@ def sums_and_seen(
     return _sums(voxels, cells, view, focal, config, num_bins, keep=True)
 
 
+def change_of_sums(
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
+    kept: tuple[UInt8[Array, " p"], UInt8[Array, " q"]],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    num_bins: int,
+) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
+    """`reference.change_of_sums`, by the fastest backend of the platform."""
+    forms = config.forms
+
+    def score_by(backend: Any) -> Callable[..., Any]:
+        def score(known: tuple[Any, Any], places: Any) -> Any:
+            return backend.changes_of_sums(*known, places, forms, num_bins)
+
+        return lambda known, places: over_views(score, known, places)
+
+    place = (jnp.concatenate([position, focal[None]]), *kept)
+    results = _by_platform(score_by)((before, after), jax.tree.map(lambda x: x[None], place))
+    return jax.tree.map(lambda of_all: of_all[0], results)
+
+
 def seen_in_view(
     voxels: MapState, cells: Cells, view: View, config: ScoringConfig
 ) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:

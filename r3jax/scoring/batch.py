@@ -27,10 +27,8 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama import Panorama, panorama_of
 from r3jax.scoring.panorama_cache import (
-    Changes,
     PanoramaCache,
     cached_panorama,
-    changes_between,
     panorama_from_cache,
 )
 from r3jax.scoring.sharding import Candidates, padded_to, score_on_devices
@@ -144,8 +142,7 @@ def score_cached_near(
 
     `threads` is that of `map_over_devices`: 1 for who calls from threads.
     """
-    changes = _changes_between(before, after)
-    score = functools.partial(_score_cached, changes, camera, config)
+    score = functools.partial(_score_cached, before, after, camera, config)
     places = (kept, positions, _all_if_none(allowed, positions, config))
     return map_over_devices(score, places, threads=threads)
 
@@ -187,9 +184,6 @@ def _score_positions(
     return jax.vmap(score)(places)
 
 
-_changes_between = jax.jit(changes_between)
-
-
 @jax.jit
 def _cache_positions(
     voxels: MapState,
@@ -203,14 +197,17 @@ def _cache_positions(
 
 @jax.jit
 def _score_cached(
-    changes: Changes,
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
     camera: Camera,
     config: ScoringConfig,
     places: tuple[PanoramaCache, Float[Array, "C 3"], Bool[Array, "C B"]],
 ) -> Panorama:
-    return jax.lax.map(
-        lambda at: panorama_from_cache(at[0], changes, camera, at[1], config, at[2]), places
-    )
+    def score(place: tuple[PanoramaCache, Array, Array]) -> Panorama:
+        kept, position, allowed = place
+        return panorama_from_cache(kept, before, after, camera, position, config, allowed)
+
+    return jax.vmap(score)(places)
 
 
 def map_over_devices(

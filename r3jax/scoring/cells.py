@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.scoring.deficit import sum_by_direction
 from r3jax.visibility.depth_buffer import DepthBuffer, is_visible
-from r3jax.visibility.selection import Selection, for_selected, narrow, select
+from r3jax.visibility.selection import Selection, narrow, select
 from r3jax.visibility.views import View
 
 
@@ -51,29 +50,6 @@ def cells_of(grid: OccupancyGrid) -> Cells:
         fill(z[None, None, :]),
         grid.unexplored.reshape(-1),
     )
-
-
-def unexplored_by_direction(
-    cells: Cells, visible: Selection, position: Float[Array, " 3"], num_bins: int
-) -> Float[Array, " B"]:
-    """U_G: number of visible cells that are still unexplored, per direction bin.
-
-    Args:
-        cells: of the coarse grid.
-        visible: which of them are seen (`visible_cells`), now or before some were explored.
-        position: of the camera [m].
-        num_bins: bins of the Fibonacci lattice; 1 counts over all directions.
-    """
-
-    def count(
-        index: Int[Array, " n"], valid: Bool[Array, " n"], total: Float[Array, " B"]
-    ) -> Float[Array, " B"]:
-        points = jnp.stack([cells.x[index], cells.y[index], cells.z[index]])
-        # Asked again: cells may have been explored since the selection was made.
-        weight = (valid & cells.unexplored[index]).astype(jnp.float32)
-        return total + sum_by_direction(points, weight, position, num_bins)
-
-    return for_selected(visible, count, jnp.zeros(num_bins, dtype=jnp.float32))
 
 
 def visible_cells(

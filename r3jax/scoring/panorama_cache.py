@@ -14,12 +14,10 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
-from r3jax.scoring.backend import sums_and_seen
-from r3jax.scoring.cells import Cells, unexplored_by_direction
+from r3jax.scoring.backend import change_of_sums, sums_and_seen
+from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.deficit import deficit_per_bin
 from r3jax.scoring.panorama import Panorama, panorama_of_bins
-from r3jax.visibility.selection import Selection, narrow, select
 from r3jax.visibility.views import panorama_view
 
 
@@ -49,27 +47,6 @@ class PanoramaCache(eqx.Module):
         )
 
 
-class Changes(eqx.Module):
-    """What imagined views have changed: `before` them and `after`, the same voxels and cells."""
-
-    before: tuple[MapState, Cells]
-    after: tuple[MapState, Cells]
-
-    voxels: Selection
-    """Those that the views would show."""
-
-    cells: Selection
-    """Those that are no longer unexplored."""
-
-
-def changes_between(before: tuple[MapState, Cells], after: tuple[MapState, Cells]) -> Changes:
-    """What differs; `after` comes of `before` by `simulate_view_near`, any number of times."""
-    # The count tells: an imagined view adds to it in just the voxels that it shows.
-    shown = after[0].count > before[0].count
-    explored = before[1].unexplored & ~after[1].unexplored
-    return Changes(before, after, select(shown), select(explored))
-
-
 def cached_panorama(
     voxels: MapState,
     cells: Cells,
@@ -88,34 +65,28 @@ def cached_panorama(
 
 def panorama_from_cache(
     kept: PanoramaCache,
-    changes: Changes,
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
     camera: Camera,
     position: Float[Array, " 3"],
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> Panorama:
-    """`panorama_of` of what is after the changes, from what was kept before them.
+    """`panorama_of` of what is known after imagined views, from what was kept before them.
 
     Args:
         kept: of this position, before.
-        changes: since.
+        before: voxels and cells that it was kept of.
+        after: the same after any number of imagined views (`simulate_view_near`).
         camera: whose field of view and focal length count.
         position: camera center [m].
         config: as when it was kept.
         allowed: as in `panorama_of`.
     """
-    (voxels, cells), (voxels_after, _) = changes.before, changes.after
-    num_bins, focal, forms = config.panorama_bins, camera.focal, config.forms
-    shown = narrow(changes.voxels, lambda index: _is_set(kept.voxels, index))
-    explored = narrow(changes.cells, lambda index: _is_set(kept.cells, index))
-    was = deficit_per_bin(voxels, shown, position, focal, forms, num_bins)
-    now = deficit_per_bin(voxels_after, shown, position, focal, forms, num_bins)
-    gone = unexplored_by_direction(cells, explored, position, num_bins)
+    seen = (kept.voxels, kept.cells)
+    change, gone = change_of_sums(
+        before, after, seen, position, camera.focal, config, config.panorama_bins
+    )
     # A difference of sums may end just below 0 by rounding, which no bin is worth.
-    bins = jnp.maximum(kept.bin_scores + (now - was) - config.lambda1 * gone, 0.0)
+    bins = jnp.maximum(kept.bin_scores + change - config.lambda1 * gone, 0.0)
     return panorama_of_bins(bins, camera, position, config, allowed)
-
-
-def _is_set(bits: UInt8[Array, " p"], index: Int[Array, " k"]) -> Bool[Array, " k"]:
-    shift = (7 - (index & 7)).astype(jnp.uint8)  # packbits puts the first item highest
-    return ((bits[index >> 3] >> shift) & 1) == 1

@@ -204,7 +204,8 @@ MUTANTS = [
     Mutant("lookahead", "turned = limits.project_to_feasible(turned)", "pass", law_motion),
     Mutant("lookahead", "ways / problem.speed", "ways", law_motion),
     Mutant("lookahead", "< _TURNED", "> _TURNED", law_apart),
-    Mutant("lookahead", "others = list(taken)", "others = []", law_apart),
+    Mutant("lookahead", "for other in taken:", "for other in ():", law_apart),
+    Mutant("lookahead", "return is_far |", "return is_far &", law_apart),
 ]
 
 

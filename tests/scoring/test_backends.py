@@ -18,6 +18,7 @@ from r3jax.scoring import backend
 from r3jax.scoring.backends import dense, reference
 from r3jax.scoring.backends.views import layout_of, row_of
 from r3jax.scoring.cells import Cells, cells_of
+from r3jax.scoring.simulated import simulate_view_near
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import View, panorama_view, pinhole_view
 
@@ -217,3 +218,56 @@ def test_terms_of_all_rows_are_those_of_the_formulas(seed):
     for name, term in vars(chosen(state, positions)).items():
         np.testing.assert_allclose(term, getattr(expected, name), atol=1e-4, err_msg=name)
     np.testing.assert_allclose(found(state, positions), slope(state, positions), atol=1e-3)
+
+
+@functools.cache
+def changes():
+    """What imagined views change: by the reference, one by one; mapped; as dense batches."""
+    bins = CONFIG.panorama_bins
+
+    def ask(module, known, kept, position):
+        return module(*known, kept, position, CAMERA.focal, CONFIG, bins)
+
+    def by_formulas(before, after, kept, position, focal, config, bins):
+        return reference.change_of_sums(before, after, kept, position, focal, config.forms, bins)
+
+    def batches(known, kept, positions):
+        points = jnp.concatenate([positions, jnp.full((NUM, 1), CAMERA.focal)], axis=1)
+        return dense.changes_of_sums(*known, (points, *kept), CONFIG.forms, bins)
+
+    exact = lambda known, kept, at: jax.lax.map(lambda x: ask(by_formulas, known, *x), (kept, at))
+    chosen = functools.partial(ask, backend.change_of_sums)
+    return jax.jit(exact), jax.jit(jax.vmap(chosen, (None, 0, 0))), jax.jit(batches)
+
+
+def known_after(seed: int):
+    """A world before and after three imagined views, and bits of what positions see of it."""
+    state, grid = world(seed)
+    before = after = (state, cells_of(grid))
+    for pose in poses_of(seed)[:3]:
+        after = simulate_view_near(*after, CAMERA, pose, CONFIG)
+    rng = np.random.default_rng([seed, 2])
+    sizes = [-(-num // 8) for num in (state.capacity, before[1].x.shape[0])]
+    kept = tuple(jnp.asarray(rng.integers(0, 256, (NUM, size)), jnp.uint8) for size in sizes)
+    return (before, after), kept
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 1000))
+def test_changes_are_those_of_the_reference(seed):
+    known, kept = known_after(seed)
+    exact, mapped, batches = changes()
+    expected = exact(known, kept, poses_of(seed)[:, :3, 3])
+    for found in (mapped, batches):
+        change, explored = found(known, kept, poses_of(seed)[:, :3, 3])
+        np.testing.assert_allclose(change, expected[0], atol=1e-4)
+        np.testing.assert_array_equal(explored, expected[1])
+
+
+def test_imagined_views_change_sums_for_the_better():
+    """Or the law above would compare nothing with nothing."""
+    known, kept = known_after(0)
+    change, explored = changes()[0](known, kept, poses_of(0)[:, :3, 3])
+    assert float(change.max()) <= 1e-6  # no renderability ever falls
+    assert float(change.sum()) < -1.0
+    assert float(explored.sum()) > 1.0

@@ -19,7 +19,15 @@ from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import wrap
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.plain_kernels import kernels_as_python
-from tests.scoring.test_backends import CAMERA, CONFIG, NUM_BINS, poses_of, view_at, world
+from tests.scoring.test_backends import (
+    CAMERA,
+    CONFIG,
+    NUM_BINS,
+    known_after,
+    poses_of,
+    view_at,
+    world,
+)
 
 SIGHT, SCORES = numba.visibility_kernels.__name__, numba.__name__
 BINS = f"{numba.mapping_kernels.__name__}.bins"
@@ -28,7 +36,7 @@ CHAIN = (
     BINS,
     *(
         f"{SCORES}.{name}"
-        for name in ("voxels", "near", "terms", "shown", "few", "sums", "pixels", "rows")
+        for name in ("voxels", "near", "terms", "shown", "few", "sums", "pixels", "rows", "changes")
     ),
 )
 VIEWS = 5  # one more than `sums.FEW`, so that bricks are made
@@ -139,7 +147,38 @@ def terms_agree(modules: Modules) -> None:
         np.testing.assert_allclose(found[0], term, atol=1e-4, err_msg=name)
 
 
+def changes_agree(modules: Modules) -> None:
+    (before, after), kept = known_after(2)
+    positions, bins = poses_of(2)[:2, :3, 3], CONFIG.panorama_bins
+    some = [np.array(bits[:2]) for bits in kept]
+    known = [
+        (*(np.array(x) for x in (m.key, m.visited, m.count, m.m2, m.resolution)),
+         np.float32(m.voxel_size))
+        for m in (before[0], after[0])
+    ]  # fmt: skip
+    space = [np.array(x) for x in (before[1].x, before[1].y, before[1].z)]
+    unexplored = [np.array(part[1].unexplored, np.uint8) for part in (before, after)]
+    points = np.float32([[*position, float(CAMERA.focal)] for position in positions.tolist()])
+    table = np.ascontiguousarray(nearest_bin_table(bins).T)
+    tables = bins_of(before[0]), table, fibonacci_lattice(bins).astype(np.float32)
+    results = np.empty((2, bins), np.float32), np.empty((2, bins), np.float32)
+    modules["changes"].changes_pass(
+        *known, (*space, *unexplored), some, points, (False, False), tables, results
+    )
+    one = lambda bits, position: reference.change_of_sums(
+        before, after, bits, position, CAMERA.focal, CONFIG.forms, bins
+    )
+    change, explored = jax.jit(jax.vmap(one))(some, positions)
+    np.testing.assert_allclose(results[0], change, atol=1e-4)
+    np.testing.assert_array_equal(results[1], explored)
+
+
 MUTANTS = [
+    Mutant("changes", "num += after[row] > before[row]", "num += after[row] < before[row]", changes_agree),
+    Mutant("changes", "(7 - (item & 7))", "(item & 7)", changes_agree),
+    Mutant("changes", "weights[j] -= was[j]", "weights[j] += was[j]", changes_agree),
+    Mutant("changes", "& (after[cell] == 0)", "", changes_agree),
+    Mutant("changes", "sums[:], results[1][i] = 0.0, 0.0", "results[1][i] = 0.0", changes_agree),
     Mutant("views", "placed[COLUMN + i] = column * half + half",
            "placed[COLUMN + i] = column * half", sums_agree),
     Mutant("views", "q = a if is_lower else b", "q = b", sums_agree),
@@ -192,7 +231,10 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-LAWS = borders_agree, sums_agree, few_agree, in_images, images_agree, images_all_round, terms_agree
+LAWS = (
+    borders_agree, sums_agree, few_agree, in_images, images_agree, images_all_round, terms_agree,
+    changes_agree,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -8,9 +8,7 @@ import pytest
 import r3jax
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import MapState
-from r3jax.scoring import deficit as lack
 from r3jax.scoring.config import PAPER, Forms
-from r3jax.visibility.selection import select
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 NUM = 64
@@ -126,22 +124,6 @@ def test_the_examples_reach_both_sides_of_every_branch():
 @each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)
-
-
-@pytest.mark.full
-def test_the_derivative_of_the_lack_is_that_of_the_dense_sum():
-    voxels = make_voxels()
-    visible = select(voxels.present)
-    position, focal = jnp.asarray(POSITION, jnp.float32), jnp.float32(FOCAL)
-    looped = lambda p: lack.deficit_per_bin(voxels, visible, p, focal, PAPER, 1)[0]
-    dense = lambda p: lack._deficit(voxels, visible.mask, p, focal, PAPER, 1)[0]
-    assert float(looped(position)) == pytest.approx(float(dense(position)), rel=1e-6)
-    gradient = np.asarray(jax.jit(jax.grad(looped))(position))
-    np.testing.assert_allclose(gradient, jax.jit(jax.grad(dense))(position), rtol=1e-5, atol=1e-5)
-    step = 1e-3
-    moves = np.eye(3, dtype=np.float32) * step
-    difference = [float(looped(position + d) - looped(position - d)) / (2 * step) for d in moves]
-    np.testing.assert_allclose(gradient, difference, rtol=0.05, atol=0.05)
 
 
 def observed(colors: np.ndarray, directions: np.ndarray) -> r3jax.MapState:

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from r3jax.planning.candidates import poses_along
 from r3jax.scoring import batch
-from r3jax.scoring import panorama_cache as real
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.simulated import simulate_view_near
 from tests.mutants import Modules, Mutant, assert_caught, each, load
@@ -82,9 +81,10 @@ def law_again(modules: Modules, seed: int = 0, num: int = 2) -> None:
 
     @jax.jit
     def score(after, items):
-        changes = module.changes_between(start(), after)
-        again = lambda at: module.panorama_from_cache(at[0], changes, CAMERA, at[1], SCORING, at[2])
-        return jax.lax.map(again, items)
+        one = lambda at: module.panorama_from_cache(
+            at[0], start(), after, CAMERA, at[1], SCORING, at[2]
+        )
+        return jax.vmap(one)(items)
 
     check(score(after_views(seed, num), (kept, places, jnp.asarray(allowed))), seed, num)
 
@@ -102,11 +102,8 @@ def test_views_change_something():
     """Or the law would hold for what forgets them."""
     voxels, cells = start()
     after, left = after_views(0, 2)
-    changes = real.changes_between(start(), (after, left))
-    shown, explored = int(changes.voxels.count), int(changes.cells.count)
-    assert min(shown, explored) > 20
-    assert explored == int(cells.unexplored.sum()) - int(left.unexplored.sum())
-    assert shown == int((after.count > voxels.count).sum())
+    assert int((after.count > voxels.count).sum()) > 20
+    assert int(cells.unexplored.sum()) - int(left.unexplored.sum()) > 20
 
 
 def test_some_of_the_positions_and_others_in_their_place():
@@ -122,11 +119,9 @@ def test_some_of_the_positions_and_others_in_their_place():
 
 
 MUTANTS = [
-    Mutant("panorama_cache", "(now - was)", "now", law_again),
+    Mutant("panorama_cache", "kept.bin_scores + change", "change", law_again),
     Mutant("panorama_cache", "- config.lambda1 * gone", "", law_again),
-    Mutant("panorama_cache", "(7 - (index & 7))", "(index & 7)", law_again),
-    Mutant("panorama_cache", "_is_set(kept.cells, index)", "index >= 0", law_again),
-    Mutant("panorama_cache", "deficit_per_bin(voxels_after,", "deficit_per_bin(voxels,", law_again),
+    Mutant("panorama_cache", "before, after, seen", "after, after, seen", law_again),
 ]
 
 

@@ -32,7 +32,7 @@ from r3jax.scoring.batch import cache_positions_near
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
-from r3jax.scoring.panorama_cache import PanoramaCache, changes_between, panorama_from_cache
+from r3jax.scoring.panorama_cache import PanoramaCache, panorama_from_cache
 from r3jax.scoring.simulated import simulate_view_near
 
 WIDTH = 12
@@ -170,8 +170,7 @@ def _expand(
 
     def one(node: tuple[Known, Float[Array, "4 4"]]) -> tuple[Known, Float[Array, " B"]]:
         after = simulate_view_near(*node[0], camera, node[1], scoring)
-        changes = changes_between(start, after)
-        panorama = panorama_from_cache(kept, changes, camera, place, scoring)
+        panorama = panorama_from_cache(kept, start, after, camera, place, scoring)
         return after, panorama.direction_scores
 
     return jax.lax.map(one, (history, poses))

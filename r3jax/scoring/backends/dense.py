@@ -7,7 +7,7 @@ Shape symbols: P views; B bins of the panorama.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from r3jax.mapping.state import MapState
 from r3jax.scoring.backends import reference
@@ -51,6 +51,22 @@ def sums_in_views(
         return *sums, *(jnp.packbits(mask) for mask in seen)
 
     return jax.lax.map(one, views, batch_size=batch_size(voxels.capacity))
+
+
+def changes_of_sums(
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
+    places: tuple[Float[Array, "P 4"], UInt8[Array, "P p"], UInt8[Array, "P q"]],
+    forms: Forms,
+    num_bins: int,
+) -> tuple[Float[Array, "P B"], Float[Array, "P B"]]:
+    """`reference.change_of_sums` of many positions."""
+
+    def one(place: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        point, *kept = place
+        return reference.change_of_sums(before, after, kept, point[:3], point[3], forms, num_bins)
+
+    return jax.lax.map(one, places, batch_size=batch_size(before[0].capacity))
 
 
 def means_in_pixels(

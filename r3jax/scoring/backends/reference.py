@@ -6,13 +6,17 @@ what is visible is held fixed. What other backends answer is held to this.
 Shape symbols: n voxels; c cells; B bins of the panorama; h w pixels of the depth buffer.
 """
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from r3jax.geometry.numerics import safe_norm
+from r3jax.geometry.sphere import nearest_bin
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms, ScoringConfig
-from r3jax.scoring.deficit import sum_by_direction
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.reference import nearest_voxels, visible
 from r3jax.visibility.views import View
@@ -45,6 +49,47 @@ def sums_in_view(
     return (
         sum_by_direction(voxels.center, deficit, position, num_bins),
         sum_by_direction(points, unexplored, position, num_bins),
+    )
+
+
+def change_of_sums(
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
+    kept: Sequence[UInt8[Array, " _"]],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    forms: Forms,
+    num_bins: int,
+) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
+    """Sums up what imagined views have changed of `sums_in_view` where the same is seen.
+
+    Args:
+        before: voxels and cells before the views.
+        after: the same after them (`simulated.simulate_view_near`).
+        kept: which voxels and which cells are seen, as bits in bytes.
+        position: of the camera [m].
+        focal: focal length of R [px].
+        forms: of kappa and delta.
+        num_bins: bins of the Fibonacci lattice.
+
+    Returns:
+        Sums of 1 - R after less before, and numbers of cells that are no longer unexplored.
+    """
+    (voxels, cells), (voxels_after, cells_after) = before, after
+    seen, empty = (
+        jnp.unpackbits(bits, count=num).astype(bool)
+        for bits, num in zip(kept, (voxels.capacity, cells.x.shape[0]), strict=True)
+    )
+    lack, left = (
+        1.0 - score_voxels(known, position, focal, forms).value for known in (voxels, voxels_after)
+    )
+    # The count tells: an imagined view adds to it in just the voxels that it shows.
+    shown = seen & (voxels_after.count > voxels.count)
+    explored = empty & cells.unexplored & ~cells_after.unexplored
+    points = jnp.stack([cells.x, cells.y, cells.z])
+    return (
+        sum_by_direction(voxels.center, jnp.where(shown, left - lack, 0.0), position, num_bins),
+        sum_by_direction(points, explored.astype(jnp.float32), position, num_bins),
     )
 
 
@@ -90,3 +135,19 @@ def voxels_of_rows(voxels: MapState, rows: Int[Array, "h w"]) -> MapState:
     flat = rows.reshape(-1)
     is_hit = flat < voxels.capacity
     return voxels.take(jnp.where(is_hit, flat, 0), is_hit)
+
+
+def sum_by_direction(
+    points: Float[Array, "3 n"],
+    weight: Float[Array, " n"],
+    position: Float[Array, " 3"],
+    num_bins: int,
+) -> Float[Array, " B"]:
+    """Sums weights into the bins in which points lie, seen from a position; 1 bin sums all."""
+    if num_bins == 1:
+        return jnp.sum(weight, keepdims=True)
+    # The choice of the bin is piecewise constant: no derivative passes through it.
+    offset = jax.lax.stop_gradient(points - position[:, None])
+    direction = offset / jnp.maximum(safe_norm(offset, axis=0), 1e-6)[None, :]
+    bins = nearest_bin(direction, num_bins)
+    return jnp.zeros(num_bins, dtype=jnp.float32).at[bins].add(weight)

@@ -62,9 +62,7 @@ def view_of(row: Float[Array, " 20"], layout: BufferLayout) -> View:
     return PinholeView(camera, T_world_camera, far)
 
 
-def over_views(
-    score: Callable[[Any, Float[Array, "P k"]], Any], shared: Any, views: Float[Array, "P k"]
-) -> Any:
+def over_views(score: Callable[[Any, Any], Any], shared: Any, views: Any) -> Any:
     """`score(shared, views)`, so that `vmap` over views is one call of all of them.
 
     Where what is shared differs as well, one call follows the other.
@@ -72,14 +70,12 @@ def over_views(
     Args:
         score: of a batch; gives arrays whose first axis is that of the views.
         shared: the same for all of them, such as the map.
-        views: one a row.
+        views: one a row, [P, k] each; an array or several.
     """
     batched = custom_vmap(score)
 
     @batched.def_vmap
-    def rule(
-        axis_size: int, in_batched: Any, shared: Any, views: Float[Array, "..."]
-    ) -> tuple[Any, Any]:
+    def rule(axis_size: int, in_batched: Any, shared: Any, views: Any) -> tuple[Any, Any]:
         shared_batched, views_batched = in_batched
         if any(jax.tree.leaves(shared_batched)):
             leaves, treedef = jax.tree.flatten((shared, views))
@@ -96,8 +92,10 @@ def over_views(
 
             scores = jax.lax.map(one, mapped)
         else:
-            flat = over_views(score, shared, views.reshape(-1, views.shape[-1]))
-            scores = jax.tree.map(lambda x: x.reshape(*views.shape[:-1], *x.shape[1:]), flat)
+            leading = jax.tree.leaves(views)[0].shape[:-1]
+            rows = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), views)
+            flat = over_views(score, shared, rows)
+            scores = jax.tree.map(lambda x: x.reshape(*leading, *x.shape[1:]), flat)
         return scores, jax.tree.map(lambda _: True, scores)
 
     return batched(shared, views)

@@ -259,19 +259,22 @@ def _apart(
 ) -> list[int]:
     """Up to `num` of the views, in order, each apart from those before it and those taken."""
     chosen: list[int] = []
-    others = list(taken)
+    is_left = np.ones(len(views.position), dtype=bool)
+    for other in taken:
+        is_left &= _are_apart(views, other)
     for i in ranked:
         if len(chosen) == num:
             break
-        view = views.position[i], views.direction[i]
-        if all(_are_apart(view, other) for other in others):
+        if is_left[i]:
             chosen.append(i)
-            others.append(view)
+            is_left &= _are_apart(views, (views.position[i], views.direction[i]))
     return chosen
 
 
-def _are_apart(first: _Sight, second: _Sight) -> bool:
-    is_far = float(np.linalg.norm(first[0] - second[0])) >= _APART
+def _are_apart(views: Candidates, other: _Sight) -> np.ndarray:
+    """Which of the views are another choice than one view, [C]."""
+    position, direction = other
+    is_far = np.linalg.norm(views.position - position, axis=1) >= _APART
     # Directions have any length: a product on the other side saves dividing by it.
-    lengths = float(np.linalg.norm(first[1]) * np.linalg.norm(second[1]))
-    return is_far or float(first[1] @ second[1]) < _TURNED * lengths
+    lengths = np.linalg.norm(views.direction, axis=1) * np.linalg.norm(direction)
+    return is_far | (views.direction @ direction < _TURNED * lengths)

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 import r3jax.visibility.backends.numba as visibility_kernels
 from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
@@ -17,7 +17,7 @@ from r3jax.mapping.backends import numba as mapping_kernels
 from r3jax.mapping.state import MapState
 from r3jax.native.compiled import forget_outdated_code
 from r3jax.native.ffi import num_workers
-from r3jax.scoring.backends.numba.bridge import PIXELS, ROWS, SUMS, register
+from r3jax.scoring.backends.numba.bridge import CHANGES, PIXELS, ROWS, SUMS, register
 from r3jax.scoring.backends.numba.rows import NUM_TERMS
 from r3jax.scoring.backends.views import BufferLayout
 from r3jax.scoring.cells import Cells
@@ -81,6 +81,28 @@ def sums_in_views(
         *_shared(voxels), views, _options(layout, forms), directions, *_tables(num_bins), *space
     )
     return tuple(results) if keep else tuple(results[:2])
+
+
+def changes_of_sums(
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
+    places: tuple[Float[Array, "P 4"], UInt8[Array, "P p"], UInt8[Array, "P q"]],
+    forms: Forms,
+    num_bins: int,
+) -> tuple[Float[Array, "P B"], Float[Array, "P B"]]:
+    """`reference.change_of_sums` of many positions, on the core of who asks."""
+    register(CHANGES)
+    (voxels, cells), (seen, left) = before, after
+    points, *kept = places
+    sums = jax.ShapeDtypeStruct((points.shape[0], num_bins), jnp.float32)
+    unexplored = [some.unexplored.astype(jnp.uint8) for some in (cells, left)]
+    changes, gone = jax.ffi.ffi_call(CHANGES, [sums, sums])(
+        *_shared(voxels), seen.visited, seen.count, seen.m2, seen.resolution,
+        cells.x, cells.y, cells.z, *unexplored, *kept, points,
+        np.array(_choices(forms), dtype=np.int32),
+        fibonacci_lattice(voxels.num_bins).astype(np.float32), *_tables(num_bins),
+    )  # fmt: skip
+    return changes, gone
 
 
 def means_in_pixels(

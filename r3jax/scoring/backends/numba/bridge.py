@@ -19,12 +19,13 @@ from r3jax.native.ffi import (
     register_handlers,
     words2,
 )
+from r3jax.scoring.backends.numba.changes import changes_pass
 from r3jax.scoring.backends.numba.pixels import pixels_pass
 from r3jax.scoring.backends.numba.rows import rows_pass
 from r3jax.scoring.backends.numba.sums import sums_pass
 
 SUMS, PIXELS = "r3jax_scoring_sums", "r3jax_scoring_pixels"
-ROWS = "r3jax_scoring_rows"
+ROWS, CHANGES = "r3jax_scoring_rows", "r3jax_scoring_changes"
 
 
 @inlined
@@ -107,7 +108,36 @@ def _rows(frame):
     return 0
 
 
-_HANDLERS = {SUMS: _sums, PIXELS: _pixels, ROWS: _rows}
+def _changes(frame):
+    """Arguments: state (6), the same later (4), cells (5), bits (2), points, options, tables (3).
+
+    Of the later state: visited, count, m2, resolution. Options: whether kappa is 1, whether delta
+    is that of pairs. Results: changes of the sums of 1 - R, numbers of cells explored.
+    """
+    if answers_metadata(frame):
+        return 0
+    before, options = _state(frame), ints1(frame, ARGUMENTS, 18)
+    changes_pass(
+        before,
+        (
+            before[0], words2(frame, ARGUMENTS, 6), floats1(frame, ARGUMENTS, 7),
+            floats1(frame, ARGUMENTS, 8), floats1(frame, ARGUMENTS, 9), before[5],
+        ),
+        (
+            floats1(frame, ARGUMENTS, 10), floats1(frame, ARGUMENTS, 11),
+            floats1(frame, ARGUMENTS, 12), bytes1(frame, ARGUMENTS, 13),
+            bytes1(frame, ARGUMENTS, 14),
+        ),
+        (bytes2(frame, ARGUMENTS, 15), bytes2(frame, ARGUMENTS, 16)),
+        floats2(frame, ARGUMENTS, 17),
+        (options[0] != 0, options[1] != 0),
+        (floats2(frame, ARGUMENTS, 19), ints2(frame, ARGUMENTS, 20), floats2(frame, ARGUMENTS, 21)),
+        (floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1)),
+    )  # fmt: skip
+    return 0
+
+
+_HANDLERS = {SUMS: _sums, PIXELS: _pixels, ROWS: _rows, CHANGES: _changes}
 
 
 def register(name: str) -> None:

@@ -61,7 +61,7 @@ def _compact(is_near, first, count, chosen):
 
 
 @inlined
-def _gather(
+def gather(
     key, words, count, m2, resolution, voxel_size, num, chosen, begin, voxels, visited, rows
 ):
     """Gathers what is known of chosen rows to where they belong."""
@@ -82,7 +82,7 @@ def _gather(
 
 
 @kernel
-def _find_consistency(counts, spreads, is_pairwise):
+def find_consistency(counts, spreads, is_pairwise):
     """Replaces counts by delta, and spreads of colors by its logarithm."""
     in_wide_vectors()
     for i in range(counts.shape[0]):
@@ -130,11 +130,11 @@ def gather_near(
                 count[first:last], voxel_size, is_near,
             )  # fmt: skip
             num = _compact(is_near, first, last - first, chosen)
-            _gather(
+            gather(
                 key, words, count, m2, resolution, voxel_size, num, chosen, to, voxels, visited,
                 rows,
             )  # fmt: skip
-            _find_consistency(
+            find_consistency(
                 voxels[DELTA, to : to + num], voxels[LOG_DELTA, to : to + num], is_pairwise
             )
             to += num

@@ -126,7 +126,7 @@ def _compact(is_seen, count, chosen):
 
 
 @inlined_fused
-def _find_directions(position, points, first, chosen, num, size, angles, cells):
+def find_directions(position, points, first, chosen, num, size, angles, cells):
     """Finds unit vectors from a position to chosen points, distances, and octahedral cells."""
     in_wide_vectors()
     x, y, z = position
@@ -146,7 +146,7 @@ def _find_directions(position, points, first, chosen, num, size, angles, cells):
 
 
 @inlined_fused
-def _add_by_direction(angles, cells, weights, num, table, lattice, sums):
+def add_by_direction(angles, cells, weights, num, table, lattice, sums):
     """Adds weights to the bins in which directions lie."""
     if sums.shape[0] == 1:
         for j in range(num):
@@ -158,7 +158,7 @@ def _add_by_direction(angles, cells, weights, num, table, lattice, sums):
 
 
 @inlined_fused
-def _find_deficits(known, first, chosen, num, settings, directions, angles, weights):
+def find_deficits(known, first, chosen, num, settings, directions, angles, weights):
     """Finds 1 - R of chosen voxels."""
     in_wide_vectors()
     voxels, visited = known
@@ -215,12 +215,12 @@ def add_seen_voxels(view, wraps, shape, voxel_size, runs, known, limit, chunk, o
             place(view, shape, wraps, voxels[X], voxels[Y], voxels[Z], first, count, placed)
             test_corners(placed, count, voxel_size, limit, side, shape, pixels, is_seen)
             num = _compact(is_seen, count, chosen)
-            _find_directions(position, voxels, first, chosen, num, size, angles, bins)
+            find_directions(position, voxels, first, chosen, num, size, angles, bins)
             _mark(rows, first, chosen, num, bits)
-            _find_deficits(
+            find_deficits(
                 (voxels, visited), first, chosen, num, settings, directions, angles, weights
             )
-            _add_by_direction(angles, bins, weights, num, table, lattice, sums)
+            add_by_direction(angles, bins, weights, num, table, lattice, sums)
 
 
 @kernel
@@ -239,5 +239,5 @@ def count_seen_cells(view, wraps, shape, empty, part, nearest, chunk, tables, co
         test_points(placed, count, nearest, side, shape, is_seen)
         num = _compact(is_seen, count, chosen)
         _mark(numbers, first, chosen, num, bits)
-        _find_directions(position, cells, first, chosen, num, size, angles, bins)
-        _add_by_direction(angles, bins, weights, num, table, lattice, counts)
+        find_directions(position, cells, first, chosen, num, size, angles, bins)
+        add_by_direction(angles, bins, weights, num, table, lattice, counts)
