@@ -30,6 +30,7 @@ from numba.np.ufunc.parallel import threading_layer
 
 from r3jax.native.compiled import called_from_python, inlined, intrinsic
 from r3jax.native.one_piece import in_one_piece
+from r3jax.native.platform import num_cores
 
 # Offsets in bytes in the structs of XLA's FFI, API version `version.WRITTEN_FOR`.
 _EXTENSION, _API = 8, 16
@@ -200,7 +201,7 @@ def require_threads() -> None:
 
 def num_workers() -> int:
     """Threads that share the work: one for each core that the process may use."""
-    return min(get_num_threads(), len(os.sched_getaffinity(0)))
+    return min(get_num_threads(), num_cores())
 
 
 @contextlib.contextmanager

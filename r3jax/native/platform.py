@@ -1,6 +1,7 @@
 """Kernels on CPUs, plain JAX elsewhere: the choice that is made where a program is lowered."""
 
 import functools
+import os
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -43,3 +44,10 @@ def _warn(version: tuple[int, int]) -> None:
         RuntimeWarning,
         stacklevel=2,
     )
+
+
+def num_cores() -> int:
+    """Cores that this process may use, which a scheduler may keep below those of the machine."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS, which ties no process to cores
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

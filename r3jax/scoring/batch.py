@@ -8,7 +8,6 @@ Shape symbols: C candidates; n voxels; c cells; B bins of the panorama.
 
 import functools
 import operator
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -21,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from r3jax.geometry.cameras import Camera, is_traced
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.native.platform import speaks_our_interface
+from r3jax.native.platform import num_cores, speaks_our_interface
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
@@ -229,9 +228,8 @@ def map_over_devices(
     if len(devices) > 1:
         scores = score_on_devices(score.func, score.args, candidates, devices)
         return jax.tree.map(lambda x: x[:num], jax.device_put(scores, devices[0]))
-    # The cores this process may use, which a scheduler may keep below those of the machine.
     is_cpu = jax.default_backend() == "cpu"
-    workers = min(len(os.sched_getaffinity(0)), num, threads or num) if is_cpu else 1
+    workers = min(num_cores(), num, threads or num) if is_cpu else 1
     if workers < 2:
         return score(candidates)
     # Shares of one size: one compiled program serves all threads.

@@ -174,7 +174,8 @@ def changes_agree(modules: Modules) -> None:
 
 
 MUTANTS = [
-    Mutant("changes", "num += after[row] > before[row]", "num += after[row] < before[row]", changes_agree),
+    Mutant("changes", "num += after[row] > before[row]", "num += after[row] < before[row]",
+           changes_agree),
     Mutant("changes", "(7 - (item & 7))", "(item & 7)", changes_agree),
     Mutant("changes", "weights[j] -= was[j]", "weights[j] += was[j]", changes_agree),
     Mutant("changes", "& (after[cell] == 0)", "", changes_agree),

@@ -88,7 +88,7 @@ def test_each_worker_has_a_gpu_or_its_share(monkeypatch):
     assert [worker["CUDA_VISIBLE_DEVICES"] for worker in crowded] == ["2", "5", "2"]
     assert {worker["XLA_PYTHON_CLIENT_MEM_FRACTION"] for worker in crowded} == {"0.450"}
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "-1")
-    monkeypatch.setattr(local.os, "sched_getaffinity", lambda pid: set(range(7)))
+    monkeypatch.setattr(local, "num_cores", lambda: 7)
     assert worker_environments(3) == [{"NUMBA_NUM_THREADS": "2"}] * 3
     monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
     assert worker_environments(2) == [{}, {}]

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from r3jax.apps.benchmark.cells import Cell
+from r3jax.native.platform import num_cores
 
 if TYPE_CHECKING:
     from r3jax.apps.benchmark.cells import Cell
@@ -216,7 +217,7 @@ def worker_environments(count: int) -> list[dict[str, str]]:
             if sharing > 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:
                 environment["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{0.9 / sharing:.3f}"
         elif "NUMBA_NUM_THREADS" not in os.environ:
-            threads = max(1, len(os.sched_getaffinity(0)) // count)
+            threads = max(1, num_cores() // count)
             environment = {"NUMBA_NUM_THREADS": str(threads)}
         else:
             environment = {}

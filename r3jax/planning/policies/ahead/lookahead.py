@@ -17,7 +17,6 @@ Shape symbols: C places.
 """
 
 import math
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -29,6 +28,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
+from r3jax.native.platform import num_cores
 from r3jax.planning.candidates import Candidates, best_views, poses_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.robot.limits import Limits
@@ -166,7 +166,7 @@ def search(problem: BeamProblem) -> list[Path]:
         for i in _apart(ranked.tolist(), views, (), config.beam)
     ]
     # A path by each core: what is worth a few milliseconds is not dealt out further.
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(num_cores()) as pool:
         for _ in range(config.horizon - 1):
             # Parents leave the beam: only paths of as many views compare their rates.
             children = pool.map(lambda path: _expanded(path, problem), beam)
