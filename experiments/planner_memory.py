@@ -5,7 +5,8 @@
 Three answers, from the narrowest to the widest: the arrays that outlive a step (map, coarse grid,
 the policy's own state); what the device holds at its peak, scoring included (GPUs only); and what
 the process has taken since before the first view, compiled programs included (Linux only; on a
-CPU it holds the arrays too). The missions are those of `experiments.planner_latency`.
+CPU it holds the arrays too). Beside that stands what it gives back when JAX forgets its programs.
+The missions are those of `experiments.planner_latency`.
 """
 
 from collections.abc import Sequence
@@ -136,6 +137,7 @@ def page(records: Records, size: str) -> list[str]:
                 "policy's own": most(row["policy_bytes"] for _, row in lasts),
                 "device, peak": most(row["device_peak_bytes"] for _, row in lasts),
                 "process, growth": most(growth(record, row) for record, row in lasts),
+                "compiled programs": most(record["compiled_bytes"] for record, _ in lasts),
             }
         )
     return [f"# What planning holds ({size})", "Megabytes.", markdown_table(table)]

@@ -5,9 +5,12 @@ that policy. A mission that is done is kept and not flown again, as long as its 
 commit are the same.
 """
 
+import ctypes
 import dataclasses
+import gc
 import json
 import os
+import platform
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -142,9 +145,10 @@ def fly(flight: Flight) -> dict[str, Any]:
     """Flies one mission.
 
     Returns:
-        The flight, the machine, the memory of the process before the first view [bytes; None if
-        unknown], and a row per decision. `key_frames` of a row are those in the map when the
-        policy decided; its memory is what is held after the frame that followed.
+        The flight, the machine, the memory of the process before the first view and that of
+        compiled programs at the end [bytes; None if unknown], and a row per decision. `key_frames`
+        of a row are those in the map when the policy decided; its memory is what is held after the
+        frame that followed.
     """
     camera = Camera.from_fov(flight.resolution, flight.resolution)
     simulator = open_scene(flight.scene, camera=camera, seed=flight.seed)
@@ -158,13 +162,14 @@ def fly(flight: Flight) -> dict[str, Any]:
         WallClock(),
     )
     state = start_state(mission, init_key)
-    before = process_memory()
+    before, rows = process_memory(), list(_rows(state, mission))
     return {
         "flight": dataclasses.asdict(flight),
         "machine": machine(),
         "backend": jax.default_backend(),
         "process_bytes_before": before,
-        "rows": list(_rows(state, mission)),
+        "rows": rows,
+        "compiled_bytes": compiled_memory(),
     }
 
 
@@ -212,6 +217,22 @@ def process_memory() -> int | None:
     except OSError:
         return None
     return int(resident) * os.sysconf("SC_PAGE_SIZE")
+
+
+def compiled_memory() -> int | None:
+    """What the process gives back when JAX forgets its programs [bytes]; None where unknown."""
+    before = _memory_in_use()
+    jax.clear_caches()
+    after = _memory_in_use()
+    return None if before is None or after is None else before - after
+
+
+def _memory_in_use() -> int | None:
+    """Resident memory without what the allocator only keeps for later."""
+    gc.collect()
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).malloc_trim(0)
+    return process_memory()
 
 
 def bucket_of(key_frames: int, width: int) -> tuple[int, int]:
