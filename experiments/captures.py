@@ -61,6 +61,9 @@ class Row:
 REFERENCE = "active-gs"
 """As published: key frames only."""
 
+OURS = "ours-ahead, captures, plans on the way"
+"""With all that looks on the way."""
+
 POLICIES = (REFERENCE, "r3con", "ours-pano", "ours-ahead", "frontier", "random")
 
 CAPTURES: dict[str, Any] = {"capture_every": 0.3}
@@ -110,14 +113,11 @@ TABLES: dict[TableName, dict[str, Row]] = {
     },
     # Rivals that keep a map of their own, as if it cost no more than ours, and at its cost here.
     "rivals": {
-        "ours-ahead": Row("ours-ahead", training=LONG),
-        "ours-ahead, captures, plans on the way": Row(
-            "ours-ahead", "ours-ahead", loop=ON_THE_WAY, training=LONG
-        ),
-        "gavis": Row("gavis", "ours-ahead", training=LONG),
-        REFERENCE: Row(REFERENCE, "ours-ahead", training=LONG),
+        OURS: Row("ours-ahead", loop=ON_THE_WAY, training=LONG),
+        REFERENCE: Row(REFERENCE, OURS, training=LONG),
+        "gavis": Row("gavis", OURS, training=LONG),
         **{
-            policy + how: Row(policy, "ours-ahead", loop=loop, training=LONG)
+            policy + how: Row(policy, OURS, loop=loop, training=LONG)
             for policy, cost in COSTS.items()
             for how, loop in ((", as fast as ours", {}), (", at its cost", cost))
         },
