@@ -106,8 +106,8 @@ def test_10_panoramas_beside_the_reference(benchmark, explored, scoring, around,
 
 def test_100_panoramas(benchmark, explored, scoring):
     positions = np.repeat(np.asarray(explored.pose)[None, :3, 3], 100, axis=0)
-    score = lambda: score_positions(
-        explored.map, explored.grid, explored.camera, positions, scoring
+    score = lambda: jax.block_until_ready(
+        score_positions(explored.map, explored.grid, explored.camera, positions, scoring)
     )
     score()
     assert benchmark(score).best_score.shape == (100,)
