@@ -275,10 +275,10 @@ def write_page(
     folder.mkdir(parents=True, exist_ok=True)
     records = with_short_names(records)
     page: list[str] = []
+    trainings = {str(row.training): row.training for row in rows.values()}
     for snapshot in snapshots_of(records):
         now = [record for record in records if record["snapshot"] == snapshot]
         # Rows are compared with rows of the same training only; another may ask for other images.
-        trainings = {str(row.training): row.training for row in rows.values()}
         for training in trainings.values():
             check_equal_terms([r for r in now if rows[r["policy"]].training == training])
         lines = quality_rows(rows, now)
