@@ -19,11 +19,12 @@ sheets can be compared."""
 _ERROR_MAP = "magma"
 _NOTHING = "#d1d5db"
 _SCALES = {
-    "error": f"mean |error| over RGB, saturates at {ERROR_SCALE:g}",
-    "renderability": "R of the voxel seen (gray: never seen, blue: out of range)",
+    # Two lines: each has the width of an image.
+    "error": f"mean |error| over RGB,\nsaturates at {ERROR_SCALE:g}",
+    "renderability": "R of the voxel seen (gray:\nnever seen, blue: out of range)",
 }
 _MARGIN, _LINE, _HEADING, _CAPTION, _CELL, _GAP, _BAR, _BAR_TEXT = (
-    0.1, 0.2, 0.25, 0.95, 2.1, 0.06, 0.07, 0.4
+    0.1, 0.2, 0.25, 0.95, 2.1, 0.06, 0.07, 0.55
 )  # fmt: skip
 """Margin, line of the title, headings of the columns, width of the captions, width of an image,
 space between images, height of a color bar and of the text below it [inch]."""
