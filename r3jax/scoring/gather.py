@@ -22,7 +22,7 @@ from r3jax.visibility.views import Coordinates
 
 SMALLEST = 1 << 16
 """Voxels at hand are padded to this or 4, 16, ... times as many: a run compiles once for each pair
-of sizes, of voxels and of cells, that it meets, which takes seconds and keeps some 40 MB for good.
+of sizes, of voxels and of cells, that it meets, which takes seconds and memory for good.
 Absent ones cost little."""
 
 

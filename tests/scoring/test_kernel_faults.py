@@ -157,13 +157,13 @@ def changes_agree(modules: Modules) -> None:
         for m in (before[0], after[0])
     ]  # fmt: skip
     space = [np.array(x) for x in (before[1].x, before[1].y, before[1].z)]
-    unexplored = [np.array(part[1].unexplored, np.uint8) for part in (before, after)]
+    explored = np.array(before[1].unexplored & ~after[1].unexplored, np.uint8)
     points = np.float32([[*position, float(CAMERA.focal)] for position in positions.tolist()])
     table = np.ascontiguousarray(nearest_bin_table(bins).T)
     tables = bins_of(before[0]), table, fibonacci_lattice(bins).astype(np.float32)
     results = np.empty((2, bins), np.float32), np.empty((2, bins), np.float32)
     modules["changes"].changes_pass(
-        *known, (*space, *unexplored), some, points, (False, False), tables, results
+        *known, (*space, explored), some, points, (False, False), tables, results
     )
     one = lambda bits, position: reference.change_of_sums(
         before, after, bits, position, CAMERA.focal, CONFIG.forms, bins
@@ -178,7 +178,7 @@ MUTANTS = [
            changes_agree),
     Mutant("changes", "(7 - (item & 7))", "(item & 7)", changes_agree),
     Mutant("changes", "weights[j] -= was[j]", "weights[j] += was[j]", changes_agree),
-    Mutant("changes", "& (after[cell] == 0)", "", changes_agree),
+    Mutant("changes", "explored, kept[1][i]", "explored, kept[1][0]", changes_agree),
     Mutant("changes", "sums[:], results[1][i] = 0.0, 0.0", "results[1][i] = 0.0", changes_agree),
     Mutant("views", "placed[COLUMN + i] = column * half + half",
            "placed[COLUMN + i] = column * half", sums_agree),

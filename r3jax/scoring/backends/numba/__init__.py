@@ -95,10 +95,10 @@ def changes_of_sums(
     (voxels, cells), (seen, left) = before, after
     points, *kept = places
     sums = jax.ShapeDtypeStruct((points.shape[0], num_bins), jnp.float32)
-    unexplored = [some.unexplored.astype(jnp.uint8) for some in (cells, left)]
+    explored = (cells.unexplored & ~left.unexplored).astype(jnp.uint8)
     changes, gone = jax.ffi.ffi_call(CHANGES, [sums, sums])(
         *_shared(voxels), seen.visited, seen.count, seen.m2, seen.resolution,
-        cells.x, cells.y, cells.z, *unexplored, *kept, points,
+        cells.x, cells.y, cells.z, explored, *kept, points,
         np.array(_choices(forms), dtype=np.int32),
         fibonacci_lattice(voxels.num_bins).astype(np.float32), *_tables(num_bins),
     )  # fmt: skip

@@ -109,14 +109,14 @@ def _rows(frame):
 
 
 def _changes(frame):
-    """Arguments: state (6), the same later (4), cells (5), bits (2), points, options, tables (3).
+    """Arguments: state (6), the same later (4), cells (4), bits (2), points, options, tables (3).
 
     Of the later state: visited, count, m2, resolution. Options: whether kappa is 1, whether delta
     is that of pairs. Results: changes of the sums of 1 - R, numbers of cells explored.
     """
     if answers_metadata(frame):
         return 0
-    before, options = _state(frame), ints1(frame, ARGUMENTS, 18)
+    before, options = _state(frame), ints1(frame, ARGUMENTS, 17)
     changes_pass(
         before,
         (
@@ -126,12 +126,11 @@ def _changes(frame):
         (
             floats1(frame, ARGUMENTS, 10), floats1(frame, ARGUMENTS, 11),
             floats1(frame, ARGUMENTS, 12), bytes1(frame, ARGUMENTS, 13),
-            bytes1(frame, ARGUMENTS, 14),
         ),
-        (bytes2(frame, ARGUMENTS, 15), bytes2(frame, ARGUMENTS, 16)),
-        floats2(frame, ARGUMENTS, 17),
+        (bytes2(frame, ARGUMENTS, 14), bytes2(frame, ARGUMENTS, 15)),
+        floats2(frame, ARGUMENTS, 16),
         (options[0] != 0, options[1] != 0),
-        (floats2(frame, ARGUMENTS, 19), ints2(frame, ARGUMENTS, 20), floats2(frame, ARGUMENTS, 21)),
+        (floats2(frame, ARGUMENTS, 18), ints2(frame, ARGUMENTS, 19), floats2(frame, ARGUMENTS, 20)),
         (floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1)),
     )  # fmt: skip
     return 0

@@ -10,6 +10,7 @@ import numpy as np
 from r3jax.native.compiled import inlined, kernel
 from r3jax.scoring.backends.numba.near import find_consistency, gather
 from r3jax.scoring.backends.numba.shown import add_by_direction, find_deficits, find_directions
+from r3jax.scoring.backends.numba.sums import unexplored_of
 from r3jax.scoring.backends.numba.terms import ANGLES
 from r3jax.scoring.backends.numba.voxels import DELTA, LOG_DELTA, SIZE
 from r3jax.visibility.backends.numba.views import CHUNK
@@ -25,16 +26,6 @@ def _shown_rows(before, after):
         rows[num] = row
         num += after[row] > before[row]
     return rows[:num]
-
-
-@kernel
-def _explored_cells(before, after):
-    """Gathers the cells that are no longer unexplored."""
-    cells, num = np.empty(after.shape[0] + 1, np.int32), 0
-    for cell in range(after.shape[0]):
-        cells[num] = cell
-        num += (before[cell] != 0) & (after[cell] == 0)
-    return cells[:num]
 
 
 @inlined
@@ -93,16 +84,6 @@ def _count_cells(point, chosen, centers, tables, scratch, counts):
 
 
 @kernel
-def _centers_of(cells, numbers):
-    """Gathers the centers of some cells, [3, k]."""
-    centers = np.empty((3, numbers.shape[0]), np.float32)
-    for j in range(numbers.shape[0]):
-        for axis in range(3):
-            centers[axis, j] = cells[axis][np.int64(numbers[j])]
-    return centers
-
-
-@kernel
 def changes_pass(before, after, cells, kept, points, forms, tables, results):
     """Sums up what imagined views have changed, for positions that see the same as before.
 
@@ -111,7 +92,7 @@ def changes_pass(before, after, cells, kept, points, forms, tables, results):
     Args:
         before: the map, as in `sums_pass`.
         after: the same voxels after the views.
-        cells: x, y, z [m], and which are unexplored before and after [c].
+        cells: x, y, z [m], and which are unexplored before, but not after [c].
         kept: bits of the rows and of the cells that each position sees [P, N / 8], [P, c / 8].
         points: positions [m] and focal lengths [px], [P, 4].
         forms: whether kappa is always 1, whether delta is that of pairs.
@@ -119,9 +100,9 @@ def changes_pass(before, after, cells, kept, points, forms, tables, results):
         results: written; sums of 1 - R after less before, and numbers of cells that are no longer
             unexplored [P, B].
     """
-    shown, explored = _shown_rows(before[2], after[2]), _explored_cells(cells[3], cells[4])
+    shown = _shown_rows(before[2], after[2])
     was, now = _known(before, shown, forms[1]), _known(after, shown, forms[1])
-    centers = _centers_of(cells[:3], explored)
+    centers, explored = unexplored_of(cells[:3], cells[3])
     chosen = np.empty(max(shown.shape[0], explored.shape[0]) + 1, np.int32)
     sums = np.empty(results[0].shape[1], np.float64)
     scratch = (
