@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import importlib
 import os
 import signal
 from pathlib import Path
@@ -134,7 +135,8 @@ def _few_programs():
 def _no_process_that_compiles_ahead():
     """Two test processes use the cores; what one compiles the other finds on the disk."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("r3jax.cli.kernels.COMMANDS", ())
+        for caller in ("r3jax.cli.main", "r3jax.planning.planner"):
+            patch.setattr(importlib.import_module(caller), "compile_ahead", lambda: None)
         yield
 
 

@@ -4,12 +4,10 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import tyro
 
 import r3jax
-from r3jax.cli import kernels
 from r3jax.cli.errors import UserError, one_line, printable
 from r3jax.cli.options import (
     AuditOptions,
@@ -28,6 +26,7 @@ from r3jax.cli.options import (
     ViewOptions,
 )
 from r3jax.cli.options.parsing import number_rules, options_of, parser_class
+from r3jax.native.ahead import cache_folder, compile_ahead
 
 _COMMANDS = {
     "demo": DemoOptions,
@@ -45,6 +44,9 @@ _COMMANDS = {
     "policies": PoliciesOptions,
     "info": InfoOptions,
 }
+
+_DECIDES = ("demo", "explore", "team", "benchmark")
+"""Commands that decide, and may train afterwards: they need the kernels."""
 
 INTERRUPTED = 130
 USER_ERROR = 2
@@ -111,16 +113,12 @@ def _run(name: str, options: object) -> int:
     from r3jax.cli.checks import check_options  # not for --help, which needs no NumPy
 
     check_options(options)
-    if name in kernels.COMMANDS:
-        kernels.compile_ahead(_cache() / "kernels")
+    if name in _DECIDES:
+        compile_ahead()
     return getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}")(options)
 
 
 def _keep_compilations() -> None:
     """Lets the second start find what the first one compiled, unless JAX is told otherwise."""
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_cache() / "jax"))
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-
-
-def _cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "r3jax"

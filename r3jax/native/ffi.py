@@ -220,14 +220,11 @@ _compiled: dict[str, Any] = {}
 """Handlers by name, kept alive: XLA holds their addresses."""
 
 
-def register_handlers(
-    handlers: dict[str, Callable[[Any], int]], *, part_by_part: bool = False
-) -> None:
+def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> None:
     """Compiles handlers (or takes them from the disk) and tells XLA of them by their names, once.
 
     Args:
         handlers: by their names.
-        part_by_part: see `in_one_piece`.
 
     Raises:
         RuntimeError: Numba has no threading layer that serves two callers at once.
@@ -235,13 +232,13 @@ def register_handlers(
     with _lock:
         missing = {name: handlers[name] for name in handlers if name not in _compiled}
         if missing:
-            _register(missing, part_by_part)
+            _register(missing)
 
 
-def _register(handlers: dict[str, Callable[[Any], int]], part_by_part: bool) -> None:
+def _register(handlers: dict[str, Callable[[Any], int]]) -> None:
     require_threads()
     compiler = cfunc(types.int64(types.int64), cache=True)
-    with _one_process_at_a_time("-".join(handlers)), in_one_piece(part_by_part=part_by_part):
+    with _one_process_at_a_time("-".join(handlers)), in_one_piece():
         compiled = tuple(compiler(inspect.unwrap(handler)) for handler in handlers.values())
     for name, handler in zip(handlers, compiled, strict=True):
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler.address), platform="cpu")

@@ -1,9 +1,10 @@
-"""Compiles a kernel and all that it calls in one piece, once.
+"""Compiles a kernel and all that it calls once, into one piece of machine code.
 
 Left to itself Numba optimizes every function, makes machine code of it and links it into its
 callers, which are optimized together with it once more: what stands at the end of a chain of six
-calls is compiled six times. The functions of a kernel are called by each other only. Here each
-stays as it was written until its address is asked for, and what it calls becomes part of it.
+calls is compiled six times. The functions of a kernel are called by each other only. Here each is
+optimized once, together with the small ones that it calls. Large ones stand apart, and are joined
+to what calls them when the address of the whole is asked for.
 """
 
 # Numba's compiler has no types, and what is private in it may change with its version.
@@ -21,27 +22,47 @@ from numba.core.registry import cpu_target
 WRITTEN_FOR = "0.68."
 """Versions of Numba whose compiler this relies on; others compile as they always do, slower."""
 
+LARGE = 400
+"""A function of more instructions, before it is optimized, stands apart from its callers."""
+
 
 class _Library(JITCodeLibrary):
     """Code of a function, which becomes machine code when an address in it is asked for."""
 
-    part_by_part = False
-    """Whether functions are optimized before their callers take them in."""
-
-    _is_native = False
+    _is_native = _is_apart = False
     environments: ClassVar[dict[str, Any]] = {}
     """Numba's data of functions that have no address yet, by the names of their places."""
 
+    def __init__(self, codegen: Any, name: str) -> None:
+        super().__init__(codegen, name)
+        self._apart: dict[_Library, None] = {}  # what it calls, after what that calls
+
     def finalize(self) -> None:
-        """Takes in what the function calls; from now on callers may take it in."""
+        """Takes in the small functions that it calls, and is optimized together with them."""
         self._raise_if_finalized()
         for library in dict.fromkeys(self._linking_libraries):
             self._reload_init.update(library._reload_init)
-            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
-        if self.part_by_part:
-            self._optimize_final_module()
+            self._apart.update(getattr(library, "_apart", {}))
+            if getattr(library, "_is_apart", False):
+                self._apart[library] = None
+            else:
+                self._take_in(library)
+        self._is_apart = _is_large(self._final_module)
+        self._optimize_final_module()
         self._finalize_dynamic_globals()
         self._finalized = True
+
+    def _take_in(self, library: JITCodeLibrary) -> None:
+        module = JITCodeLibrary._get_module_for_linking(library)
+        self._final_module.link_in(module, preserve=True)
+
+    def _get_module_for_linking(self) -> Any:
+        """The function and all that it calls, for what Numba compiles in its own way."""
+        module = super()._get_module_for_linking().clone()
+        # Callers first: LLVM leaves out what nobody calls yet.
+        for library in reversed(self._apart):
+            module.link_in(JITCodeLibrary._get_module_for_linking(library), preserve=True)
+        return module
 
     def get_pointer_to_function(self, name: str) -> int:
         """The address of a function; 0 if it is not defined here, as is usual."""
@@ -60,9 +81,9 @@ class _Library(JITCodeLibrary):
     def _make_native(self) -> None:
         if self._is_native:
             return
-        if not self.part_by_part:
-            self._get_module_for_linking()  # callers optimize it as a part of themselves
-            self._optimize_final_module()
+        JITCodeLibrary._get_module_for_linking(self)  # callers take in what stands here now
+        for library in reversed(self._apart):
+            self._take_in(library)
         self._final_module.verify()
         places = [place.name for place in self._final_module.global_variables]
         self._finalize_final_module()
@@ -78,22 +99,23 @@ class _Library(JITCodeLibrary):
         return super()._get_compiled_object()
 
 
-class _PartByPart(_Library):
-    part_by_part = True
+def _is_large(module: Any) -> bool:
+    """Whether a function of a module is large, other than those that callers always take in."""
+    return any(
+        sum(1 for block in function.blocks for _ in block.instructions) > LARGE
+        for function in module.functions
+        if not function.is_declaration
+        and not any(b"alwaysinline" in kept for kept in function.attributes)
+    )
 
 
 @contextlib.contextmanager
-def in_one_piece(*, part_by_part: bool = False) -> Generator[None]:
-    """What Numba compiles meanwhile becomes machine code once; used as always afterwards.
-
-    Args:
-        part_by_part: optimizes every function before its callers take it in, as Numba does by
-            itself. Takes longer, and rounds as it always has.
-    """
-    if not numba.__version__.startswith(WRITTEN_FOR):
+def in_one_piece() -> Generator[None]:
+    """What Numba compiles meanwhile becomes machine code once; used as always afterwards."""
+    codegen = cpu_target.target_context.codegen()
+    if not numba.__version__.startswith(WRITTEN_FOR) or codegen._library_class is _Library:
         yield
         return
-    codegen = cpu_target.target_context.codegen()
 
     def set_environment(name: str, environment: Any) -> None:
         if codegen._engine.is_symbol_defined(name):
@@ -101,8 +123,7 @@ def in_one_piece(*, part_by_part: bool = False) -> Generator[None]:
         else:
             _Library.environments[name] = environment
 
-    library = _PartByPart if part_by_part else _Library
-    codegen._library_class, codegen.set_env = library, set_environment
+    codegen._library_class, codegen.set_env = _Library, set_environment
     try:
         yield
     finally:

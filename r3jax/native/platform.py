@@ -22,9 +22,14 @@ def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Call
     if not speaks_our_interface():
         return default
     # Both would be traced, which takes a fifth of a short run, for one that nobody can ask for.
-    if set(backend.backends()) == {"cpu"}:
+    if is_cpu_only():
         return cpu
     return functools.partial(jax.lax.platform_dependent, cpu=cpu, default=default)
+
+
+def is_cpu_only() -> bool:
+    """Whether JAX has found no other device."""
+    return set(backend.backends()) == {"cpu"}
 
 
 def speaks_our_interface() -> bool:

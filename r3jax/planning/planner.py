@@ -26,6 +26,8 @@ from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
+from r3jax.native.ahead import compile_ahead
+from r3jax.native.platform import is_cpu_only
 from r3jax.planning.decision import PlannerState
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PlansAhead, Policy
 from r3jax.planning.registry import make_policy
@@ -83,6 +85,8 @@ def start(
     Raises:
         ValueError: no box, too many cells, a policy that is not known.
     """
+    if is_cpu_only():
+        compile_ahead()
     config = MappingConfig() if config is None else config
     policy = make_policy(policy) if isinstance(policy, str) else policy
     # A fixed default: a plug-in without a seed still decides the same way twice.

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from numba import cfunc, njit, types
 
+from r3jax.native import one_piece
 from r3jax.native.compiled import kernel
 from r3jax.native.one_piece import WRITTEN_FOR, in_one_piece
 
@@ -16,6 +17,12 @@ pytestmark = pytest.mark.skipif(
 INTEGER = types.int64(types.int64)
 
 
+@pytest.fixture(params=[0, one_piece.LARGE], ids=["all stand apart", "small ones are taken in"])
+def _sizes(request, monkeypatch):
+    monkeypatch.setattr(one_piece, "LARGE", request.param)
+
+
+@pytest.mark.usefixtures("_sizes")
 def test_a_chain_of_kernels_gives_what_python_gives():
     @kernel
     def leaf(x):
@@ -37,6 +44,7 @@ def test_a_chain_of_kernels_gives_what_python_gives():
     assert not overload.library._is_native  # nobody asked for its address
 
 
+@pytest.mark.usefixtures("_sizes")
 def test_what_was_compiled_in_between_can_be_called_from_python_and_others():
     @njit
     def shared(x):

@@ -17,8 +17,9 @@ from r3jax.mapping.backends import numba as mapping_kernels
 from r3jax.mapping.state import MapState
 from r3jax.native.compiled import forget_outdated_code
 from r3jax.native.ffi import num_workers
-from r3jax.scoring.backends.numba.bridge import CHANGES, PIXELS, ROWS, SUMS, register
+from r3jax.scoring.backends.numba.bridge import CHANGES, PIXELS, ROWS, SUMS, SUMS_OF_FEW, register
 from r3jax.scoring.backends.numba.rows import NUM_TERMS
+from r3jax.scoring.backends.numba.sums import FEW
 from r3jax.scoring.backends.views import BufferLayout
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms
@@ -31,7 +32,7 @@ forget_outdated_code(
 
 
 def _shared(voxels: MapState) -> tuple[Array, ...]:
-    """The map's arrays, as `sums_pass` takes them."""
+    """The map's arrays, as `sums_of_many` takes them."""
     return (
         voxels.key, voxels.visited, voxels.count, voxels.m2, voxels.resolution,
         voxels.voxel_size[None],
@@ -70,14 +71,15 @@ def sums_in_views(
         Sums of 1 - R [P, B] and numbers of unexplored cells [P, B]. If `keep`: also which rows
         of the map and which cells each view sees, as bits in bytes [P, p] and [P, q].
     """
-    register(SUMS)
     num = views.shape[0]
+    name = SUMS if num > FEW else SUMS_OF_FEW
+    register(name)
     sums = jax.ShapeDtypeStruct((num, num_bins), jnp.float32)
     sizes = [-(-size // 8) if keep else 0 for size in (voxels.capacity, cells.x.shape[0])]
     bits = [jax.ShapeDtypeStruct((num, size), jnp.uint8) for size in sizes]
     directions = fibonacci_lattice(voxels.num_bins).astype(np.float32)
     space = (cells.x, cells.y, cells.z, cells.unexplored.astype(jnp.uint8))
-    results = jax.ffi.ffi_call(SUMS, [sums, sums, *bits])(
+    results = jax.ffi.ffi_call(name, [sums, sums, *bits])(
         *_shared(voxels), views, _options(layout, forms), directions, *_tables(num_bins), *space
     )
     return tuple(results) if keep else tuple(results[:2])

@@ -22,9 +22,10 @@ from r3jax.native.ffi import (
 from r3jax.scoring.backends.numba.changes import changes_pass
 from r3jax.scoring.backends.numba.pixels import pixels_pass
 from r3jax.scoring.backends.numba.rows import rows_pass
-from r3jax.scoring.backends.numba.sums import sums_pass
+from r3jax.scoring.backends.numba.sums import sums_of_few, sums_of_many
 
-SUMS, PIXELS = "r3jax_scoring_sums", "r3jax_scoring_pixels"
+SUMS, SUMS_OF_FEW = "r3jax_scoring_sums", "r3jax_scoring_sums_of_few"
+PIXELS = "r3jax_scoring_pixels"
 ROWS, CHANGES = "r3jax_scoring_rows", "r3jax_scoring_changes"
 
 
@@ -38,16 +39,15 @@ def _state(frame):
     )  # fmt: skip
 
 
-def _sums(frame):
-    """Arguments: state (6), views, options, directions, table, lattice, cells (4).
+@inlined
+def _arguments_of_sums(frame):
+    """State (6), views, options, directions, table, lattice, cells (4), and the results.
 
     Options: wraps, height, width, whether kappa is 1, whether delta is that of pairs, workers.
     Results: sums of 1 - R, numbers of unexplored cells, bits of rows and of cells seen.
     """
-    if answers_metadata(frame):
-        return 0
     options = ints1(frame, ARGUMENTS, 7)
-    sums_pass(
+    return (
         _state(frame),
         (
             floats1(frame, ARGUMENTS, 11), floats1(frame, ARGUMENTS, 12),
@@ -63,11 +63,22 @@ def _sums(frame):
             bytes2(frame, RESULTS, 2), bytes2(frame, RESULTS, 3),
         ),
     )  # fmt: skip
+
+
+def _sums(frame):
+    if not answers_metadata(frame):
+        sums_of_many(*_arguments_of_sums(frame))
+    return 0
+
+
+def _sums_of_few(frame):
+    if not answers_metadata(frame):
+        sums_of_few(*_arguments_of_sums(frame))
     return 0
 
 
 def _pixels(frame):
-    """Arguments: state (6), views, options as in `_sums`, directions.
+    """Arguments: state (6), views, options as in `_arguments_of_sums`, directions.
 
     Results: means of R, rows of the map in the pixels.
     """
@@ -136,11 +147,11 @@ def _changes(frame):
     return 0
 
 
-_HANDLERS = {SUMS: _sums, PIXELS: _pixels, ROWS: _rows, CHANGES: _changes}
+_HANDLERS = {
+    SUMS: _sums, SUMS_OF_FEW: _sums_of_few, PIXELS: _pixels, ROWS: _rows, CHANGES: _changes,
+}  # fmt: skip
 
 
 def register(name: str) -> None:
     """Compiles a handler (or takes it from the disk) and tells XLA of it, once."""
-    # A score does not depend on what else is scored, bit by bit: optimized as a whole, loops would
-    # round their last elements otherwise.
-    register_handlers({name: _HANDLERS[name]}, part_by_part=True)
+    register_handlers({name: _HANDLERS[name]})

@@ -90,13 +90,13 @@ def changes_pass(before, after, cells, kept, points, forms, tables, results):
     By the thread that calls: a search over paths has one for each core.
 
     Args:
-        before: the map, as in `sums_pass`.
+        before: the map, as in `sums_of_many`.
         after: the same voxels after the views.
         cells: x, y, z [m], and which are unexplored before, but not after [c].
         kept: bits of the rows and of the cells that each position sees [P, N / 8], [P, c / 8].
         points: positions [m] and focal lengths [px], [P, 4].
         forms: whether kappa is always 1, whether delta is that of pairs.
-        tables: as in `sums_pass`.
+        tables: as in `sums_of_many`.
         results: written; sums of 1 - R after less before, and numbers of cells that are no longer
             unexplored [P, B].
     """

@@ -177,7 +177,7 @@ def pixels_pass(state, views, layout, forms, directions, workers, results):
     """Finds what each pixel of many views shows.
 
     Args:
-        state: as in `sums_pass`.
+        state: as in `sums_of_many`.
         views: [P, VIEW_SIZE].
         layout: whether views wrap, and height and width of their buffers [px].
         forms: whether kappa is always 1, whether delta is that of pairs.

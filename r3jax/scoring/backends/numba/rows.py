@@ -181,7 +181,7 @@ def rows_pass(state, points, forms, directions, workers, results):
     """Works out the terms of all rows of a map.
 
     Args:
-        state: as in `sums_pass`.
+        state: as in `sums_of_many`.
         points: positions [m] and focal lengths [px], [P, 4].
         forms: whether kappa is always 1, whether delta is that of pairs.
         directions: of the voxels' bins [b, 3].

@@ -126,29 +126,22 @@ def score_all(
 
 
 @kernel
-def _sums_of_few(state, cells, views, is_sound, layout, forms, tables, workers, results):
-    """`sums_pass` of views that do not pay for an index."""
-    key, words, count, m2, resolution, voxel_size = state
-    capacity = count.shape[0]
-    # Never filled: the system gives only the pages that are written.
-    voxels, rows = np.empty((SIZE, capacity), np.float32), np.empty(capacity, np.int32)
-    visited = np.empty(((words.shape[0] + 1) // 2, capacity), np.uint64)
-    runs = np.empty((workers, 2), np.int64)
-    gather_near(
-        views, is_sound, layout[0], layout[1][0], layout[1][1], key, words, count, m2, resolution,
-        voxel_size, forms[1], workers, voxels, visited, rows, runs,
-    )  # fmt: skip
-    empty, numbers = unexplored_of(cells[:3], cells[3])
-    score_few(
-        views, is_sound, layout[0], layout[1][0], layout[1][1], voxel_size, runs, voxels, visited,
-        rows, empty, numbers, forms[0], tables[0], tables[1], tables[2], workers, results[0],
-        results[1], results[2], results[3],
-    )  # fmt: skip
+def sums_of_many(state, cells, views, layout, forms, tables, workers, results):
+    """Sums what many views of one map would show; they share an index.
 
-
-@kernel
-def _sums_of_many(state, cells, views, is_sound, layout, forms, tables, workers, results):
-    """`sums_pass` of views that share an index."""
+    Args:
+        state: key [2, N], visited [W, N], count [N], m2 [N], resolution [N], voxel size [m].
+        cells: x, y, z [m] and unexplored [c].
+        views: [P, VIEW_SIZE].
+        layout: whether views wrap, and height and width of their buffers [px].
+        forms: whether kappa is always 1, whether delta is that of pairs.
+        tables: directions of the voxels' bins [b, 3]; candidates of each octahedral cell
+            [S^2, K] and directions of the panorama's bins [B, 3].
+        workers: threads.
+        results: written; sums of 1 - R [P, B], numbers of unexplored cells [P, B], and a bit for
+            each row of the map and each cell that a view sees [P, N / 8], [P, c / 8], or [P, 0].
+    """
+    is_sound = sound_views(views, state[5])
     key, words, count, m2, resolution, voxel_size = state
     slots, starts, spheres = sorted_slots(key, count, views, is_sound, voxel_size, MOST, workers)
     num = starts[starts.shape[0] - 1]
@@ -167,23 +160,22 @@ def _sums_of_many(state, cells, views, is_sound, layout, forms, tables, workers,
 
 
 @kernel
-def sums_pass(state, cells, views, layout, forms, tables, workers, results):
-    """Sums what many views of one map would show.
-
-    Args:
-        state: key [2, N], visited [W, N], count [N], m2 [N], resolution [N], voxel size [m].
-        cells: x, y, z [m] and unexplored [c].
-        views: [P, VIEW_SIZE].
-        layout: whether views wrap, and height and width of their buffers [px].
-        forms: whether kappa is always 1, whether delta is that of pairs.
-        tables: directions of the voxels' bins [b, 3]; candidates of each octahedral cell
-            [S^2, K] and directions of the panorama's bins [B, 3].
-        workers: threads.
-        results: written; sums of 1 - R [P, B], numbers of unexplored cells [P, B], and a bit for
-            each row of the map and each cell that a view sees [P, N / 8], [P, c / 8], or [P, 0].
-    """
+def sums_of_few(state, cells, views, layout, forms, tables, workers, results):
+    """`sums_of_many` for views that do not pay for an index."""
     is_sound = sound_views(views, state[5])
-    if views.shape[0] <= FEW:
-        _sums_of_few(state, cells, views, is_sound, layout, forms, tables, workers, results)
-    else:
-        _sums_of_many(state, cells, views, is_sound, layout, forms, tables, workers, results)
+    key, words, count, m2, resolution, voxel_size = state
+    capacity = count.shape[0]
+    # Never filled: the system gives only the pages that are written.
+    voxels, rows = np.empty((SIZE, capacity), np.float32), np.empty(capacity, np.int32)
+    visited = np.empty(((words.shape[0] + 1) // 2, capacity), np.uint64)
+    runs = np.empty((workers, 2), np.int64)
+    gather_near(
+        views, is_sound, layout[0], layout[1][0], layout[1][1], key, words, count, m2, resolution,
+        voxel_size, forms[1], workers, voxels, visited, rows, runs,
+    )  # fmt: skip
+    empty, numbers = unexplored_of(cells[:3], cells[3])
+    score_few(
+        views, is_sound, layout[0], layout[1][0], layout[1][1], voxel_size, runs, voxels, visited,
+        rows, empty, numbers, forms[0], tables[0], tables[1], tables[2], workers, results[0],
+        results[1], results[2], results[3],
+    )  # fmt: skip
