@@ -35,7 +35,7 @@ from r3jax.evaluation.statistics import paired_difference
 
 NAME = "captures"
 
-TableName = Literal["modes", "rivals", "gaze", "turning", "r3con", "training"]
+TableName = Literal["modes", "rivals", "gaze", "spacing", "turning", "r3con", "training"]
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,8 @@ LENGTHS: dict[str, dict[str, Any]] = {
 """Trainings: the suite's, a longer one, one that may also grow further, and another trainer's."""
 
 
-def _gaze(loop: dict[str, Any], length: str = "1500 iterations") -> Row:
-    against = f"panorama, every 0.3 m, {length}"
-    return Row("ours-ahead", against, loop=ON_THE_WAY | loop, training=LENGTHS[length])
+def _gaze(loop: dict[str, Any]) -> Row:
+    return Row("ours-ahead", "panorama", loop=ON_THE_WAY | loop)
 
 
 TABLES: dict[TableName, dict[str, Row]] = {
@@ -122,18 +121,18 @@ TABLES: dict[TableName, dict[str, Row]] = {
             for how, loop in ((", as fast as ours", {}), (", at its cost", cost))
         },
     },
-    # Where the camera looks on the way, and how often.
-    "gaze": {
-        "panorama, every 0.3 m, 1500 iterations": _gaze({}),
-        "planned, every 0.3 m, 1500 iterations": _gaze({"gaze": "planned"}),
-        "blend, every 0.3 m, 1500 iterations": _gaze({"gaze": "blend"}),
-        "ahead, every 0.3 m, 1500 iterations": _gaze({"gaze": "ahead"}),
-        "panorama, every 0.15 m, 1500 iterations": _gaze({"capture_every": 0.15}),
-        # More frames need longer trainings.
-        "panorama, every 0.3 m, 6000 iterations": _gaze({}, "6000 iterations"),
-        "panorama, every 0.15 m, 6000 iterations": _gaze(
-            {"capture_every": 0.15}, "6000 iterations"
-        ),
+    # Where the camera looks on the way.
+    "gaze": {gaze: _gaze({"gaze": gaze}) for gaze in ("panorama", "planned", "blend", "ahead")},
+    # How often it looks, for ours and for the rival; more frames need longer trainings.
+    "spacing": {
+        REFERENCE: Row(REFERENCE, training=LONG),
+        **{
+            f"{policy}, a frame every {meters} m": Row(
+                policy, REFERENCE, loop=ON_THE_WAY | {"capture_every": meters}, training=LONG
+            )
+            for policy in (REFERENCE, "ours-ahead")
+            for meters in (0.3, 0.15)
+        },
     },
     # A camera that turns at most 90 degrees a second, instead of in no time.
     "turning": {
