@@ -35,7 +35,7 @@ from r3jax.evaluation.statistics import paired_difference
 
 NAME = "captures"
 
-TableName = Literal["modes", "rivals", "gaze", "spacing", "turning", "r3con", "training"]
+TableName = Literal["modes", "rivals", "gaze", "spacing", "horizon", "turning", "r3con", "training"]
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ POLICIES = (REFERENCE, "r3con", "ours-pano", "ours-ahead", "frontier", "random")
 
 CAPTURES: dict[str, Any] = {"capture_every": 0.3}
 ON_THE_WAY: dict[str, Any] = {"capture_every": 0.3, "plan_while_moving": True}
+CLOSE: dict[str, Any] = {"capture_every": 0.15, "plan_while_moving": True}
 
 MODES: dict[str, dict[str, Any]] = {
     "": {},
@@ -133,6 +134,15 @@ TABLES: dict[TableName, dict[str, Row]] = {
             for policy in (REFERENCE, "ours-ahead")
             for meters in (0.3, 0.15)
         },
+    },
+    # How many views `ours-ahead` plans: one, its four, or as many as MAGICIAN (2603.22650).
+    "horizon": {
+        label: Row("ours-ahead", "4 views, a beam of 4", planner, CLOSE, LONG)
+        for label, planner in {
+            "1 view": {"horizon": 1},
+            "4 views, a beam of 4": {},  # as it is
+            "10 views, a beam of 10": {"horizon": 10, "beam": 10},
+        }.items()
     },
     # A camera that turns at most 90 degrees a second, instead of in no time.
     "turning": {
