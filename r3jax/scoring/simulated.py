@@ -23,11 +23,12 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.seen import mark_rows
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, visible_cells
+from r3jax.scoring.backend import seen_in_view
+from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
 from r3jax.visibility.depth_buffer import seen_in
-from r3jax.visibility.selection import Selection
+from r3jax.visibility.selection import Selection, select
 from r3jax.visibility.views import pinhole_view
 
 
@@ -97,10 +98,9 @@ def simulate_view_near(
         config: range and size of the depth buffer.
     """
     view = pinhole_view(camera, T_world_camera, config)
-    buffer, visible = seen_in(voxels, view, config)
-    after = observed(voxels, visible, T_world_camera[:3, 3], camera.focal)
-    left = cells.unexplored & ~visible_cells(cells, view, buffer).mask
-    return after, eqx.tree_at(lambda c: c.unexplored, cells, left)
+    shown, empty = seen_in_view(voxels, cells, view, config)
+    after = observed(voxels, select(shown), T_world_camera[:3, 3], camera.focal)
+    return after, eqx.tree_at(lambda c: c.unexplored, cells, cells.unexplored & ~empty)
 
 
 def observed(

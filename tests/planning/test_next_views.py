@@ -164,7 +164,7 @@ MUTANTS = [
     Mutant("next_views", "is_new[:] = False", "is_new[:] = True", law_greedy),
     Mutant("next_views", "left[best] -= 1", "left[best] -= 0", law_each_once),
     Mutant("next_views", "np.argsort(-bound[stale]", "np.argsort(bound[stale]", law_lazy),
-    Mutant("simulated", "& ~visible_cells", "| visible_cells", law_greedy),
+    Mutant("simulated", "& ~empty", "| empty", law_greedy),
     Mutant("seen", "visited[:, index] | words", "visited[:, index]", law_greedy),
 ]
 
