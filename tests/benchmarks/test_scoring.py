@@ -135,3 +135,31 @@ def test_a_decision(benchmark, views, edge):
     decision, _, info = benchmark(decide)
     assert decision is not None
     assert info.num_candidates == 100
+
+
+FLOWN = [
+    ("ours-pano", 2, 96),
+    *(
+        pytest.param(policy, views, 256, marks=pytest.mark.measured)
+        for policy in ("ours-pano", "ours-ahead")
+        for views in (4, 40)
+    ),
+]
+
+
+@pytest.mark.parametrize(("policy", "views", "edge"), FLOWN)
+def test_a_decision_on_its_own_way(benchmark, policy, views, edge):
+    """Target: 200 ms of `ours-ahead`, after so many views of the flat that it chose itself."""
+    world = r3jax.open_scene("flat", camera=r3jax.Camera.from_fov(edge, edge))
+    pose = world.start_pose
+    planner = r3jax.start(world.camera, world.bounds, policy, starts=[pose])
+    *keys, last = jax.random.split(jax.random.key(0), views)
+    for key in keys:
+        planner = r3jax.observe(planner, world.render(pose))
+        decision, planner, _ = r3jax.decide(planner, pose, key)
+        pose = decision.T_world_camera
+    planner = r3jax.observe(planner, world.render(pose))
+    r3jax.decide(planner, pose, last)
+    decision, _, info = benchmark(lambda: r3jax.decide(planner, pose, last))
+    assert decision is not None
+    assert info.num_candidates == 100
