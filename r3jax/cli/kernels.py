@@ -1,7 +1,4 @@
-"""Compiles all kernels for CPUs: the process that `native.ahead` starts.
-
-python -m r3jax.cli.kernels NOTE
-"""
+"""Compiles all kernels for CPUs, `python -m r3jax.cli.kernels NOTE`: what `native.ahead` starts."""
 
 import os
 import sys

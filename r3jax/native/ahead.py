@@ -34,7 +34,9 @@ def compile_ahead(cache: Path | None = None) -> None:
         cache: folder for the note that it did; None: in the package's own.
     """
     note = _note_in(cache_folder() / "kernels" if cache is None else cache)
-    if note.exists():
+    # Where a program embeds Python, it is the executable, and would start once more.
+    is_python = Path(sys.executable or "").name.startswith("python")
+    if note.exists() or not is_python:
         return
     # What cannot be started is compiled where it is needed.
     with contextlib.suppress(OSError):

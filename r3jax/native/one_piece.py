@@ -112,10 +112,10 @@ def _is_large(module: Any) -> bool:
 @contextlib.contextmanager
 def in_one_piece() -> Generator[None]:
     """What Numba compiles meanwhile becomes machine code once; used as always afterwards."""
-    codegen = cpu_target.target_context.codegen()
-    if not numba.__version__.startswith(WRITTEN_FOR) or codegen._library_class is _Library:
+    if not numba.__version__.startswith(WRITTEN_FOR):
         yield
         return
+    codegen = cpu_target.target_context.codegen()
 
     def set_environment(name: str, environment: Any) -> None:
         if codegen._engine.is_symbol_defined(name):

@@ -72,6 +72,8 @@ def start(
 ) -> Planner:
     """Starts a planner that has seen nothing.
 
+    The first one on a machine also starts a process that compiles the kernels for CPUs.
+
     Args:
         camera: of the frames to come.
         bounds: box of the space to explore: lower and upper corner, [2, 3] [m].

@@ -38,6 +38,12 @@ def test_other_sources_are_compiled_anew(tmp_path, started, monkeypatch):
     assert started[0][-1] != started[1][-1]
 
 
+def test_a_program_that_embeds_python_is_not_started_once_more(tmp_path, started, monkeypatch):
+    monkeypatch.setattr(ahead.sys, "executable", "/opt/blender/blender")
+    compile_ahead(tmp_path)
+    assert not started
+
+
 def test_what_cannot_be_started_is_no_error(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise OSError("no more processes")
