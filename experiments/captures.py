@@ -18,8 +18,16 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
-from experiments.pages.artifacts import Origin, markdown_table, write_csv, write_markdown
+from experiments.pages.artifacts import (
+    Origin,
+    markdown_table,
+    write_csv,
+    write_figure,
+    write_markdown,
+)
+from experiments.pages.benchmark_figures import curve_figure
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import Records, origin, request_of, run_cells
 from r3jax.apps.benchmark.cells import Cell, paths_of
@@ -298,7 +306,24 @@ def write_page(
             "on the same test views, with its interval of 95 %",
             markdown_table(lines),
         ]
+    if len(trainings) == 1:  # models of other trainings are no points of one curve
+        write_figure(folder / f"{table}_by_frames.png", frames_figure(records), source)
+        page.append(f"![PSNR against the number of frames]({table}_by_frames.png)")
     write_markdown(folder / f"{table}.md", page, source)
+
+
+def frames_figure(records: Records) -> Figure:
+    """PSNR against the frames taken, a panel per scene; what a row does looks like a setting."""
+    named = [{**record, "policy": _as_method(record["policy"])} for record in records]
+    figure = curve_figure(named, "views", "psnr")
+    for axes in figure.axes:
+        axes.set_xlabel("frames")  # a record's views are all that the model is trained on
+    return figure
+
+
+def _as_method(label: str) -> str:
+    policy, comma, how = label.partition(", ")
+    return f"{policy} ({how})" if comma else policy
 
 
 def quality_rows(rows: Mapping[str, Row], records: Records) -> list[dict[str, str]]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from experiments import captures
 from experiments.captures import TABLES, Options, Row, as_line, quality_rows, rows_of, run_in_turn
@@ -126,3 +127,14 @@ def test_a_table_holds_the_times_that_were_asked_for(tmp_path, monkeypatch):
     captures.main(Options(table="gaze", rows=("blend",), work=tmp_path, out=tmp_path))
     assert [line["snapshot"] for line in written] == ["seconds:60"]
     assert written[0]["policy"] == "blend"
+
+
+def test_a_row_is_drawn_in_the_color_of_its_policy(monkeypatch):
+    drawn, figure = [], Figure()
+    figure.add_subplot()
+    monkeypatch.setattr(
+        captures, "curve_figure", lambda records, x, y: drawn.extend(records) or figure
+    )
+    captures.frames_figure([record("active-gs", 0, [1.0], 3), record("seeing, often", 0, [1.0], 3)])
+    assert [r["policy"] for r in drawn] == ["active-gs", "seeing (often)"]
+    assert figure.axes[0].get_xlabel() == "frames"
