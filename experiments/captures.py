@@ -76,7 +76,7 @@ POLICIES = (REFERENCE, "r3con", "ours-pano", "ours-ahead", "frontier", "random")
 
 CAPTURES: dict[str, Any] = {"capture_every": 0.3}
 ON_THE_WAY: dict[str, Any] = {"capture_every": 0.3, "plan_while_moving": True}
-CLOSE: dict[str, Any] = {"capture_every": 0.15, "plan_while_moving": True}
+CLOSE: dict[str, Any] = ON_THE_WAY | {"capture_every": 0.15}
 
 MODES: dict[str, dict[str, Any]] = {
     "": {},
@@ -108,10 +108,6 @@ LENGTHS: dict[str, dict[str, Any]] = {
 """Trainings: the suite's, a longer one, one that may also grow further, and another trainer's."""
 
 
-def _gaze(loop: dict[str, Any]) -> Row:
-    return Row("ours-ahead", "panorama", loop=ON_THE_WAY | loop)
-
-
 TABLES: dict[TableName, dict[str, Row]] = {
     # Every policy blind between its views, with captures, and planning while it moves.
     "modes": {
@@ -131,16 +127,17 @@ TABLES: dict[TableName, dict[str, Row]] = {
         },
     },
     # Where the camera looks on the way.
-    "gaze": {gaze: _gaze({"gaze": gaze}) for gaze in ("panorama", "planned", "blend", "ahead")},
+    "gaze": {
+        gaze: Row("ours-ahead", "panorama", loop=ON_THE_WAY | {"gaze": gaze})
+        for gaze in ("panorama", "planned", "blend", "ahead")
+    },
     # How often it looks, for ours and for the rival; more frames need longer trainings.
     "spacing": {
         REFERENCE: Row(REFERENCE, training=LONG),
         **{
-            f"{policy}, a frame every {meters} m": Row(
-                policy, REFERENCE, loop=ON_THE_WAY | {"capture_every": meters}, training=LONG
-            )
+            f"{policy}, a frame every {meters} m": Row(policy, REFERENCE, loop=loop, training=LONG)
             for policy in (REFERENCE, "ours-ahead")
-            for meters in (0.3, 0.15)
+            for meters, loop in ((0.3, ON_THE_WAY), (0.15, CLOSE))
         },
     },
     # How many views `ours-ahead` plans: one, its four, or as many as MAGICIAN (2603.22650).
