@@ -191,9 +191,6 @@ class Options(SuiteOptions):
     rows: tuple[str, ...] = ()
     """Rows of it other than all; `--policies` leaves those of others out, too."""
 
-    seconds: tuple[int, ...] = ()
-    """Times at which models are trained and judged, other than the size's; the flight stays."""
-
 
 def main(options: Options) -> Path:
     """Runs what is left of the cells, writes the page, and returns the folder of the results."""
@@ -240,9 +237,6 @@ def cells_of(options: Options, row: Row, root: Path) -> list[Cell]:
     request = request_of(replace(options, policies=(row.policy,)), "seconds")
     # The model clock: the same run on every machine, whatever else it does meanwhile.
     conditions = replace(request.conditions, clock="model", loop=dict(row.loop), **row.training)
-    if options.seconds:
-        snapshots = tuple(f"seconds:{amount}" for amount in options.seconds)
-        conditions = replace(conditions, snapshots=snapshots)
     asked = replace(request, conditions=conditions, settings=dict(row.planner))
     return list(make_plan(asked, root))
 

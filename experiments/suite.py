@@ -45,6 +45,9 @@ class Options:
     seeds: tuple[int, ...] = ()
     """Seeds other than the size's."""
 
+    snapshots: tuple[int, ...] = ()
+    """Views or seconds at which models are judged, other than the size's; the last ends the run."""
+
     engine: Literal["local", "slurm"] = "local"
     """Processes on this machine, or an array job."""
 
@@ -115,7 +118,8 @@ _AMOUNTS = {
 def request_of(options: Options, unit: Literal["views", "seconds"]) -> Request:
     """What the benchmark is asked for."""
     size = _SIZES[options.size]
-    snapshots = tuple(f"{unit}:{amount}" for amount in _AMOUNTS[options.size, unit])
+    amounts = options.snapshots or _AMOUNTS[options.size, unit]
+    snapshots = tuple(f"{unit}:{amount}" for amount in amounts)
     # Seconds are measured on this machine; views cost the same whatever the machine.
     clock = "wall" if unit == "seconds" else "model"
     return Request(

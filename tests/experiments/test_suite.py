@@ -51,6 +51,9 @@ def test_every_size_is_a_benchmark_that_can_run(size, unit):
         assert len(request.seeds) == 3
     other = request_of(Options(size=size, scenes=("loft",), policies=("cover",)), unit)
     assert (other.scenes, other.policies) == (("loft",), ("cover",))
+    shorter = request_of(Options(size=size, snapshots=(5, 20)), unit).conditions
+    assert shorter.snapshots == (f"{unit}:5", f"{unit}:20")
+    assert shorter.budget == f"{unit}:20"
 
 
 def test_tables_hold_the_last_snapshot(records, tmp_path):
