@@ -8,11 +8,13 @@ Shape symbols: F faces; K materials; T textures; L lamps; S texels of all levels
 """
 
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
+from r3jax.native.platform import num_cores
 from r3jax.simulators.world import World
 
 MAX_LEVELS = 14
@@ -45,52 +47,63 @@ def build_atlas(images: list[np.ndarray]) -> TextureAtlas:
     Raises:
         ValueError: the textures together are too large to be indexed with 31 bits.
     """
-    pieces: list[np.ndarray] = []
-    sizes = np.ones((len(images), 2), dtype=np.int32)
-    offsets = np.zeros((len(images), MAX_LEVELS), dtype=np.int64)
-    total = 0
-    for i, image in enumerate(images):
-        sizes[i] = image.shape[1], image.shape[0]
-        levels = mip_levels(image)
-        for k in range(MAX_LEVELS):
-            if k < len(levels):
-                offsets[i, k] = total
-                pieces.append(_pack(levels[k]))
-                total += len(pieces[-1])
-            else:
-                offsets[i, k] = offsets[i, k - 1]
+    shapes = [_level_shapes(*image.shape[:2]) for image in images]
+    areas = np.array([[height * width for height, width in own] for own in shapes], dtype=np.int64)
+    areas = areas.reshape(len(images), MAX_LEVELS)
+    is_repeat = np.diff(areas, axis=1, prepend=0) == 0  # nothing is smaller than one texel
+    areas[is_repeat] = 0
+    total = int(areas.sum())
     if total >= 2**31:
         raise ValueError(
             f"the world's textures hold {total:.3g} texels, more than the 2^31 that can be "
             "indexed: halve the texture sizes"
         )
-    texels = np.concatenate(pieces) if pieces else np.zeros(0, np.uint32)
+    ends = np.cumsum(areas).reshape(areas.shape)
+    # A level that is repeated begins where the last of its texture does.
+    offsets = np.maximum.accumulate(np.where(is_repeat, 0, ends - areas), axis=1)
+    texels = np.empty(total, np.uint32)
+
+    def fill(i: int) -> None:
+        own = [
+            texels[begin : begin + height * width].reshape(height, width)
+            for begin, (height, width) in zip(offsets[i], shapes[i], strict=True)
+        ]
+        _pack(images[i], own[0])
+        for k in range(1, MAX_LEVELS - int(is_repeat[i].sum())):
+            _halve(own[k - 1], own[k])
+
+    with ThreadPoolExecutor(num_cores()) as pool:
+        list(pool.map(fill, range(len(images))))
+    sizes = np.array([own[0][::-1] for own in shapes], dtype=np.int32).reshape(-1, 2)
     return TextureAtlas(texels, sizes, offsets.astype(np.int32))
 
 
-def mip_levels(image: np.ndarray) -> list[np.ndarray]:
-    """The image [h, w, 3] uint8 and its halvings down to 1x1, at most MAX_LEVELS in all."""
-    levels = [image]
-    while len(levels) < MAX_LEVELS and max(levels[-1].shape[:2]) > 1:
-        levels.append(_halve(levels[-1]))
-    return levels
+def _level_shapes(height: int, width: int) -> list[tuple[int, int]]:
+    """Heights and widths of MAX_LEVELS levels, each half of the one before, at least 1."""
+    return [(max(height >> k, 1), max(width >> k, 1)) for k in range(MAX_LEVELS)]
 
 
-def _halve(image: np.ndarray) -> np.ndarray:
-    """Box filter of 2x2 texels, size floor(n / 2) but at least 1 (an odd last row is dropped)."""
-    height, width = image.shape[:2]
-    rows = image[: height - height % 2] if height > 1 else np.repeat(image, 2, axis=0)
-    both = rows[:, : width - width % 2] if width > 1 else np.repeat(rows, 2, axis=1)
-    total = both[0::2, 0::2].astype(np.uint16)
-    for row, column in ((0, 1), (1, 0), (1, 1)):
-        total += both[row::2, column::2]
-    return ((total + 2) >> 2).astype(np.uint8)
+def _pack(image: np.ndarray, texels: np.ndarray) -> None:
+    """Writes an image [h, w, 3] uint8 as texels [h, w]."""
+    quads = texels.view(np.uint8).reshape(*texels.shape, 4)
+    quads[..., :3], quads[..., 3] = image, 0
 
 
-def _pack(image: np.ndarray) -> np.ndarray:
-    quads = np.zeros((*image.shape[:2], 4), dtype=np.uint8)
-    quads[..., :3] = image
-    return quads.reshape(-1, 4).view("<u4")[:, 0]
+def _halve(texels: np.ndarray, halved: np.ndarray) -> None:
+    """Writes the rounded means of 2x2 texels (an odd last row or column is dropped)."""
+    height, width = (2 * n for n in halved.shape)
+    # Where there is one row, or one column, it stands for both.
+    rows = texels[:height] if texels.shape[0] > 1 else np.repeat(texels, 2, axis=0)
+    both = rows[:, :width] if texels.shape[1] > 1 else np.repeat(rows, 2, axis=1)
+    # Red and blue are summed in one word with eight bits to spare between them, green by itself.
+    halved[:] = _mean_of_four(both & 0xFF00FF, 0x20002) & 0xFF00FF
+    halved[:] |= (_mean_of_four(both >> 8 & 0xFF, 2) & 0xFF) << 8
+
+
+def _mean_of_four(texels: np.ndarray, half: int) -> np.ndarray:
+    """Sums of 2x2 numbers, rounded by `half` of four and divided by four."""
+    rows = texels[0::2] + texels[1::2]
+    return (rows[:, 0::2] + rows[:, 1::2] + np.uint32(half)) >> 2
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r3jax.simulators.raycast.shading_tables import MAX_LEVELS, build_atlas, mip_levels
+from r3jax.simulators.raycast.shading_tables import MAX_LEVELS, build_atlas
 
 RNG = np.random.default_rng(1)
 
@@ -20,19 +20,31 @@ def unpacked(atlas, index, level):
     return np.stack(channels, axis=-1).reshape(height, width, 3)
 
 
-@pytest.mark.parametrize("size", [(8, 8), (5, 12), (1, 7), (33, 2)])
-def test_every_level_can_be_read_back(size):
-    images = [image(3, 4), image(*size)]
+def halved(level):
+    """Means of 2x2 texels, halves up; a single row or column is there twice."""
+    height, width = (max(n // 2, 1) for n in level.shape[:2])
+    rows = np.minimum(np.arange(2 * height), level.shape[0] - 1)
+    columns = np.minimum(np.arange(2 * width), level.shape[1] - 1)
+    blocks = level[rows][:, columns].astype(float).reshape(height, 2, width, 2, 3)
+    return np.floor(blocks.mean(axis=(1, 3)) + 0.5)
+
+
+@pytest.mark.parametrize("size", [(8, 8), (5, 12), (1, 7), (33, 2), (1, 1), (64, 64)])
+def test_every_level_is_the_rounded_mean_of_the_one_before(size):
+    images = [image(3, 4), image(*size), image(2, 5)]
     atlas = build_atlas(images)
-    for level, expected in enumerate(mip_levels(images[1])):
+    expected, level = images[1], 0
+    np.testing.assert_array_equal(unpacked(atlas, 1, 0), expected)
+    while max(expected.shape[:2]) > 1:
+        expected, level = halved(expected), level + 1
         np.testing.assert_array_equal(unpacked(atlas, 1, level), expected)
+    np.testing.assert_array_equal(unpacked(atlas, 2, 0), images[2])
 
 
-def test_levels_shrink_to_one_texel_that_is_the_mean():
-    source = image(64, 64)
-    levels = mip_levels(source)
-    assert [level.shape[0] for level in levels] == [64, 32, 16, 8, 4, 2, 1]
-    np.testing.assert_allclose(levels[-1][0, 0], source.mean(axis=(0, 1)), atol=2.0)
+def test_nothing_stands_between_the_levels():
+    shapes = [(3, 4), (1, 7)]
+    atlas = build_atlas([image(*shape) for shape in shapes])
+    assert len(atlas.texels) == (12 + 2 + 1) + (7 + 3 + 1)
 
 
 def test_levels_beyond_the_last_repeat_it():
