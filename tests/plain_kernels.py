@@ -4,7 +4,6 @@ import contextlib
 import sys
 from collections.abc import Generator
 from types import ModuleType
-from unittest import mock
 
 import numpy as np
 
@@ -13,11 +12,16 @@ import numpy as np
 def kernels_as_python() -> Generator[None]:
     """Modules of kernels that are loaded meanwhile stay Python."""
     doubles = _python_compiler(), _numpy_arithmetic(), _numpy_lanes()
-    with (
-        mock.patch.dict(sys.modules, {double.__name__: double for double in doubles}),
-        np.errstate(all="ignore"),
-    ):
-        yield
+    before = dict(sys.modules)
+    sys.modules |= {double.__name__: double for double in doubles}
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    finally:
+        # Ours only: parts of Numba that were first imported meanwhile cannot be imported twice.
+        for name in [name for name in sys.modules if name.startswith("r3jax.")]:
+            del sys.modules[name]
+        sys.modules |= {name: before[name] for name in before if name.startswith("r3jax.")}
 
 
 def _python_compiler() -> ModuleType:

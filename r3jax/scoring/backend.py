@@ -7,6 +7,7 @@ Shape symbols: n voxels; c cells; B bins of the panorama; p q bytes that hold a 
 and every cell; h w pixels of a depth buffer.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -73,7 +74,7 @@ def sums_and_seen(
     config: ScoringConfig,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"], UInt8[Array, " p"], UInt8[Array, " q"]]:
-    """`sums_in_view`, and which voxels and unexplored cells are seen: bits, packed in bytes."""
+    """`sums_in_view`, and which voxels (of the sample) and cells are in it: bits in bytes."""
     return _sums(voxels, cells, view, focal, config, num_bins, keep=True)
 
 
@@ -103,7 +104,8 @@ def change_of_sums(
 def seen_in_view(
     voxels: MapState, cells: Cells, view: View, config: ScoringConfig
 ) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:
-    """`reference.seen_in_view`: the voxels and the unexplored cells that sums are taken over."""
+    """`reference.seen_in_view`: the voxels and the unexplored cells that a view sees."""
+    config = dataclasses.replace(config, sample=1)
     *_, seen, empty = sums_and_seen(voxels, cells, view, jnp.ones(()), config, 1)
     return (
         jnp.unpackbits(seen, count=voxels.capacity).astype(bool),

@@ -14,10 +14,14 @@ class Forms(NamedTuple):
 
     kappa: str = "box"
     delta: str = "trace"
+    sample: int = 1
 
 
 PAPER = Forms()
 """What the paper's equations and algorithms say."""
+
+MOST_SAMPLED = 64
+"""A view of 128 x 96 pixels then still scores some hundred of the voxels that it shows."""
 
 
 class ScoringConfig(VisibilityConfig):
@@ -37,10 +41,15 @@ class ScoringConfig(VisibilityConfig):
     panorama_bins: int = eqx.field(default=526, static=True)
     """Directions of the panorama; 526 are 10 degrees apart."""
 
+    sample: int = eqx.field(default=1, static=True)
+    """Score one of so many visible voxels, and count it so many times; 1: every one, exactly.
+    Which voxels stay is a regular pattern, so that every surface keeps its share. What hides
+    what, and the unexplored cells, are never sampled."""
+
     @property
     def forms(self) -> Forms:
         """Forms of the terms of R."""
-        return Forms(self.kappa, self.delta)
+        return Forms(self.kappa, self.delta, self.sample)
 
     def __check_init__(self) -> None:
         """Refuses settings that no formula knows."""
@@ -48,6 +57,8 @@ class ScoringConfig(VisibilityConfig):
             raise ValueError(f"kappa must be 'box' or 'one', got {self.kappa!r}")
         if self.delta not in ("trace", "pairwise"):
             raise ValueError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
+        if not 1 <= self.sample <= MOST_SAMPLED:
+            raise ValueError(f"sample must lie between 1 and {MOST_SAMPLED}, got {self.sample}")
 
 
 scoring_settings = or_none(one(ScoringConfig, "None: its defaults"))

@@ -5,6 +5,7 @@ candidates; utilities left undivided; the worst candidate taken; hopeless cells 
 scorer's grid; the trail forgotten; `frontier` looking at the same cell again.
 """
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -18,10 +19,11 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decision import ENOUGH_LOOKS, initial_state, net_utility, prepare_decision
 from r3jax.planning.policies.frontier import Frontier
 from r3jax.planning.policies.random import Random
-from r3jax.planning.policies.renderability import Ours, OursPano
+from r3jax.planning.policies.renderability import SETTLED, Ours, OursPano
 from r3jax.planning.policy import DecisionOutcome, Policy
 from r3jax.planning.registry import describe, make_policy, policy_names, source_of
 from r3jax.planning.robot.travel import plan_travel
+from r3jax.scoring.config import ScoringConfig
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 from tests.planning.test_travel import assert_inside
 
@@ -64,6 +66,30 @@ def policies() -> list:
         Frontier(CONFIG),
         Random(CONFIG),
     ]
+
+
+def test_the_last_word_on_a_sample_is_exact(world):
+    """Estimates are half too high here: the best are replaced, the others scaled alike."""
+    asked = []
+
+    def score(map_state, grid, camera, positions, config, allowed):
+        asked.append((config.sample, np.asarray(positions)))
+        factor, axis = (1.5, 2) if config.sample > 1 else (1.0, 0)
+        worth = 1.0 + np.asarray(positions, np.float64)[:, 0]
+        direction = np.tile(np.eye(3)[axis], (len(positions), 1))
+        return SimpleNamespace(best_direction=direction, best_score=factor * worth)
+
+    config = dataclasses.replace(CONFIG, scoring=ScoringConfig(sample=4))
+    decision, _, _ = decide(OursPano(config, score), world, center((4, 4, 3)))
+    assert [sample for sample, _ in asked] == [4, 1]
+    x = decision.candidates[:, 0, 3]
+    settled = np.flatnonzero(decision.candidates[:, 0, 2] > 0.5)
+    assert len(settled) == len(asked[1][1]) == SETTLED
+    assert x[settled].min() >= np.sort(x)[-SETTLED]
+    np.testing.assert_allclose(decision.utilities["utility"], 1.0 + x, rtol=1e-6)
+    exact, _, _ = decide(OursPano(CONFIG, score), world, center((4, 4, 3)))
+    np.testing.assert_array_equal(exact.T_world_camera, decision.T_world_camera)
+    assert [sample for sample, _ in asked] == [4, 1, 1]
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """Every backend says what the reference says, however it is asked: one by one or many at once."""
 
+import dataclasses
 import functools
 
 import jax
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import r3jax
+from r3jax.geometry.voxels import pack
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.native import platform
@@ -61,13 +63,13 @@ def view_at(kind: str, pose: jax.Array) -> View:
     return panorama_view(pose[:3, 3], CONFIG)
 
 
-def asked_of(module, kind: str):
+def asked_of(module, kind: str, config: r3jax.ScoringConfig = CONFIG):
     """`sums_in_view` of `backend` or `reference`, as a function of what is known and of a pose."""
 
     def ask(voxels: MapState, cells: Cells, pose: jax.Array):
         view, position = view_at(kind, pose), pose[:3, 3]
         focal, bins = CAMERA.focal, NUM_BINS[kind]
-        return module.sums_in_view(voxels, cells, view, position, focal, CONFIG, bins)
+        return module.sums_in_view(voxels, cells, view, position, focal, config, bins)
 
     return ask
 
@@ -115,6 +117,44 @@ def test_dense_batches_are_those_of_the_reference(kind):
         lambda v, c, rows: dense.sums_in_views(v, c, rows, frame, forms, NUM_BINS[kind])
     )(state, cells, rows)
     assert_same(found, programs(kind)[0](state, cells, poses))
+
+
+@pytest.mark.parametrize("kind", NUM_BINS)
+def test_a_sample_is_that_of_the_reference(kind):
+    """One by one by the reference; many, few, and as dense batches by what is chosen."""
+    state, grid = world(1)
+    cells, poses = cells_of(grid), poses_of(1)
+    config = dataclasses.replace(CONFIG, sample=4)
+    ask = lambda module: jax.jit(
+        jax.vmap(lambda pose: asked_of(module, kind, config)(state, cells, pose))
+    )
+    expected = ask(reference)(poses)
+    assert_same(ask(backend)(poses), expected)
+    assert_same(ask(backend)(poses[:2]), jax.tree.map(lambda x: x[:2], expected))
+    rows = jax.vmap(lambda pose: row_of(view_at(kind, pose), CAMERA.focal, config))(poses)
+    layout = layout_of(view_at(kind, poses[0]))
+    found = dense.sums_in_views(state, cells, rows, layout, config.forms, NUM_BINS[kind])
+    assert_same(found, expected)
+
+
+def test_a_sample_keeps_its_share_of_every_wall():
+    """Of walls along every axis the same share stays."""
+    ranges = jnp.arange(-32, 32)
+    a, b = (x.reshape(-1) for x in jnp.meshgrid(ranges, ranges))
+    for axis in range(3):
+        index = [a, b]
+        index.insert(axis, jnp.full_like(a, 7))
+        wall = dataclasses.replace(r3jax.empty_map(len(a), 0.1), key=jnp.stack(pack(*index)))
+        for sample in (2, 3, 4, 8):
+            share = float(jnp.mean(reference.is_sampled(wall, sample)))
+            # Less than one voxel too many or too few in each of the 64 rows of a wall.
+            assert abs(share - 1.0 / sample) < 1.0 / 64, (axis, sample)
+
+
+@pytest.mark.parametrize("sample", [0, -1, 65])
+def test_samples_that_are_none_are_refused(sample):
+    with pytest.raises(ValueError, match=f"sample must lie between 1 and 64, got {sample}"):
+        r3jax.ScoringConfig(sample=sample)
 
 
 @pytest.mark.parametrize("kind", NUM_BINS)

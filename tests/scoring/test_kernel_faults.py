@@ -69,14 +69,15 @@ def frame_and_rows(kind: str):
 
 
 @functools.cache
-def expected(kind: str):
+def expected(kind: str, sample: int = 1):
     """Sums, cells, and means in pixels of every view, by the reference."""
+    config = dataclasses.replace(CONFIG, sample=sample)
     state, cells, *_ = asked()
     views, *_ = frame_and_rows(kind)
 
     @jax.jit
     def look(view, position):
-        at = position, CAMERA.focal, CONFIG
+        at = position, CAMERA.focal, config
         sums = reference.sums_in_view(state, cells, view, *at, NUM_BINS[kind])
         return *sums, reference.mean_in_pixels(state, view, *at[:2], CONFIG.forms)
 
@@ -89,7 +90,11 @@ def bins_of(state) -> np.ndarray:
 
 
 def sums_agree(
-    modules: Modules, kind: str = "panorama", num: int = VIEWS, way: str = "sums_of_many"
+    modules: Modules,
+    kind: str = "panorama",
+    num: int = VIEWS,
+    way: str = "sums_of_many",
+    sample: int = 1,
 ) -> None:
     state, _, known, space = asked()
     _, frame, rows = frame_and_rows(kind)
@@ -99,15 +104,24 @@ def sums_agree(
     none = np.empty((num, 0), np.uint8)
     results = (*np.empty((2, num, bins), np.float32), none, none)
     add_up = getattr(modules["sums"], way)
-    add_up(known, space, rows[:num], frame, (False, False), tables, 2, results)
-    deficits, unexplored = (part[:num] for part in expected(kind)[:2])
-    np.testing.assert_allclose(results[0], deficits, atol=1e-4 * deficits.max())
+    add_up(known, space, rows[:num], frame, (False, False, sample), tables, 2, results)
+    deficits, unexplored = (part[:num] for part in expected(kind, sample)[:2])
+    np.testing.assert_allclose(sample * results[0], deficits, atol=1e-4 * deficits.max())
     np.testing.assert_array_equal(results[1], unexplored)
 
 
 def few_agree(modules: Modules) -> None:
     """Without an index, by two threads that share the views' work."""
     sums_agree(modules, num=2, way="sums_of_few")
+
+
+def samples_agree(modules: Modules) -> None:
+    """One of four voxels is scored, and all of them hide what is behind them."""
+    sums_agree(modules, sample=4)
+
+
+def few_samples_agree(modules: Modules) -> None:
+    sums_agree(modules, num=2, way="sums_of_few", sample=4)
 
 
 def images_agree(modules: Modules, kind: str = "pinhole") -> None:
@@ -227,6 +241,13 @@ MUTANTS = [
     Mutant("terms", "kappa * (_ONE - bias)", "(_ONE - bias)", terms_agree),
     Mutant("bins", "is_better = cosine > best", "is_better = k == 0", sums_agree),
     Mutant("shown", "num += is_seen[i]", "num += 1", sums_agree),
+    Mutant("sums", "x + 3 * y + 2 * z", "x + y + z", samples_agree),
+    Mutant("sums", "starts, spheres, voxels, _, _ = hiding",
+           "starts, spheres, voxels, _, _ = scored", samples_agree),
+    Mutant("sums", "runs, voxels, _, _ = hiding", "runs, voxels, _, _ = scored",
+           few_samples_agree),
+    Mutant("sums", "state, some, views, is_sound, layout",
+           "state, state[2], views, is_sound, layout", few_samples_agree),
     Mutant("pixels", "key_of(placed[DISTANCE + i], rows[first + i])",
            "key_of(placed[DISTANCE + i], first + i)", images_agree),
     Mutant("pixels", "if row != last:", "if last < 0:", images_agree),
@@ -236,8 +257,8 @@ MUTANTS = [
 
 
 LAWS = (
-    borders_agree, sums_agree, few_agree, in_images, images_agree, images_all_round, terms_agree,
-    changes_agree,
+    borders_agree, sums_agree, few_agree, samples_agree, few_samples_agree, in_images,
+    images_agree, images_all_round, terms_agree, changes_agree,
 )  # fmt: skip
 
 

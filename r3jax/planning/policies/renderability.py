@@ -8,6 +8,7 @@ direction of each one's panorama: one depth buffer per position answers for all 
 Shape symbols: C candidates, always `config.num_candidates`, so that scoring compiles once.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -18,6 +19,10 @@ from r3jax.planning.candidates import Candidates, best_views
 from r3jax.planning.greedy import Drawn, GreedyPolicy, ScoreViews, random_places
 from r3jax.planning.policy import Situation
 from r3jax.scoring.batch import score_positions, score_views
+from r3jax.scoring.config import ScoringConfig
+
+SETTLED = 8
+"""Best estimates of a sample that are scored once more, exactly."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,15 @@ class OursPano(GreedyPolicy):
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """Every position's best direction that is allowed, and what the panorama promises there."""
         del key
-        scoring = self.config.scoring
+        turned, utility = self._turned(situation, candidates, self.config.scoring)
+        if self.config.scoring.sample > 1:
+            turned, utility = self._settled(situation, turned, utility)
+        return turned, {"utility": utility}
+
+    def _turned(
+        self, situation: Situation, candidates: Candidates, scoring: ScoringConfig
+    ) -> tuple[Candidates, np.ndarray]:
+        """Candidates along the best directions of their panoramas, and what those promise [C]."""
         panorama = self.score_all(
             situation.map_state,
             situation.scoring_grid,
@@ -81,5 +94,20 @@ class OursPano(GreedyPolicy):
             situation.limits.allowed_axes(candidates.position, scoring.panorama_bins),
         )
         # Positions stay, lines of sight are the panorama's choice.
-        turned, utility = best_views(candidates, panorama)
-        return turned, {"utility": utility}
+        return best_views(candidates, panorama)
+
+    def _settled(
+        self, situation: Situation, turned: Candidates, estimate: np.ndarray
+    ) -> tuple[Candidates, np.ndarray]:
+        """The same where the best estimates of a sample are replaced by what is exact."""
+        # Not padding: it repeats others, and is never chosen.
+        order = np.argsort(np.where(turned.valid, -estimate, np.inf), kind="stable")
+        best = order[:SETTLED]
+        exact = dataclasses.replace(self.config.scoring, sample=1)
+        again, utility = self._turned(situation, turned.take(best), exact)
+        # What was chosen for its estimate was overrated on the average: so the others are, too.
+        known = estimate[best] > 0.0
+        ratio = float(np.median(utility[known] / estimate[best][known])) if known.any() else 1.0
+        settled, direction = ratio * estimate, turned.direction.copy()
+        settled[best], direction[best] = utility, again.direction
+        return dataclasses.replace(turned, direction=direction), settled

@@ -26,7 +26,7 @@ def batch_size(num_voxels: int) -> int:
 
 
 def _config(row: Float[Array, " 20"], forms: Forms) -> ScoringConfig:
-    return ScoringConfig(max_range=row[16], tolerance=row[17], kappa=forms.kappa, delta=forms.delta)
+    return ScoringConfig(max_range=row[16], tolerance=row[17], **forms._asdict())
 
 
 def sums_in_views(
@@ -47,8 +47,9 @@ def sums_in_views(
         sums = reference.sums_in_view(voxels, cells, view, position, focal, config, num_bins)
         if not keep:
             return sums
-        seen = reference.seen_in_view(voxels, cells, view, config)
-        return *sums, *(jnp.packbits(mask) for mask in seen)
+        seen, empty = reference.seen_in_view(voxels, cells, view, config)
+        seen = seen & reference.is_sampled(voxels, forms.sample)
+        return *sums, jnp.packbits(seen), jnp.packbits(empty)
 
     return jax.lax.map(one, views, batch_size=batch_size(voxels.capacity))
 

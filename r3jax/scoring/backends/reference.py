@@ -1,4 +1,4 @@
-"""What a view shows of a map, by the paper's formulas: every voxel, in plain JAX.
+"""What a view shows of a map, by the paper's formulas, in plain JAX.
 
 Differentiable with respect to the position, the focal length and what is known of the voxels;
 what is visible is held fixed. What other backends answer is held to this.
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
+from r3jax.geometry.voxels import unpack
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms, ScoringConfig
@@ -43,11 +44,12 @@ def sums_in_view(
         num_bins: bins of the Fibonacci lattice; 1 sums over all directions.
     """
     seen, empty = seen_in_view(voxels, cells, view, config)
+    seen = seen & is_sampled(voxels, config.sample)
     deficit = 1.0 - score_voxels(voxels, position, focal, config.forms).value
     deficit, unexplored = jnp.where(seen, deficit, 0.0), empty.astype(jnp.float32)
     points = jnp.stack([cells.x, cells.y, cells.z])
     return (
-        sum_by_direction(voxels.center, deficit, position, num_bins),
+        config.sample * sum_by_direction(voxels.center, deficit, position, num_bins),
         sum_by_direction(points, unexplored, position, num_bins),
     )
 
@@ -66,10 +68,10 @@ def change_of_sums(
     Args:
         before: voxels and cells before the views.
         after: the same after them (`simulated.simulate_view_near`).
-        kept: which voxels and which cells are seen, as bits in bytes.
+        kept: which voxels (of the sample) and which cells are seen, as bits in bytes.
         position: of the camera [m].
         focal: focal length of R [px].
-        forms: of kappa and delta.
+        forms: of kappa and delta, and the sample.
         num_bins: bins of the Fibonacci lattice.
 
     Returns:
@@ -87,8 +89,9 @@ def change_of_sums(
     shown = seen & (voxels_after.count > voxels.count)
     explored = empty & cells.unexplored & ~cells_after.unexplored
     points = jnp.stack([cells.x, cells.y, cells.z])
+    change = forms.sample * jnp.where(shown, left - lack, 0.0)
     return (
-        sum_by_direction(voxels.center, jnp.where(shown, left - lack, 0.0), position, num_bins),
+        sum_by_direction(voxels.center, change, position, num_bins),
         sum_by_direction(points, explored.astype(jnp.float32), position, num_bins),
     )
 
@@ -100,6 +103,13 @@ def seen_in_view(
     points = jnp.stack([cells.x, cells.y, cells.z])
     seen, empty = visible(voxels, points, view, config)
     return seen, empty & cells.unexplored
+
+
+def is_sampled(voxels: MapState, sample: int) -> Bool[Array, " n"]:
+    """Tells which voxels stand for `sample` of their neighbors: one of so many in every plane."""
+    x, y, z = unpack(voxels.key[0], voxels.key[1])
+    # With factors that differ, walls along any axis keep their share, not all of it or none.
+    return (x + 3 * y + 2 * z) % sample == 0
 
 
 def rows_in_pixels(voxels: MapState, view: View) -> Int[Array, "h w"]:

@@ -40,7 +40,7 @@ def _shared(voxels: MapState) -> tuple[Array, ...]:
 
 
 def _options(layout: BufferLayout, forms: Forms) -> np.ndarray:
-    return np.array([*layout, *_choices(forms), num_workers()], dtype=np.int32)
+    return np.array([*layout, *_choices(forms), forms.sample, num_workers()], dtype=np.int32)
 
 
 def _choices(forms: Forms) -> tuple[bool, bool]:
@@ -82,7 +82,9 @@ def sums_in_views(
     results = jax.ffi.ffi_call(name, [sums, sums, *bits])(
         *_shared(voxels), views, _options(layout, forms), directions, *_tables(num_bins), *space
     )
-    return tuple(results) if keep else tuple(results[:2])
+    deficits, *others = results
+    deficits = forms.sample * deficits
+    return (deficits, *others) if keep else (deficits, others[0])
 
 
 def changes_of_sums(
@@ -104,7 +106,7 @@ def changes_of_sums(
         np.array(_choices(forms), dtype=np.int32),
         fibonacci_lattice(voxels.num_bins).astype(np.float32), *_tables(num_bins),
     )  # fmt: skip
-    return changes, gone
+    return forms.sample * changes, gone
 
 
 def means_in_pixels(

@@ -43,8 +43,9 @@ def _state(frame):
 def _arguments_of_sums(frame):
     """State (6), views, options, directions, table, lattice, cells (4), and the results.
 
-    Options: wraps, height, width, whether kappa is 1, whether delta is that of pairs, workers.
-    Results: sums of 1 - R, numbers of unexplored cells, bits of rows and of cells seen.
+    Options: wraps, height, width, whether kappa is 1, whether delta is that of pairs, one of how
+    many voxels is scored, workers. Results: sums of 1 - R, numbers of unexplored cells, bits of
+    rows and of cells seen.
     """
     options = ints1(frame, ARGUMENTS, 7)
     return (
@@ -55,9 +56,9 @@ def _arguments_of_sums(frame):
         ),
         floats2(frame, ARGUMENTS, 6),
         (options[0] != 0, (np.int64(options[1]), np.int64(options[2]))),
-        (options[3] != 0, options[4] != 0),
+        (options[3] != 0, options[4] != 0, np.int64(options[5])),
         (floats2(frame, ARGUMENTS, 8), ints2(frame, ARGUMENTS, 9), floats2(frame, ARGUMENTS, 10)),
-        np.int64(options[5]),
+        np.int64(options[6]),
         (
             floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1),
             bytes2(frame, RESULTS, 2), bytes2(frame, RESULTS, 3),
@@ -91,7 +92,7 @@ def _pixels(frame):
         (options[0] != 0, (np.int64(options[1]), np.int64(options[2]))),
         (options[3] != 0, options[4] != 0),
         floats2(frame, ARGUMENTS, 8),
-        np.int64(options[5]),
+        np.int64(options[6]),
         (floats1(frame, RESULTS, 0), ints2(frame, RESULTS, 1)),
     )  # fmt: skip
     return 0

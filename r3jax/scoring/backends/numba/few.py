@@ -1,7 +1,7 @@
 """Sums of a few views, one after the other, each by all threads.
 
 Every thread splats its share of the voxels into a buffer of its own; the least of all is the
-view's, in which every thread then tests and scores its share.
+view's, in which every thread then tests and scores its share of those of the sample.
 """
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
@@ -91,8 +91,9 @@ def _add_up(sums, found, lacks, counts):
 # Array expressions stand in kernels of their own: here they would become loops of all threads.
 @parallel_kernel
 def score_few(
-    views, is_sound, wraps, height, width, voxel_size, runs, voxels, visited, rows, cells, numbers,
-    is_always_one, directions, table, lattice, workers, lacks, counts, seen_bits, cell_bits,
+    views, is_sound, wraps, height, width, voxel_size, runs, voxels, own_runs, own_voxels, visited,
+    rows, cells, numbers, is_always_one, directions, table, lattice, workers, lacks, counts,
+    seen_bits, cell_bits,
 ):  # fmt: skip
     """Scores views, each by all threads. Flat arguments: Numba's threads take no nested ones."""
     side, num_bins = side_of((height, width)), lacks.shape[1]
@@ -115,8 +116,8 @@ def score_few(
             )
             for share in prange(workers):
                 _add_share(
-                    views[i], wraps, (height, width), voxel_size, runs[share : share + 1],
-                    (voxels, visited, rows), (cells, numbers), (pixels[0], limit),
+                    views[i], wraps, (height, width), voxel_size, own_runs[share : share + 1],
+                    (own_voxels, visited, rows), (cells, numbers), (pixels[0], limit),
                     (is_always_one, (directions, table, lattice)), (share, workers), sums[share],
                     found[share], seen_bits[i], cell_bits[i],
                 )  # fmt: skip

@@ -26,7 +26,7 @@ from r3jax.scoring.backends.numba.voxels import (
     SIZE,
     gather_voxels,
 )
-from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots
+from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots, voxel_of
 from r3jax.visibility.backends.numba.limit import padded_size
 from r3jax.visibility.backends.numba.picture import (
     picture_size,
@@ -71,11 +71,15 @@ def unexplored_of(cells, unexplored):
 
 @kernel
 def _score_share(
-    next_view, views, is_sound, layout, voxel_size, index, known, empty, options, results
+    next_view, views, is_sound, layout, voxel_size, hiding, scored, empty, options, results
 ):
-    """Scores views until none is left; what is claimed by one thread is left out by the others."""
+    """Scores views until none is left; what is claimed by one thread is left out by the others.
+
+    `hiding` and `scored` are the bricks of all voxels and of those of the sample.
+    """
     wraps, shape = layout
-    starts, spheres = index
+    starts, spheres, voxels = hiding
+    own_starts, own_spheres, known = scored
     lacks, counts, seen_bits, cell_bits = results
     side = side_of(shape)
     placed, targets = np.empty(PLACED, np.float32), np.empty(TARGETS, np.int32)
@@ -93,8 +97,9 @@ def _score_share(
         sums[:], counts[i], seen_bits[i], cell_bits[i] = 0.0, 0.0, 0, 0
         if is_sound[i]:
             num = find_runs(view, wraps, shape, voxel_size, starts, spheres, runs)
-            splat(view, wraps, shape, voxel_size, runs[:num], known[0], (placed, targets), nearest)
+            splat(view, wraps, shape, voxel_size, runs[:num], voxels, (placed, targets), nearest)
             finish_buffer(view, wraps, shape, voxel_size, nearest, (padded, slopes), limit)
+            num = find_runs(view, wraps, shape, voxel_size, own_starts, own_spheres, runs)
             add_seen_voxels(
                 view, wraps, shape, voxel_size, runs[:num], known, limit,
                 (placed, targets, is_seen, chosen, angles, bins, weights), options, sums,
@@ -111,18 +116,44 @@ def _score_share(
 
 @parallel_kernel
 def score_all(
-    views, is_sound, wraps, height, width, voxel_size, starts, spheres, voxels, visited, rows,
-    cells, numbers, is_always_one, directions, table, lattice, workers, lacks, counts, seen_bits,
-    cell_bits,
+    views, is_sound, wraps, height, width, voxel_size, starts, spheres, voxels, own_starts,
+    own_spheres, own_voxels, visited, rows, cells, numbers, is_always_one, directions, table,
+    lattice, workers, lacks, counts, seen_bits, cell_bits,
 ):  # fmt: skip
     """Scores views, each by one thread. Flat arguments: Numba's threads take no nested ones."""
     next_view = np.zeros(1, np.int64)
     for _ in prange(workers):
         _score_share(
-            next_view, views, is_sound, (wraps, (height, width)), voxel_size, (starts, spheres),
-            (voxels, visited, rows), (cells, numbers),
+            next_view, views, is_sound, (wraps, (height, width)), voxel_size,
+            (starts, spheres, voxels), (own_starts, own_spheres, (own_voxels, visited, rows)),
+            (cells, numbers),
             (is_always_one, (directions, table, lattice)), (lacks, counts, seen_bits, cell_bits),
         )  # fmt: skip
+
+
+@kernel
+def sampled(key, count, sample):
+    """Observations of the voxels of a sample, 0 of the others (`reference.is_sampled`)."""
+    kept = np.empty(count.shape[0], np.float32)
+    for row in range(count.shape[0]):
+        x, y, z = voxel_of(key, row)
+        kept[row] = count[row] if (x + 3 * y + 2 * z) % sample == 0 else 0.0
+    return kept
+
+
+@kernel
+def _sorted_voxels(state, count, views, is_sound, is_pairwise, workers):
+    """Bricks of the voxels near some views: where they begin, spheres, voxels, visited, rows."""
+    key, words, _, m2, resolution, voxel_size = state
+    slots, starts, spheres = sorted_slots(key, count, views, is_sound, voxel_size, MOST, workers)
+    num = starts[starts.shape[0] - 1]
+    voxels, rows = np.empty((SIZE, num), np.float32), np.empty(num, np.int32)
+    visited = np.empty(((words.shape[0] + 1) // 2, num), np.uint64)
+    gather_voxels(
+        slots, starts, key, words, count, m2, resolution, voxel_size, is_pairwise, workers,
+        voxels, visited, rows,
+    )  # fmt: skip
+    return starts, spheres, voxels, visited, rows
 
 
 @kernel
@@ -134,36 +165,34 @@ def sums_of_many(state, cells, views, layout, forms, tables, workers, results):
         cells: x, y, z [m] and unexplored [c].
         views: [P, VIEW_SIZE].
         layout: whether views wrap, and height and width of their buffers [px].
-        forms: whether kappa is always 1, whether delta is that of pairs.
+        forms: whether kappa is always 1, whether delta is that of pairs, and one of how many
+            voxels is scored.
         tables: directions of the voxels' bins [b, 3]; candidates of each octahedral cell
             [S^2, K] and directions of the panorama's bins [B, 3].
         workers: threads.
-        results: written; sums of 1 - R [P, B], numbers of unexplored cells [P, B], and a bit for
-            each row of the map and each cell that a view sees [P, N / 8], [P, c / 8], or [P, 0].
+        results: written; sums of 1 - R [P, B] of the sample, numbers of unexplored cells [P, B],
+            and a bit for each row of the sample and each cell that a view sees [P, N / 8],
+            [P, c / 8], or [P, 0].
     """
-    is_sound = sound_views(views, state[5])
-    key, words, count, m2, resolution, voxel_size = state
-    slots, starts, spheres = sorted_slots(key, count, views, is_sound, voxel_size, MOST, workers)
-    num = starts[starts.shape[0] - 1]
-    voxels, rows = np.empty((SIZE, num), np.float32), np.empty(num, np.int32)
-    visited = np.empty(((words.shape[0] + 1) // 2, num), np.uint64)
-    gather_voxels(
-        slots, starts, key, words, count, m2, resolution, voxel_size, forms[1], workers,
-        voxels, visited, rows,
-    )  # fmt: skip
+    is_sound, voxel_size = sound_views(views, state[5]), state[5]
+    hiding = scored = _sorted_voxels(state, state[2], views, is_sound, forms[1], workers)
+    if forms[2] > 1:
+        some = sampled(state[0], state[2], forms[2])
+        scored = _sorted_voxels(state, some, views, is_sound, forms[1], workers)
+    starts, spheres, voxels, _, _ = hiding
+    own_starts, own_spheres, own_voxels, visited, rows = scored
     empty, numbers = unexplored_of(cells[:3], cells[3])
     score_all(
         views, is_sound, layout[0], layout[1][0], layout[1][1], voxel_size, starts, spheres,
-        voxels, visited, rows, empty, numbers, forms[0], tables[0], tables[1], tables[2], workers,
-        results[0], results[1], results[2], results[3],
+        voxels, own_starts, own_spheres, own_voxels, visited, rows, empty, numbers, forms[0],
+        tables[0], tables[1], tables[2], workers, results[0], results[1], results[2], results[3],
     )  # fmt: skip
 
 
 @kernel
-def sums_of_few(state, cells, views, layout, forms, tables, workers, results):
-    """`sums_of_many` for views that do not pay for an index."""
-    is_sound = sound_views(views, state[5])
-    key, words, count, m2, resolution, voxel_size = state
+def _near_voxels(state, count, views, is_sound, layout, is_pairwise, workers):
+    """Voxels near some views in the order of the map: runs, voxels, visited, rows."""
+    key, words, _, m2, resolution, voxel_size = state
     capacity = count.shape[0]
     # Never filled: the system gives only the pages that are written.
     voxels, rows = np.empty((SIZE, capacity), np.float32), np.empty(capacity, np.int32)
@@ -171,11 +200,24 @@ def sums_of_few(state, cells, views, layout, forms, tables, workers, results):
     runs = np.empty((workers, 2), np.int64)
     gather_near(
         views, is_sound, layout[0], layout[1][0], layout[1][1], key, words, count, m2, resolution,
-        voxel_size, forms[1], workers, voxels, visited, rows, runs,
+        voxel_size, is_pairwise, workers, voxels, visited, rows, runs,
     )  # fmt: skip
+    return runs, voxels, visited, rows
+
+
+@kernel
+def sums_of_few(state, cells, views, layout, forms, tables, workers, results):
+    """`sums_of_many` for views that do not pay for an index."""
+    is_sound, voxel_size = sound_views(views, state[5]), state[5]
+    hiding = scored = _near_voxels(state, state[2], views, is_sound, layout, forms[1], workers)
+    if forms[2] > 1:
+        some = sampled(state[0], state[2], forms[2])
+        scored = _near_voxels(state, some, views, is_sound, layout, forms[1], workers)
+    runs, voxels, _, _ = hiding
+    own_runs, own_voxels, visited, rows = scored
     empty, numbers = unexplored_of(cells[:3], cells[3])
     score_few(
-        views, is_sound, layout[0], layout[1][0], layout[1][1], voxel_size, runs, voxels, visited,
-        rows, empty, numbers, forms[0], tables[0], tables[1], tables[2], workers, results[0],
-        results[1], results[2], results[3],
+        views, is_sound, layout[0], layout[1][0], layout[1][1], voxel_size, runs, voxels, own_runs,
+        own_voxels, visited, rows, empty, numbers, forms[0], tables[0], tables[1], tables[2],
+        workers, results[0], results[1], results[2], results[3],
     )  # fmt: skip
