@@ -24,6 +24,7 @@ from scipy.stats import spearmanr
 
 from experiments.error_terms import prediction_columns
 from experiments.judged_models import (
+    FISHER,
     MAX_RANGE,
     SCORES,
     judged_capture,
@@ -52,8 +53,9 @@ NAME = "expected_error"
 EXPECTED = "expected error"
 """The prediction that is put to the test, by a fit that has not seen the scene."""
 
-BASELINES = ("R", "coverage", "bias", "cover", "texture")
-"""What it is held against: `cover` is COVER's term, `texture` is of the true image, negated."""
+BASELINES = ("R", "coverage", "bias", "cover", "texture", *FISHER)
+"""What it is held against: `cover` is COVER's term; `texture` of the true image and what the
+trained model says of itself, `fisherrf` and `d-opt`, are negated."""
 
 _RIDGE = 1e-4
 """Keeps coefficients small that the views say nothing about."""
@@ -151,6 +153,7 @@ def model_of(path: Path) -> Model:
         ]
         columns = prediction_columns(found.state, camera, found.poses, config)
         columns = {name: columns[name] for name in BASELINES if name in columns}
+        columns |= {name: -values for name, values in found.fisher.items()}
         columns |= {"texture": -found.texture} | found.scores
         plain = {
             "name": found.name,
@@ -266,7 +269,8 @@ def model_rows(models: Sequence[Model]) -> list[dict[str, Any]]:
                 prediction = -mine if name == EXPECTED else model.columns[name]
                 value = rank(prediction, sign * model.columns[score])
                 row[f"{name}, {score}"] = round(value, 3)
-        for name, prediction in ((EXPECTED, -by_psnr), ("R", model.columns["R"])):
+        for name in (EXPECTED, *BASELINES):
+            prediction = -by_psnr if name == EXPECTED else model.columns[name]
             area = sparsification(prediction, -model.columns["psnr"]).relative
             row[f"{name}, AUSE"] = round(area, 3)
         rows.append(row)
@@ -292,6 +296,7 @@ def summary_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         line |= {f"with {score}": median(rows, f"{name}, {score}") for score in SCORES}
         for score in ("psnr", "ssim"):
             line[f"{score}, covered well"] = median(covered, f"{name}, {score}")
+        line["AUSE"] = median(rows, f"{name}, AUSE")
         table.append(line)
     return table
 
@@ -344,10 +349,12 @@ def write_page(folder: Path, models: Sequence[Model], source: Origin) -> None:
         "has not seen its scene. Spearman within each model; *with LPIPS* the sign is changed, and "
         "the fit is that of SSIM. Medians over models, with 95 % intervals of a bootstrap over "
         f"models (those of a scene resemble each other). *Covered well*: the {covered} models "
-        "whose test views have a mean coverage of 0.95 or more. *Texture* is the mean gradient of "
-        "the true image, which no planner has.",
+        "whose test views have a mean coverage of 0.95 or more. *AUSE* is that of PSNR, relative: "
+        "0 perfect, 1 chance. *Texture* is the mean gradient of the true image, which no planner "
+        "has; *fisherrf* and *d-opt* (POp-GS) ask the trained model how much each view would still "
+        "tell it, which takes a model.",
         markdown_table(summary_rows(rows)),
-        "Scene by scene, means over models; AUSE is relative: 0 perfect, 1 chance:",
+        "Scene by scene, means over models:",
         markdown_table(scene_rows(rows)),
         f"![Spearman of every model]({NAME}.png)",
         "Coefficients of the fit on all scenes"

@@ -27,10 +27,14 @@ from r3jax.formats.captures import open_capture
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.state import MapState
+from r3jax.rivals.fisher import Form, known_information
+from r3jax.rivals.fisher import scores as information_scores
 from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import open_world
+from r3jax.splatting.ply import read_scene
+from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.train import fit
 from r3jax.splatting.views import Views, load_views
@@ -47,6 +51,12 @@ _NUM_TEST = 40
 
 _ITERATIONS, _GAUSSIANS, _RESOLUTION = 1500, 20_000, 128
 """Of a training, as in the benchmark's small size."""
+
+FISHER = {
+    "fisherrf": Form(),
+    "d-opt": Form(criterion="d-opt", quirk=False),
+}
+"""What the models themselves say of a view, by FisherRF as published and by POp-GS."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +87,9 @@ class Judged:
     texture: np.ndarray
     """Logarithm of the mean gradient of each true image, [V]."""
 
+    fisher: dict[str, np.ndarray]
+    """What the trained model says of each view, as in `FISHER`, [V]; greater: less known."""
+
 
 def judged_cells(root: Path, folder: Path) -> Iterator[Path]:
     """The models of a benchmark, from its records, runs and test images."""
@@ -92,7 +105,10 @@ def judged_cell(root: Path, record: Mapping[str, Any], folder: Path) -> Path:
         run = read_run(root / record["run"])
         frames = [run.frame(step) for step in range(record["exploration"]["views"])]
         images = reference_images(root, record)
+        scene = read_scene(run.path / "models" / slug / "scene.ply")
         scores = {name: record["views"][name] for name in SCORES}
+        trained = np.stack([np.asarray(frame.T_world_camera) for frame in frames])
+        scores |= fisher_scores(scene, trained, images.views)
         tested = [run.camera] * len(images.poses), images.poses
         _write(path, record["scene"], "explored", frames, tested, images.views, scores)
     return path
@@ -175,8 +191,26 @@ def judged_folds(
 
 def _train(train: Views, test: Views, gaussians: int, seed: int) -> dict[str, Any]:
     config = TrainConfig(iterations=_ITERATIONS, num_gaussians=gaussians, seed=seed)
-    rows = evaluate(fit(train, config).scene, test, lpips=load_lpips()).rows
-    return {name: [getattr(row, name) for row in rows] for name in SCORES}
+    scene = fit(train, config).scene
+    rows = evaluate(scene, test, lpips=load_lpips()).rows
+    scores: dict[str, Any] = {name: [getattr(row, name) for row in rows] for name in SCORES}
+    return scores | fisher_scores(scene, np.asarray(train.T_world_camera), test)
+
+
+def fisher_scores(scene: GaussianScene, trained: np.ndarray, test: Views) -> dict[str, np.ndarray]:
+    """What a model says of test views, [V] each, as in `FISHER`.
+
+    Args:
+        scene: the model.
+        trained: poses of the views that it was trained on, [T, 4, 4].
+        test: of one camera, as good as.
+    """
+    camera, poses = test.view(0).camera, np.asarray(test.T_world_camera)
+    found = {}
+    for name, form in FISHER.items():
+        known = known_information(scene, camera, trained, form)
+        found[name] = information_scores(scene, camera, poses, known, form)
+    return found
 
 
 def _write(
@@ -240,6 +274,15 @@ def read_judged(path: Path) -> Judged:
         Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
         for fx, fy, cx, cy in found["K"].tolist()
     )
-    scores = {name: found[name].astype(np.float64) for name in SCORES}
-    kind, scene = str(found["kind"]), str(found["scene"])
-    return Judged(path.stem, scene, kind, state, cameras, found["poses"], scores, found["texture"])
+    columns = lambda names: {name: found[name].astype(np.float64) for name in names}
+    return Judged(
+        path.stem,
+        str(found["scene"]),
+        str(found["kind"]),
+        state,
+        cameras,
+        found["poses"],
+        columns(SCORES),
+        found["texture"],
+        columns(FISHER),
+    )

@@ -143,7 +143,9 @@ def compared(exact: Decision, found: Decision | None) -> dict[str, Any]:
     total = exact.utilities["total"]
     # Padding repeats places: the one that counts has the greatest total.
     own = np.where(gap <= gap.min(), total, -np.inf).max()
-    best, least = total[np.isfinite(total)].max(), total[np.isfinite(total)].min()
+    known = total[np.isfinite(total)]
+    # From 0 up at least: of a few paths that are all good the worst has not lost everything.
+    best, least = known.max(), min(known.min(), 0.0)
     lost = (best - own) / max(best - least, 1e-12) if np.isfinite(own) else float("nan")
     apart = np.abs(found.T_world_camera - exact.T_world_camera).max()
     is_same = np.linalg.norm((found.T_world_camera - exact.T_world_camera)[:3, 3]) < 1e-6
@@ -159,8 +161,9 @@ def page(rows: Rows, size: str) -> list[str]:
     return [
         f"# Decisions on a sample of the voxels ({size})",
         "`place`, `view`: of how many decisions the sample chooses the same; `lost`: what its "
-        "choice has less of the exact total, as a share of the range over all candidates, where "
-        "the exact decision gave it one (`rated`); medians of milliseconds.",
+        "choice has less of the exact total, as a share of what the best candidate has over the "
+        "worst (over 0, if all have more), where the exact decision gave it one (`rated`); medians "
+        "of milliseconds.",
         markdown_table(table),
     ]
 

@@ -31,7 +31,7 @@ def made_up(name: str, scene: str, factor: float = 1.0, kind: str = "captured") 
     terms = np.stack([np.ones(60), unseen, hard, lack**2, hard * lack], axis=1)
     error = factor * (terms @ TRUE) * np.exp(0.05 * random.standard_normal(60))
     columns = {"psnr": -10.0 * np.log10(error), "ssim": 1.0 - 8.0 * error, "lpips": error}
-    columns |= {name: 1.0 - lack for name in ("R", "bias", "cover")}
+    columns |= {name: 1.0 - lack for name in ("R", "bias", "cover", "fisherrf", "d-opt")}
     columns |= {"coverage": 1.0 - unseen, "texture": -hard}
     return Model(name, scene, kind, terms, columns)
 

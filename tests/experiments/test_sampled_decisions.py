@@ -13,7 +13,7 @@ from r3jax.planning.policy import Decision
 pytestmark = pytest.mark.full
 
 PLACES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-TOTAL = np.array([0.1, 0.3, 0.5, -np.inf])
+TOTAL = np.array([-0.1, 0.3, 0.5, -np.inf])
 """The last one is padding, and repeats the best place."""
 
 
@@ -27,9 +27,15 @@ def test_what_is_lost_is_a_share_of_the_range():
     assert compared(chosen(2), chosen(2)) == {"same_place": True, "same_view": True, "loss": 0.0}
     other = compared(chosen(2), chosen(1))
     assert not other["same_place"]
-    np.testing.assert_allclose(other["loss"], 0.5)  # 0.5 - 0.3 of 0.5 - 0.1
+    np.testing.assert_allclose(other["loss"], 1 / 3)  # 0.5 - 0.3 of 0.5 + 0.1
     turned = compared(chosen(2), chosen(2, (0.0, 1.0, 0.0)))
     assert turned == {"same_place": True, "same_view": False, "loss": 0.0}
+
+
+def test_where_all_are_good_the_worst_has_not_lost_everything():
+    exact = chosen(2)
+    exact.utilities["total"] = np.array([0.3, 0.4, 0.5, -np.inf])
+    np.testing.assert_allclose(compared(exact, chosen(0))["loss"], 0.4)  # 0.5 - 0.3 of 0.5
 
 
 def test_a_place_without_an_exact_total_is_not_rated():
