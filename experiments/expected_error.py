@@ -226,6 +226,8 @@ def expected(model: Model, coefficients: np.ndarray) -> np.ndarray:
 
 def left_out(models: Sequence[Model], errors: Errors) -> list[np.ndarray]:
     """What is expected of each model's views by a fit that has not seen its scene, [V] each."""
+    if len({m.scene for m in models}) < 2:
+        raise ValueError("one scene is left out at a time: give models of two scenes or more")
     fits = {
         scene: fit_coefficients([m for m in models if m.scene != scene], errors)
         for scene in dict.fromkeys(m.scene for m in models)

@@ -138,18 +138,20 @@ def test_a_decision(benchmark, views, edge):
 
 
 FLOWN = [
-    ("ours-pano", 2, 96),
+    ("ours-pano", 2, 96, 1),
     *(
-        pytest.param(policy, views, 256, marks=pytest.mark.measured)
+        pytest.param(policy, views, 256, sample, marks=pytest.mark.measured)
         for policy in ("ours-pano", "ours-ahead")
         for views in (4, 40)
+        for sample in (1, 4)
     ),
 ]
 
 
-@pytest.mark.parametrize(("policy", "views", "edge"), FLOWN)
-def test_a_decision_on_its_own_way(benchmark, policy, views, edge):
+@pytest.mark.parametrize(("policy", "views", "edge", "sample"), FLOWN)
+def test_a_decision_on_its_own_way(benchmark, policy, views, edge, sample):
     """Target: 200 ms of `ours-ahead`, after so many views of the flat that it chose itself."""
+    policy = make_policy(policy, scoring=r3jax.ScoringConfig(sample=sample))
     world = r3jax.open_scene("flat", camera=r3jax.Camera.from_fov(edge, edge))
     pose = world.start_pose
     planner = r3jax.start(world.camera, world.bounds, policy, starts=[pose])

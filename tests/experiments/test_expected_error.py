@@ -59,6 +59,11 @@ def test_a_model_is_expected_by_a_fit_that_has_not_seen_its_scene():
     assert len(fit.coefficients) == len(TERMS)
 
 
+def test_one_scene_alone_cannot_be_left_out():
+    with pytest.raises(ValueError, match="models of two scenes or more"):
+        left_out(MODELS[:1], squared)
+
+
 def test_the_folds_of_a_recording_are_one_model():
     folds = [made_up("a", "lounge", kind="recording"), made_up("bb", "lounge", kind="recording")]
     found = pooled([*folds, MODELS[2]])
