@@ -153,6 +153,28 @@ def in_images(modules: Modules) -> None:
     sums_agree(modules, "pinhole")
 
 
+def points_lie_in_their_bricks(modules: Modules) -> None:
+    """Each once, in the order that they had, as far from the middle as is said at most."""
+    sort = modules["bricks"].sorted_points
+    points = np.random.default_rng(0).uniform(-4.0, 3.0, (3, 500)).astype(np.float32)
+    points[:, 400:] = np.float32([2.4, -3.2, 0.8])[:, None]  # many in one place, on edges
+    for most in (1 << 12, 5):
+        order, starts, spheres = sort(points, most)
+        np.testing.assert_array_equal(np.sort(order), np.arange(500))
+        assert 1 <= len(spheres) == len(starts) - 1 <= most
+        for i, (*middle, radius) in enumerate(spheres):
+            own = order[starts[i] : starts[i + 1]]
+            assert len(own) > 0
+            assert (np.diff(own) > 0).all()
+            assert np.linalg.norm(points[:, own].T - middle, axis=1).max() <= radius
+        assert radius < (1.0 if most > 5 else 12.0)  # edges of 0.8 and 12.8 m
+    for odd in (points[:, :0], np.full((3, 2), np.nan, np.float32)):
+        order, starts, spheres = sort(odd, 8)
+        assert order.tolist() == list(range(odd.shape[1]))
+        assert starts.tolist() == [0, odd.shape[1]]
+        np.testing.assert_array_equal(spheres, [[0.0, 0.0, 0.0, np.inf]])
+
+
 def terms_agree(modules: Modules) -> None:
     state, _, known, _ = asked()
     position = poses_of(2)[0, :3, 3]
@@ -223,6 +245,10 @@ MUTANTS = [
     Mutant("bricks", "reach, wide = far + radius", "reach, wide = far", sums_agree),
     Mutant("bricks", "(down - slopes[2] * ahead >= -wide * slants[2])",
            "(down - slopes[2] * ahead >= wide * slants[2])", in_images),
+    Mutant("bricks", "spheres[b, 3] = 0.9 * edge", "spheres[b, 3] = 0.5 * edge",
+           points_lie_in_their_bricks),
+    Mutant("bricks", "(cell[axis] + 0.5) * edge", "cell[axis] * edge", points_lie_in_their_bricks),
+    Mutant("bricks", "= i\n        counts[0, slots[i]] += 1", "= i", sums_agree),
     Mutant("near", "& (count[i] > _ZERO)", "& (count[i] >= _ZERO)", few_agree),
     Mutant("near", "MARGIN = np.float32(4.0)", "MARGIN = np.float32(-2.0)", few_agree),
     Mutant("few", "least[i] = min(least[i], own[i])", "least[i] = own[i]", few_agree),
@@ -257,8 +283,8 @@ MUTANTS = [
 
 
 LAWS = (
-    borders_agree, sums_agree, few_agree, samples_agree, few_samples_agree, in_images,
-    images_agree, images_all_round, terms_agree, changes_agree,
+    borders_agree, points_lie_in_their_bricks, sums_agree, few_agree, samples_agree,
+    few_samples_agree, in_images, images_agree, images_all_round, terms_agree, changes_agree,
 )  # fmt: skip
 
 

@@ -69,9 +69,12 @@ def _add_share(
         view, wraps, shape, voxel_size, runs, known, limit,
         (placed, pixels, is_seen, chosen, angles, bins, weights), options, sums, seen_bits,
     )  # fmt: skip
-    first, last = _first_cell(numbers, share, workers), _first_cell(numbers, share + 1, workers)
+    own = np.empty((1, 2), np.int64)
+    own[0, 0], own[0, 1] = (
+        _first_cell(numbers, share, workers), _first_cell(numbers, share + 1, workers),
+    )  # fmt: skip
     count_seen_cells(
-        view, wraps, shape, empty, (first, last), nearest,
+        view, wraps, shape, empty, own, nearest,
         (placed, is_seen, chosen, angles, bins, weights), options[1], counts, cell_bits,
     )  # fmt: skip
 

@@ -224,20 +224,20 @@ def add_seen_voxels(view, wraps, shape, voxel_size, runs, known, limit, chunk, o
 
 
 @kernel
-def count_seen_cells(view, wraps, shape, empty, part, nearest, chunk, tables, counts, bits):
-    """Counts the unexplored cells of a part whose center a view sees, one sum for each bin."""
+def count_seen_cells(view, wraps, shape, empty, runs, nearest, chunk, tables, counts, bits):
+    """Counts the unexplored cells of some runs whose center a view sees, one sum for each bin."""
     cells, numbers = empty
-    begin, end = part
     placed, is_seen, chosen, angles, bins, weights = chunk
     _, table, lattice = tables
     side, size = side_of(shape), np.float32(math.sqrt(table.shape[0]))
     position = view[POSITION], view[POSITION + 1], view[POSITION + 2]
     weights[:] = _ONE
-    for first in range(begin, end, CHUNK):
-        count = min(CHUNK, end - first)
-        place(view, shape, wraps, cells[X], cells[Y], cells[Z], first, count, placed)
-        test_points(placed, count, nearest, side, shape, is_seen)
-        num = _compact(is_seen, count, chosen)
-        _mark(numbers, first, chosen, num, bits)
-        find_directions(position, cells, first, chosen, num, size, angles, bins)
-        add_by_direction(angles, bins, weights, num, table, lattice, counts)
+    for begin, end in runs:
+        for first in range(begin, end, CHUNK):
+            count = min(CHUNK, end - first)
+            place(view, shape, wraps, cells[X], cells[Y], cells[Z], first, count, placed)
+            test_points(placed, count, nearest, side, shape, is_seen)
+            num = _compact(is_seen, count, chosen)
+            _mark(numbers, first, chosen, num, bits)
+            find_directions(position, cells, first, chosen, num, size, angles, bins)
+            add_by_direction(angles, bins, weights, num, table, lattice, counts)

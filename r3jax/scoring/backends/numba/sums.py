@@ -26,7 +26,13 @@ from r3jax.scoring.backends.numba.voxels import (
     SIZE,
     gather_voxels,
 )
-from r3jax.visibility.backends.numba.bricks import MOST, find_runs, sorted_slots, voxel_of
+from r3jax.visibility.backends.numba.bricks import (
+    MOST,
+    find_runs,
+    sorted_points,
+    sorted_slots,
+    voxel_of,
+)
 from r3jax.visibility.backends.numba.limit import padded_size
 from r3jax.visibility.backends.numba.picture import (
     picture_size,
@@ -75,11 +81,12 @@ def _score_share(
 ):
     """Scores views until none is left; what is claimed by one thread is left out by the others.
 
-    `hiding` and `scored` are the bricks of all voxels and of those of the sample.
+    `hiding`, `scored` and `empty` are bricks of all voxels, of those of the sample, and of cells.
     """
     wraps, shape = layout
     starts, spheres, voxels = hiding
     own_starts, own_spheres, known = scored
+    cells, cell_starts, cell_spheres = empty
     lacks, counts, seen_bits, cell_bits = results
     side = side_of(shape)
     placed, targets = np.empty(PLACED, np.float32), np.empty(TARGETS, np.int32)
@@ -90,7 +97,8 @@ def _score_share(
         np.empty(pyramid_size(side) + SPARE, np.float32), np.empty(picture_size(side), np.float32),
     )  # fmt: skip
     padded, slopes = np.empty(padded_size(shape), np.float32), np.empty(shape[1], np.float32)
-    sums, runs = np.empty(lacks.shape[1], np.float64), np.empty((spheres.shape[0], 2), np.int64)
+    sums = np.empty(lacks.shape[1], np.float64)
+    runs = np.empty((max(spheres.shape[0], cell_spheres.shape[0]), 2), np.int64)
     i = claim(next_view)
     while i < views.shape[0]:
         view = views[i]
@@ -105,8 +113,9 @@ def _score_share(
                 (placed, targets, is_seen, chosen, angles, bins, weights), options, sums,
                 seen_bits[i],
             )  # fmt: skip
+            num = find_runs(view, wraps, shape, voxel_size, cell_starts, cell_spheres, runs)
             count_seen_cells(
-                view, wraps, shape, empty, (0, empty[1].shape[0]), nearest,
+                view, wraps, shape, cells, runs[:num], nearest,
                 (placed, is_seen, chosen, angles, bins, weights), options[1], counts[i],
                 cell_bits[i],
             )  # fmt: skip
@@ -117,8 +126,8 @@ def _score_share(
 @parallel_kernel
 def score_all(
     views, is_sound, wraps, height, width, voxel_size, starts, spheres, voxels, own_starts,
-    own_spheres, own_voxels, visited, rows, cells, numbers, is_always_one, directions, table,
-    lattice, workers, lacks, counts, seen_bits, cell_bits,
+    own_spheres, own_voxels, visited, rows, cell_starts, cell_spheres, cells, numbers,
+    is_always_one, directions, table, lattice, workers, lacks, counts, seen_bits, cell_bits,
 ):  # fmt: skip
     """Scores views, each by one thread. Flat arguments: Numba's threads take no nested ones."""
     next_view = np.zeros(1, np.int64)
@@ -126,7 +135,7 @@ def score_all(
         _score_share(
             next_view, views, is_sound, (wraps, (height, width)), voxel_size,
             (starts, spheres, voxels), (own_starts, own_spheres, (own_voxels, visited, rows)),
-            (cells, numbers),
+            ((cells, numbers), cell_starts, cell_spheres),
             (is_always_one, (directions, table, lattice)), (lacks, counts, seen_bits, cell_bits),
         )  # fmt: skip
 
@@ -182,10 +191,12 @@ def sums_of_many(state, cells, views, layout, forms, tables, workers, results):
     starts, spheres, voxels, _, _ = hiding
     own_starts, own_spheres, own_voxels, visited, rows = scored
     empty, numbers = unexplored_of(cells[:3], cells[3])
+    order, cell_starts, cell_spheres = sorted_points(empty, MOST)
     score_all(
         views, is_sound, layout[0], layout[1][0], layout[1][1], voxel_size, starts, spheres,
-        voxels, own_starts, own_spheres, own_voxels, visited, rows, empty, numbers, forms[0],
-        tables[0], tables[1], tables[2], workers, results[0], results[1], results[2], results[3],
+        voxels, own_starts, own_spheres, own_voxels, visited, rows, cell_starts, cell_spheres,
+        empty[:, order], numbers[order], forms[0], tables[0], tables[1], tables[2], workers,
+        results[0], results[1], results[2], results[3],
     )  # fmt: skip
 
 

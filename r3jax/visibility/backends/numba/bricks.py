@@ -1,4 +1,4 @@
-"""The voxels near some views, sorted into bricks: what a view cannot see is skipped by the brick.
+"""Voxels and points, sorted into bricks: what a view cannot see is skipped by the brick.
 
 The index is built anew in every call, by counting: a share of the time of one panorama.
 """
@@ -20,6 +20,9 @@ EDGE = 3
 
 MOST = 1 << 19
 """Bricks at most."""
+
+POINTS_EDGE = 0.8
+"""Edge of a brick of points [m], unless that makes too many bricks."""
 
 _LIMIT = np.int64(INDEX_LIMIT)
 _LOW = np.int64((1 << 21) - 1)
@@ -163,6 +166,67 @@ def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
             spheres[b, axis] = (np.float32(low) + _HALF * np.float32(1 << shift)) * voxel_size
         spheres[b, 3] = np.float32(math.sqrt(3.0)) * _HALF * np.float32(1 << shift) * voxel_size
     return slots, starts[: used + 1], spheres
+
+
+@kernel
+def divide_points(points, most):
+    """Chooses bricks for points [3, n], all of them finite: lower corner, edge [m], numbers."""
+    low, dims, edge = np.zeros(3), np.ones(3), POINTS_EDGE
+    spans = np.zeros(3)
+    for axis in range(3):
+        low[axis] = points[axis].min()
+        spans[axis] = points[axis].max() - low[axis]
+    while True:
+        for axis in range(3):
+            dims[axis] = math.floor(spans[axis] / edge) + 1.0
+        if dims[0] * dims[1] * dims[2] <= most:
+            return low, edge, dims.astype(np.int64)
+        edge *= 2.0
+
+
+@kernel
+def sorted_points(points, most):
+    """Sorts points into bricks.
+
+    Args:
+        points: x, y and z [3, n] [m].
+        most: bricks at most.
+
+    Returns:
+        The order of the points [n], by brick, as they stand within a brick; where each brick
+        begins in it [b + 1]; and the middle of each brick and how far points lie from it [b, 4]
+        [m].
+    """
+    num = points.shape[1]
+    order, slots = np.arange(num, dtype=np.int32), np.empty(num, np.int64)
+    if num == 0 or not np.isfinite(points).all():
+        # One brick, that any view may see.
+        spheres = np.zeros((1, 4), np.float32)
+        spheres[0, 3] = np.inf
+        return order, np.array([0, num]), spheres
+    low, edge, dims = divide_points(points, most)
+    counts = np.zeros((1, dims[0] * dims[1] * dims[2]), np.int32)
+    for i in range(num):
+        brick = np.int64(0)
+        for axis in range(3):
+            brick = brick * dims[axis] + np.int64((points[axis, i] - low[axis]) / edge)
+        slots[i] = brick
+        counts[0, brick] += 1
+    starts = np.empty(counts.shape[1] + 1, np.int64)
+    bricks = np.empty(counts.shape[1], np.int64)
+    used = begin_bricks(counts, starts, bricks)
+    for i in range(num):
+        order[counts[0, slots[i]]] = i
+        counts[0, slots[i]] += 1
+    spheres = np.empty((used, 4), np.float32)
+    for b in range(used):
+        i, rest = bricks[b] // (dims[1] * dims[2]), bricks[b] % (dims[1] * dims[2])
+        cell = (i, rest // dims[2], rest % dims[2])
+        for axis in range(3):
+            spheres[b, axis] = low[axis] + (cell[axis] + 0.5) * edge
+        # More than half the diagonal: rounding may put a point just outside of its brick.
+        spheres[b, 3] = 0.9 * edge
+    return order, starts[: used + 1], spheres
 
 
 @inlined
