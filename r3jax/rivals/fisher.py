@@ -66,13 +66,17 @@ def information(
 
 def with_quirk(squares: GaussianScene, scene: GaussianScene) -> GaussianScene:
     """Divides squares by the activations' derivatives, which are squared in them, once."""
-    alive = scene.is_alive
     opacity = jax.nn.sigmoid(scene.opacity_logits)
-    slope = jnp.where(alive, opacity * (1.0 - opacity), 1.0)
+    # Where float32 rounds a derivative to 0 (an opacity of 1, after long trainings), its square
+    # is 0, too: nothing is left to divide.
+    divide = lambda square, slope: jnp.where(slope > 0.0, square / slope, 0.0)
     return eqx.tree_at(
         lambda s: (s.log_scales, s.opacity_logits),
         squares,
-        (squares.log_scales / jnp.exp(scene.log_scales), squares.opacity_logits / slope),
+        (
+            divide(squares.log_scales, jnp.exp(scene.log_scales)),
+            divide(squares.opacity_logits, opacity * (1.0 - opacity)),
+        ),
     )
 
 
