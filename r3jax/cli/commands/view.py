@@ -2,8 +2,11 @@
 
 import contextlib
 import os
+import signal
 import sys
 import threading
+import time
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 from r3jax.apps.viewer.film import export_film, load_av
@@ -60,16 +63,28 @@ def _show(options: ViewOptions, run: Run, console: Console) -> None:
         )
         with console.status("opening the run ..."):
             shown = stack.enter_context(page)
-        with contextlib.suppress(KeyboardInterrupt):
-            console.say(f"view      {shown.url}")
+        console.say(f"view      {shown.url}")
+        with noted_interrupt() as was_interrupted:
             console.say("Ctrl-C ends it")  # from here on, and not only once this waits
-            until_interrupted()
+            while not was_interrupted():
+                time.sleep(0.1)
         end_at_once()
 
 
-def until_interrupted() -> None:
-    """Waits for Ctrl-C."""
-    threading.Event().wait()
+@contextlib.contextmanager
+def noted_interrupt() -> Generator[Callable[[], bool]]:
+    """Notes Ctrl-C instead of raising it.
+
+    An exception would be lost where it happens to reach a finalizer or a callback of the garbage
+    collector, and a thread that waits without a time limit may miss the signal altogether: the
+    page would stay for ever.
+    """
+    asked = threading.Event()
+    before = signal.signal(signal.SIGINT, lambda *_: asked.set())
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def end_at_once() -> None:
