@@ -45,7 +45,7 @@ def main(options: Options) -> Path:
     """Runs what is left of the cells, writes the page, and returns the folder of the results."""
     root, _, records = run_requests(options, "views", requests_of(options))
     folder = options.out / NAME / options.size
-    write_page(folder, root, records, origin(f"experiments.{NAME}", records))
+    write_page(folder, root, records, origin("experiments.extensions", records))
     print(f"results  {folder}")
     return folder
 
