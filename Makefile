@@ -62,8 +62,9 @@ docs: setup
 notebooks: setup
 	$(BIN)/python -m docs.figures.notebooks
 
+# As users run it: without the checks of types at run time that tests have.
 benchmark: setup
-	$(BIN)/pytest tests/benchmarks --benchmark-enable --benchmark-only --benchmark-columns=min,median,rounds
+	$(BIN)/pytest tests/benchmarks --jaxtyping-packages= --benchmark-enable --benchmark-only --benchmark-columns=min,median,rounds
 
 # For a machine with an NVIDIA GPU, in an environment that has JAX's CUDA plug-in.
 gpu-check:

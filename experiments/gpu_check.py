@@ -89,8 +89,8 @@ def steps_of(options: Options, timings: Path) -> list[Step]:
         Step("tests", (*pytest, "-m", "not (mutant or slow)", *options.tests)),
         Step(
             "benchmarks",
-            (*pytest, "tests/benchmarks", "--benchmark-enable", "--benchmark-only",
-             f"--benchmark-json={timings}"),
+            (*pytest, "tests/benchmarks", "--jaxtyping-packages=", "--benchmark-enable",
+             "--benchmark-only", f"--benchmark-json={timings}"),
         ),
         Step("experiment", (python, "-m", "experiments.replica_dense_views", *smoke)),
     ]  # fmt: skip

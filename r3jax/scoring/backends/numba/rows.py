@@ -10,7 +10,14 @@ from numba import prange
 
 from r3jax.mapping.backends.numba.bins import center_of
 from r3jax.native.arithmetic import exp2
-from r3jax.native.compiled import claim, in_wide_vectors, inlined_fused, kernel, parallel_kernel
+from r3jax.native.compiled import (
+    claim,
+    in_wide_vectors,
+    inlined,
+    inlined_fused,
+    kernel,
+    parallel_kernel,
+)
 from r3jax.scoring.backends.numba.terms import (
     ANGLES,
     DELTAS,
@@ -50,16 +57,24 @@ def _write_unknown(first, number, forms, terms):
 
 
 @inlined_fused
-def _find_known(first, number, state, chosen):
-    """Writes which rows hold something, or what is left of it; returns how many they are."""
+def _mark_known(first, number, state, is_known):
+    """Marks the rows that hold something, or what is left of it."""
+    in_wide_vectors()
     words, count, m2 = state[1], state[2], state[3]
+    for j in range(number):
+        is_known[j] = _ONE if (count[first + j] > _ZERO) | (m2[first + j] > _ZERO) else _ZERO
+    for word in range(words.shape[0]):
+        for j in range(number):
+            is_known[j] = _ONE if words[word, first + j] > 0 else is_known[j]
+
+
+@inlined
+def _choose(first, number, is_known, chosen):
+    """Writes which rows are known; returns how many they are."""
     num = 0
-    for row in range(first, first + number):
-        chosen[num] = row
-        is_known = (count[row] > _ZERO) | (m2[row] > _ZERO)
-        for word in range(words.shape[0]):
-            is_known |= words[word, row] > 0
-        num += is_known
+    for j in range(number):
+        chosen[num] = first + j
+        num += is_known[j] > _ZERO
     return num
 
 
@@ -151,7 +166,8 @@ def _score_blocks(next_block, points, state, forms, directions, results):
         for first in range(begin, min(begin + _BLOCK, num), CHUNK):
             number = min(CHUNK, num - first)
             _write_unknown(first, number, forms, terms)
-            number = _find_known(first, number, state, chosen)
+            _mark_known(first, number, state, present)
+            number = _choose(first, number, present, chosen)
             _gather(point, chosen, number, state, angles)
             _find_angles(number, forms[1], angles, present)
             _compare_directions(

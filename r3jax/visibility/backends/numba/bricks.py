@@ -26,7 +26,7 @@ POINTS_EDGE = 0.8
 
 _LIMIT = np.int64(INDEX_LIMIT)
 _LOW = np.int64((1 << 21) - 1)
-_HALF, _ONE = np.float32(0.5), np.float32(1.0)
+_ONE = np.float32(1.0)
 
 
 @inlined
@@ -132,6 +132,27 @@ def number_slots(counts, slots):
 
 
 @kernel
+def spheres_round(bricks, dims, low, edge):
+    """Finds spheres round bricks: middle and radius [b, 4] [m].
+
+    Args:
+        bricks: their numbers [b].
+        dims: bricks along each axis.
+        low: where the first one begins along each axis [m].
+        edge: of a brick [m].
+    """
+    spheres = np.empty((bricks.shape[0], 4), np.float32)
+    for b in range(bricks.shape[0]):
+        i, rest = bricks[b] // (dims[1] * dims[2]), bricks[b] % (dims[1] * dims[2])
+        cell = (i, rest // dims[2], rest % dims[2])
+        for axis in range(3):
+            spheres[b, axis] = low[axis] + (cell[axis] + 0.5) * edge
+        # More than half the diagonal: rounding may put a point just outside of its brick.
+        spheres[b, 3] = 0.9 * edge
+    return spheres
+
+
+@kernel
 def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
     """Sorts the rows that some view may see into bricks.
 
@@ -146,7 +167,7 @@ def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
 
     Returns:
         The slot of every row [N], -1 for those out of range; where each brick begins among the
-        slots [b + 1]; and the middle and half the diagonal of each brick [b, 4] [m].
+        slots [b + 1]; and a sphere round each brick [b, 4] [m].
     """
     box = box_of(views, is_sound, voxel_size)
     shift, dims = divide(box, most)
@@ -157,15 +178,8 @@ def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
     starts, bricks = np.empty(num_bricks + 1, np.int64), np.empty(num_bricks, np.int64)
     used = begin_bricks(counts, starts, bricks)
     number_slots(counts, slots)
-    spheres = np.empty((used, 4), np.float32)
-    for b in range(used):
-        i, rest = bricks[b] // (dims[1] * dims[2]), bricks[b] % (dims[1] * dims[2])
-        corner = (i, rest // dims[2], rest % dims[2])
-        for axis in range(3):
-            low = box[0, axis] + (corner[axis] << shift)
-            spheres[b, axis] = (np.float32(low) + _HALF * np.float32(1 << shift)) * voxel_size
-        spheres[b, 3] = np.float32(math.sqrt(3.0)) * _HALF * np.float32(1 << shift) * voxel_size
-    return slots, starts[: used + 1], spheres
+    low, edge = voxel_size * box[0].astype(np.float64), np.float64(voxel_size) * (1 << shift)
+    return slots, starts[: used + 1], spheres_round(bricks[:used], dims, low, edge)
 
 
 @kernel
@@ -194,8 +208,7 @@ def sorted_points(points, most):
 
     Returns:
         The order of the points [n], by brick, as they stand within a brick; where each brick
-        begins in it [b + 1]; and the middle of each brick and how far points lie from it [b, 4]
-        [m].
+        begins in it [b + 1]; and a sphere round each brick [b, 4] [m].
     """
     num = points.shape[1]
     order, slots = np.arange(num, dtype=np.int32), np.empty(num, np.int64)
@@ -218,15 +231,7 @@ def sorted_points(points, most):
     for i in range(num):
         order[counts[0, slots[i]]] = i
         counts[0, slots[i]] += 1
-    spheres = np.empty((used, 4), np.float32)
-    for b in range(used):
-        i, rest = bricks[b] // (dims[1] * dims[2]), bricks[b] % (dims[1] * dims[2])
-        cell = (i, rest // dims[2], rest % dims[2])
-        for axis in range(3):
-            spheres[b, axis] = low[axis] + (cell[axis] + 0.5) * edge
-        # More than half the diagonal: rounding may put a point just outside of its brick.
-        spheres[b, 3] = 0.9 * edge
-    return order, starts[: used + 1], spheres
+    return order, starts[: used + 1], spheres_round(bricks[:used], dims, low, edge)
 
 
 @inlined
