@@ -63,8 +63,8 @@ def _show(options: ViewOptions, run: Run, console: Console) -> None:
         )
         with console.status("opening the run ..."):
             shown = stack.enter_context(page)
-        console.say(f"view      {shown.url}")
         with noted_interrupt() as was_interrupted:
+            console.say(f"view      {shown.url}")
             console.say("Ctrl-C ends it")  # from here on, and not only once this waits
             while not was_interrupted():
                 time.sleep(0.1)

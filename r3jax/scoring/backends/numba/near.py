@@ -51,12 +51,12 @@ def _find_near(views, is_sound, wraps, shape, low, high, count, voxel_size, is_n
 
 
 @inlined
-def _compact(is_near, first, count, chosen):
-    """Writes the rows that are near; returns how many they are."""
+def choose_marked(marks, first, count, chosen):
+    """Writes the rows that are marked; returns how many they are."""
     num = 0
     for i in range(count):
         chosen[num] = first + i
-        num += is_near[i] > _ZERO
+        num += marks[i] > _ZERO
     return num
 
 
@@ -129,7 +129,7 @@ def gather_near(
                 views, is_sound, wraps, (height, width), key[0][first:last], key[1][first:last],
                 count[first:last], voxel_size, is_near,
             )  # fmt: skip
-            num = _compact(is_near, first, last - first, chosen)
+            num = choose_marked(is_near, first, last - first, chosen)
             gather(
                 key, words, count, m2, resolution, voxel_size, num, chosen, to, voxels, visited,
                 rows,

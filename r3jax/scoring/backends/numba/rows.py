@@ -10,14 +10,8 @@ from numba import prange
 
 from r3jax.mapping.backends.numba.bins import center_of
 from r3jax.native.arithmetic import exp2
-from r3jax.native.compiled import (
-    claim,
-    in_wide_vectors,
-    inlined,
-    inlined_fused,
-    kernel,
-    parallel_kernel,
-)
+from r3jax.native.compiled import claim, in_wide_vectors, inlined_fused, kernel, parallel_kernel
+from r3jax.scoring.backends.numba.near import choose_marked
 from r3jax.scoring.backends.numba.terms import (
     ANGLES,
     DELTAS,
@@ -66,16 +60,6 @@ def _mark_known(first, number, state, is_known):
     for word in range(words.shape[0]):
         for j in range(number):
             is_known[j] = _ONE if words[word, first + j] > 0 else is_known[j]
-
-
-@inlined
-def _choose(first, number, is_known, chosen):
-    """Writes which rows are known; returns how many they are."""
-    num = 0
-    for j in range(number):
-        chosen[num] = first + j
-        num += is_known[j] > _ZERO
-    return num
 
 
 @inlined_fused
@@ -167,7 +151,7 @@ def _score_blocks(next_block, points, state, forms, directions, results):
             number = min(CHUNK, num - first)
             _write_unknown(first, number, forms, terms)
             _mark_known(first, number, state, present)
-            number = _choose(first, number, present, chosen)
+            number = choose_marked(present, first, number, chosen)
             _gather(point, chosen, number, state, angles)
             _find_angles(number, forms[1], angles, present)
             _compare_directions(
