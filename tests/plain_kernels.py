@@ -38,6 +38,7 @@ def _python_compiler() -> ModuleType:
         claim=claim,
         in_wide_vectors=lambda: None,
         flush_denormals=lambda: None,
+        prefetch=lambda array, index: None,
         intrinsic=lambda function: _plain_lowest_bit,
     )
     return module
@@ -51,6 +52,8 @@ def _numpy_arithmetic() -> ModuleType:
     """Stands for `arithmetic.py`."""
     single, module = np.float32, ModuleType("r3jax.native.arithmetic")
     bits_of = lambda value: single(value).view(np.uint32)
+    # NaN becomes any number in machine code.
+    biased = lambda index: int(np.nan_to_num(index)) + (1 << 20)
     module.__dict__.update(
         floor=lambda x: single(np.floor(x)),
         ceil_log2=lambda x: single(np.ceil(np.log2(x))),
@@ -59,6 +62,8 @@ def _numpy_arithmetic() -> ModuleType:
         count_bits=lambda word: int(word).bit_count(),
         middle_of=lambda word, other: int(word) >> 21 | (int(other) & 1023) << 11,
         end_of=lambda word: int(word) >> 10,
+        low_word=lambda x, y: np.uint32((biased(x) | biased(y) << 21) & 0xFFFFFFFF),
+        high_word=lambda y, z: np.uint32(biased(y) >> 11 | biased(z) << 10),
         signed_of=lambda word: single((int(word) & (1 << 21) - 1) - (1 << 20)),
         bits_of=bits_of,
         float_of=lambda word: np.uint32(word).view(single),
@@ -82,7 +87,6 @@ def _numpy_lanes() -> ModuleType:
         store12=lambda array, index, value: store(array, index, value, 12),
         splat=lambda value: np.full(16, value, single),
         lane_numbers=lambda: np.arange(16, dtype=single),
-        prefetch=lambda array, index: None,
         any_above=lambda vector, level: bool((vector > level).any()),
         fma=lambda a, b, c: single(1) * a * b + c,
         quotient=lambda a, b: a / b,

@@ -154,7 +154,8 @@ def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Boo
         voxel_size: edge of a voxel [m].
     """
     far = 1e4  # stands for inf, so that differences stay finite
-    capped = jnp.minimum(depth, far)
+    # What is no measurement is a hole, whatever it is.
+    capped = jnp.where(depth > 0.0, jnp.minimum(depth, far), 0.0)
     around = _neighborhood(capped)
     # Holes take the value of the pixel in the middle.
     median = _median9([jnp.where(value > 0.0, value, capped) for value in around])

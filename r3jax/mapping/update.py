@@ -149,9 +149,10 @@ def _by_kernels(
     """The same in machine code."""
     from r3jax.mapping.backends import numba
 
-    points, valid, factor = _measured(state, frame, max_range, drop_edges)
+    factor = sound(frame.camera, frame.T_world_camera)
     position, focal = frame.position, frame.camera.focal
-    state = numba.join_points(state, points, frame.rgb.reshape(-1, 3), valid, position, focal)
+    # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
+    state = numba.join_pixels(state, frame, factor * max_range, drop_edges)
     state = eqx.tree_at(lambda m: m.voxel_size, state, factor * state.voxel_size)
     codes, has_holes = numba.codes_of_rows(state, frame, max_range)
     # A branch: what hides what must be known only where depth has failed.

@@ -126,6 +126,33 @@ def signed_of(typingctx, word):
     return types.float32(types.uint32), codegen
 
 
+def _biased(builder, index):
+    """A whole number from -2^20 on, in a float, as 21 bits; inverse of `signed_of`."""
+    return builder.add(builder.fptosi(index, _INT), _int(1 << 20))
+
+
+@intrinsic
+def low_word(typingctx, x, y):
+    """The low word of a packed key (`geometry.voxels.pack`), of whole numbers in floats."""
+
+    def codegen(context, builder, sig, args):
+        x, y = _biased(builder, args[0]), _biased(builder, args[1])
+        return builder.or_(x, builder.shl(y, _int(21)))
+
+    return types.uint32(types.float32, types.float32), codegen
+
+
+@intrinsic
+def high_word(typingctx, y, z):
+    """The high word of a packed key, of whole numbers in floats."""
+
+    def codegen(context, builder, sig, args):
+        y, z = _biased(builder, args[0]), _biased(builder, args[1])
+        return builder.or_(builder.lshr(y, _int(11)), builder.shl(z, _int(10)))
+
+    return types.uint32(types.float32, types.float32), codegen
+
+
 @intrinsic
 def fused(typingctx, a, b, c):
     """Product of two floats plus a third with one rounding, whatever LLVM fuses by itself."""

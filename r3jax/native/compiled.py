@@ -110,6 +110,22 @@ def claim(typingctx: Any, counter: Any) -> Any:
 
 
 @intrinsic
+def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
+    """Asks for the cache line of an array's element, to be read soon."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        array = context.make_array(sig.args[0])(context, builder, args[0])
+        byte, integer = ir.IntType(8).as_pointer(), ir.IntType(32)
+        pointer = builder.bitcast(builder.gep(array.data, [args[1]]), byte)
+        kind = ir.FunctionType(ir.VoidType(), [byte, integer, integer, integer])
+        read, keep, data = (ir.Constant(integer, i) for i in (0, 3, 1))
+        builder.call(_declared(builder, kind, "llvm.prefetch.p0"), [pointer, read, keep, data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), codegen
+
+
+@intrinsic
 def in_wide_vectors(typingctx: Any) -> Any:
     """Asks LLVM for the widest vectors of the processor in the kernel that calls this.
 

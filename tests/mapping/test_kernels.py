@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
-from r3jax.geometry.voxels import EMPTY_WORD, pack, voxel_index
 from r3jax.mapping import update
 from r3jax.mapping.backends import numba
 from r3jax.mapping.seen import mark_rows, rows_in_view
@@ -23,14 +22,14 @@ from r3jax.visibility.selection import select
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.plain_kernels import kernels_as_python
 
-WIDTH, HEIGHT, CAPACITY = 24, 18, 1024  # one shape: one compile
-CAMERA = Camera(WIDTH, HEIGHT, 20.0, 22.0, 11.0, 9.5)
+WIDTH, HEIGHT, CAPACITY = 24, 40, 4096  # one shape: one compile; more rows than a block has
+CAMERA = Camera(WIDTH, HEIGHT, 40.0, 44.0, 11.0, 20.5)
 REACH = jnp.float32(3.0)
 MAPS = numba.__name__
 SIGHT = visibility_kernels.__name__
 CHAIN = (
     *(f"{SIGHT}.{name}" for name in ("views", "bricks")),
-    *(f"{MAPS}.{name}" for name in ("bins", "look", "add")),
+    *(f"{MAPS}.{name}" for name in ("bins", "look", "group", "add")),
 )
 
 formulas = jax.jit(update._by_formulas)
@@ -122,8 +121,8 @@ def test_the_public_verb_takes_them_mapped_and_differentiated_forward():
 
 
 @functools.cache
-def asked(third: int = 2):
-    """A map of two frames, a third one, and what the formulas make of it.
+def asked(third: int = 2, reach: float = 3.0, drops: bool = True):
+    """A map of two frames, a third one, and the map that the formulas make of both.
 
     Number 0 was there before; from 3 cm farther off some of its voxels are in the map, others not.
     """
@@ -133,9 +132,8 @@ def asked(third: int = 2):
     frame = frame_of(third)
     farther = jnp.where(frame.depth > 0, frame.depth + 0.03, 0.0)
     frame = eqx.tree_at(lambda f: f.depth, frame, farther if third < 2 else frame.depth)
-    pixels = jax.jit(update._measured)(state, frame, REACH, jnp.asarray(True))
-    added = jax.jit(update.integrate_pixels)(state, frame, REACH, jnp.asarray(True))
-    return state, frame, pixels, added
+    added = jax.jit(update.integrate_pixels)(state, frame, jnp.float32(reach), jnp.asarray(drops))
+    return state, frame, added
 
 
 def camera_of(state: MapState, frame: Frame) -> np.ndarray:
@@ -145,21 +143,23 @@ def camera_of(state: MapState, frame: Frame) -> np.ndarray:
 def law_add(modules: Modules) -> None:
     for third in (2, 0):
         check_add(modules, third)
-    before, after = (np.asarray(asked(0)[k].count) for k in (0, 3))
+    depth = np.asarray(frame_of(2).depth)
+    check_add(modules, 2, float(np.median(depth[np.isfinite(depth) & (depth > 0)])))
+    check_add(modules, 2, np.inf, drops=False)
+    before, after = (np.asarray(asked(0)[k].count) for k in (0, 2))
     assert ((after > before) & (before > 0)).sum() > 20
     assert ((after > before) & (before == 0)).sum() > 20
 
 
-def check_add(modules: Modules, third: int) -> None:
-    state, frame, pixels, expected = asked(third)
+def check_add(modules: Modules, third: int, reach: float = 3.0, *, drops: bool = True) -> None:
+    state, frame, expected = asked(third, reach, drops)
     table = [np.array(getattr(state, name)) for name in ROWS]
-    low, high = pack(*voxel_index(pixels.points, state.voxel_size))
-    keys = jnp.where(pixels.valid, jnp.stack([low, high]), jnp.uint32(EMPTY_WORD))
+    numbers = numba._numbers(state, frame, jnp.float32(reach), jnp.asarray(drops))
     lost = np.zeros(1, np.int32)
     with kernels_as_python():
         modules["add"].add_pass(
-            table, camera_of(state, frame), np.array(keys), np.array(frame.rgb).reshape(-1, 3),
-            *numba._tables(state.num_bins), 2, lost,
+            table, camera_of(state, frame), np.array(frame.depth), np.array(frame.rgb),
+            np.array(numbers), *numba._tables(state.num_bins), 2, lost,
         )  # fmt: skip
     assert lost[0] == 0
     for name, found in zip(ROWS, table, strict=True):
@@ -167,15 +167,26 @@ def check_add(modules: Modules, third: int) -> None:
 
 
 def law_look(modules: Modules) -> None:
-    _, frame, _, state = asked()
+    _, frame, state = asked()
+    check_look(modules, *comb(frame), REACH)
     rows = np.asarray(state.center).T[np.asarray(state.occupied)]
     near = np.quantile(np.linalg.norm(rows - np.asarray(frame.position), axis=-1), 0.7)
     for reach in (REACH, jnp.float32(near)):
-        check_look(modules, reach)
+        check_look(modules, state, frame, reach)
 
 
-def check_look(modules: Modules, reach: jax.Array) -> None:
-    _, frame, _, state = asked()
+def comb(frame: Frame) -> tuple[MapState, Frame]:
+    """A map and a frame with teeth of a pixel: beside each lies what is farther."""
+    teeth = np.where(np.asarray(frame.depth) > 0, 1.2 + 0.4 * (np.arange(WIDTH) % 2), 0.0)
+    frame = eqx.tree_at(lambda f: f.depth, frame, jnp.asarray(teeth, jnp.float32))
+    # Seen from beside itself: its points then lie between the pixels.
+    beside = frame.T_world_camera.at[:3, 3].add(0.02 * frame.T_world_camera[:3, 0])
+    moved = eqx.tree_at(lambda f: f.T_world_camera, frame, beside)
+    state = formulas(empty_map(CAPACITY, 0.05, 40), moved, REACH, jnp.asarray(False))
+    return state, frame
+
+
+def check_look(modules: Modules, state: MapState, frame: Frame, reach: jax.Array) -> None:
     T = np.linalg.inv(np.asarray(frame.T_world_camera, np.float64))[:3].reshape(-1)
     numbers = np.array([state.voxel_size, reach, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
     numbers = np.concatenate([numbers, T]).astype(np.float32)
@@ -199,7 +210,7 @@ def check_look(modules: Modules, reach: jax.Array) -> None:
 
 
 def law_mark(modules: Modules) -> None:
-    _, frame, _, state = asked()
+    _, frame, state = asked()
     codes = np.arange(CAPACITY).astype(np.uint8) % 3
     codes[np.asarray(~state.occupied)] = 0
     in_holes = (np.arange(CAPACITY) % 2).astype(np.uint8)
@@ -240,15 +251,29 @@ MUTANTS = [
     Mutant("bins", "table[cell, 2] == chosen", "True", law_nearest_bin),
     Mutant("bins", "-_ONE) if is_lower else u", "-_ONE) if not is_lower else u", law_mark),
     Mutant("bins", "camera[1] / distance", "camera[1] * distance", law_mark),
-    Mutant("look", "resolution[row] = max(", "resolution[row] = min(", law_mark),
-    Mutant("look", "and shown_in_holes[row] != 0", "", law_mark),
-    Mutant("look", "z <= depth[i, j] + slack or z <= _farthest_around(depth, i, j) + slack",
-           "z <= depth[i, j]", law_look),
-    Mutant("look", "    if depth[i, j] == _ZERO:\n        return HOLE\n", "", law_look),
+    Mutant("bins", "resolution[row] = max(", "resolution[row] = min(", law_mark),
+    Mutant("look", " & (shown_in_holes[row] != 0)", "", law_mark),
+    Mutant("look", "depth, numbers[_SIZE])", "depth, _ZERO)", law_look),
+    Mutant("look", "z <= _farthest_around(depth, row, column)", "z <= measured", law_look),
+    Mutant("look", "    if measured == _ZERO:\n        return HOLE\n", "", law_look),
     Mutant("look", "numbers[_RANGE] * numbers[_RANGE]", "numbers[_RANGE]", law_look),
     Mutant("add", "squared * before * weight", "squared * weight", law_add),
-    Mutant("add", "points = max(sums[group, 3], _ONE)", "points = _ONE", law_add),
-    Mutant("add", "last[np.uint32(group_of[i])] == i", "True", law_add),
+    Mutant("add", "points = max(sums[i, 3], _ONE)", "points = _ONE", law_add),
+    Mutant("group", "sums[group, 0] += rgb[j, 0]", "sums[group, 0] = rgb[j, 0]", law_add),
+    Mutant("group", "if keys[found, 0] == low and keys[found, 1] == high:",
+           "if keys[found, 1] == high:", law_add),
+    Mutant("group", "merged_sums[group, channel] += sums", "merged_sums[group, channel] = sums",
+           law_add),
+    Mutant("group", "j = np.uint32(low.shape[0] - 1 - k)", "j = np.uint32(k)", law_add),
+    Mutant("group", "(depth <= reach) & ", "", law_add),
+    Mutant("group", "(depth < _INFINITE) & ", "", law_add),
+    Mutant("group", " & (counted[j] > _ZERO)", "", law_add),
+    Mutant("group", "medians[end] = medians[end - 1]", "pass", law_add),
+    Mutant("group", "        is_edge |= _breaks(median[j - 1], middle, median[j + 1], size)\n", "",
+           law_add),
+    Mutant("group", "_THIN * depth", "_TWO * depth", law_add),
+    Mutant("group", "return value if value > _ZERO else other", "return value", law_add),
+    Mutant("group", "own, _or(here[j + 1], own))", "own, own)", law_add),
     Mutant("add", "bids[k] = slot if table[1, slot] == _EMPTY else -1", "bids[k] = slot", law_add),
     Mutant("add", "if rows[i] == capacity:\n            wanting", "if True:\n            wanting",
            law_add),

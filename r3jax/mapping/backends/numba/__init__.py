@@ -1,6 +1,6 @@
 """A frame joins the map in machine code on CPUs: what `update.integrate` says, in two passes.
 
-Shape symbols: N rows of the map; P points of a frame; H W image size.
+Shape symbol: N rows of the map.
 """
 
 import functools
@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float, UInt8
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import invert_pose
 from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
-from r3jax.geometry.voxels import EMPTY_WORD, pack, voxel_index
 from r3jax.mapping.backends.numba.bridge import ADD, LOOK, MARK, register
 from r3jax.mapping.state import MapState
 from r3jax.native.compiled import forget_outdated_code
@@ -43,30 +42,30 @@ def _options() -> np.ndarray:
     return np.array([num_workers()], dtype=np.int32)
 
 
-def join_points(
-    state: MapState,
-    points: Float[Array, "3 P"],
-    rgb: Float[Array, "P 3"],
-    valid: Bool[Array, " P"],
-    position: Float[Array, " 3"],
-    focal: Float[Array, ""],
-) -> MapState:
-    """One observation per voxel that a point falls into joins the map.
+def _numbers(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> Float[Array, " 19"]:
+    """Voxel size, range, 1 to leave out edges, camera and pose, as `group_pixels` takes them."""
+    camera = frame.camera
+    numbers = [state.voxel_size, max_range, drop_edges.astype(jnp.float32)]
+    numbers = jnp.stack([*numbers, camera.fx, camera.fy, camera.cx, camera.cy])
+    return jnp.concatenate([numbers, frame.T_world_camera[:3].reshape(-1)])
 
-    What `update.integrate_groups` does with the groups of `associate.group_by_voxel`: the same
-    rows, and the same numbers beyond rounding.
+
+def join_pixels(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    """One observation per voxel that a measured pixel falls into joins the map.
+
+    What `update.integrate_pixels` says: the same rows, and the same numbers beyond rounding.
 
     Args:
         state: the map before.
-        points: in the world [m].
-        rgb: their colors.
-        valid: False for points to ignore.
-        position: where they were seen from [m].
-        focal: focal length [px].
+        frame: the frame.
+        max_range: measurements beyond this z-depth are ignored; NaN ignores all [m].
+        drop_edges: True leaves out pixels on depth edges.
     """
     register(ADD)
-    low, high = pack(*voxel_index(points, state.voxel_size))
-    keys = jnp.where(valid, jnp.stack([low, high]), jnp.uint32(EMPTY_WORD))
     table = (state.key, state.visited, state.count, state.mean, state.m2, state.resolution)
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in table]
     lost = jax.ShapeDtypeStruct((1,), jnp.int32)
@@ -76,8 +75,8 @@ def join_points(
         input_output_aliases={i: i for i in range(len(table))},
         vmap_method="sequential",
     )(
-        *table, _camera(state, position, focal), keys, rgb,
-        *_tables(state.num_bins), _options(),
+        *table, _camera(state, frame.position, frame.camera.focal), frame.depth, frame.rgb,
+        _numbers(state, frame, max_range, drop_edges), *_tables(state.num_bins), _options(),
     )  # fmt: skip
     key, visited, count, mean, m2, resolution = after
     return MapState(

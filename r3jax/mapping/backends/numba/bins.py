@@ -8,7 +8,13 @@ import math
 import numpy as np
 
 from r3jax.native.arithmetic import end_of, floor, middle_of, signed_of, whole
-from r3jax.native.compiled import inlined, inlined_fused
+from r3jax.native.compiled import in_wide_vectors, inlined, inlined_fused, kernel
+
+_X, _Y, _Z, _SHARPNESS = 0, 1, 2, 3
+"""Rows of a chunk's looks: direction and resolution [px/m]."""
+
+_CHUNK = 256
+"""Voxels whose looks are worked out together, in vectors, and stay in the L1 cache."""
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _LEAST, _TINY = np.float32(1e-6), np.float32(1e-20)
@@ -68,22 +74,48 @@ def center_of(key, row, voxel_size):
 
 
 @inlined_fused
-def evidence(key, row, camera, table, lattice):
-    """Bin towards a camera and resolution [px/m] of the voxel in a row (`seen.evidence_of_view`).
+def _look(low, high, num, camera, size, looks, cells):
+    """Directions to a camera, their octahedral cells, and resolutions of some voxels."""
+    in_wide_vectors()
+    for i in range(num):
+        center = center_of_words(low[i], high[i], camera[0])
+        x, y, z = camera[2] - center[0], camera[3] - center[1], camera[4] - center[2]
+        distance = max(math.sqrt(x * x + y * y + z * z), _LEAST)
+        x, y, z = x / distance, y / distance, z / distance
+        looks[_X, i], looks[_Y, i], looks[_Z, i] = x, y, z
+        looks[_SHARPNESS, i] = camera[1] / distance
+        cells[i] = fold(x, y, z, size)
+
+
+@kernel
+def mark_rows(key, visited, resolution, rows, num, camera, table, lattice):
+    """Sets the bin of rows towards a camera, and raises their resolution (`seen.mark_rows`).
 
     Args:
         key: of the map [2, N].
-        row: which.
+        visited: words of bins, changed in place [W, N].
+        resolution: best so far [px/m], changed in place [N].
+        rows: which; all of them hold voxels.
+        num: how many of them.
         camera: voxel size, focal length and position.
         table: candidates of each octahedral cell [S^2, K].
         lattice: directions of the bins [B, 3].
     """
-    center = center_of(key, row, camera[0])
-    x, y, z = camera[2] - center[0], camera[3] - center[1], camera[4] - center[2]
-    distance = max(math.sqrt(x * x + y * y + z * z), _LEAST)
-    x, y, z = x / distance, y / distance, z / distance
-    cell = fold(x, y, z, np.float32(math.sqrt(table.shape[0])))
-    return nearest_bin(x, y, z, cell, table, lattice), camera[1] / distance
+    size = np.float32(math.sqrt(table.shape[0]))
+    low, high = np.empty(_CHUNK, np.uint32), np.empty(_CHUNK, np.uint32)
+    looks, cells = np.empty((4, _CHUNK), np.float32), np.empty(_CHUNK, np.int32)
+    for first in range(0, num, _CHUNK):
+        count = min(_CHUNK, num - first)
+        for i in range(count):
+            row = np.int64(rows[first + i])
+            low[i], high[i] = key[0, row], key[1, row]
+        _look(low, high, count, camera, size, looks, cells)
+        for i in range(count):
+            row = np.int64(rows[first + i])
+            x, y, z = looks[_X, i], looks[_Y, i], looks[_Z, i]
+            chosen = nearest_bin(x, y, z, cells[i], table, lattice)
+            visited[chosen >> 5, row] |= np.uint32(1) << np.uint32(chosen & 31)
+            resolution[row] = max(resolution[row], looks[_SHARPNESS, i])
 
 
 @inlined

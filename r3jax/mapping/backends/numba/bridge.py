@@ -14,6 +14,7 @@ from r3jax.native.ffi import (
     bytes1,
     floats1,
     floats2,
+    floats3,
     ints1,
     ints2,
     register_handlers,
@@ -24,7 +25,7 @@ ADD, LOOK, MARK = "r3jax_mapping_add", "r3jax_mapping_look", "r3jax_mapping_mark
 
 
 def _add(frame):
-    """Arguments: table (6), camera, keys of points, colors, tables of bins (2), workers.
+    """Arguments: table (6), camera, depth, colors, numbers, tables of bins (2), workers.
 
     Results: the table, in the place of the arguments, and how many voxels found no row.
     """
@@ -36,11 +37,12 @@ def _add(frame):
             floats2(frame, RESULTS, 3), floats1(frame, RESULTS, 4), floats1(frame, RESULTS, 5),
         ),
         floats1(frame, ARGUMENTS, 6),
-        words2(frame, ARGUMENTS, 7),
-        floats2(frame, ARGUMENTS, 8),
-        ints2(frame, ARGUMENTS, 9),
-        floats2(frame, ARGUMENTS, 10),
-        np.int64(ints1(frame, ARGUMENTS, 11)[0]),
+        floats2(frame, ARGUMENTS, 7),
+        floats3(frame, ARGUMENTS, 8),
+        floats1(frame, ARGUMENTS, 9),
+        ints2(frame, ARGUMENTS, 10),
+        floats2(frame, ARGUMENTS, 11),
+        np.int64(ints1(frame, ARGUMENTS, 12)[0]),
         ints1(frame, RESULTS, 6),
     )  # fmt: skip
     return 0

@@ -7,9 +7,9 @@ import numpy as np
 from numba import prange
 
 from r3jax.geometry.voxels import EMPTY_WORD
-from r3jax.mapping.backends.numba.bins import center_of, evidence, is_sound
+from r3jax.mapping.backends.numba.bins import center_of, is_sound, mark_rows
 from r3jax.native.arithmetic import whole
-from r3jax.native.compiled import in_wide_vectors, inlined_fused, parallel_kernel
+from r3jax.native.compiled import in_wide_vectors, inlined_fused, parallel_kernel, prefetch
 
 SHOWS, HOLE = 1, 2
 """Codes of rows: a measurement shows the voxel; the pixel where it lies has none."""
@@ -19,6 +19,9 @@ _SIZE, _RANGE, _FX, _FY, _CX, _CY, _POSE = 0, 1, 2, 3, 4, 5, 6
 
 _BLOCK = 1 << 12
 """Rows that a worker looks at before it takes the next."""
+
+_AHEAD = 16
+"""Rows whose pixels are on their way from memory while one is looked at: they lie anywhere."""
 
 _EMPTY = np.uint32(EMPTY_WORD)
 _ZERO, _ONE, _NEAREST = np.float32(0.0), np.float32(1.0), np.float32(1e-3)
@@ -71,18 +74,18 @@ def _project(key, first, num, numbers, shape, pixels, depths):
 
 
 @inlined_fused
-def _code_of(pixel, z, depth, slack):
+def _code_of(pixel, measured, z, depth, slack):
     """What a frame says of a row that lies in one of its pixels; see `codes_of_rows`."""
-    i, j = pixel // depth.shape[1], pixel % depth.shape[1]
-    if depth[i, j] == _ZERO:
+    if measured == _ZERO:
         return HOLE
-    if not depth[i, j] > _ZERO:
+    if not measured > _ZERO:
         return 0
     # One edge of slack: a surface may lie anywhere within its voxel. Mostly the pixel itself says
     # so, which is farther than none of those around it.
-    if z <= depth[i, j] + slack or z <= _farthest_around(depth, i, j) + slack:
+    if z <= measured + slack:
         return SHOWS
-    return 0
+    row, column = pixel // depth.shape[1], pixel % depth.shape[1]
+    return SHOWS if z <= _farthest_around(depth, row, column) + slack else 0
 
 
 @parallel_kernel
@@ -97,20 +100,29 @@ def look_pass(key, numbers, depth, workers, codes, has_holes):
         codes: written [N].
         has_holes: written: 1 if any row is in a hole [1].
     """
-    num, holes = key.shape[1], np.zeros(workers, np.int32)
+    capacity, holes = key.shape[1], np.zeros(workers, np.int32)
     sound = np.isfinite(numbers[_FX:]).all() and numbers[_SIZE] > _ZERO
-    blocks = (num + _BLOCK - 1) // _BLOCK
+    blocks, flat = (capacity + _BLOCK - 1) // _BLOCK, depth.reshape(depth.size)
     for worker in prange(workers):
         pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
+        seen = np.empty(_BLOCK, np.int32)
         for block in range(worker, blocks, workers):
-            first, size = block * _BLOCK, min(_BLOCK, num - block * _BLOCK)
+            first, size = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
             pixels[:] = -1
             if sound:
                 _project(key, first, size, numbers, depth.shape, pixels, depths)
+            codes[first : first + size] = 0
+            # Listed without a branch: whether a row is in view is a guess that often fails.
+            num = 0
             for i in range(size):
-                code = 0
-                if pixels[i] >= 0:
-                    code = _code_of(np.int64(pixels[i]), depths[i], depth, numbers[_SIZE])
+                seen[num] = i
+                num += pixels[i] >= 0
+            for k in range(num):
+                if k + _AHEAD < num:
+                    prefetch(flat, np.int64(pixels[seen[k + _AHEAD]]))
+                i = np.int64(seen[k])
+                pixel = np.int64(pixels[i])
+                code = _code_of(pixel, flat[pixel], depths[i], depth, numbers[_SIZE])
                 codes[first + i] = code
                 if code == HOLE:
                     holes[worker] = 1
@@ -132,13 +144,14 @@ def mark_pass(visited, resolution, key, camera, codes, shown_in_holes, table, la
         lattice: directions of the bins [B, 3].
         workers: threads.
     """
-    num = key.shape[1]
-    blocks = (num + _BLOCK - 1) // _BLOCK
-    sound = is_sound(camera)
+    capacity = key.shape[1]
+    blocks = (capacity + _BLOCK - 1) // _BLOCK if is_sound(camera) else 0
     for worker in prange(workers):
-        for block in range(worker, blocks if sound else 0, workers):
-            for row in range(block * _BLOCK, min((block + 1) * _BLOCK, num)):
-                if codes[row] == SHOWS or (codes[row] == HOLE and shown_in_holes[row] != 0):
-                    chosen, sharper = evidence(key, row, camera, table, lattice)
-                    visited[chosen >> 5, row] |= np.uint32(1) << np.uint32(chosen & 31)
-                    resolution[row] = max(resolution[row], sharper)
+        rows = np.empty(_BLOCK, np.int32)
+        for block in range(worker, blocks, workers):
+            num = 0
+            for row in range(block * _BLOCK, min((block + 1) * _BLOCK, capacity)):
+                rows[num] = row
+                is_in_hole = (codes[row] == HOLE) & (shown_in_holes[row] != 0)
+                num += (codes[row] == SHOWS) | is_in_hole
+            mark_rows(key, visited, resolution, rows, num, camera, table, lattice)

@@ -16,7 +16,7 @@ forward pass's own.
 import numpy as np
 from numba import prange
 
-from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel
+from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel, prefetch
 from r3jax.splatting import config
 from r3jax.splatting.backends.numba import records as at
 from r3jax.splatting.backends.numba.lanes import (
@@ -28,7 +28,6 @@ from r3jax.splatting.backends.numba.lanes import (
     lane_numbers,
     larger,
     load,
-    prefetch,
     quotient,
     smaller,
     splat,

@@ -204,24 +204,6 @@ def store12(typingctx, array, index, value):
 
 
 @intrinsic
-def prefetch(typingctx, array, index):
-    """Asks for the cache line of an array's element, to be read soon."""
-
-    def codegen(context, builder, sig, args):
-        array = context.make_array(sig.args[0])(context, builder, args[0])
-        pointer = builder.gep(array.data, [args[1]])
-        byte, integer = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte, integer, integer, integer])
-        name = "llvm.prefetch.p0"
-        function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-        read, keep, data = (ir.Constant(integer, i) for i in (0, 3, 1))
-        builder.call(function, [builder.bitcast(pointer, byte), read, keep, data])
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64), codegen
-
-
-@intrinsic
 def any_above(typingctx, vector, threshold):
     """Whether any lane is above a scalar."""
 

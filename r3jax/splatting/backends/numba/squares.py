@@ -17,7 +17,7 @@ backward pass itself, given one of the seven numbers at a time.
 import numpy as np
 from numba import prange
 
-from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel
+from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel, prefetch
 from r3jax.splatting.backends.numba import records as at
 from r3jax.splatting.backends.numba.compositing import (
     AHEAD,
@@ -33,7 +33,6 @@ from r3jax.splatting.backends.numba.lanes import (
     keep_gt,
     lane_numbers,
     load,
-    prefetch,
     quotient,
     smaller,
     splat,

@@ -6,7 +6,7 @@
 import numpy as np
 from numba import prange
 
-from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel
+from r3jax.native.compiled import claim, inlined, kernel, parallel_kernel, prefetch
 from r3jax.splatting.backends.numba import records as at
 from r3jax.splatting.backends.numba.compositing import (
     AHEAD,
@@ -20,7 +20,6 @@ from r3jax.splatting.backends.numba.lanes import (
     keep_gt,
     lane_numbers,
     load,
-    prefetch,
     smaller,
     splat,
     store,
