@@ -268,7 +268,7 @@ MUTANTS = [
     Mutant("group", "(depth <= reach) & ", "", law_add),
     Mutant("group", "(depth < _INFINITE) & ", "", law_add),
     Mutant("group", " & (counted[j] > _ZERO)", "", law_add),
-    Mutant("group", "medians[end] = medians[end - 1]", "pass", law_add),
+    Mutant("group", "_repeat(medians[end - 1], medians[end])", "pass", law_add),
     Mutant("group", "        is_edge |= _breaks(median[j - 1], middle, median[j + 1], size)\n", "",
            law_add),
     Mutant("group", "_THIN * depth", "_TWO * depth", law_add),

@@ -17,7 +17,7 @@ _CHUNK = 256
 """Voxels whose looks are worked out together, in vectors, and stay in the L1 cache."""
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
-_LEAST, _TINY = np.float32(1e-6), np.float32(1e-20)
+_LEAST, _TINY, _INFINITE = np.float32(1e-6), np.float32(1e-20), np.float32(np.inf)
 
 
 @inlined_fused
@@ -119,6 +119,9 @@ def mark_rows(key, visited, resolution, rows, num, camera, table, lattice):
 
 
 @inlined
-def is_sound(camera):
-    """False if a number of a camera cannot be: nothing is seen from there."""
-    return np.isfinite(camera).all() and camera[0] > _ZERO
+def is_sound(numbers, first=0):
+    """False if a voxel size, or a number from place `first` on, cannot be: nothing is seen then."""
+    sound = numbers[0] > _ZERO
+    for i in range(first, numbers.shape[0]):
+        sound &= abs(numbers[i]) < _INFINITE
+    return sound

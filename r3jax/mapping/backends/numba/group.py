@@ -139,6 +139,21 @@ def _pack_row(depths, counted, columns, v, numbers, low, high, mixed):
         mixed[j] = _mix(low[j], high[j])
 
 
+# Rows and tables are filled one by one: Numba compiles each assignment to a slice for a second.
+
+
+@inlined
+def _repeat(row, copy):
+    for j in range(row.shape[0]):
+        copy[j] = row[j]
+
+
+@inlined
+def _empty(slots):
+    for i in range(slots.shape[0]):
+        slots[i] = np.int32(-1)
+
+
 @inlined_fused
 def _fill_medians(block, medians, first, height):
     """Medians of a block's rows and of one row on both sides; the image's border is repeated."""
@@ -147,10 +162,10 @@ def _fill_medians(block, medians, first, height):
         if 0 <= first + k - _AROUND < height:
             _median_row(block[k - 1], block[k], block[k + 1], medians[k])
     if first == 0:
-        medians[_AROUND - 1] = medians[_AROUND]
+        _repeat(medians[_AROUND], medians[_AROUND - 1])
     if first + _ROWS >= height:
         end = height - first + _AROUND
-        medians[end] = medians[end - 1]
+        _repeat(medians[end - 1], medians[end])
 
 
 @inlined
@@ -213,7 +228,10 @@ def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
         columns[j] = (np.float32(j) + _HALF - numbers[_CX]) / numbers[_FX]
     for worker in prange(workers):
         block = np.empty((_ROWS + 2 * _AROUND, width + 2), np.float32)
-        medians, counted = np.empty_like(block), np.ones(width, np.float32)
+        medians = np.empty((_ROWS + 2 * _AROUND, width + 2), np.float32)
+        counted = np.empty(width, np.float32)
+        for j in range(width):
+            counted[j] = _ONE
         low, high = np.empty(width, np.uint32), np.empty(width, np.uint32)
         mixed = np.empty(width, np.uint32)
         # A thread's own, which stay in its caches from block to block.
@@ -225,8 +243,9 @@ def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
             if numbers[_DROPS_EDGES] > _ZERO:
                 _copy_rows(depth, first, block)
                 _fill_medians(block, medians, first, height)
-            slots[:] = -1
-            count = 0
+            _empty(slots)
+            # Not 0, for whose type Numba would compile what it is given to once more.
+            count = np.int64(0)
             for row in range(end - 1, first - 1, -1):
                 if numbers[_DROPS_EDGES] > _ZERO:
                     _drop_edges(block, medians, row - first + _AROUND, numbers[_SIZE], counted)
@@ -236,8 +255,11 @@ def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
                     low, high, mixed, rgb[row], shift, slots, own_keys, own_sums, count
                 )
             counts[number] = count
-            keys[first * width : first * width + count] = own_keys[:count]
-            sums[first * width : first * width + count] = own_sums[:count]
+            for i in range(count):
+                place = first * width + i
+                keys[place, 0], keys[place, 1] = own_keys[i, 0], own_keys[i, 1]
+                for channel in range(4):
+                    sums[place, channel] = own_sums[i, channel]
 
 
 @kernel
@@ -256,12 +278,14 @@ def group_pixels(depth, rgb, numbers, workers):
     """
     height, width = depth.shape
     keys, sums = np.empty((depth.size, 2), np.uint32), np.empty((depth.size, 4), np.float32)
-    counts = np.zeros((height + _ROWS - 1) // _ROWS, np.int32)
+    counts, most = np.empty((height + _ROWS - 1) // _ROWS, np.int64), 0
     _group_blocks(depth, rgb, numbers, workers, keys, sums, counts)
-    most = counts.sum()
+    for number in range(counts.shape[0]):
+        most += counts[number]
     merged_keys, merged_sums = np.empty((most, 2), np.uint32), np.empty((most, 4), np.float32)
     shift, place = _shift_for(most), most
-    slots = np.full(1 << (32 - shift), np.int32(-1))
+    slots = np.empty(1 << (32 - shift), np.int32)
+    _empty(slots)
     # From the last pixel to the first, as the blocks were gone through: the first group of a
     # voxel that is met has its last pixel. Filled from the end, so the order is that of pixels.
     for number in range(counts.shape[0] - 1, -1, -1):
@@ -269,7 +293,8 @@ def group_pixels(depth, rgb, numbers, workers):
             low, high = keys[i, 0], keys[i, 1]
             group = _group_of(low, high, _mix(low, high), shift, slots, merged_keys, place - 1)
             if group == place - 1:
-                merged_sums[group] = _ZERO
+                for channel in range(4):
+                    merged_sums[group, channel] = _ZERO
                 place -= 1
             for channel in range(4):
                 merged_sums[group, channel] += sums[i, channel]

@@ -100,23 +100,23 @@ def look_pass(key, numbers, depth, workers, codes, has_holes):
         codes: written [N].
         has_holes: written: 1 if any row is in a hole [1].
     """
-    capacity, holes = key.shape[1], np.zeros(workers, np.int32)
-    sound = np.isfinite(numbers[_FX:]).all() and numbers[_SIZE] > _ZERO
+    capacity, holes = key.shape[1], np.empty(workers, np.int32)
+    sound = is_sound(numbers, _FX)
     blocks, flat = (capacity + _BLOCK - 1) // _BLOCK, depth.reshape(depth.size)
     for worker in prange(workers):
         pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
         seen = np.empty(_BLOCK, np.int32)
+        holes[worker] = 0
         for block in range(worker, blocks, workers):
             first, size = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
-            pixels[:] = -1
             if sound:
                 _project(key, first, size, numbers, depth.shape, pixels, depths)
-            codes[first : first + size] = 0
             # Listed without a branch: whether a row is in view is a guess that often fails.
             num = 0
             for i in range(size):
+                codes[first + i] = 0
                 seen[num] = i
-                num += pixels[i] >= 0
+                num += (pixels[i] >= 0) & sound
             for k in range(num):
                 if k + _AHEAD < num:
                     prefetch(flat, np.int64(pixels[seen[k + _AHEAD]]))
@@ -126,7 +126,9 @@ def look_pass(key, numbers, depth, workers, codes, has_holes):
                 codes[first + i] = code
                 if code == HOLE:
                     holes[worker] = 1
-    has_holes[0] = holes.max()
+    has_holes[0] = 0
+    for worker in range(workers):
+        has_holes[0] |= holes[worker]
 
 
 @parallel_kernel
@@ -149,7 +151,7 @@ def mark_pass(visited, resolution, key, camera, codes, shown_in_holes, table, la
     for worker in prange(workers):
         rows = np.empty(_BLOCK, np.int32)
         for block in range(worker, blocks, workers):
-            num = 0
+            num = np.int64(0)
             for row in range(block * _BLOCK, min((block + 1) * _BLOCK, capacity)):
                 rows[num] = row
                 is_in_hole = (codes[row] == HOLE) & (shown_in_holes[row] != 0)
