@@ -4,7 +4,7 @@ Shape symbols: P points of a frame; M observations that join at once; H W image 
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -93,23 +93,10 @@ def integrate_groups(
     return jax.lax.fori_loop(0, (num_voxels + (size - 1)) // size, join_chunk, state)
 
 
-class _Pixels(NamedTuple):
-    """What a frame measures."""
-
-    points: Float[Array, "3 P"]
-    """In the world [m]; anything where not valid."""
-
-    valid: Bool[Array, " P"]
-    """True for pixels that join the map."""
-
-    factor: Float[Array, ""]
-    """1; NaN where the pose is unsound."""
-
-
-def _measured(
+def integrate_pixels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
-) -> _Pixels:
-    """The points of a frame that join the map."""
+) -> MapState:
+    """Adds the frame's measured pixels to the map: the part of `integrate` that counts colors."""
     depth = frame.depth
     factor = sound(frame.camera, frame.T_world_camera)
     # An unsound pose makes the factor NaN, and NaN > 0 is False: the frame adds nothing.
@@ -122,15 +109,8 @@ def _measured(
     )
     # 1 m stands for what is not measured: inf would make NaN of the points.
     points = points_of_pixels(frame, jnp.where(is_measured, depth, 1.0))
-    return _Pixels(points, valid.reshape(-1), factor)
-
-
-def integrate_pixels(
-    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
-) -> MapState:
-    """Adds the frame's measured pixels to the map: the part of `integrate` that counts colors."""
-    points, valid, factor = _measured(state, frame, max_range, drop_edges)
-    groups = group_by_voxel(points, frame.rgb.reshape(-1, 3), valid, state.voxel_size)
+    rgb = frame.rgb.reshape(-1, 3)
+    groups = group_by_voxel(points, rgb, valid.reshape(-1), state.voxel_size)
     after = integrate_groups(state, groups, frame.position, frame.camera.focal)
     # NaN in the edge reaches every later score, and no later frame can undo it.
     return eqx.tree_at(lambda m: m.voxel_size, after, factor * after.voxel_size)

@@ -1,4 +1,4 @@
-"""How the kernels are compiled, and the atomic counter that hands out their work."""
+"""How the kernels are compiled, what they ask of the processor, and the counter of their work."""
 
 import contextlib
 import inspect

@@ -1,4 +1,4 @@
-"""Groups a frame's pixels by voxel: `update._measured` and `mapping.associate` in machine code.
+"""Groups a frame's measured pixels by voxel: `mapping.associate` in machine code.
 
 Blocks of rows are grouped each by itself, and their groups put together: what comes out does not
 depend on the number of threads.
@@ -123,7 +123,7 @@ def _index(numbers, axis, x, y, depth):
 
 
 @inlined_fused
-def _pack_row(depths, counted, columns, v, numbers, low, high, mixed):
+def _pack_row(depths, counted, columns, v, numbers, low, high, spread):
     """Packed keys of the voxels of a row's pixels, all ones where nothing counts."""
     in_wide_vectors()
     reach = numbers[_RANGE]
@@ -136,7 +136,7 @@ def _pack_row(depths, counted, columns, v, numbers, low, high, mixed):
         at_z = _index(numbers, 2, x, y, depth)
         low[j] = low_word(at_x, at_y) if is_in else _EMPTY
         high[j] = high_word(at_y, at_z) if is_in else _EMPTY
-        mixed[j] = _mix(low[j], high[j])
+        spread[j] = _spread(low[j], high[j])
 
 
 # Rows and tables are filled one by one: Numba compiles each assignment to a slice for a second.
@@ -169,15 +169,19 @@ def _fill_medians(block, medians, first, height):
 
 
 @inlined
-def _mix(low, high):
-    """Spreads a packed key over a word, whose upper bits depend on all bits of the key."""
+def _spread(low, high):
+    """Spreads a packed key over a word, whose upper bits depend on all bits of the key.
+
+    Two products instead of the hash of the map's table: no row is chosen by it, and every pixel
+    needs one.
+    """
     return np.uint32(np.uint32(low * _SPREAD_LOW) ^ np.uint32(high * _SPREAD_HIGH))
 
 
 @inlined
-def _group_of(low, high, mixed, shift, slots, keys, new):
+def _group_of(low, high, spread, shift, slots, keys, new):
     """Finds the group of a voxel in a scratch table; a voxel without one becomes group `new`."""
-    slot, mask = np.uint32(mixed >> shift), np.uint32(slots.shape[0] - 1)
+    slot, mask = np.uint32(spread >> shift), np.uint32(slots.shape[0] - 1)
     while slots[slot] >= 0:
         found = np.uint32(slots[slot])
         if keys[found, 0] == low and keys[found, 1] == high:
@@ -197,7 +201,7 @@ def _shift_for(num):
 
 
 @inlined_fused
-def _group_row(low, high, mixed, rgb, shift, slots, keys, sums, count):
+def _group_row(low, high, spread, rgb, shift, slots, keys, sums, count):
     """Adds a row's pixels to the groups of a block, last pixel first; returns how many there are.
 
     Each pixel is looked up by itself: whether it shares the voxel of the pixel before is a guess
@@ -206,7 +210,7 @@ def _group_row(low, high, mixed, rgb, shift, slots, keys, sums, count):
     for k in range(low.shape[0]):
         j = np.uint32(low.shape[0] - 1 - k)
         if high[j] != _EMPTY:
-            found = _group_of(low[j], high[j], mixed[j], shift, slots, keys, count)
+            found = _group_of(low[j], high[j], spread[j], shift, slots, keys, count)
             group = np.uint32(found)
             if found == count:
                 sums[group, 0], sums[group, 1], sums[group, 2] = _ZERO, _ZERO, _ZERO
@@ -233,7 +237,7 @@ def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
         for j in range(width):
             counted[j] = _ONE
         low, high = np.empty(width, np.uint32), np.empty(width, np.uint32)
-        mixed = np.empty(width, np.uint32)
+        spread = np.empty(width, np.uint32)
         # A thread's own, which stay in its caches from block to block.
         slots = np.empty(1 << (32 - shift), np.int32)
         own_keys = np.empty((_ROWS * width, 2), np.uint32)
@@ -250,9 +254,9 @@ def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
                 if numbers[_DROPS_EDGES] > _ZERO:
                     _drop_edges(block, medians, row - first + _AROUND, numbers[_SIZE], counted)
                 v = (np.float32(row) + _HALF - numbers[_CY]) / numbers[_FY]
-                _pack_row(depth[row], counted, columns, v, numbers, low, high, mixed)
+                _pack_row(depth[row], counted, columns, v, numbers, low, high, spread)
                 count = _group_row(
-                    low, high, mixed, rgb[row], shift, slots, own_keys, own_sums, count
+                    low, high, spread, rgb[row], shift, slots, own_keys, own_sums, count
                 )
             counts[number] = count
             for i in range(count):
@@ -291,7 +295,7 @@ def group_pixels(depth, rgb, numbers, workers):
     for number in range(counts.shape[0] - 1, -1, -1):
         for i in range(number * _ROWS * width, number * _ROWS * width + counts[number]):
             low, high = keys[i, 0], keys[i, 1]
-            group = _group_of(low, high, _mix(low, high), shift, slots, merged_keys, place - 1)
+            group = _group_of(low, high, _spread(low, high), shift, slots, merged_keys, place - 1)
             if group == place - 1:
                 for channel in range(4):
                     merged_sums[group, channel] = _ZERO
