@@ -6,8 +6,9 @@
 A table is a list of rows, each a policy under settings that differ from the suite's, and each is
 compared on the same test views with the row that it changes. The mission clock is the model's: a
 decision 0.3 s, one reconsidered on arrival 0.05 s, a frame 0.02 s, a gaze 0.01 s, 1 m/s, turns for
-nothing. Whoever does not look or plan on the way flies as published. What is done in `--work` is
-not done again, and what differs in its training only is not flown again.
+nothing; or, with `--clock wall`, what all of this takes on this machine, which then has nothing
+else to do. Whoever does not look or plan on the way flies as published. What is done in `--work`
+is not done again, and what differs in its training only is not flown again.
 """
 
 import shutil
@@ -40,6 +41,7 @@ from r3jax.evaluation.comparison import (
     with_short_names,
 )
 from r3jax.evaluation.statistics import paired_difference
+from r3jax.exploration.config import ClockName
 
 NAME = "captures"
 
@@ -200,6 +202,9 @@ class Options(SuiteOptions):
     rows: tuple[str, ...] = ()
     """Rows of it other than all; `--policies` leaves those of others out, too."""
 
+    clock: ClockName = "model"
+    """`model`: the same run on every machine, whatever else it does. `wall`: measured."""
+
 
 def main(options: Options) -> Path:
     """Runs what is left of the cells, writes the page, and returns the folder of the results."""
@@ -244,8 +249,9 @@ def rows_of(options: Options) -> dict[str, Row]:
 def cells_of(options: Options, row: Row, root: Path) -> list[Cell]:
     """A row's cells: every scene and seed."""
     request = request_of(replace(options, policies=(row.policy,)), "seconds")
-    # The model clock: the same run on every machine, whatever else it does meanwhile.
-    conditions = replace(request.conditions, clock="model", loop=dict(row.loop), **row.training)
+    conditions = replace(
+        request.conditions, clock=options.clock, loop=dict(row.loop), **row.training
+    )
     asked = replace(request, conditions=conditions, settings=dict(row.planner))
     return list(make_plan(asked, root))
 
