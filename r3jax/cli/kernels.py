@@ -7,16 +7,17 @@ from pathlib import Path
 
 def main(note: Path) -> None:
     """Compiles all kernels, and leaves a note."""
-    # What takes longest first: who waits opens a scene and compiles the map's kernels meanwhile.
+    # What takes longest first, then what is needed last: who waits opens a scene, renders, and
+    # compiles the map's kernels meanwhile.
     from r3jax.scoring.backends.numba import bridge as scoring
 
-    scoring.register(scoring.SUMS)
+    for name in (scoring.SUMS, scoring.SUMS_OF_FEW, scoring.PIXELS):
+        scoring.register(name)
     from r3jax.mapping.backends.numba import bridge as mapping
 
-    for name in (mapping.ADD, mapping.LOOK, mapping.MARK):
+    for name in (mapping.MARK, mapping.LOOK, mapping.ADD):
         mapping.register(name)
-    for name in (scoring.PIXELS, scoring.SUMS_OF_FEW, scoring.CHANGES):
-        scoring.register(name)
+    scoring.register(scoring.CHANGES)
     from r3jax.splatting.backends.numba import bridge as splatting
 
     splatting.register()

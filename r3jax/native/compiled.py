@@ -11,6 +11,8 @@ from llvmlite import ir
 from numba import extending, njit, types
 from numba.core import cgutils
 
+from r3jax.native.one_piece import in_one_piece
+
 _Function = Callable[..., Any]
 
 _BARE: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -18,7 +20,6 @@ _BARE: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 entry would hold the kernel once more, to be compiled once more."""
 
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
-
 
 _HERE = Path(__file__).parent
 
@@ -50,6 +51,20 @@ def intrinsic(function: _Function) -> _Function:
     return extending.intrinsic(inspect.unwrap(function))
 
 
+def _compiled_by(compiler: Any, function: _Function) -> _Function:
+    """Makes a kernel of a function, compiled once for all values of whole numbers.
+
+    Numba would compile it for every constant that it is called with.
+    """
+    # A type checker hooked into the import may have wrapped the function; Numba needs the bare one.
+    dispatcher = compiler(inspect.unwrap(function))
+    with_constants = dispatcher.get_call_template
+    dispatcher.get_call_template = lambda args, kws: with_constants(
+        tuple(map(types.unliteral, args)), {name: types.unliteral(kws[name]) for name in kws}
+    )
+    return dispatcher
+
+
 def kernel(function: _Function) -> _Function:
     """Compiles a kernel to machine code, together with the handler that calls it.
 
@@ -57,8 +72,7 @@ def kernel(function: _Function) -> _Function:
     Floating-point operations stay as written: two passes that must take the same decisions
     (counting and listing intersections, blending and its gradient) then do.
     """
-    # A type checker hooked into the import may have wrapped the function; Numba needs the bare one.
-    return njit(error_model="numpy", **_BARE)(inspect.unwrap(function))
+    return _compiled_by(njit(error_model="numpy", **_BARE), function)
 
 
 def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Function]:
@@ -68,12 +82,18 @@ def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Func
         parallel: its `prange` loops share the cores that the process may use.
     """
     compiler = njit(cache=True, error_model="numpy", parallel=parallel)
-    return lambda function: compiler(inspect.unwrap(function))
+
+    def decorate(function: _Function) -> _Function:
+        dispatcher: Any = _compiled_by(compiler, function)
+        dispatcher.compile = in_one_piece()(dispatcher.compile)
+        return dispatcher
+
+    return decorate
 
 
 def inlined(function: _Function) -> _Function:
     """Compiles a small function into its callers."""
-    return njit(error_model="numpy", **_BARE, forceinline=True)(inspect.unwrap(function))
+    return _compiled_by(njit(error_model="numpy", **_BARE, forceinline=True), function)
 
 
 def inlined_fast(function: _Function) -> _Function:
@@ -82,18 +102,18 @@ def inlined_fast(function: _Function) -> _Function:
     NaN and infinity keep their meaning.
     """
     compiler = njit(error_model="numpy", **_BARE, forceinline=True, fastmath=_FAST)
-    return compiler(inspect.unwrap(function))
+    return _compiled_by(compiler, function)
 
 
 def inlined_fused(function: _Function) -> _Function:
     """The same where LLVM may do no more than fuse a product with a sum."""
     compiler = njit(error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"})
-    return compiler(inspect.unwrap(function))
+    return _compiled_by(compiler, function)
 
 
 def parallel_kernel(function: _Function) -> _Function:
     """Compiles a kernel whose `prange` loops share the cores that the process may use."""
-    return njit(error_model="numpy", **_BARE, parallel=True)(inspect.unwrap(function))
+    return _compiled_by(njit(error_model="numpy", **_BARE, parallel=True), function)
 
 
 @intrinsic

@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 import numba
 from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import cpu_target
 
 WRITTEN_FOR = "0.68."
@@ -111,11 +112,22 @@ def _is_large(module: Any) -> bool:
 
 @contextlib.contextmanager
 def in_one_piece() -> Generator[None]:
-    """What Numba compiles meanwhile becomes machine code once; used as always afterwards."""
-    if not numba.__version__.startswith(WRITTEN_FOR):
-        yield
-        return
+    """What Numba compiles meanwhile becomes machine code once; used as always afterwards.
+
+    Other threads compile before or after; what compiles so may begin to do so again.
+    """
     codegen = cpu_target.target_context.codegen()
+    with global_compiler_lock:
+        if numba.__version__.startswith(WRITTEN_FOR) and codegen._library_class is not _Library:
+            with _made_by(codegen):
+                yield
+        else:
+            yield
+
+
+@contextlib.contextmanager
+def _made_by(codegen: Any) -> Generator[None]:
+    """Lets a code generator make such libraries."""
 
     def set_environment(name: str, environment: Any) -> None:
         if codegen._engine.is_symbol_defined(name):

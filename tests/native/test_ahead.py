@@ -9,6 +9,7 @@ import pytest
 import r3jax
 from r3jax.native import ahead
 from r3jax.planning import planner
+from r3jax.simulators.scenes import registry
 
 compile_ahead = ahead.compile_ahead.__wrapped__  # as in a new process
 
@@ -57,6 +58,16 @@ def test_a_planner_starts_it(monkeypatch):
     monkeypatch.setattr(planner, "compile_ahead", lambda: calls.append("started"))
     camera = r3jax.Camera.from_fov(32, 32)
     r3jax.start(camera, np.array([[0.0, 0, 0], [1, 1, 1]]), "random")
+    assert calls == ["started"]
+
+
+def test_a_scene_starts_it_unless_its_name_is_unknown(monkeypatch):
+    calls = []
+    monkeypatch.setattr(registry, "compile_ahead", lambda: calls.append("started"))
+    with pytest.raises(ValueError, match="castle"):
+        r3jax.open_scene("castle")
+    assert calls == []
+    r3jax.open_scene("flat", camera=r3jax.Camera.from_fov(32, 32))
     assert calls == ["started"]
 
 

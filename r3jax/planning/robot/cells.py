@@ -151,6 +151,8 @@ def nearest_in_ring(mask, middle, reach, cell_size, closest, farthest, most):
         dx, dy, dz = found[i, 0] - middle[0], found[i, 1] - middle[1], found[i, 2] - middle[2]
         distance = math.sqrt(dx * dx + dy * dy + dz * dz) * cell_size
         if (distance >= closest) & (distance <= farthest):
-            found[num] = found[i]
+            # By its numbers: Numba takes a second to compile an array's assignment to another.
+            for axis in range(3):
+                found[num, axis] = found[i, axis]
             num += 1
     return found[:num]

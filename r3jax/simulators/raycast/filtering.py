@@ -212,9 +212,13 @@ def filter_block(floats, wholes, atlas, steps, num):
     # Whole vectors: what lies beyond is of the block before, and nobody asks for it.
     num = (num + _LANES - 1) // _LANES * _LANES
     _measure(floats, steps, num)
-    floats[COLOR : COLOR + 3 * BLOCK] = _ZERO
+    for i in range(3 * BLOCK):
+        floats[COLOR + i] = _ZERO
+    blends = False
+    for i in range(num):
+        blends |= floats[_BLEND + i] > _ZERO
     # Between two levels; magnified textures have but one.
-    for coarser in range(2 if (floats[_BLEND : _BLEND + num] > _ZERO).any() else 1):
+    for coarser in range(2 if blends else 1):
         _find_levels(floats, wholes, (sizes, offsets), num, coarser)
         for probe in range(PROBES):
             _choose(floats, wholes, num, coarser, probe)

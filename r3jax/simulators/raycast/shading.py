@@ -168,10 +168,10 @@ def _add_highlights(lamp, block, num):
 
 @inlined_fused
 def _light_block(lamps, ambient, block, num, colors):
-    """The module's formula for a block of surface colors, in place."""
-    sums = block[_DIFFUSE:]
-    sums[:] = _ZERO
-    shines = (block[_SPECULAR : _SPECULAR + num] > _ZERO).any()
+    """The module's formula for a block of surface colors, in place; sums of light begin at 0."""
+    shines = False
+    for i in range(num):
+        shines |= block[_SPECULAR + i] > _ZERO
     for i in range(lamps.shape[0]):
         _add_diffuse(lamps[i], block, num)
         if shines:
@@ -211,9 +211,12 @@ def _shade_all(
         # Every `workers`-th block, so that each thread gets of all parts of the image.
         for block in range(worker, blocks, workers):
             first, end, textured = block * BLOCK, min((block + 1) * BLOCK, num), 0
-            lit[:] = _ZERO
+            # Element by element, as everywhere here: as arrays they take long to compile.
+            for i in range(lit.shape[0]):
+                lit[i] = _ZERO
             for i in range(first, end):
-                colors[i] = _ZERO
+                for channel in range(3):
+                    colors[i, channel] = _ZERO
                 if face[i] >= 0:
                     row, direction = faces[face[i]], _row(directions, i, 0)
                     material = np.int64(row[15])

@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 
 from r3jax.geometry.cameras import Camera
+from r3jax.native.ahead import compile_ahead
+from r3jax.native.platform import is_cpu_only
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.habitat.habitat import HabitatSimulator
@@ -79,6 +81,9 @@ def open_scene(
 ) -> Simulator:
     """Opens a scene for exploration.
 
+    The first one on a machine also starts a process that compiles the kernels for CPUs, which
+    whoever explores will need.
+
     Args:
         spec: the name of an embedded scene, or one of `outside_scenes`.
         up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
@@ -95,6 +100,8 @@ def open_scene(
         ImportError: a Habitat scene, and Habitat-Sim is not installed; says how to get it.
     """
     kind, rest = split_name(spec)
+    if is_cpu_only():
+        compile_ahead()
     simulator: Simulator
     if kind == "habitat":
         check_scale(spec, scale)

@@ -149,7 +149,7 @@ def mark_pass(visited, resolution, key, camera, codes, shown_in_holes, table, la
     capacity = key.shape[1]
     blocks = (capacity + _BLOCK - 1) // _BLOCK if is_sound(camera) else 0
     for worker in prange(workers):
-        rows = np.empty(_BLOCK, np.int32)
+        rows = np.empty(_BLOCK, np.int64)
         for block in range(worker, blocks, workers):
             num = np.int64(0)
             for row in range(block * _BLOCK, min((block + 1) * _BLOCK, capacity)):

@@ -110,9 +110,11 @@ def changes_pass(before, after, cells, kept, points, forms, tables, results):
         np.empty(CHUNK, np.float32),
     )  # fmt: skip
     for i in range(points.shape[0]):
-        sums[:], results[1][i] = 0.0, 0.0
+        for bin in range(sums.shape[0]):
+            sums[bin], results[1][i, bin] = 0.0, 0.0
         num = _find_set(shown, kept[0][i], chosen)
         _add_voxels(points[i], chosen[:num], was, now, forms[0], tables, scratch, sums)
         num = _find_set(explored, kept[1][i], chosen)
         _count_cells(points[i], chosen[:num], centers, tables, scratch, results[1][i])
-        results[0][i] = sums
+        for bin in range(sums.shape[0]):
+            results[0][i, bin] = sums[bin]

@@ -13,6 +13,7 @@ from numba import prange
 from r3jax.native.compiled import inlined, kernel, parallel_kernel
 from r3jax.scoring.backends.numba.shown import (
     add_seen_voxels,
+    clear,
     count_seen_cells,
     finish_buffer,
     splat,
@@ -22,6 +23,8 @@ from r3jax.visibility.backends.numba.limit import padded_size
 from r3jax.visibility.backends.numba.picture import picture_size, pyramid_size, side_of
 from r3jax.visibility.backends.numba.splat import SPARE, TARGETS
 from r3jax.visibility.backends.numba.views import CHUNK, PLACED
+
+_ZERO = np.float32(0.0)
 
 
 @kernel
@@ -64,7 +67,8 @@ def _add_share(
     is_seen, chosen = np.empty(CHUNK, np.int32), np.empty(CHUNK + 1, np.int32)
     angles, bins = np.empty(ANGLES, np.float32), np.zeros(CHUNK, np.int32)
     weights = np.empty(CHUNK, np.float32)
-    sums[:], counts[:] = 0.0, 0.0
+    for bin in range(sums.shape[0]):
+        sums[bin], counts[bin] = 0.0, _ZERO
     add_seen_voxels(
         view, wraps, shape, voxel_size, runs, known, limit,
         (placed, pixels, is_seen, chosen, angles, bins, weights), options, sums, seen_bits,
@@ -80,15 +84,14 @@ def _add_share(
 
 
 @kernel
-def _clear(lacks, counts, seen_bits, cell_bits):
-    lacks[:], counts[:], seen_bits[:], cell_bits[:] = 0.0, 0.0, 0, 0
-
-
-@kernel
 def _add_up(sums, found, lacks, counts):
     """Adds up what the threads have found [workers, B]."""
     for bin in range(lacks.shape[0]):
-        lacks[bin], counts[bin] = sums[:, bin].sum(), found[:, bin].sum()
+        lack, count = 0.0, _ZERO
+        for worker in range(sums.shape[0]):
+            lack += sums[worker, bin]
+            count += found[worker, bin]
+        lacks[bin], counts[bin] = lack, count
 
 
 # Array expressions stand in kernels of their own: here they would become loops of all threads.
@@ -103,9 +106,13 @@ def score_few(
     pixels = np.empty((workers, pyramid_size(side) + SPARE), np.float32)
     limit = np.empty(picture_size(side), np.float32)
     padded, slopes = np.empty(padded_size((height, width)), np.float32), np.empty(width, np.float32)
-    sums, found = np.empty((workers, num_bins), np.float64), np.empty((workers, num_bins), np.int32)
+    sums, found = (
+        np.empty((workers, num_bins), np.float64),
+        np.empty((workers, num_bins), np.float32),
+    )
+    # Shares as int64: Numba would compile what takes them once more for the loops' own type.
     for i in range(views.shape[0]):
-        _clear(lacks[i], counts[i], seen_bits[i], cell_bits[i])
+        clear(lacks[i], counts[i], seen_bits[i], cell_bits[i])
         if is_sound[i]:
             for share in prange(workers):
                 _splat_share(
@@ -113,7 +120,7 @@ def score_few(
                     pixels[share],
                 )  # fmt: skip
             for share in prange(workers):
-                _keep_least(pixels, share)
+                _keep_least(pixels, np.int64(share))
             finish_buffer(
                 views[i], wraps, (height, width), voxel_size, pixels[0], (padded, slopes), limit
             )
@@ -121,7 +128,7 @@ def score_few(
                 _add_share(
                     views[i], wraps, (height, width), voxel_size, own_runs[share : share + 1],
                     (own_voxels, visited, rows), (cells, numbers), (pixels[0], limit),
-                    (is_always_one, (directions, table, lattice)), (share, workers), sums[share],
-                    found[share], seen_bits[i], cell_bits[i],
+                    (is_always_one, (directions, table, lattice)), (np.int64(share), workers),
+                    sums[share], found[share], seen_bits[i], cell_bits[i],
                 )  # fmt: skip
             _add_up(sums, found, lacks[i], counts[i])

@@ -224,6 +224,20 @@ def add_seen_voxels(view, wraps, shape, voxel_size, runs, known, limit, chunk, o
 
 
 @kernel
+def clear(sums, counts, seen_bits, cell_bits):
+    """Sets to 0 what a view's sums and bits are added to.
+
+    In loops, as elsewhere in kernels: a slice that is assigned to takes Numba long to compile.
+    """
+    for bin in range(sums.shape[0]):
+        sums[bin], counts[bin] = 0.0, 0
+    for byte in range(seen_bits.shape[0]):
+        seen_bits[byte] = 0
+    for byte in range(cell_bits.shape[0]):
+        cell_bits[byte] = 0
+
+
+@kernel
 def count_seen_cells(view, wraps, shape, empty, runs, nearest, chunk, tables, counts, bits):
     """Counts the unexplored cells of some runs whose center a view sees, one sum for each bin."""
     cells, numbers = empty

@@ -3,31 +3,26 @@
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
+import math
+
 import numpy as np
 from numba import prange
 
-from r3jax.native.compiled import (
-    claim,
-    kernel,
-    parallel_kernel,
-)
+from r3jax.native.compiled import claim, kernel, parallel_kernel
 from r3jax.scoring.backends.numba.few import score_few
 from r3jax.scoring.backends.numba.near import gather_near
 from r3jax.scoring.backends.numba.shown import (
     add_seen_voxels,
+    clear,
     count_seen_cells,
     finish_buffer,
     splat,
 )
-from r3jax.scoring.backends.numba.terms import (
-    ANGLES,
-)
-from r3jax.scoring.backends.numba.voxels import (
-    SIZE,
-    gather_voxels,
-)
+from r3jax.scoring.backends.numba.terms import ANGLES
+from r3jax.scoring.backends.numba.voxels import SIZE, gather_voxels
 from r3jax.visibility.backends.numba.bricks import (
     MOST,
+    are_finite,
     find_runs,
     sorted_points,
     sorted_slots,
@@ -54,7 +49,9 @@ def sound_views(views, voxel_size):
     """False for views with anything that is not finite, which see nothing."""
     is_sound = np.empty(views.shape[0], np.bool_)
     for i in range(views.shape[0]):
-        is_sound[i] = np.isfinite(views[i]).all() and voxel_size > 0.0 and np.isfinite(voxel_size)
+        is_sound[i] = (
+            are_finite(views[i : i + 1]) and voxel_size > 0.0 and math.isfinite(voxel_size)
+        )
     return is_sound
 
 
@@ -102,7 +99,7 @@ def _score_share(
     i = claim(next_view)
     while i < views.shape[0]:
         view = views[i]
-        sums[:], counts[i], seen_bits[i], cell_bits[i] = 0.0, 0.0, 0, 0
+        clear(sums, counts[i], seen_bits[i], cell_bits[i])
         if is_sound[i]:
             num = find_runs(view, wraps, shape, voxel_size, starts, spheres, runs)
             splat(view, wraps, shape, voxel_size, runs[:num], voxels, (placed, targets), nearest)
@@ -119,7 +116,8 @@ def _score_share(
                 (placed, is_seen, chosen, angles, bins, weights), options[1], counts[i],
                 cell_bits[i],
             )  # fmt: skip
-        lacks[i] = sums
+        for bin in range(sums.shape[0]):
+            lacks[i, bin] = sums[bin]
         i = claim(next_view)
 
 
@@ -166,6 +164,19 @@ def _sorted_voxels(state, count, views, is_sound, is_pairwise, workers):
 
 
 @kernel
+def _sorted_cells(cells):
+    """Bricks of the unexplored cells: centers [3, k], numbers [k], where they begin, spheres."""
+    centers, places = unexplored_of(cells[:3], cells[3])
+    order, starts, spheres = sorted_points(centers, MOST)
+    empty, numbers = np.empty_like(centers), np.empty_like(places)
+    for k in range(order.shape[0]):
+        numbers[k] = places[order[k]]
+        for axis in range(3):
+            empty[axis, k] = centers[axis, order[k]]
+    return empty, numbers, starts, spheres
+
+
+@kernel
 def sums_of_many(state, cells, views, layout, forms, tables, workers, results):
     """Sums what many views of one map would show; they share an index.
 
@@ -190,12 +201,11 @@ def sums_of_many(state, cells, views, layout, forms, tables, workers, results):
         scored = _sorted_voxels(state, some, views, is_sound, forms[1], workers)
     starts, spheres, voxels, _, _ = hiding
     own_starts, own_spheres, own_voxels, visited, rows = scored
-    empty, numbers = unexplored_of(cells[:3], cells[3])
-    order, cell_starts, cell_spheres = sorted_points(empty, MOST)
+    empty, numbers, cell_starts, cell_spheres = _sorted_cells(cells)
     score_all(
         views, is_sound, layout[0], layout[1][0], layout[1][1], voxel_size, starts, spheres,
         voxels, own_starts, own_spheres, own_voxels, visited, rows, cell_starts, cell_spheres,
-        empty[:, order], numbers[order], forms[0], tables[0], tables[1], tables[2], workers,
+        empty, numbers, forms[0], tables[0], tables[1], tables[2], workers,
         results[0], results[1], results[2], results[3],
     )  # fmt: skip
 

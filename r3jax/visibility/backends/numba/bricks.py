@@ -185,17 +185,31 @@ def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
 @kernel
 def divide_points(points, most):
     """Chooses bricks for points [3, n], all of them finite: lower corner, edge [m], numbers."""
-    low, dims, edge = np.zeros(3), np.ones(3), POINTS_EDGE
-    spans = np.zeros(3)
+    low, high, dims, edge = np.empty(3), np.empty(3), np.empty(3, np.int64), POINTS_EDGE
     for axis in range(3):
-        low[axis] = points[axis].min()
-        spans[axis] = points[axis].max() - low[axis]
+        low[axis] = high[axis] = points[axis, 0]
+        for i in range(1, points.shape[1]):
+            low[axis] = min(low[axis], points[axis, i])
+            high[axis] = max(high[axis], points[axis, i])
     while True:
+        num = 1.0
         for axis in range(3):
-            dims[axis] = math.floor(spans[axis] / edge) + 1.0
-        if dims[0] * dims[1] * dims[2] <= most:
-            return low, edge, dims.astype(np.int64)
+            along = math.floor((high[axis] - low[axis]) / edge) + 1.0
+            num *= along
+            dims[axis] = np.int64(min(along, np.float64(INDEX_LIMIT)))
+        if num <= most:
+            return low, edge, dims
         edge *= 2.0
+
+
+@kernel
+def are_finite(numbers):
+    """Whether all of some numbers [a, b] are finite."""
+    found = True
+    for i in range(numbers.shape[0]):
+        for j in range(numbers.shape[1]):
+            found = found and math.isfinite(numbers[i, j])
+    return found
 
 
 @kernel
@@ -211,12 +225,17 @@ def sorted_points(points, most):
         begins in it [b + 1]; and a sphere round each brick [b, 4] [m].
     """
     num = points.shape[1]
-    order, slots = np.arange(num, dtype=np.int32), np.empty(num, np.int64)
-    if num == 0 or not np.isfinite(points).all():
+    order, slots = np.empty(num, np.int32), np.empty(num, np.int64)
+    if num == 0 or not are_finite(points):
         # One brick, that any view may see.
-        spheres = np.zeros((1, 4), np.float32)
+        starts, spheres = np.empty(2, np.int64), np.empty((1, 4), np.float32)
+        starts[0], starts[1] = 0, num
+        for axis in range(3):
+            spheres[0, axis] = 0.0
         spheres[0, 3] = np.inf
-        return order, np.array([0, num]), spheres
+        for i in range(num):
+            order[i] = i
+        return order, starts, spheres
     low, edge, dims = divide_points(points, most)
     counts = np.zeros((1, dims[0] * dims[1] * dims[2]), np.int32)
     for i in range(num):
