@@ -114,20 +114,18 @@ def _is_large(module: Any) -> bool:
 def in_one_piece() -> Generator[None]:
     """What Numba compiles meanwhile becomes machine code once; used as always afterwards.
 
-    Other threads compile before or after; what compiles so may begin to do so again.
+    Other threads compile before or after. It may be entered again inside: kernels compile kernels.
     """
     codegen = cpu_target.target_context.codegen()
-    with global_compiler_lock:
+    with global_compiler_lock, contextlib.ExitStack() as changes:
         if numba.__version__.startswith(WRITTEN_FOR) and codegen._library_class is not _Library:
-            with _made_by(codegen):
-                yield
-        else:
-            yield
+            changes.enter_context(_whole_libraries(codegen))
+        yield
 
 
 @contextlib.contextmanager
-def _made_by(codegen: Any) -> Generator[None]:
-    """Lets a code generator make such libraries."""
+def _whole_libraries(codegen: Any) -> Generator[None]:
+    """Lets Numba's code generator make libraries of the class above."""
 
     def set_environment(name: str, environment: Any) -> None:
         if codegen._engine.is_symbol_defined(name):

@@ -9,7 +9,6 @@ Steps go to the 26 neighbors. A diagonal step needs every cell of the block that
 """
 
 import functools
-import inspect
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -78,10 +77,9 @@ def _steps(
 def _compiled() -> _Kernel:
     """The kernel; compiled on the first call, and the disk keeps it for the next process."""
     # Imported only here: whoever plans no way does not wait for Numba.
-    from numba import njit
+    from r3jax.native.compiled import called_from_python
 
-    # A type checker hooked into the import may have wrapped the function; Numba needs the bare one.
-    return njit(cache=True)(inspect.unwrap(_settle))
+    return called_from_python()(_settle)
 
 
 def _settle(

@@ -151,7 +151,7 @@ def _join_rows(
     capacity, num = key.shape[1], sums.shape[0]
     for worker in prange(workers):
         begin, end = worker * num // workers, (worker + 1) * num // workers
-        joined, number = np.empty(end - begin, np.int64), np.int64(0)
+        joined, number = np.empty(end - begin, np.int64), 0
         for i in range(begin, end):
             if i + _AHEAD < end:
                 _ask_for(table, rows[i + _AHEAD])

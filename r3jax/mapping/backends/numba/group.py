@@ -248,8 +248,7 @@ def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
                 _copy_rows(depth, first, block)
                 _fill_medians(block, medians, first, height)
             _empty(slots)
-            # Not 0, for whose type Numba would compile what it is given to once more.
-            count = np.int64(0)
+            count = 0
             for row in range(end - 1, first - 1, -1):
                 if numbers[_DROPS_EDGES] > _ZERO:
                     _drop_edges(block, medians, row - first + _AROUND, numbers[_SIZE], counted)

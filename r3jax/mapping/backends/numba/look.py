@@ -151,7 +151,7 @@ def mark_pass(visited, resolution, key, camera, codes, shown_in_holes, table, la
     for worker in prange(workers):
         rows = np.empty(_BLOCK, np.int64)
         for block in range(worker, blocks, workers):
-            num = np.int64(0)
+            num = 0
             for row in range(block * _BLOCK, min((block + 1) * _BLOCK, capacity)):
                 rows[num] = row
                 is_in_hole = (codes[row] == HOLE) & (shown_in_holes[row] != 0)

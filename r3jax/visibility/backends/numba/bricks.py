@@ -185,20 +185,17 @@ def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
 @kernel
 def divide_points(points, most):
     """Chooses bricks for points [3, n], all of them finite: lower corner, edge [m], numbers."""
-    low, high, dims, edge = np.empty(3), np.empty(3), np.empty(3, np.int64), POINTS_EDGE
+    low, high, dims, edge = np.empty(3), np.empty(3), np.empty(3), POINTS_EDGE
     for axis in range(3):
         low[axis] = high[axis] = points[axis, 0]
         for i in range(1, points.shape[1]):
             low[axis] = min(low[axis], points[axis, i])
             high[axis] = max(high[axis], points[axis, i])
     while True:
-        num = 1.0
         for axis in range(3):
-            along = math.floor((high[axis] - low[axis]) / edge) + 1.0
-            num *= along
-            dims[axis] = np.int64(min(along, np.float64(INDEX_LIMIT)))
-        if num <= most:
-            return low, edge, dims
+            dims[axis] = math.floor((high[axis] - low[axis]) / edge) + 1.0
+        if dims[0] * dims[1] * dims[2] <= most:
+            return low, edge, dims.astype(np.int64)
         edge *= 2.0
 
 
