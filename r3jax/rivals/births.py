@@ -134,37 +134,29 @@ Rows = tuple[GaussianScene, Array, Array]
 
 def grown(rows: Rows, capacity: int) -> Rows:
     """Adds unused rows up to a capacity."""
-    scene, marks, shown = rows
-    more = capacity - scene.capacity
+    before = rows[0].capacity
+    more = capacity - before
     if more == 0:
         return rows
 
-    def extended(x: Array) -> Array:
-        return jnp.concatenate([x, jnp.zeros((more, *x.shape[1:]), x.dtype)])
+    def extended(x: Array) -> np.ndarray:
+        return np.concatenate([x, np.zeros((more, *x.shape[1:]), x.dtype)])
 
-    scene, marks, shown = jax.tree.map(extended, (scene, marks, shown))
-    return _with_unused(scene, scene.capacity - more), marks, shown
+    return _with_unused(jax.tree.map(extended, rows), before)
 
 
 def kept_rows(rows: Rows, keep: np.ndarray) -> Rows:
     """Moves the rows to keep [n] to the front, in their order; the others are unused."""
-    num = int(keep.sum())
     # Stable: what stays keeps its order, and with it every later result.
     order = np.argsort(~keep, kind="stable")
-    scene, marks, shown = jax.tree.map(lambda x: x[order], rows)
-    blank: Any = jnp.arange(len(keep)) >= num
-    marks = jnp.where(blank[:, None], 0.0, marks)
-    return _with_unused(scene, num), marks, shown & ~blank
+    return _with_unused(jax.tree.map(lambda x: np.asarray(x)[order], rows), int(keep.sum()))
 
 
-def _with_unused(scene: GaussianScene, num: int) -> GaussianScene:
-    """Marks all rows from `num` on as unused."""
-    is_used = jnp.arange(scene.capacity) < num
-    unit = jnp.zeros((scene.capacity, 4)).at[:, 0].set(1.0)
-    return GaussianScene(
-        means=jnp.where(is_used[:, None], scene.means, 0.0),
-        quats=jnp.where(is_used[:, None], scene.quats, unit),
-        log_scales=jnp.where(is_used[:, None], scene.log_scales, 0.0),
-        opacity_logits=jnp.where(is_used, scene.opacity_logits, DEAD_LOGIT),
-        sh=jnp.where(is_used[:, None, None], scene.sh, 0.0),
-    )
+def _with_unused(rows: Any, num: int) -> Rows:
+    """Marks all rows from `num` on as unused, in place, and moves all to the device."""
+    for array in jax.tree.leaves(rows):
+        array[num:] = 0
+    scene: Any = rows[0]
+    scene.quats[num:, 0] = 1.0
+    scene.opacity_logits[num:] = DEAD_LOGIT
+    return jax.tree.map(jnp.asarray, rows)

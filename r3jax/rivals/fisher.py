@@ -81,19 +81,17 @@ def with_quirk(squares: GaussianScene, scene: GaussianScene) -> GaussianScene:
 
 
 @partial(jax.jit, static_argnames="form")
-def _known(
-    config: RasterConfig, scene: GaussianScene, camera: Camera, poses: Array, form: Form
+def _added(
+    config: RasterConfig,
+    scene: GaussianScene,
+    camera: Camera,
+    pose: Array,
+    total: GaussianScene,
+    form: Form,
 ) -> tuple[GaussianScene, Array]:
-    """The sum of H over views, one after the other."""
-
-    def add(carry: tuple[GaussianScene, Array], pose: Array) -> tuple[Any, None]:
-        total, most = carry
-        found, overflow = information(config, scene, camera, pose, form)
-        total = jax.tree.map(jnp.add, total, found)
-        return (total, jnp.maximum(most, overflow)), None
-
-    start = jax.tree.map(jnp.zeros_like, scene), jnp.zeros((), jnp.int32)
-    return jax.lax.scan(add, start, poses)[0]
+    """The sum of H with one more view in it."""
+    found, overflow = information(config, scene, camera, pose, form)
+    return jax.tree.map(jnp.add, total, found), overflow
 
 
 @partial(jax.jit, static_argnames="form")
@@ -135,21 +133,11 @@ def known_information(
         poses: T_world_camera of each view, [T, 4, 4].
         form: which of the published forms.
     """
-    size = 1
-    while size < len(poses):
-        size *= 2
-    scene, camera, poses = on_cpu((scene, camera, jnp.asarray(poses, jnp.float32)))
-    # In blocks of powers of two: another number of views must not compile anew.
+    scene, camera = on_cpu((scene, camera))
     total = jax.tree.map(jnp.zeros_like, scene)
-    begin = 0
-    while begin < len(poses):
-        while size > len(poses) - begin:
-            size //= 2
-        part = poses[begin : begin + size]
-        total = jax.tree.map(
-            jnp.add, total, with_room(partial(_known, form=form), scene, camera, part)
-        )
-        begin += size
+    # One view a call: a scan would compile anew for every number of views.
+    for pose in np.asarray(poses, np.float32):
+        total = with_room(partial(_added, form=form), scene, camera, pose, total)
     return total
 
 

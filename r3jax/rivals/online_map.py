@@ -190,15 +190,12 @@ def _with_births(online: OnlineMap, settings: MapSettings, rng: np.random.Genera
     while capacity < num + more:
         capacity *= 2
     scene, marks, shown = grown((online.scene, online.marks, online.shown), capacity)
-    rows = slice(num, num + more)
-    scene = GaussianScene(
-        means=scene.means.at[rows].set(born.means),
-        quats=scene.quats.at[rows].set(born.quats),
-        log_scales=scene.log_scales.at[rows].set(born.log_scales),
-        opacity_logits=scene.opacity_logits.at[rows].set(0.0),
-        sh=scene.sh.at[rows, 0].set((born.colors - 0.5) / C0),
-    )
-    return replace(online, scene=scene, marks=marks, shown=shown)
+    # On the host: on the device, every number of births would compile anew.
+    scene, rows = jax.tree.map(np.array, scene), slice(num, num + more)
+    scene.means[rows], scene.quats[rows] = born.means, born.quats
+    scene.log_scales[rows], scene.opacity_logits[rows] = born.log_scales, 0.0
+    scene.sh[rows, 0] = (born.colors - 0.5) / C0
+    return replace(online, scene=jax.tree.map(jnp.asarray, scene), marks=marks, shown=shown)
 
 
 class _Target(eqx.Module):

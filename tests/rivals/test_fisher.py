@@ -169,7 +169,7 @@ def test_a_larger_batch_begins_with_the_smaller_one_and_repeats_nothing():
     assert greedy_batch(scene, camera, pool, pool[:2], 3, Form()) == whole[:3]
 
 
-def test_known_information_is_a_sum_over_views_in_blocks():
+def test_known_information_is_a_sum_over_views():
     scene, camera, pool = random_cloud(4, 20, 0), view(16, 16)[0], a_pool()
     singles = [known_information(scene, camera, pool[i : i + 1], Form()) for i in range(7)]
     for total, *parts in zip(

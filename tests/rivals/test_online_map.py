@@ -9,10 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from r3jax.exploration.clock import _compilations
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.rivals import births
 from r3jax.rivals.births import grown, kept_rows, one_per_voxel, turned_to
 from r3jax.rivals.online_map import (
+    FIRST_CAPACITY,
     FIRST_ERROR,
     add_frame,
     colored,
@@ -79,6 +81,19 @@ def test_training_lessens_the_error_of_what_was_born():
     assert color_error(mapped(replace(DISCS, steps=40, rate_opacities=0.05), 3), 2) < 0.8 * (
         color_error(untrained, 2)
     )
+
+
+def test_frames_compile_nothing_once_the_first_are_in():
+    frames, settings = list(room_frames(6)), replace(DISCS, image_width=32, steps=2, prune_every=2)
+    online = empty_online_map(frames[0].camera, settings, KEY)
+    before = []
+    for frame in frames:
+        before.append(_compilations.count)
+        online = add_frame(online, frame, 5.0, settings)
+    assert online.scene.capacity == FIRST_CAPACITY
+    assert before[1] > before[0]
+    # Each frame has births, drawn frames and rows of its own.
+    assert _compilations.count == before[3]
 
 
 def test_a_batch_is_the_latest_frames_and_earlier_ones_by_their_error():
@@ -210,9 +225,8 @@ MUTANTS = [
            discs_lie_on_their_wall),
     Mutant("births", "(np.arange(camera.width) + 0.5", "(np.arange(camera.width) + 1.0",
            discs_lie_on_their_wall),
-    Mutant("births", "marks = jnp.where(blank[:, None], 0.0, marks)", "pass", rows_move_whole),
-    Mutant("births", "return _with_unused(scene, num), marks", "return scene, marks",
-           rows_move_whole),
+    Mutant("births", "array[num:] = 0", "pass", rows_move_whole),
+    Mutant("births", "scene.opacity_logits[num:] = DEAD_LOGIT", "pass", rows_move_whole),
 ]  # fmt: skip
 
 
