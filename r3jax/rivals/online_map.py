@@ -207,14 +207,15 @@ class _Target(eqx.Module):
 
 
 @partial(jax.jit, static_argnames="settings")
-def _gradient(
+def _added_gradient(
     config: RasterConfig,
     scene: GaussianScene,
     camera: Camera,
     target: Any,
+    total: GaussianScene,
     settings: MapSettings,
 ) -> tuple[tuple[Array, GaussianScene], Array]:
-    """Color and depth error of a view, the gradient of its loss, and the overflow."""
+    """Color and depth error of a view, the sum of gradients with its own, and the overflow."""
 
     def loss(scene: GaussianScene) -> tuple[Array, tuple[Array, Array]]:
         seen, overflow = _show(config, scene, camera, target.T_world_camera)
@@ -231,7 +232,7 @@ def _gradient(
         return total, (color + depth, overflow)
 
     gradient, (error, overflow) = jax.grad(loss, has_aux=True)(scene)
-    return (error, gradient), overflow
+    return (error, jax.tree.map(jnp.add, total, gradient)), overflow
 
 
 def _mean_over(values: Array, mask: Array) -> Float[Array, ""]:
@@ -250,10 +251,9 @@ def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator)
             target = _Target(
                 frames.rgb[number], frames.depth[number], frames.T_world_camera[number]
             )
-            function = partial(_gradient, settings=settings)
-            found, gradient = with_room(function, scene, online.camera, target)
+            function = partial(_added_gradient, settings=settings)
+            found, total = with_room(function, scene, online.camera, target, total)
             error[number] = float(found)
-            total = jax.tree.map(jnp.add, total, gradient)
         scene, moments, shown = _stepped(scene, moments, shown, total, len(batch), settings)
     frames = replace(online.frames, error=error)
     return replace(online, scene=scene, shown=shown, frames=frames)

@@ -26,6 +26,11 @@ from r3jax.splatting.backends.numba.project import (
     sigmoid,
 )
 
+ROOM = 71
+"""Numbers that one Gaussian needs room for: rotation (9), rows of J R (6), axes in the image (6),
+scales (3), gradients by the rows of J R (6) and by the rotation (9), basis of the harmonics (16),
+gradients by it (16)."""
+
 _HALF = np.float32(0.5)
 
 
@@ -44,7 +49,7 @@ def _sum_slots(start, count, slots, sums):
 
 
 @inlined_fast
-def _conic_gradient(sums, xx, xy, yy):
+def conic_gradient(sums, xx, xy, yy):
     """Gradients by the center (2) and by the covariance xx, xy, yy (3).
 
     s = d^T K d / 2 with K the inverse of the covariance S; with M the sum of v d d^T and
@@ -76,20 +81,19 @@ def _quat_gradient(g, unit, inverse, g_quat):
 
 
 @inlined_fast
-def _shape_gradient(g_cov, log_scales, rows, rotation, axes, unit, inverse, scratch, out):
-    """Writes the gradients by scales (3) and quaternion (4) to the two arrays `out`.
-
-    That by the rows of J R stays in scratch[:6].
-    """
+def shape_gradient(g_cov, shape, room, g_scales, g_quat):
+    """Writes the gradients by scales (3) and quaternion (4), and that by the rows of J R."""
     g_xx, g_xy, g_yy = g_cov
-    g_rows, g_rotation = scratch[:6], scratch[6:15]
-    g_scales, g_quat = out
-    g_rows[:] = ZERO
+    unit, inverse = shape
+    rotation, rows, axes, scales = room[:9], room[9:15], room[15:21], room[21:24]
+    g_rows, g_rotation = room[24:30], room[30:39]
+    for i in range(6):
+        g_rows[i] = ZERO
     for j in range(3):
         ax, ay = axes[j], axes[3 + j]
         g_ax, g_ay = TWO * g_xx * ax + g_xy * ay, TWO * g_yy * ay + g_xy * ax
         g_scales[j] = g_ax * ax + g_ay * ay
-        scale = np.exp(log_scales[j])
+        scale = scales[j]
         for i in range(3):
             g_rows[i] += scale * g_ax * rotation[3 * i + j]
             g_rows[3 + i] += scale * g_ay * rotation[3 * i + j]
@@ -125,7 +129,7 @@ def _row_gradient(axis, g_row, row, ratio, slope, z, focal, view, g_view, g_cent
 
 
 @inlined_fast
-def _color_gradient(mean, sh, view, record, g_color, basis, g_basis, g_sh):
+def color_gradient(mean, sh, view, record, g_color, basis, g_basis, g_sh):
     """Writes the gradient by the harmonics; returns that by the center, through the direction."""
     x, y, z, inverse = direction_of(mean, view)
     count = sh.shape[0] // 3
@@ -142,33 +146,57 @@ def _color_gradient(mean, sh, view, record, g_color, basis, g_basis, g_sh):
     return (dx - along * x) * inverse, (dy - along * y) * inverse, (dz - along * z) * inverse
 
 
+@inlined_fast
+def geometry_of(mean, quat, log_scales, view, size, room):
+    """Lays out what the gradients of a Gaussian need; its matrices go to `room`.
+
+    Returns:
+        Center in the camera's frame; the slopes of the Jacobian; the covariance xx, xy, yy; and
+        the quaternion at unit length with 1 / its length.
+    """
+    x, y, z = in_camera(mean, view)
+    rotation, rows, axes = room[:9], room[9:15], room[15:21]
+    w, qx, qy, qz, inverse = rotation_of(quat, rotation)
+    u = clamped_slope(x / z, view[15], view[17], size[0])
+    v = clamped_slope(y / z, view[16], view[18], size[1])
+    jacobian_rows(view, u, v, view[15] / z, view[16] / z, rows)
+    image_axes(rows, rotation, log_scales, axes)
+    for j in range(3):
+        room[21 + j] = np.exp(log_scales[j])
+    return (x, y, z), (u, v), covariance_of(axes), ((w, qx, qy, qz), inverse)
+
+
+@inlined_fast
+def center_gradient(g_u, g_v, center, slopes, view, room, g_view):
+    """Gradients by the center in the camera's frame: through its pixel, and through J R."""
+    x, y, z = center
+    g_rows, rows = room[24:30], room[9:15]
+    g_x, g_z = _row_gradient(
+        0, g_rows[:3], rows[:3], x / z, slopes[0], z, view[15], view, g_view, g_u
+    )
+    g_y, more = _row_gradient(
+        1, g_rows[3:], rows[3:], y / z, slopes[1], z, view[16], view, g_view, g_v
+    )
+    return g_x, g_y, g_z + more
+
+
 @kernel
-def gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
+def _gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
     """Gradients of one Gaussian that was drawn; adds its share of the view's gradient."""
     means, quats, log_scales, logits, sh, _ = cloud
     g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
-    rotation, rows, axes = room[:9], room[9:15], room[15:21]
-    scratch, basis, g_basis = room[21:36], room[36:52], room[52:68]
-    x, y, z = in_camera(means[i], view)
-    fx, fy = view[15], view[16]
-    w, qx, qy, qz, inverse = rotation_of(quats[i], rotation)
-    u = clamped_slope(x / z, fx, view[17], size[0])
-    v = clamped_slope(y / z, fy, view[18], size[1])
-    jacobian_rows(view, u, v, fx / z, fy / z, rows)
-    image_axes(rows, rotation, log_scales[i], axes)
-    xx, xy, yy = covariance_of(axes)
-    g_u, g_v, g_xx, g_xy, g_yy = _conic_gradient(sums, xx, xy, yy)
+    point, basis, g_basis = means[i], room[39:55], room[55:71]
+    center, slopes, covariance, shape = geometry_of(
+        point, quats[i], log_scales[i], view, size, room
+    )
+    xx, xy, yy = covariance
+    g_u, g_v, g_xx, g_xy, g_yy = conic_gradient(sums, xx, xy, yy)
     g_offsets[i, 0], g_offsets[i, 1] = g_u, g_v
     g_logits[i] = sums[0] * (ONE - sigmoid(logits[i]))
-    _shape_gradient(
-        (g_xx, g_xy, g_yy), log_scales[i], rows, rotation, axes,
-        (w, qx, qy, qz), inverse, scratch, (g_scales[i], g_quats[i]),
-    )  # fmt: skip
-    point = means[i]
-    g_x, g_z = _row_gradient(0, scratch[:3], rows[:3], x / z, u, z, fx, view, g_view, g_u)
-    g_y, more = _row_gradient(1, scratch[3:6], rows[3:], y / z, v, z, fy, view, g_view, g_v)
-    g_z += more + sums[9]
-    away = _color_gradient(point, sh[i], view, record, sums[6:9], basis, g_basis, g_sh[i])
+    shape_gradient((g_xx, g_xy, g_yy), shape, room, g_scales[i], g_quats[i])
+    g_x, g_y, g_z = center_gradient(g_u, g_v, center, slopes, view, room, g_view)
+    g_z += sums[9]
+    away = color_gradient(point, sh[i], view, record, sums[6:9], basis, g_basis, g_sh[i])
     for k in range(3):
         g_means[i, k] = view[k] * g_x + view[3 + k] * g_y + view[6 + k] * g_z + away[k]
         g_view[k] += g_x * point[k]
@@ -184,12 +212,12 @@ def gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
 def _gradient_of_block(block, cloud, records, slots, view, size, g_cloud, g_view):
     """Gradients of a block of Gaussians; 0 for those that were not drawn."""
     integers = records.view(np.int32)
-    room, sums = np.empty(68, np.float32), np.empty(10, np.float32)
+    room, sums = np.empty(ROOM, np.float32), np.empty(10, np.float32)
     g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
     for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
         count, start = integers[i, at.COUNT], integers[i, at.START]
         if count > 0 and _sum_slots(start, count, slots, sums):
-            gradient_of_one(i, cloud, records[i], sums, view, size, room, g_cloud, g_view)
+            _gradient_of_one(i, cloud, records[i], sums, view, size, room, g_cloud, g_view)
         else:
             g_means[i], g_quats[i], g_scales[i] = ZERO, ZERO, ZERO
             g_logits[i], g_sh[i], g_offsets[i] = ZERO, ZERO, ZERO

@@ -1,14 +1,15 @@
 """Squared gradients of single pixels, summed over the image: the Hessian diagonal of FisherRF.
 
 Of one pixel's color, summed over its channels, the gradient by a Gaussian's parameters is linear
-in seven numbers: v, v dx, v dx^2, v dy, v dx dy, v dy^2 with v = alpha dC/dalpha (see
+in seven numbers: v, v dx, v dy, v dx^2, v dx dy, v dy^2 with v = alpha dC/dalpha (see
 `compositing.py`), and the weight w. With A the matrix of that map, which depends on the Gaussian
 and the view alone,
 
     sum over pixels of (A s)^2 = diagonal of A M A^T,    M = sum over pixels of s s^T.
 
-So the tiles sum up M, 22 numbers, and A is applied once per Gaussian. Its columns come from the
-backward pass itself, given one of the seven numbers at a time.
+So the tiles sum up M, and A is applied once per Gaussian. v alone moves nothing but the opacity,
+so that of its row of M one number is needed, and 19 in all. The other columns of A come from the
+backward pass, given one of the six numbers at a time.
 """
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
@@ -26,7 +27,14 @@ from r3jax.splatting.backends.numba.compositing import (
     TRANSMITTANCE_MIN,
     alpha_in_row,
 )
-from r3jax.splatting.backends.numba.gradient import gradient_of_one
+from r3jax.splatting.backends.numba.gradient import (
+    ROOM,
+    center_gradient,
+    color_gradient,
+    conic_gradient,
+    geometry_of,
+    shape_gradient,
+)
 from r3jax.splatting.backends.numba.lanes import (
     fma,
     keep_ge,
@@ -41,13 +49,27 @@ from r3jax.splatting.backends.numba.lanes import (
     sums_of_10,
 )
 from r3jax.splatting.backends.numba.passes import expect_writes
+from r3jax.splatting.backends.numba.project import sigmoid
 from r3jax.splatting.config import TILE
 
-MOMENTS = 22
-"""Different numbers in M: v^2 by the 15 monomials of dx, dy up to degree 4, v w by the 6 up to
-degree 2, w^2. Powers of dx rise first."""
+MOMENTS = 19
+"""Different numbers in M: v^2 by the monomials 1, dx^2, dx^3, dx^4, dx dy, dx^2 dy, dx^3 dy, dy^2,
+dx dy^2, dx^2 dy^2, dy^3, dx dy^3, dy^4; v w by dx, dx^2, dy, dx dy, dy^2; w^2."""
 
-SLOT = 32
+_PLACES = (
+    (1, 4, 2, 5, 8, 13),
+    (4, 7, 5, 8, 10, 15),
+    (2, 5, 3, 6, 9, 14),
+    (5, 8, 6, 9, 11, 16),
+    (8, 10, 9, 11, 12, 17),
+    (13, 15, 14, 16, 17, 18),
+)
+"""Where each entry of M stands among the moments, for v dx, v dy, v dx^2, v dx dy, v dy^2, w."""
+
+_NUMBERS = (1, 3, 2, 4, 5, 6)
+"""Where the backward pass takes these six; the weight moves the colors from 6 to 8."""
+
+SLOT = 24
 """Floats of an intersection: `MOMENTS`, and what the last vector that is stored writes beyond."""
 
 _HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
@@ -117,18 +139,16 @@ def _squares_of_tile(
         dx2 = dx * dx
         dx3, dx4 = dx2 * dx, dx2 * dx2
         a = sums_of_10(
-            vv0, vv0 * dx, vv0 * dx2, vv0 * dx3, vv0 * dx4,
-            vv1, vv1 * dx, vv1 * dx2, vv1 * dx3, vv2,
+            vv0, vv0 * dx2, vv0 * dx3, vv0 * dx4,
+            vv1 * dx, vv1 * dx2, vv1 * dx3, vv2, vv2 * dx, vv2 * dx2,
         )  # fmt: skip
         b = sums_of_10(
-            vv2 * dx, vv2 * dx2, vv3, vv3 * dx, vv4, vw0, vw0 * dx, vw0 * dx2, vw1, vw1 * dx
-        )
-        c = sums_of_10(vw2, ww, zero, zero, zero, zero, zero, zero, zero, zero)
+            vv3, vv3 * dx, vv4, vw0 * dx, vw0 * dx2, vw1, vw1 * dx, vw2, ww, zero
+        )  # fmt: skip
         # In this order: each vector has twelve lanes, of which ten count.
         slot = list_slots[place] * SLOT
         store12(slots, slot, a)
         store12(slots, slot + 10, b)
-        store12(slots, slot + 20, c)
 
 
 @parallel_kernel
@@ -155,76 +175,78 @@ def squares_of_all(lists, records, images, background, workers, slots):
 
 
 @inlined
-def _moment_matrix(start, count, slots, sums, matrix):
-    """Sums the moments of a Gaussian's intersections up to M [7, 7]; is there any but 0?"""
-    sums[:] = _ZERO
+def _sum_moments(start, count, slots, sums):
+    """Sums the moments of a Gaussian's intersections up; is there any but 0?"""
+    for k in range(MOMENTS):
+        sums[k] = _ZERO
     for slot in range(start, start + count):
         for k in range(MOMENTS):
             sums[k] += slots[slot * SLOT + k]
-    # Powers of dx and dy of the first six numbers, and where each power of dy begins.
-    powers = ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (0, 2))
-    by_dy, crossed = (0, 5, 9, 12, 14), (15, 18, 20)
-    for k in range(6):
-        for j in range(6):
-            dx, dy = powers[k][0] + powers[j][0], powers[k][1] + powers[j][1]
-            matrix[k, j] = sums[by_dy[dy] + dx]
-        moment = sums[crossed[powers[k][1]] + powers[k][0]]
-        matrix[k, 6], matrix[6, k] = moment, moment
-    matrix[6, 6] = sums[MOMENTS - 1]
-    return matrix[0, 0] != _ZERO or matrix[6, 6] != _ZERO
+    return sums[0] != _ZERO or sums[MOMENTS - 1] != _ZERO
 
 
 @inlined
-def _quadratic(columns, matrix, parameter):
+def _quadratic(columns, sums, parameter, first, last):
     """a^T M a for one parameter, a being its row of A; rounding takes none below 0."""
     total = _ZERO
-    for k in range(7):
-        inner = _ZERO
-        for j in range(7):
-            inner += matrix[k, j] * columns[j, parameter]
+    for k in range(first, last):
+        inner = _HALF * sums[_PLACES[k][k]] * columns[k, parameter]
+        for j in range(first, k):
+            inner += sums[_PLACES[k][j]] * columns[j, parameter]
         total += columns[k, parameter] * inner
-    return _ZERO if total < _ZERO else total
+    return _ZERO if total < _ZERO else total + total
+
+
+@inlined
+def _fill_columns(i, cloud, record, view, size, room, unit, g_view, g_sh, columns):
+    """Writes A by center, scales and quaternion, [6, 10], and the gradient by the harmonics."""
+    means, quats, log_scales, _, sh, _ = cloud
+    center, slopes, covariance, shape = geometry_of(
+        means[i], quats[i], log_scales[i], view, size, room
+    )
+    xx, xy, yy = covariance
+    for k in range(5):
+        for j in range(9):
+            unit[j] = _ZERO
+        unit[_NUMBERS[k]] = _ONE
+        g_u, g_v, g_xx, g_xy, g_yy = conic_gradient(unit, xx, xy, yy)
+        shape_gradient((g_xx, g_xy, g_yy), shape, room, columns[k, 3:6], columns[k, 6:10])
+        g_x, g_y, g_z = center_gradient(g_u, g_v, center, slopes, view, room, g_view)
+        for j in range(3):
+            columns[k, j] = view[j] * g_x + view[3 + j] * g_y + view[6 + j] * g_z
+    # The weight moves all three channels, which are summed before they are squared.
+    unit[6], unit[7], unit[8] = _ONE, _ONE, _ONE
+    basis, g_basis = room[39:55], room[55:71]
+    away = color_gradient(means[i], sh[i], view, record, unit[6:9], basis, g_basis, g_sh)
+    columns[5, 0], columns[5, 1], columns[5, 2] = away
 
 
 @kernel
 def _squares_of_block(block, cloud, records, slots, view, size, squares):
     """Squares of a block of Gaussians; 0 for those that were not drawn."""
     integers = records.view(np.int32)
-    room, unit, sums = np.empty(68, np.float32), np.empty(10, np.float32), np.empty(22, np.float32)
-    matrix, columns = np.empty((7, 7), np.float32), np.empty((7, 11), np.float32)
-    means, quats, log_scales, logits, sh, offsets = cloud
-    # One row each: what the backward pass writes for one of the seven numbers.
-    g_means, g_quats = np.empty((1, 3), np.float32), np.empty((1, 4), np.float32)
-    g_scales, g_logits = np.empty((1, 3), np.float32), np.empty(1, np.float32)
-    g_sh, g_offsets = np.empty((1, sh.shape[1]), np.float32), np.empty((1, 2), np.float32)
-    g_cloud, g_view = (g_means, g_quats, g_scales, g_logits, g_sh, g_offsets), np.zeros(19)
+    room, sums = np.empty(ROOM, np.float32), np.empty(MOMENTS, np.float32)
+    unit, columns = np.empty(9, np.float32), np.empty((6, 10), np.float32)
+    g_view, g_sh = np.zeros(19), np.empty(cloud[4].shape[1], np.float32)
     s_means, s_quats, s_scales, s_logits, s_sh = squares
     for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
         count, start = integers[i, at.COUNT], integers[i, at.START]
-        if count == 0 or not _moment_matrix(start, count, slots, sums, matrix):
+        if count == 0 or not _sum_moments(start, count, slots, sums):
             s_means[i], s_quats[i], s_scales[i] = _ZERO, _ZERO, _ZERO
             s_logits[i], s_sh[i] = _ZERO, _ZERO
             continue
-        one = (
-            means[i : i + 1], quats[i : i + 1], log_scales[i : i + 1], logits[i : i + 1],
-            sh[i : i + 1], offsets[i : i + 1],
-        )  # fmt: skip
-        for k in range(7):
-            unit[:] = _ZERO
-            # The weight moves all three channels, which are summed before they are squared.
-            unit[k : 9 if k == 6 else k + 1] = _ONE
-            gradient_of_one(0, one, records[i], unit, view, size, room, g_cloud, g_view)
-            columns[k, 0:3], columns[k, 3:7] = g_means[0], g_quats[0]
-            columns[k, 7:10], columns[k, 10] = g_scales[0], g_logits[0]
+        _fill_columns(i, cloud, records[i], view, size, room, unit, g_view, g_sh, columns)
         for k in range(3):
-            s_means[i, k] = _quadratic(columns, matrix, k)
-            s_scales[i, k] = _quadratic(columns, matrix, 7 + k)
+            s_means[i, k] = _quadratic(columns, sums, k, 0, 6)
+            # Nothing but the covariance, numbers 2 to 4, depends on shapes.
+            s_scales[i, k] = _quadratic(columns, sums, 3 + k, 2, 5)
         for k in range(4):
-            s_quats[i, k] = _quadratic(columns, matrix, 3 + k)
-        s_logits[i] = _quadratic(columns, matrix, 10)
+            s_quats[i, k] = _quadratic(columns, sums, 6 + k, 2, 5)
+        slope = _ONE - sigmoid(cloud[3][i])
+        s_logits[i] = slope * slope * sums[0]
         # A coefficient moves its own channel alone.
-        for k in range(sh.shape[1]):
-            s_sh[i, k] = g_sh[0, k] * g_sh[0, k] * matrix[6, 6]
+        for k in range(g_sh.shape[0]):
+            s_sh[i, k] = g_sh[k] * g_sh[k] * sums[MOMENTS - 1]
 
 
 @parallel_kernel
