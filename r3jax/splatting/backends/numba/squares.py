@@ -66,8 +66,8 @@ _PLACES = (
 )
 """Where each entry of M stands among the moments, for v dx, v dy, v dx^2, v dx dy, v dy^2, w."""
 
-_NUMBERS = (1, 3, 2, 4, 5, 6)
-"""Where the backward pass takes these six; the weight moves the colors from 6 to 8."""
+_NUMBERS = (1, 3, 2, 4, 5)
+"""Where the backward pass takes the first five."""
 
 SLOT = 24
 """Floats of an intersection: `MOMENTS`, and what the last vector that is stored writes beyond."""
@@ -214,7 +214,7 @@ def _fill_columns(i, cloud, record, view, size, room, unit, g_view, g_sh, column
         g_x, g_y, g_z = center_gradient(g_u, g_v, center, slopes, view, room, g_view)
         for j in range(3):
             columns[k, j] = view[j] * g_x + view[3 + j] * g_y + view[6 + j] * g_z
-    # The weight moves all three channels, which are summed before they are squared.
+    # The weight moves all three channels, 6 to 8, which are summed before they are squared.
     unit[6], unit[7], unit[8] = _ONE, _ONE, _ONE
     basis, g_basis = room[39:55], room[55:71]
     away = color_gradient(means[i], sh[i], view, record, unit[6:9], basis, g_basis, g_sh)
