@@ -129,10 +129,10 @@ def _row_gradient(axis, g_row, row, ratio, slope, z, focal, view, g_view, g_cent
 
 
 @inlined_fast
-def color_gradient(mean, sh, view, record, g_color, basis, g_basis, g_sh):
+def color_gradient(mean, sh, view, record, g_color, room, g_sh):
     """Writes the gradient by the harmonics; returns that by the center, through the direction."""
     x, y, z, inverse = direction_of(mean, view)
-    count = sh.shape[0] // 3
+    count, basis, g_basis = sh.shape[0] // 3, room[39:55], room[55:71]
     basis_at(x, y, z, count, basis)
     red = g_color[0] if record[at.RED] > ZERO else ZERO
     green = g_color[1] if record[at.GREEN] > ZERO else ZERO
@@ -185,7 +185,7 @@ def _gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
     """Gradients of one Gaussian that was drawn; adds its share of the view's gradient."""
     means, quats, log_scales, logits, sh, _ = cloud
     g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
-    point, basis, g_basis = means[i], room[39:55], room[55:71]
+    point = means[i]
     center, slopes, covariance, shape = geometry_of(
         point, quats[i], log_scales[i], view, size, room
     )
@@ -196,7 +196,7 @@ def _gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
     shape_gradient((g_xx, g_xy, g_yy), shape, room, g_scales[i], g_quats[i])
     g_x, g_y, g_z = center_gradient(g_u, g_v, center, slopes, view, room, g_view)
     g_z += sums[9]
-    away = color_gradient(point, sh[i], view, record, sums[6:9], basis, g_basis, g_sh[i])
+    away = color_gradient(point, sh[i], view, record, sums[6:9], room, g_sh[i])
     for k in range(3):
         g_means[i, k] = view[k] * g_x + view[3 + k] * g_y + view[6 + k] * g_z + away[k]
         g_view[k] += g_x * point[k]

@@ -216,8 +216,7 @@ def _fill_columns(i, cloud, record, view, size, room, unit, g_view, g_sh, column
             columns[k, j] = view[j] * g_x + view[3 + j] * g_y + view[6 + j] * g_z
     # The weight moves all three channels, 6 to 8, which are summed before they are squared.
     unit[6], unit[7], unit[8] = _ONE, _ONE, _ONE
-    basis, g_basis = room[39:55], room[55:71]
-    away = color_gradient(means[i], sh[i], view, record, unit[6:9], basis, g_basis, g_sh)
+    away = color_gradient(means[i], sh[i], view, record, unit[6:9], room, g_sh)
     columns[5, 0], columns[5, 1], columns[5, 2] = away
 
 
