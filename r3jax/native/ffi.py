@@ -31,15 +31,19 @@ from numba.np.ufunc.parallel import threading_layer
 from r3jax.native.compiled import called_from_python, inlined, intrinsic
 from r3jax.native.one_piece import in_one_piece
 from r3jax.native.platform import num_cores
+from r3jax.native.structs import OFFSETS, VALUES
 
-# Offsets in bytes in the structs of XLA's FFI, API version `version.WRITTEN_FOR`.
-_EXTENSION, _API = 8, 16
-_API_MINOR = 36  # in XLA_FFI_Api
-ARGUMENTS, RESULTS = 72, 112  # in XLA_FFI_CallFrame: arrays of pointers to buffers
-_DATA, _RANK, _DIMENSIONS = 24, 32, 40  # in XLA_FFI_Buffer
-_EXTENSION_TYPE, _EXTENSION_METADATA = 8, 24
-_METADATA_MAJOR, _METADATA_MINOR = 24, 28  # in XLA_FFI_Metadata
-_IS_METADATA = 1
+# Bytes in structs; the names say whose, where it is not the call frame.
+_EXTENSION, _API = OFFSETS["CallFrame.extension_start"], OFFSETS["CallFrame.api"]
+_API_MINOR = OFFSETS["Api.api_version.minor_version"]
+# Arrays of pointers to buffers.
+ARGUMENTS, RESULTS = OFFSETS["CallFrame.args.args"], OFFSETS["CallFrame.rets.rets"]
+_DATA, _RANK, _DIMENSIONS = (OFFSETS[f"Buffer.{field}"] for field in ("data", "rank", "dims"))
+_EXTENSION_TYPE = OFFSETS["Metadata_Extension.extension_base.type"]
+_EXTENSION_METADATA = OFFSETS["Metadata_Extension.metadata"]
+_METADATA_MAJOR = OFFSETS["Metadata.api_version.major_version"]
+_METADATA_MINOR = OFFSETS["Metadata.api_version.minor_version"]
+_IS_METADATA = VALUES["XLA_FFI_Extension_Metadata"]
 
 
 def _reader(numba_type, llvm_type):
@@ -82,8 +86,8 @@ def _write_int32(typingctx, address, value):
 def answers_metadata(frame):
     """XLA asks first which version of the interface a handler speaks; True if this is that call.
 
-    The major version is ours; within it the structs only grow at their ends, so any minor one,
-    that is, the caller's, will do.
+    The major version is ours; within it all fields that are read lie where they were (`structs`),
+    so any minor one, that is, the caller's, will do.
     """
     extension = _int64_at(frame + _EXTENSION)
     if extension == 0 or _int32_at(extension + _EXTENSION_TYPE) != _IS_METADATA:

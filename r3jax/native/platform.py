@@ -7,9 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jaxlib
 from jax.extend import backend
 
-from r3jax.native.version import WRITTEN_FOR, ffi_version
+from r3jax.native.structs import misread
 
 
 def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Callable[..., Any]:
@@ -19,7 +20,7 @@ def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Call
         cpu: calls kernels. Not asked where XLA's interface is another than theirs.
         default: the same in plain JAX.
     """
-    if not speaks_our_interface():
+    if not can_call_kernels():
         return default
     # Both would be traced, which takes a fifth of a short run, for one that nobody can ask for.
     if is_cpu_only():
@@ -32,22 +33,24 @@ def is_cpu_only() -> bool:
     return set(backend.backends()) == {"cpu"}
 
 
-def speaks_our_interface() -> bool:
-    """Whether XLA can call the kernels; warns once if its interface is another."""
-    if (version := ffi_version()) != WRITTEN_FOR:
-        _warn(version)
-        return False
-    return True
+def can_call_kernels(instead: str = "mapping and scoring in plain JAX") -> bool:
+    """Whether XLA can call the kernels; warns once if its structs are not those that they read.
+
+    Args:
+        instead: what the caller does then.
+    """
+    if problem := misread():
+        _warn(problem, instead)
+    return not problem
 
 
 @functools.cache
-def _warn(version: tuple[int, int]) -> None:
+def _warn(problem: str, instead: str) -> None:
     warnings.warn(
-        f"the kernels for CPUs read XLA's structs as they are in version "
-        f"{'.'.join(map(str, WRITTEN_FOR))} of its foreign function interface; this jaxlib has "
-        f"{'.'.join(map(str, version))}: mapping and scoring in plain JAX, which is slower",
+        f"the kernels for CPUs cannot read the structs of jaxlib {jaxlib.__version__}: {problem}; "
+        f"{instead}, which is slower. jaxlib 0.10 to 0.12 are known to work",
         RuntimeWarning,
-        stacklevel=2,
+        stacklevel=3,
     )
 
 

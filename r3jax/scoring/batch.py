@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from r3jax.geometry.cameras import Camera, is_traced
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.native.platform import num_cores, speaks_our_interface
+from r3jax.native.platform import can_call_kernels, num_cores
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
@@ -79,7 +79,7 @@ def _at_hand(
     """The whole map and grid; where no kernel finds its way in them, what is within range."""
     if is_traced(state.key, positions):
         raise TypeError("score_views and score_positions deal out work: call them outside jit")
-    if jax.default_backend() == "cpu" and speaks_our_interface():
+    if jax.default_backend() == "cpu" and can_call_kernels():
         return state, _cells_of(grid)
     voxels, cells, _ = gather_in_range(state, grid, positions, config)
     return voxels, cells

@@ -1,7 +1,6 @@
 """What a rasterizer backend takes and gives, and which one serves where."""
 
 import importlib.util
-import warnings
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -9,7 +8,7 @@ import jax
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera
-from r3jax.native.version import WRITTEN_FOR, ffi_version
+from r3jax.native.platform import can_call_kernels
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 
@@ -52,7 +51,7 @@ class Rasterize(Protocol):
 def find_backend(name: str) -> Rasterize:
     """Finds the backend of a name; `auto` takes the fastest that runs on this machine.
 
-    `numba` becomes `xla`, with a warning, where its bridge does not know XLA's interface.
+    `numba` becomes `xla`, with a warning, where it cannot read XLA's structs.
 
     Raises:
         ValueError: there is no such backend.
@@ -60,14 +59,7 @@ def find_backend(name: str) -> Rasterize:
     """
     if name == "auto":
         name = _fastest()
-    if name == "numba" and (version := ffi_version()) != WRITTEN_FOR:
-        warnings.warn(
-            "the numba rasterizer reads XLA's structs as they are in version "
-            f"{'.'.join(map(str, WRITTEN_FOR))} of its foreign function interface; this jaxlib has "
-            f"{'.'.join(map(str, version))}: rendering with backend='xla', which is slower",
-            RuntimeWarning,
-            stacklevel=2,
-        )
+    if name == "numba" and not can_call_kernels("rendering with backend='xla'"):
         name = "xla"
     if name == "numba":
         from r3jax.splatting.backends.numba import rasterize
