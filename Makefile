@@ -2,6 +2,7 @@
 #
 #   make test       formulas, laws, one run end to end: minutes
 #   make test-all   also browsers, notebooks, fuzzing, whole runs of every policy
+#   make test-newest  `make test` with the newest version of every library
 #   make mutants    plants every listed fault and asks whether a law notices
 #   make stress     kill loops, thousands of damaged files, long runs: hours
 #   make docs       the documentation, to open from its folder
@@ -16,7 +17,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/r3jax
 # Python keeps what it compiled, too: a test process saves six seconds each time.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-all test-added mutants stress lint docs notebooks benchmark gpu-check clean
+.PHONY: setup demo test test-all test-newest test-added mutants stress lint docs notebooks benchmark gpu-check clean
 
 setup: $(STAMP)
 
@@ -35,6 +36,12 @@ test: setup
 	$(PYTEST)
 
 test-all: test test-added
+
+# Versions as `pip install` gives them to users, not the pinned ones: jax 0.11 and later want Python 3.12.
+test-newest:
+	$(PYTHON) -m venv .venv-newest
+	.venv-newest/bin/pip install --quiet --upgrade --editable '.[dev]'
+	$(PYTEST:$(BIN)%=.venv-newest/bin%)
 
 # What `test-all` adds to `test`.
 test-added: setup
