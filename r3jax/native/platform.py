@@ -4,10 +4,10 @@ import functools
 import os
 import warnings
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Any
 
 import jax
-import jaxlib
 from jax.extend import backend
 
 from r3jax.native.structs import misread
@@ -47,7 +47,7 @@ def can_call_kernels(instead: str = "mapping and scoring in plain JAX") -> bool:
 @functools.cache
 def _warn(problem: str, instead: str) -> None:
     warnings.warn(
-        f"the kernels for CPUs cannot read the structs of jaxlib {jaxlib.__version__}: {problem}; "
+        f"the kernels for CPUs cannot read the structs of jaxlib {version('jaxlib')}: {problem}; "
         f"{instead}, which is slower. jaxlib 0.10 to 0.12 are known to work",
         RuntimeWarning,
         stacklevel=3,
