@@ -48,7 +48,7 @@ def can_call_kernels(instead: str = "mapping and scoring in plain JAX") -> bool:
 def _warn(problem: str, instead: str) -> None:
     warnings.warn(
         f"the kernels for CPUs cannot read the structs of jaxlib {version('jaxlib')}: {problem}; "
-        f"{instead}, which is slower. jaxlib 0.10 to 0.12 are known to work",
+        f"{instead}, which is slower. jaxlib 0.10 to 0.12 have them where they are read",
         RuntimeWarning,
         stacklevel=3,
     )
