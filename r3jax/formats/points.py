@@ -13,14 +13,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.files import read_bytes
-from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.state import MapState
 
 _MAX_BYTES = 4 << 30
@@ -172,8 +170,7 @@ def _colors(table: np.ndarray) -> np.ndarray:
 def voxel_points(map_state: MapState) -> tuple[np.ndarray, np.ndarray]:
     """Centers [m] and mean colors of the occupied voxels: [n, 3] float32 and [n, 3] uint8."""
     occupied = np.asarray(map_state.occupied)
-    index = jnp.stack(unpack(map_state.key[0], map_state.key[1]))
-    centers = np.asarray(voxel_center(index, map_state.voxel_size)).T[occupied]
+    centers = np.asarray(map_state.center).T[occupied]
     colors = np.rint(np.asarray(map_state.mean).T[occupied] * 255.0)
     return centers.astype(np.float32), colors.clip(0, 255).astype(np.uint8)
 

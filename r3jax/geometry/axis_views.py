@@ -2,12 +2,16 @@
 
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 
 from r3jax.geometry.cameras import pose_along
 
 LOOKS = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Names of the directions."""
+
+
+_pose_along = jax.jit(pose_along)
 
 
 def poses_at(positions: np.ndarray, looks: Sequence[str] | np.ndarray) -> np.ndarray:
@@ -18,7 +22,7 @@ def poses_at(positions: np.ndarray, looks: Sequence[str] | np.ndarray) -> np.nda
         direction = np.zeros(3, np.float32)
         direction["xyz".index(look[1])] = 1.0 if look[0] == "+" else -1.0
         # Entries are 0 or 1 up to rounding; adding 0 turns -0.0 into 0.0.
-        axes[look] = np.rint(pose_along(np.zeros(3, np.float32), direction)) + 0.0
+        axes[look] = np.rint(_pose_along(np.zeros(3, np.float32), direction)) + 0.0
     poses = np.zeros((len(looks), 4, 4))
     for i, look in enumerate(looks):
         poses[i] = axes[str(look)]

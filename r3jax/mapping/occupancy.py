@@ -87,6 +87,7 @@ class OccupancyGrid(eqx.Module):
         return self.log_odds > OCCUPIED_LOG_ODDS
 
     @property
+    @jax.jit  # one program, not one for every operation: planning asks outside of jit
     def unexplored(self) -> Bool[Array, "X Y Z"]:
         """Cells that are neither, and worth a look."""
         # The mask never makes a known cell unexplored, only an unknown one not worth a look.
@@ -99,7 +100,7 @@ class OccupancyGrid(eqx.Module):
         What is known of them stays: a planner that wrote them as occupied would have a robot's
         body collide with space that nobody has seen.
         """
-        left = ~jnp.asarray(cells)
+        left = jnp.asarray(~cells, dtype=bool)
         if self.worth_a_look is not None:
             left = left & self.worth_a_look
         return replace(self, worth_a_look=left)

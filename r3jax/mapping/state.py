@@ -9,8 +9,10 @@ Shape symbols used throughout the package:
 """
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
@@ -57,7 +59,9 @@ class MapState(eqx.Module):
         """Number of rows N."""
         return self.count.shape[-1]
 
+    # One program each, not one for every operation: what loops ask for outside of jit.
     @property
+    @jax.jit
     def occupied(self) -> Bool[Array, " N"]:
         """True for rows that describe a voxel."""
         # One word decides: the top bit of a packed key's high word is 0.
@@ -69,6 +73,7 @@ class MapState(eqx.Module):
         return self.count > 0.0
 
     @property
+    @jax.jit
     def center(self) -> Float[Array, "3 N"]:
         """Centers of the voxels [m]; meaningless where there is none."""
         return voxel_center(jnp.stack(unpack(self.key[0], self.key[1])), self.voxel_size)
@@ -96,6 +101,7 @@ class MapState(eqx.Module):
         )
 
     @property
+    @jax.jit
     def num_occupied(self) -> Int[Array, ""]:
         """Number of rows in use."""
         return jnp.sum(self.occupied, dtype=jnp.int32)
@@ -130,6 +136,11 @@ def empty_map(
         raise ValueError(f"voxel_size must be positive and finite [m], got {voxel_size}")
     if num_bins < 1:
         raise ValueError(f"num_bins must be at least 1, got {num_bins}")
+    return _empty_map(capacity, float(voxel_size), num_bins)
+
+
+@partial(jax.jit, static_argnums=(0, 2))
+def _empty_map(capacity: int, voxel_size: Float[Array, ""], num_bins: int) -> MapState:
     num_words = -(-num_bins // 32)
     return MapState(
         key=jnp.full((2, capacity), EMPTY_WORD, dtype=jnp.uint32),

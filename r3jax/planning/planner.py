@@ -236,4 +236,5 @@ def add_frame(
     )
     # Depth before the body: a hit measured in this frame must not be vouched away.
     grid = _integrate_depth(grid, frame, config.max_range)
-    return map_state, _mark_free_ball(grid, frame.position, config.body_radius)
+    position = np.asarray(frame.T_world_camera)[:3, 3]
+    return map_state, _mark_free_ball(grid, position, config.body_radius)

@@ -37,7 +37,8 @@ def gather_in_range(
     if is_traced(state.key, positions):
         raise TypeError("score_views and score_positions choose sizes: call them outside jit")
     # The box round all positions: one test per voxel, however many candidates there are.
-    low, high = positions.min(axis=0), positions.max(axis=0)
+    places = np.asarray(positions)
+    low, high = places.min(axis=0), places.max(axis=0)
     # Counted first, on the host: the shapes of what is gathered must be known beforehand.
     counts = np.asarray(_count_near(state, grid, low, high, config))
     sizes = _sizes(int(counts[0]), int(counts[1]), state.capacity, grid.log_odds.size)

@@ -219,7 +219,7 @@ def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
     voxels, cells = simulate_view_near(path.voxels, path.cells, problem.camera, T, config.scoring)
     places = jnp.asarray(offered.position, dtype=jnp.float32)
     allowed = limits.allowed_axes(offered.position, config.scoring.panorama_bins)
-    rows = jnp.asarray([tried[i % len(tried)] for i in range(config.branching)])
+    rows = np.array([tried[i % len(tried)] for i in range(config.branching)], dtype=np.int32)
     kept, now = problem.kept.at(rows), (voxels, cells)
     panorama = score_cached_near(
         kept, problem.start, now, problem.camera, places, config.scoring, allowed, threads=1
