@@ -117,8 +117,9 @@ TABLES: dict[TableName, dict[str, Row]] = {
     "rivals": {
         OURS: Row("ours-ahead", loop=ON_THE_WAY, training=LONG),
         **{
-            policy: Row(policy, OURS, training=LONG)
+            policy + mode: Row(policy, OURS, loop=loop, training=LONG)
             for policy in (REFERENCE, "gavis", "active-gs-online", "fisherrf", "gauss-mi")
+            for mode, loop in MODES.items()
         },
     },
     # Where the camera looks on the way.

@@ -33,6 +33,7 @@ from experiments.pages.artifacts import (
 from experiments.pages.pool_figure import pool_figure
 from experiments.pages.pool_table import gain_rows, mean_rows, result_rows
 from experiments.pool_choice import choose, pool_of
+from experiments.suite import HOUSE
 from r3jax.apps.benchmark.photos.choosers import SCORED
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.evaluation.evaluate import evaluate
@@ -50,7 +51,7 @@ from r3jax.splatting.views import Views, load_views
 NAME = "pool_selection"
 
 
-SizeName = Literal["smoke", "small", "paper"]
+SizeName = Literal["smoke", "small", "house", "paper"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,9 @@ class Size:
 SIZES: dict[SizeName, Size] = {
     "smoke": Size(("flat",), (0,), 64, 3, (8, 16), 128, 48, 300, 4_000, 60),
     "small": Size(("flat", "office"), (0, 1), 250, 3, (30, 60), 256, 128, 1500, 20_000, 120),
+    # How much a minute or two could bring at best, where nothing stands in the way: as many frames
+    # as `experiments.captures` takes on the way, and trainings as long.
+    "house": Size((HOUSE,), (0,), 1000, 3, (170, 300, 600), 256, 128, 6000, 20_000, 120),
     "paper": Size(
         ("flat", "apartment", "office", "gallery"),
         (0, 1, 2),
@@ -92,7 +96,7 @@ SIZES: dict[SizeName, Size] = {
         1000,
     ),
 }
-"""Ten minutes on two cores; three hours on two cores; many hours on a GPU."""
+"""Ten minutes on two cores; three hours; half an hour; many hours on a GPU."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,8 @@ class Options:
     """Greedy choice from a pool of poses by each policy's utility, without paths."""
 
     size: SizeName = "smoke"
-    """How much is done: `smoke` in minutes, `small` in hours, `paper` on GPUs."""
+    """How much is done: `smoke` in minutes, `small` in hours, `paper` on GPUs; `house` is one
+    scene that is hard to cover, with long trainings."""
 
     policies: tuple[str, ...] = SCORED
     """Whose utility chooses."""
@@ -140,7 +145,8 @@ class Choice:
     def file_name(self) -> str:
         """Where its record is kept."""
         kind = "known" if self.known_cells else "all"
-        return f"{self.scene}-{self.policy}-{self.size.pool}poses-{kind}-seed{self.seed}.json"
+        scene = Path(self.scene).stem  # a mesh is named by its path
+        return f"{scene}-{self.policy}-{self.size.pool}poses-{kind}-seed{self.seed}.json"
 
 
 def main(options: Options) -> Path:
