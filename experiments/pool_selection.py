@@ -96,7 +96,8 @@ SIZES: dict[SizeName, Size] = {
         1000,
     ),
 }
-"""Ten minutes on two cores; three hours; half an hour; many hours on a GPU."""
+"""Ten minutes on two cores; three hours; seven minutes a policy and the choice, which takes `ours`
+longer; many hours on a GPU."""
 
 
 @dataclass(frozen=True)

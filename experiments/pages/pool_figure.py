@@ -1,5 +1,6 @@
 """The figure of `pool_selection`: PSNR over the number of chosen views."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,10 @@ def pool_figure(rows: list[dict[str, Any]]) -> Figure:
             views = sorted({row["views"] for row in own})
             means = [np.mean([r["psnr"] for r in own if r["views"] == v]) for v in views]
             axes.plot(views, means, label=policy, **look.line())
-        axes.set(title=scene, xlabel="views", xticks=sorted({row["views"] for row in rows}))
+        # A mesh is named by its path.
+        axes.set(
+            title=Path(scene).stem, xlabel="views", xticks=sorted({row["views"] for row in rows})
+        )
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("PSNR [dB], mean of test views")
     legend_below(figure, list(looks))
