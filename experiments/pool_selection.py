@@ -36,6 +36,7 @@ from experiments.pool_choice import choose, pool_of
 from experiments.suite import HOUSE
 from r3jax.apps.benchmark.photos.choosers import SCORED
 from r3jax.apps.benchmark.record import machine, source_commit
+from r3jax.evaluation.comparison import scene_title
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.scores import summarize
 from r3jax.evaluation.test_views import load_view_set, render_view_set
@@ -80,8 +81,8 @@ class Size:
 SIZES: dict[SizeName, Size] = {
     "smoke": Size(("flat",), (0,), 64, 3, (8, 16), 128, 48, 300, 4_000, 60),
     "small": Size(("flat", "office"), (0, 1), 250, 3, (30, 60), 256, 128, 1500, 20_000, 120),
-    # How much a minute or two could bring at best, where nothing stands in the way: as many frames
-    # as `experiments.captures` takes on the way, and trainings as long.
+    # What as many frames bring as `experiments.captures` takes in one and in two minutes, and twice
+    # that, where no way has to be flown; trainings as long as there.
     "house": Size((HOUSE,), (0,), 1000, 3, (170, 300, 600), 256, 128, 6000, 20_000, 120),
     "paper": Size(
         ("flat", "apartment", "office", "gallery"),
@@ -96,8 +97,8 @@ SIZES: dict[SizeName, Size] = {
         1000,
     ),
 }
-"""Ten minutes on two cores; three hours; seven minutes a policy and the choice, which takes `ours`
-longer; many hours on a GPU."""
+"""On two cores ten minutes, three hours, and seven minutes for `random` (a policy that scores poses
+takes longer); many hours on a GPU."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ class Choice:
     def file_name(self) -> str:
         """Where its record is kept."""
         kind = "known" if self.known_cells else "all"
-        scene = Path(self.scene).stem  # a mesh is named by its path
+        scene = scene_title(self.scene)
         return f"{scene}-{self.policy}-{self.size.pool}poses-{kind}-seed{self.seed}.json"
 
 

@@ -1,12 +1,12 @@
 """The figure of `pool_selection`: PSNR over the number of chosen views."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.pages.policy_style import legend_below, styles_of
+from r3jax.evaluation.comparison import scene_title
 
 
 def pool_figure(rows: list[dict[str, Any]]) -> Figure:
@@ -25,9 +25,8 @@ def pool_figure(rows: list[dict[str, Any]]) -> Figure:
             views = sorted({row["views"] for row in own})
             means = [np.mean([r["psnr"] for r in own if r["views"] == v]) for v in views]
             axes.plot(views, means, label=policy, **look.line())
-        # A mesh is named by its path.
         axes.set(
-            title=Path(scene).stem, xlabel="views", xticks=sorted({row["views"] for row in rows})
+            title=scene_title(scene), xlabel="views", xticks=sorted({row["views"] for row in rows})
         )
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("PSNR [dB], mean of test views")

@@ -53,7 +53,7 @@ def with_short_names(cells: Sequence[Cell]) -> list[Cell]:
     file's name without folder and suffix, unless two scenes would then be called the same.
     """
     shared = shared_settings(cells)
-    titles = {scene: _scene_title(scene) for scene in scenes_of(cells)}
+    titles = {scene: scene_title(scene) for scene in scenes_of(cells)}
     if len(set(titles.values())) < len(titles):
         titles = {scene: scene for scene in titles}
     return [
@@ -66,7 +66,8 @@ def with_short_names(cells: Sequence[Cell]) -> list[Cell]:
     ]
 
 
-def _scene_title(scene: str) -> str:
+def scene_title(scene: str) -> str:
+    """The name of a scene, without folder and suffix where it is that of a file."""
     kind, colon, path = scene.partition(":")
     return PurePath(path).stem if colon and kind == "mesh" else scene
 

@@ -10,7 +10,6 @@ from r3jax.geometry.cameras import pose_along
 LOOKS = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Names of the directions."""
 
-
 _pose_along = jax.jit(pose_along)
 
 
