@@ -7,7 +7,7 @@ Markers and dashes say the same again, for print.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -33,11 +33,15 @@ class PolicyStyle:
     order: float
     """Height in the stack of artists: ours are drawn on top."""
 
+    fill: Literal["full", "none", "left", "bottom"] = "full"
+    """How much of the marker is filled: a curve of one point has no line to tell it by."""
+
     def line(self) -> dict[str, Any]:
         """Arguments of `Axes.plot`."""
         return {
             "color": self.color, "marker": self.marker, "linestyle": self.dashes,
             "linewidth": self.width, "markersize": 4.5, "zorder": self.order,
+            "fillstyle": self.fill,
         }  # fmt: skip
 
 
@@ -63,13 +67,17 @@ _POLICIES = {
 """Color, marker and dashes; the variants of one idea share a color."""
 
 _UNKNOWN = ("#8b5cf6", "*", "-")
-_DASHES = (":", "-.", (0, (5, 1, 1, 1, 1, 1)))
+_VARIANTS: tuple[tuple[Any, Literal["none", "left", "bottom"]], ...] = (
+    (":", "none"), ("-.", "left"), ((0, (5, 1, 1, 1, 1, 1)), "bottom"),
+)  # fmt: skip
+"""Dashes and filling of the markers, of other settings of a policy than the first."""
 
 
 def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
     """The look of each method, as `equal_terms.method_name` writes it.
 
-    The first settings of a policy look the same in every figure; others have other dashes.
+    The first settings of a policy look the same in every figure; others have other dashes, and
+    markers that are not filled.
     """
     seen: dict[str, int] = {}
     styles: dict[str, PolicyStyle] = {}
@@ -77,10 +85,11 @@ def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
         policy = method.partition(" (")[0]
         color, marker, dashes = _POLICIES.get(policy, _UNKNOWN)
         variant = seen[policy] = seen.get(policy, -1) + 1
+        fill = "full"
         if variant:
-            dashes = _DASHES[(variant - 1) % len(_DASHES)]
+            dashes, fill = _VARIANTS[(variant - 1) % len(_VARIANTS)]
         width, order = (2.6, 4.0) if policy.startswith("ours") else (1.5, 3.0)
-        styles[method] = PolicyStyle(color, marker, dashes, width, order)
+        styles[method] = PolicyStyle(color, marker, dashes, width, order, fill)
     return styles
 
 

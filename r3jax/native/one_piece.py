@@ -12,6 +12,7 @@ to what calls them when the address of the whole is asked for.
 # pyright: reportUnknownArgumentType=false, reportAttributeAccessIssue=false
 
 import contextlib
+import itertools
 from collections.abc import Generator
 from typing import Any, ClassVar
 
@@ -103,11 +104,17 @@ class _Library(JITCodeLibrary):
 def _is_large(module: Any) -> bool:
     """Whether a function of a module is large, other than those that callers always take in."""
     return any(
-        sum(1 for block in function.blocks for _ in block.instructions) > LARGE
+        _is_long(function)
         for function in module.functions
         if not function.is_declaration
         and not any(b"alwaysinline" in kept for kept in function.attributes)
     )
+
+
+def _is_long(function: Any) -> bool:
+    """Whether a function has more than `LARGE` instructions, of which no more are looked at."""
+    instructions = (one for block in function.blocks for one in block.instructions)
+    return next(itertools.islice(instructions, LARGE, None), None) is not None
 
 
 @contextlib.contextmanager

@@ -122,6 +122,8 @@ def test_every_method_has_its_own_look():
     variants = ["ours", "ours (bins=32)", "ours (bins=8)"]
     looks = styles_of([*SKILL, *variants[1:], "mine"])
     assert len({(look.color, str(look.dashes)) for look in looks.values()}) == len(SKILL) + 3
+    # Nor do points without a line look the same.
+    assert len({(look.color, look.marker, look.fill) for look in looks.values()}) == len(SKILL) + 3
     assert len({look.color for name, look in looks.items() if name in variants}) == 1
     assert len({looks[name].marker for name in SKILL}) == len(SKILL)
     assert styles_of(["ours"])["ours"] == looks["ours"]  # whoever else is drawn
