@@ -23,7 +23,7 @@ from r3jax.scoring.backends import dense, reference
 from r3jax.scoring.backends.views import layout_of, over_views, row_of
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import PAPER, Forms, ScoringConfig
-from r3jax.scoring.terms import Renderability, score_voxels
+from r3jax.scoring.terms import Renderability
 from r3jax.visibility.views import View
 
 LARGEST_BUFFER = 2048
@@ -193,7 +193,7 @@ def _rows_in_pixels_jvp(primals: Any, tangents: Any) -> Any:
 def terms_of_rows(
     voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
-    """`score_voxels`, by the fastest backend of the platform."""
+    """`reference.terms_of_rows`, by the fastest backend of the platform."""
 
     def score_by(backend: Any) -> Callable[..., Any]:
         score = lambda voxels, points: backend.terms_of_rows(voxels, points, forms)
@@ -205,4 +205,4 @@ def terms_of_rows(
 
 @terms_of_rows.defjvp
 def _terms_of_rows_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
-    return jax.jvp(functools.partial(score_voxels, forms=forms), primals, tangents)
+    return jax.jvp(functools.partial(reference.terms_of_rows, forms=forms), primals, tangents)

@@ -29,11 +29,10 @@ from r3jax.visibility.views import pinhole_view
 def _voxel_renderability(
     state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
-    terms = terms_of_rows(state, camera_position, focal, forms)
     positive = jnp.stack([focal, state.voxel_size])
-    is_sound = jnp.all(jnp.isfinite(camera_position)) & jnp.all(jnp.isfinite(positive))
-    factor = jnp.where(is_sound & jnp.all(positive > 0.0), 1.0, jnp.nan)
-    return jax.tree.map(lambda term: factor * term, terms)
+    is_sound = jnp.all(jnp.isfinite(positive) & (positive > 0.0))
+    position = jnp.where(is_sound, camera_position, jnp.nan)
+    return terms_of_rows(state, position, focal, forms)
 
 
 @checked(state=a_map)

@@ -284,6 +284,8 @@ MUTANTS = [
     Mutant("pixels", "if row != last:", "if last < 0:", images_agree),
     Mutant("rows", "is_there * bias * noise * resolution", "bias * noise * resolution",
            terms_agree),
+    Mutant("rows", "(word & (word - _ONE_BIT) != _NO_BITS) | ", "", terms_agree),
+    Mutant("rows", "| (np.uint64(own[j]) << shift)", "| np.uint64(own[j])", terms_agree),
 ]  # fmt: skip
 
 

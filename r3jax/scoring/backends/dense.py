@@ -14,7 +14,6 @@ from r3jax.scoring.backends import reference
 from r3jax.scoring.backends.views import BufferLayout, view_of
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms, ScoringConfig
-from r3jax.scoring.terms import score_voxels
 
 _ELEMENTS = 1 << 26
 """Voxels times views at a time on a GPU; each takes some 60 bytes."""
@@ -94,9 +93,9 @@ def rows_in_pixels(
 def terms_of_rows(
     voxels: MapState, points: Float[Array, "P 4"], forms: Forms
 ) -> tuple[Float[Array, "P n"], ...]:
-    """`score_voxels` from many points (position, focal length), field by field."""
+    """`reference.terms_of_rows` from many points (position, focal length), field by field."""
 
     def one(point: Float[Array, " 4"]) -> tuple[Float[Array, " n"], ...]:
-        return tuple(jax.tree.leaves(score_voxels(voxels, point[:3], point[3], forms)))
+        return tuple(jax.tree.leaves(reference.terms_of_rows(voxels, point[:3], point[3], forms)))
 
     return jax.lax.map(one, points, batch_size=batch_size(voxels.capacity))

@@ -18,7 +18,7 @@ from r3jax.geometry.voxels import unpack
 from r3jax.mapping.state import MapState
 from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms, ScoringConfig
-from r3jax.scoring.terms import score_voxels
+from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.visibility.reference import nearest_voxels, visible
 from r3jax.visibility.views import View
 
@@ -138,6 +138,15 @@ def mean_of_rows(
     """Averages R of the voxels in the pixels of an image; 0 where there is none."""
     shown = voxels_of_rows(voxels, rows)
     return jnp.mean(score_voxels(shown, position, focal, forms).value)
+
+
+def terms_of_rows(
+    voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
+) -> Renderability:
+    """`score_voxels` of every row; where the position is not finite, every term is NaN."""
+    factor = jnp.where(jnp.all(jnp.isfinite(position)), 1.0, jnp.nan)
+    terms = score_voxels(voxels, position, focal, forms)
+    return jax.tree.map(lambda term: factor * term, terms)
 
 
 def voxels_of_rows(voxels: MapState, rows: Int[Array, "h w"]) -> MapState:

@@ -143,7 +143,7 @@ def _look(
 def terms_of_rows(
     voxels: MapState, points: Float[Array, "P 4"], forms: Forms
 ) -> tuple[Float[Array, "P n"], ...]:
-    """`terms.score_voxels` from many points (position, focal length), field by field."""
+    """`reference.terms_of_rows` from many points (position, focal length), field by field."""
     register(ROWS)
     # An array for each field: none is copied out of one for all.
     field = jax.ShapeDtypeStruct((points.shape[0], voxels.capacity), jnp.float32)

@@ -35,7 +35,8 @@ _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np
 _INFINITE, _POLE, _LEAST = np.float32(np.inf), np.float32(1e-12), np.float32(1e-6)
 _EDGE = np.float32(directions.ON_EDGE)
 _NO_BITS, _ONE_BIT = np.uint64(0), np.uint64(1)
-_NEARLY_ONE = np.float32(0.999)  # 2.6 degrees: far outside of a box as large as `_EDGE`
+NEARLY_ONE = np.float32(0.999)
+"""Cosine of 2.6 degrees: far outside of a box as large as `_EDGE`."""
 
 
 @intrinsic
@@ -70,7 +71,7 @@ def look_from(visited, at, lattice, direction):
         # A box of one direction is a point, in which only that very direction lies.
         k = np.uint64(lowest_bit(word))
         cosine = lattice[k, 0] * x + lattice[k, 1] * y + lattice[k, 2] * z
-        if cosine < _NEARLY_ONE:
+        if cosine < NEARLY_ONE:
             return max(cosine, _ZERO), False
     is_pole = x * x + y * y < _POLE
     a_x, a_y = (_ONE if is_pole else -y), (_ZERO if is_pole else x)
