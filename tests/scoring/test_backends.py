@@ -260,6 +260,19 @@ def test_terms_of_all_rows_are_those_of_the_formulas(seed):
     np.testing.assert_allclose(found(state, positions), slope(state, positions), atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("place", "focal"),
+    [((np.nan, 0.0, 0.0), 100.0), ((0.0, np.inf, 0.0), 100.0), ((0.0, 0.0, 0.0), 0.0),
+     ((0.0, 0.0, 0.0), np.nan)],
+)  # fmt: skip
+def test_a_question_without_an_answer_has_none_in_any_row(place, focal):
+    state = world(0)[0]
+    ask = jax.jit(r3jax.voxel_renderability)
+    for name, term in vars(ask(state, jnp.array(place), jnp.float32(focal))).items():
+        assert np.isnan(term).all(), name
+    assert np.isfinite(ask(state, jnp.zeros(3), jnp.float32(100.0)).kappa).all()
+
+
 @functools.cache
 def changes():
     """What imagined views change: by the reference, one by one; mapped; as dense batches."""
