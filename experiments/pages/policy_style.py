@@ -77,7 +77,7 @@ def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
     """The look of each method, as `equal_terms.method_name` writes it.
 
     The first settings of a policy look the same in every figure; others have other dashes, and
-    markers that are not filled.
+    markers that are hollow or half filled.
     """
     seen: dict[str, int] = {}
     styles: dict[str, PolicyStyle] = {}
