@@ -11,6 +11,7 @@ else to do. Whoever does not look or plan on the way flies as published. What is
 is not done again, and what differs in its training only is not flown again.
 """
 
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,12 +37,15 @@ from r3jax.apps.benchmark.plan import make_plan
 from r3jax.apps.benchmark.record import read_records
 from r3jax.evaluation.comparison import (
     check_equal_terms,
+    scene_title,
     scores_by_method,
     snapshots_of,
     with_short_names,
 )
 from r3jax.evaluation.statistics import paired_difference
 from r3jax.exploration.config import ClockName
+from r3jax.formats.submissions import submission_of_run, write_submission
+from r3jax.trace.reader import read_run
 
 NAME = "captures"
 
@@ -214,6 +218,8 @@ def main(options: Options) -> Path:
     ]
     folder = options.out / NAME / options.size
     write_page(folder, options.table, rows, records, origin(f"experiments.{NAME}", records))
+    if options.clock == "wall":
+        write_submissions(folder / f"{options.table}_flights", cells, root)
     print(f"results  {folder}")
     return folder
 
@@ -308,6 +314,21 @@ def write_page(
         write_figure(folder / f"{table}_by_frames.png", frames_figure(records), source)
         page.append(f"![PSNR against the number of frames]({table}_by_frames.png)")
     write_markdown(folder / f"{table}.md", page, source)
+
+
+def write_submissions(folder: Path, cells: Mapping[str, Sequence[Cell]], root: Path) -> None:
+    """Writes the poses of every cell, a submission each, under the name of its row.
+
+    No machine flies by the wall clock twice alike: with these files anybody can take the frames,
+    train, and judge again.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for label, own in cells.items():
+        row = re.sub("[^0-9a-z.]+", "-", label)
+        for cell in own:
+            flown = submission_of_run(read_run(paths_of(root, cell).run))
+            named = replace(flown, policy=flown.policy | {"name": label})
+            write_submission(folder / f"{row}_{scene_title(cell.scene)}_{cell.seed}.jsonl", named)
 
 
 def frames_figure(records: Records) -> Figure:

@@ -12,7 +12,9 @@ from experiments.captures import TABLES, Options, Row, as_line, quality_rows, ro
 from experiments.suite import request_of
 from r3jax.apps.benchmark.cells import Cell, paths_of
 from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.formats.submissions import read_submission
 from r3jax.planning.registry import make_policy
+from tests.formats.test_submissions import make_submission
 
 ROWS = {
     "blind": Row("active-gs"),
@@ -127,6 +129,36 @@ def test_a_table_holds_the_times_that_were_asked_for(tmp_path, monkeypatch):
     captures.main(Options(table="gaze", rows=("blend",), work=tmp_path, out=tmp_path))
     assert [line["snapshot"] for line in written] == ["seconds:60"]
     assert written[0]["policy"] == "blend"
+
+
+def test_what_was_flown_is_written_beside_a_table_of_the_wall_clock(tmp_path, monkeypatch):
+    """One file for each row, scene and seed: that cell's run, called as its row."""
+    cells = {
+        f"{policy}, every 0.15 m": [
+            Cell(scene, "a", policy, seed, Conditions(), "b", 9)
+            for scene in ("flat", "mesh:../scenes/hall.glb")
+            for seed in (0, 3)
+        ]
+        for policy in ("ours", "random")
+    }
+    runs = {paths_of(tmp_path, cell).run: cell for own in cells.values() for cell in own}
+    monkeypatch.setattr(captures, "read_run", runs.__getitem__)
+    monkeypatch.setattr(
+        captures,
+        "submission_of_run",
+        lambda cell: make_submission(seed=cell.seed, policy={"name": "?", "version": cell.policy}),
+    )
+    captures.write_submissions(tmp_path / "flights", cells, tmp_path)
+    written = {path.name: read_submission(path) for path in (tmp_path / "flights").iterdir()}
+    assert {name: (file.policy, file.seed) for name, file in written.items()} == {
+        f"{policy}-every-0.15-m_{scene}_{seed}.jsonl": (
+            {"name": f"{policy}, every 0.15 m", "version": policy},
+            seed,
+        )
+        for policy in ("ours", "random")
+        for scene in ("flat", "hall")
+        for seed in (0, 3)
+    }
 
 
 def test_a_row_is_drawn_in_the_color_of_its_policy(monkeypatch):
