@@ -170,3 +170,10 @@ def test_a_row_is_drawn_in_the_color_of_its_policy(monkeypatch):
     captures.frames_figure([record("active-gs", 0, [1.0], 3), record("seeing, often", 0, [1.0], 3)])
     assert [r["policy"] for r in drawn] == ["active-gs", "seeing (often)"]
     assert figure.axes[0].get_xlabel() == "frames"
+
+
+def test_the_flights_that_stand_in_the_results_are_read_by_this_version():
+    files = sorted((Path(captures.__file__).parent / "results").rglob("*_flights/*.jsonl"))
+    assert files
+    for path in files:
+        assert path.stem.endswith(f"_{read_submission(path).seed}"), path
