@@ -310,7 +310,8 @@ def write_page(
             "on the same test views, with its interval of 95 %",
             markdown_table(lines),
         ]
-    if len(trainings) == 1:  # models of other trainings are no points of one curve
+    # Models of other trainings are no points of one curve, and two points are none at all.
+    if len(trainings) == 1 and len(rows) * len(snapshots_of(records)) > 2:
         write_figure(folder / f"{table}_by_frames.png", frames_figure(records), source)
         page.append(f"![PSNR against the number of frames]({table}_by_frames.png)")
     write_markdown(folder / f"{table}.md", page, source)

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from experiments import captures
 from experiments.captures import TABLES, Options, Row, as_line, quality_rows, rows_of, run_in_turn
+from experiments.pages.artifacts import Origin
 from experiments.suite import request_of
 from r3jax.apps.benchmark.cells import Cell, paths_of
 from r3jax.apps.benchmark.conditions import Conditions
@@ -170,6 +171,24 @@ def test_a_row_is_drawn_in_the_color_of_its_policy(monkeypatch):
     captures.frames_figure([record("active-gs", 0, [1.0], 3), record("seeing, often", 0, [1.0], 3)])
     assert [r["policy"] for r in drawn] == ["active-gs", "seeing (often)"]
     assert figure.axes[0].get_xlabel() == "frames"
+
+
+def test_two_points_are_no_curve(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(captures, "check_equal_terms", lambda records: None)
+    monkeypatch.setattr(
+        captures, "frames_figure", lambda records: drawn.append(len(records)) or Figure()
+    )
+    for snapshots in (("seconds:60",), ("seconds:30", "seconds:60")):
+        records = [
+            record(label, 0, [10.0, 20.0], 40, snapshot=snapshot)
+            for label in ROWS
+            for snapshot in snapshots
+        ]
+        captures.write_page(tmp_path, "gaze", ROWS, records, Origin("a command", "none", "abc"))
+        page = (tmp_path / "gaze.md").read_text()
+        assert ("gaze_by_frames.png" in page) == (len(snapshots) == 2)
+    assert drawn == [4]
 
 
 def test_the_flights_that_stand_in_the_results_are_read_by_this_version():
