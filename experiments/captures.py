@@ -7,8 +7,9 @@ A table is a list of rows, each a policy under settings that differ from the sui
 compared on the same test views with the row that it changes. The mission clock is the model's: a
 decision 0.3 s, one reconsidered on arrival 0.05 s, a frame 0.02 s, a gaze 0.01 s, 1 m/s, turns for
 nothing; or, with `--clock wall`, what all of this takes on this machine, which then has nothing
-else to do. Whoever does not look or plan on the way flies as published. What is done in `--work`
-is not done again, and what differs in its training only is not flown again.
+else to do, and the poses of every flight are kept beside the table. Whoever does not look or plan
+on the way flies as published. What is done in `--work` is not done again, and what differs in its
+training only is not flown again.
 """
 
 import re
