@@ -1,14 +1,16 @@
-"""At equal time: what looking on the way, gaze, spacing, turning, and longer trainings are worth.
+"""At equal time or views: what looking on the way, gaze, spacing, and longer trainings are worth.
 
     python -m experiments.captures modes --size small --scenes flat office --seeds 0
     python -m experiments.captures gaze --size small --scenes flat office --seeds 0
+    python -m experiments.captures rivals --size small --budget views --snapshots 30
 
 A table is a list of rows, each a policy under settings that differ from the suite's, and each is
 compared on the same test views with the row that it changes. The mission clock is the model's: a
 decision 0.3 s, one reconsidered on arrival 0.05 s, a frame 0.02 s, a gaze 0.01 s, 1 m/s, turns for
 nothing; or, with `--clock wall`, what all of this takes on this machine, which then has nothing
 else to do, and the poses of every flight are kept beside the table. Whoever does not look or plan
-on the way flies as published. What is done in `--work` is not done again, and what differs in its
+on the way flies as published. With `--budget views` the views that a policy chose are counted, and
+frames on the way come on top. What is done in `--work` is not done again, and what differs in its
 training only is not flown again.
 """
 
@@ -199,6 +201,9 @@ class Options(SuiteOptions):
     rows: tuple[str, ...] = ()
     """Rows of it other than all; `--policies` leaves those of others out, too."""
 
+    budget: Literal["seconds", "views"] = "seconds"
+    """What `--snapshots` count: seconds of the mission, or views that the policy chose."""
+
     clock: ClockName = "model"
     """`model`: the same run on every machine, whatever else it does. `wall`: measured."""
 
@@ -206,7 +211,7 @@ class Options(SuiteOptions):
 def main(options: Options) -> Path:
     """Runs what is left of the cells, writes the page, and returns the folder of the results."""
     rows = rows_of(options)
-    root = options.work / f"{options.size}-seconds"
+    root = options.work / f"{options.size}-{options.budget}"
     root.mkdir(parents=True, exist_ok=True)
     cells = {label: cells_of(options, row, root) for label, row in rows.items()}
     run_in_turn([cell for own in cells.values() for cell in own], root, options)
@@ -218,9 +223,10 @@ def main(options: Options) -> Path:
         if record["snapshot"] in own[0].conditions.snapshots
     ]
     folder = options.out / NAME / options.size
-    write_page(folder, options.table, rows, records, origin(f"experiments.{NAME}", records))
+    name = options.table if options.budget == "seconds" else f"{options.table}_by_views"
+    write_page(folder, name, rows, records, origin(f"experiments.{NAME}", records))
     if options.clock == "wall":
-        write_submissions(folder / f"{options.table}_flights", cells, root)
+        write_submissions(folder / f"{name}_flights", cells, root)
     print(f"results  {folder}")
     return folder
 
@@ -247,7 +253,7 @@ def rows_of(options: Options) -> dict[str, Row]:
 
 def cells_of(options: Options, row: Row, root: Path) -> list[Cell]:
     """A row's cells: every scene and seed."""
-    request = request_of(replace(options, policies=(row.policy,)), "seconds")
+    request = request_of(replace(options, policies=(row.policy,)), options.budget)
     conditions = replace(
         request.conditions, clock=options.clock, loop=dict(row.loop), **row.training
     )
@@ -291,7 +297,7 @@ def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> d
 
 
 def write_page(
-    folder: Path, table: TableName, rows: Mapping[str, Row], records: Records, source: Origin
+    folder: Path, name: str, rows: Mapping[str, Row], records: Records, source: Origin
 ) -> None:
     """Writes a table for every snapshot, and the differences from the rows' references."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -304,18 +310,23 @@ def write_page(
         for training in trainings.values():
             check_equal_terms([r for r in now if rows[r["policy"]].training == training])
         lines = quality_rows(rows, now)
-        write_csv(folder / f"{table}_{snapshot.replace(':', '_')}.csv", lines, source)
+        write_csv(folder / f"{name}_{snapshot.replace(':', '_')}.csv", lines, source)
         page += [
-            f"**After {snapshot.partition(':')[2]} s**: PSNR in dB, in brackets the 5th percentile "
+            f"**After {_amount(snapshot)}**: PSNR in dB, in brackets the 5th percentile "
             "of the test views, then frames, means over seeds; and PSNR minus that of another row "
             "on the same test views, with its interval of 95 %",
             markdown_table(lines),
         ]
     # Models of other trainings are no points of one curve, and two points are none at all.
     if len(trainings) == 1 and len(rows) * len(snapshots_of(records)) > 2:
-        write_figure(folder / f"{table}_by_frames.png", frames_figure(records), source)
-        page.append(f"![PSNR against the number of frames]({table}_by_frames.png)")
-    write_markdown(folder / f"{table}.md", page, source)
+        write_figure(folder / f"{name}_by_frames.png", frames_figure(records), source)
+        page.append(f"![PSNR against the number of frames]({name}_by_frames.png)")
+    write_markdown(folder / f"{name}.md", page, source)
+
+
+def _amount(snapshot: str) -> str:
+    unit, _, number = snapshot.partition(":")
+    return f"{number} {'s' if unit == 'seconds' else unit}"
 
 
 def write_submissions(folder: Path, cells: Mapping[str, Sequence[Cell]], root: Path) -> None:

@@ -132,6 +132,37 @@ def test_a_table_holds_the_times_that_were_asked_for(tmp_path, monkeypatch):
     assert written[0]["policy"] == "blend"
 
 
+def test_a_table_counts_views_where_they_are_the_budget(tmp_path, monkeypatch):
+    """The cells that are run stop after so many views, and page and files say so."""
+    asked, pages = [], []
+    monkeypatch.setattr(captures, "run_in_turn", lambda cells, root, options: asked.extend(cells))
+    monkeypatch.setattr(
+        captures,
+        "read_records",
+        lambda root, cells: [
+            record("", 0, [10.0, 20.0], 95, snapshot="views:30", sensing={}, training={})
+        ],
+    )
+    monkeypatch.setattr(captures, "check_equal_terms", lambda records: None)
+    monkeypatch.setattr(
+        captures, "origin", lambda name, records: Origin("a command", "none", "abc")
+    )
+    monkeypatch.setattr(captures, "write_submissions", lambda *given: pages.append(given))
+    options = Options(
+        table="gaze", rows=("blend",), size="small", scenes=("flat",), seeds=(3,),
+        budget="views", snapshots=(30,), work=tmp_path / "work", out=tmp_path / "out",
+    )  # fmt: skip
+    folder = captures.main(options)
+    (cell,) = asked
+    assert (cell.conditions.budget, cell.conditions.clock) == ("views:30", "model")
+    assert cell.conditions.loop["capture_every"] == 0.3
+    assert {path.name for path in folder.iterdir()} == {
+        "gaze_by_views.md", "gaze_by_views_views_30.csv",
+    }  # fmt: skip
+    assert "**After 30 views**" in (folder / "gaze_by_views.md").read_text()
+    assert not pages  # the model's clock flies the same on every machine
+
+
 def test_what_was_flown_is_written_beside_a_table_of_the_wall_clock(tmp_path, monkeypatch):
     """One file for each row, scene and seed: that cell's run, called as its row."""
     cells = {
