@@ -47,7 +47,7 @@ from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import motion_of
 from r3jax.trace.images import frame_hash, stored_form
-from r3jax.trace.rows import Choice, StepRow, make_choice
+from r3jax.trace.rows import Choice, Coverage, StepRow, make_choice
 
 _LEAST_EXTENT = 1.0
 """Smaller worlds have no place with half a meter free all round [m]."""
@@ -403,7 +403,20 @@ def _look(
         arrival_renderability=arrival,
         num_probes=mission.config.num_probes,
     )
-    row = StepRow(
+    row = _row(state, frame, shot, charged, coverage)
+    stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
+    return state, TakenView(row, frame, stages, shot.decision)
+
+
+def _row(
+    state: LoopState,
+    frame: Frame,
+    shot: _Shot,
+    charged: dict[str, float],
+    coverage: Coverage,
+) -> StepRow:
+    """What the trace says of a frame, given the state after it."""
+    return StepRow(
         step=state.views - 1,
         # The frame's float32, not what was asked for: a replay has no other pose.
         pose=np.asarray(frame.T_world_camera),
@@ -417,8 +430,6 @@ def _look(
         captured=shot.captured,
         hidden=0.0 if shot.leg is None or shot.leg.taken else shot.leg.hidden,
     )
-    stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
-    return state, TakenView(row, frame, stages, shot.decision)
 
 
 def relive(

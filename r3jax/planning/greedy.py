@@ -245,13 +245,7 @@ class GreedyPolicy(ABC):
             utilities = utilities | {"path": path}
         if self.climbs and self.config.refine:
             with stopwatch.part("refining"):
-                first = (utilities["utility"], utilities["path"])
-                # The sums stay those of the candidates as drawn: a view that rises must not
-                # lower the others' shares.
-                weigh = partial(net_utility, lambda2=self.config.lambda2, among=first)
-                candidates, utilities = refine_best(
-                    situation, candidates, utilities, self.config, weigh
-                )
+                candidates, utilities = self._climb(situation, candidates, utilities)
         # Last, so that views that have climbed compete with their new utility and path.
         utilities = utilities | {"total": self.weigh(utilities)}
         best, decision, state, info = select_best(
@@ -259,6 +253,16 @@ class GreedyPolicy(ABC):
         )
         memory = self.conclude(situation, candidates, utilities, best)
         return decision, replace(state, memory=memory), info
+
+    def _climb(
+        self, situation: Situation, candidates: Candidates, utilities: dict[str, np.ndarray]
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+        """The best candidates where climbing has brought them, and what they are worth there."""
+        # The sums stay those of the candidates as drawn: a view that rises must not lower the
+        # others' shares.
+        first = (utilities["utility"], utilities["path"])
+        weigh = partial(net_utility, lambda2=self.config.lambda2, among=first)
+        return refine_best(situation, candidates, utilities, self.config, weigh)
 
     def _limits(self, T_world_camera: np.ndarray, travel: Travel) -> Limits:
         """What the robot may do next from a pose [4, 4]."""

@@ -1,10 +1,11 @@
 """The figures of a run. Each function makes one `matplotlib` figure from what was recorded."""
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
@@ -16,7 +17,7 @@ from r3jax.apps.report.summary import map_row_bytes, stage_times
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.reader import Run
-from r3jax.trace.rows import path_between
+from r3jax.trace.rows import StepRow, path_between
 
 _DOT, _CAPTURED_DOT = 26, 8
 """Areas of the marks of views, and of frames that were captured on the way [pt^2]."""
@@ -64,49 +65,14 @@ def progress_figure(run: Run) -> Figure:
 def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
     """The place from above, with the path colored by acquisition order."""
     positions = np.array([row.pose[:3, 3] for row in run.rows])
-    forward = np.array([row.pose[:3, 2] for row in run.rows])
     picture, extent = floor_picture(map_state, grid, float(np.median(positions[:, 2])))
     width, height = extent[1] - extent[0], extent[3] - extent[2]
     figure = style.new_figure(9.0, float(np.clip(9.0 * height / width, 4.0, 12.0)))
     axes = style.dress(figure.subplots(), x="x [m]", y="y [m]")
     axes.grid(visible=False)
     axes.imshow(picture, origin="lower", extent=extent, interpolation="nearest")
-    order = np.arange(len(run.rows))
-    segments: list[np.ndarray] = []
-    colors: list[int] = []
-    for before, row in itertools.pairwise(run.rows):
-        if row.choice is not None or before.captured:  # else another run of a merged one begins
-            segments.append(path_between(before, row)[:, :2])
-            colors.append(row.step)
-    span = (0, max(1, len(order) - 1))
-    edge = LineCollection(segments, linewidths=4.0, colors="white", capstyle="round")
-    lines = LineCollection(segments, linewidths=2.0, cmap=style.PATH_MAP, capstyle="round")
-    lines.set_array(np.asarray(colors, dtype=float))
-    lines.set_clim(*span)
-    axes.add_collection(edge)
-    axes.add_collection(lines)
-    axes.quiver(
-        *(positions[:, :2].T),
-        *(forward[:, :2].T),
-        order,
-        cmap=style.PATH_MAP,
-        clim=span,
-        angles="xy",
-        scale_units="xy",
-        scale=3.0,
-        width=0.0028,
-    )
-    dots = axes.scatter(
-        *positions[:, :2].T,
-        c=order,
-        cmap=style.PATH_MAP,
-        vmin=span[0],
-        vmax=span[1],
-        s=[_CAPTURED_DOT if row.captured else _DOT for row in run.rows],
-        edgecolors="white",
-        linewidths=0.8,
-        zorder=3,
-    )
+    _draw_path(axes, run.rows)
+    dots = _draw_views(axes, run.rows)
     for place, text, offset in (
         (positions[0], "start", (-34, -16)),
         (positions[-1], "end", (8, 8)),
@@ -126,6 +92,58 @@ def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, colors=style.MUTED)
     return figure
+
+
+def _draw_path(axes: Axes, rows: Sequence[StepRow]) -> None:
+    """Draws the paths from view to view in the order of acquisition."""
+    segments: list[np.ndarray] = []
+    colors: list[int] = []
+    for before, row in itertools.pairwise(rows):
+        if row.choice is not None or before.captured:  # else another run of a merged one begins
+            segments.append(path_between(before, row)[:, :2])
+            colors.append(row.step)
+    edge = LineCollection(segments, linewidths=4.0, colors="white", capstyle="round")
+    lines = LineCollection(segments, linewidths=2.0, cmap=style.PATH_MAP, capstyle="round")
+    lines.set_array(np.asarray(colors, dtype=float))
+    lines.set_clim(*_span(rows))
+    axes.add_collection(edge)
+    axes.add_collection(lines)
+
+
+def _draw_views(axes: Axes, rows: Sequence[StepRow]) -> PathCollection:
+    """Draws where frames were taken, smaller on the way, and where the camera looked."""
+    x, y, _ = np.array([row.pose[:3, 3] for row in rows]).T
+    u, v, _ = np.array([row.pose[:3, 2] for row in rows]).T
+    order, (low, high) = np.arange(len(rows)), _span(rows)
+    axes.quiver(
+        x,
+        y,
+        u,
+        v,
+        order,
+        cmap=style.PATH_MAP,
+        clim=(low, high),
+        angles="xy",
+        scale_units="xy",
+        scale=3.0,
+        width=0.0028,
+    )
+    return axes.scatter(
+        x,
+        y,
+        c=order,
+        cmap=style.PATH_MAP,
+        vmin=low,
+        vmax=high,
+        s=[_CAPTURED_DOT if row.captured else _DOT for row in rows],
+        edgecolors="white",
+        linewidths=0.8,
+        zorder=3,
+    )
+
+
+def _span(rows: Sequence[StepRow]) -> tuple[int, int]:
+    return 0, max(1, len(rows) - 1)
 
 
 def panorama_figure(picture: PanoramaPicture) -> Figure:
