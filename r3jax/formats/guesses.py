@@ -6,6 +6,8 @@ from pathlib import Path
 
 from r3jax.formats.errors import FormatError
 from r3jax.formats.phones.archives import SUFFIXES, open_zip
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_database
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff")
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi")
@@ -47,10 +49,7 @@ def _names(path: Path) -> list[str]:
 def _of_archive(path: Path) -> str | None:
     """A zip archive or database that is damaged, or of something else."""
     if path.suffix.lower() == ".db":
-        return (
-            "this is no database of RTAB-Map: of COLMAP give the folder of a model (colmap mapper "
-            f"--database_path {path} --image_path IMAGES --output_path OUT)"
-        )
+        return _of_database(path)
     if path.suffix.lower() not in SUFFIXES:
         return None
     try:
@@ -66,6 +65,17 @@ def _of_archive(path: Path) -> str | None:
         if sentence is not None:
             return f"unpack this archive first; {sentence}"
     return "this archive holds no capture that is known: unpack it and give the folder"
+
+
+def _of_database(path: Path) -> str:
+    try:
+        check_database(path)
+    except ForeignFileError as error:
+        return f"{error}: copy it again"
+    return (
+        "this is no database of RTAB-Map: of COLMAP give the folder of a model (colmap mapper "
+        f"--database_path {path} --image_path IMAGES --output_path OUT)"
+    )
 
 
 def _bags(path: Path, names: list[str]) -> str | None:

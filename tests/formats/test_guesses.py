@@ -1,6 +1,7 @@
 """Folders that are no capture: what they most likely are, and the command that converts them."""
 
 import sqlite3
+from contextlib import closing
 
 import pytest
 
@@ -91,7 +92,7 @@ def test_a_file_that_is_no_capture_says_what_to_do(tmp_path, name, message):
 
 
 def test_a_database_of_colmap_says_what_to_do(tmp_path):
-    with sqlite3.connect(tmp_path / "database.db") as connection:
+    with closing(sqlite3.connect(tmp_path / "database.db")) as connection:
         connection.execute("CREATE TABLE cameras (camera_id INTEGER)")
     with pytest.raises(FormatError, match="no database of RTAB-Map: of COLMAP give the folder of"):
         open_capture(tmp_path / "database.db")

@@ -112,6 +112,15 @@ def test_a_database_that_lacks_something_says_so(tmp_path, damage):
     assert str(path) in str(found.value)
 
 
+def test_a_database_that_was_copied_in_part_says_so(tmp_path):
+    path = tmp_path / "map.db"
+    whole = rtabmap.database()
+    for lost in (1, 1000, len(whole) // 2):
+        path.write_bytes(whole[:-lost])
+        with pytest.raises(FormatError, match=r"the database is cut off: .* copy it again"):
+            open_capture(path)
+
+
 def test_rvl_comes_back_and_damage_is_refused():
     rng = np.random.default_rng(0)
     steps = rng.integers(0, 65_536, (17, 23)).astype(np.uint16)

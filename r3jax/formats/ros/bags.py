@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.ros.unpack import unpack_chunk
-from r3jax.formats.validation.files import check_regular
+from r3jax.formats.validation.files import check_database, check_regular
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Files of ROS 1, and of ROS 2's two storages."""
@@ -84,10 +84,14 @@ class Bag:
         """
         highlevel, typesys = _load_rosbags(path)
         self.path = path
-        for file in [path] if path.is_file() else list(path.iterdir()):
+        files = [path] if path.is_file() else list(path.iterdir())
+        for file in files:
             with naming(file):
                 check_regular(file)
         with self._reading("opened"):
+            for file in files:
+                if file.suffix.lower() == ".db3":
+                    check_database(file)
             # Bags of ROS 2 before Iron do not say what their messages look like.
             default = typesys.get_typestore(typesys.Stores.LATEST)
             self._reader: Any = highlevel.AnyReader([_BagPath(path)], default_typestore=default)

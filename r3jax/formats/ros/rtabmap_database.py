@@ -34,7 +34,7 @@ from r3jax.formats.ros.messages import clean_depth, rectified_lens
 from r3jax.formats.ros.rtabmap_export import COMMAND
 from r3jax.formats.ros.rvl import unpack_rvl
 from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import check_regular
+from r3jax.formats.validation.files import check_database
 from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size
 
 _HEADER = 11
@@ -123,7 +123,7 @@ def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
         FormatError: missing, no database, damaged, or without such tables.
     """
     with naming(path):
-        check_regular(path)
+        check_database(path)
         try:
             name = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
             with closing(sqlite3.connect(name, uri=True)) as connection:

@@ -147,5 +147,6 @@ def test_a_command_that_is_none_is_refused(command, says):
         ("exec:/usr/bin/python3.11 mine.py", "mine"),
     ],
 )
-def test_a_command_has_a_short_name(name, short):
+def test_a_command_has_a_short_name(name, short, monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda program: program)  # wherever Python may be
     assert short_name(name) == short
