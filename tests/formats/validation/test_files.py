@@ -1,4 +1,4 @@
-"""Only regular files within a limit are opened."""
+"""Only regular files within a limit are opened, and databases only if they are whole."""
 
 import os
 import sqlite3
