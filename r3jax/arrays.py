@@ -110,14 +110,14 @@ def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float
     if metres_per_step is None:
         if is_whole:
             raise ValueError(
-                f"depth is {array.dtype}: say how many metres one step is, depth_scale=0.001 for "
+                f"depth is {array.dtype}: say how many meters one step is, depth_scale=0.001 for "
                 "millimeters"
             )
         return jnp.asarray(_float32(array))
     scale = float(metres_per_step)
     if not 0.0 < scale < np.inf or (is_whole and scale >= 1.0):
         raise ValueError(
-            "depth_scale is how many metres one step of the depth is, such as 0.001 for "
+            "depth_scale is how many meters one step of the depth is, such as 0.001 for "
             f"millimeters, got {scale:g}"
         )
     if isinstance(array, np.ndarray):

@@ -169,7 +169,7 @@ class Frame(eqx.Module):
             if not jnp.issubdtype(array.dtype, jnp.floating):
                 raise ValueError(
                     f"{name} must be float32, got {array.dtype}: convert it first "
-                    "(8-bit color / 255, depth to metres)"
+                    "(8-bit color / 255, depth to meters)"
                 )
 
     def _check_values(self) -> None:

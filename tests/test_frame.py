@@ -56,7 +56,7 @@ BAD = {
     "float depth in mm": ({"depth": np.full((6, 8), 2e3)}, r"median depth is 2000 m.*millimeters"),
     "another camera": ({"camera": Camera.from_fov(16, 12)}, "camera's image is"),
     "uint8 image": ({"rgb": np.zeros((6, 8, 3), np.uint8)}, "rgb must be float32, got uint8.*255"),
-    "depth in mm": ({"depth": np.full((6, 8), 900, np.uint16)}, "depth must be float32.*metres"),
+    "depth in mm": ({"depth": np.full((6, 8), 900, np.uint16)}, "depth must be float32.*meters"),
     "rgb above 1": (with_value("rgb", (1, 2, 0), 255.0), r"rgb must lie in \[0, 1\].* to 255"),
     "rgb below 0": (with_value("rgb", (1, 2, 0), -0.1), r"rgb must lie in \[0, 1\].* from -0.1"),
     "rgb NaN": (with_value("rgb", (1, 2, 0), np.nan), r"rgb must lie in \[0, 1\].* nan"),

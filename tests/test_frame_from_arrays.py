@@ -89,7 +89,7 @@ def test_a_matrix_projects_as_in_opencv(row, column, z):
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("kind", [np.asarray, Foreign])
-def test_floats_are_colors_from_0_to_1_and_metres(dtype, kind):
+def test_floats_are_colors_from_0_to_1_and_meters(dtype, kind):
     rgb, depth = (RGB / 255).astype(dtype), (STEPS / 1000).astype(dtype)
     frame = Frame.from_arrays(kind(rgb), kind(depth), POSE, CAMERA)
     np.testing.assert_array_equal(frame.rgb, rgb.astype(np.float32))
@@ -149,10 +149,10 @@ BAD = {
     "no columns": ({"rgb": RGB[:, :0], "camera": K}, r"no pixels: its shape is \(6, 0, 3\)"),
     "depth of another size": ({"depth": STEPS[:3]}, r"depth has shape \(3, 8\)"),
     "depth with a channel": ({"depth": STEPS[..., None]}, r"depth has shape \(6, 8, 1\)"),
-    "steps without unit": ({"depth_scale": None}, "depth is uint16: say how many metres one step"),
-    "steps per metre": ({"depth_scale": 1000}, "how many metres one step .* got 1000"),
-    "unit zero": ({"depth_scale": 0.0}, "how many metres one step .* got 0"),
-    "unit NaN": ({"depth_scale": np.nan}, "how many metres one step .* got nan"),
+    "steps without unit": ({"depth_scale": None}, "depth is uint16: say how many meters one step"),
+    "steps per meter": ({"depth_scale": 1000}, "how many meters one step .* got 1000"),
+    "unit zero": ({"depth_scale": 0.0}, "how many meters one step .* got 0"),
+    "unit NaN": ({"depth_scale": np.nan}, "how many meters one step .* got nan"),
     "depth true and false": ({"depth": STEPS > 0}, "depth must be numbers, got bool"),
     "depth NaN": ({"depth": np.where(STEPS > 0, 1.0, np.nan)}, "depth must be >= 0 and not NaN"),
     "depth negative": ({"depth": -1 - STEPS.astype(np.int32)}, "depth must be >= 0"),

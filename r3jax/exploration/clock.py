@@ -83,7 +83,8 @@ class _Compilations:
             self.count += 1
 
 
-_compilations = _Compilations()
+compilations = _Compilations()
+"""Of this process, so far."""
 
 
 def timed(
@@ -106,9 +107,9 @@ def timed(
         The result, ready, and the seconds it took.
     """
     # Events, not a warm-up call: a table of the map that grows compiles anew in mid-mission.
-    before = _compilations.count
+    before = compilations.count
     result, seconds = _measure(function, *args, **kwargs)
-    if repeat_compiled and _compilations.count > before:
+    if repeat_compiled and compilations.count > before:
         result, seconds = _measure(function, *args, **kwargs)
     return result, seconds
 

@@ -108,7 +108,7 @@ def check_world(bounds: np.ndarray, cell_size: float) -> None:
         ValueError: says what is odd, and which scale would mend it.
     """
     extent = np.ptp(np.asarray(bounds, np.float64), axis=0)
-    size = f"the world is {' x '.join(f'{length:.3g}' for length in extent)} m large"
+    size = f"the world is {' x '.join(f'{length:.6g}' for length in extent)} m large"
     units = {0.001: "millimeters", 0.01: "centimeters", 1000.0: "kilometers"}
     hints = [
         f"; if its mesh is in {unit}, give --scale {scale:g}"

@@ -127,7 +127,7 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
     box = np.asarray(bounds, dtype=np.float64)
     if box.shape != (2, 3) or not np.all(np.isfinite(box)) or not np.all(box[1] > box[0]):
         raise ValueError(
-            "bounds are a lower and an upper corner, [2, 3] in metres, finite, each upper value "
+            "bounds are a lower and an upper corner, [2, 3] in meters, finite, each upper value "
             f"above the lower one; got {box.tolist()}"
         )
     if not (math.isfinite(cell_size) and cell_size > 0.0):
@@ -138,7 +138,7 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
     if float(np.prod(cells)) > MAX_CELLS:
         raise ValueError(
             f"bounds {box.tolist()} at {cell_size} m make {np.prod(cells):.3g} cells, more than "
-            f"{MAX_CELLS:.0e}: are the bounds in metres?"
+            f"{MAX_CELLS:.0e}: are the bounds in meters?"
         )
     return OccupancyGrid(
         log_odds=jnp.zeros(tuple(int(c) for c in cells), dtype=jnp.float32),

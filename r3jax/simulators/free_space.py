@@ -235,7 +235,7 @@ def _nodes(bounds: np.ndarray, spacing: np.ndarray, margin: float) -> _Nodes:
     if math.prod(shape) > _MAX_NODES:
         raise ValueError(
             f"the world extends {np.round(bounds[1] - bounds[0], 1).tolist()} m: its free space "
-            f"needs {math.prod(shape):.2g} nodes, over {_MAX_NODES:.0g}; is the unit metres? "
+            f"needs {math.prod(shape):.2g} nodes, over {_MAX_NODES:.0g}; is the unit meters? "
             "Otherwise cut the mesh"
         )
     picks = [slice(b, None, f) for b, f in zip(before.tolist(), finer.tolist(), strict=True)]

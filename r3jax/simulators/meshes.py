@@ -104,7 +104,7 @@ def scaled_turn(path: Path, up: str | None, scale: Any) -> np.ndarray:
         ValueError: `up` is no axis, or `scale` no positive number.
     """
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0.0 < scale < math.inf:
-        raise ValueError(f"scale must be a number > 0, the metres in a unit, got {scale!r}")
+        raise ValueError(f"scale must be a number > 0, the meters in a unit, got {scale!r}")
     return scale * world_from_file(path, up)
 
 
@@ -257,6 +257,6 @@ def _check(path: Path, world: World) -> None:
         )
     if extent.max() > _MAX_EXTENT:
         raise ValueError(
-            f"{path} extends {extent.max():.3g} m; the unit is metres: scale the mesh first, with "
+            f"{path} extends {extent.max():.6g} m; the unit is meters: scale the mesh first, with "
             "--scale 0.001 if it is in millimeters"
         )

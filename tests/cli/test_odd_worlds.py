@@ -40,7 +40,7 @@ ODD = {
     "plane": (plane, "6 x 4 x 0 m large: it is flat"),
     "millimeters": (
         lambda: house(1000.0),
-        r"1e\+04 x 8e\+03 x 3e\+03 m large: .* cells of 0.2 m.*in millimeters, give --scale 0.001",
+        r"10000 x 8000 x 3000 m large: .* cells of 0.2 m.*in millimeters, give --scale 0.001",
     ),
     "centimeters": (lambda: house(100.0), "in centimeters, give --scale 0.01"),
     "countries": (lambda: house(9e3), "is in millimeters"),

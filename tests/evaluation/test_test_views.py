@@ -95,7 +95,7 @@ GOLDEN = "c65d47a8609320c09a79fafe888c42e750d09174d43d658770b49ac7cce47060"
 
 
 @given(st.integers(0, 89), st.integers(0, 2), st.sampled_from([-1e-4, 1e-4]))
-def test_the_hash_knows_a_tenth_of_a_millimetre(view, axis, shift):
+def test_the_hash_knows_a_tenth_of_a_millimeter(view, axis, shift):
     views = compute_view_set(Toy(), max_views=120)
     fields = {name: getattr(views, name) for name in ViewSet.__dataclass_fields__}
     moved, noisy = views.positions.copy(), views.positions.copy()

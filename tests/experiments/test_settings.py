@@ -11,7 +11,7 @@ from r3jax.apps.benchmark.cells import Cell, paths_of
 from r3jax.apps.benchmark.conditions import Conditions
 from r3jax.apps.benchmark.record import read_records
 from r3jax.apps.benchmark.run_cell import run_cell
-from r3jax.exploration.clock import _compilations
+from r3jax.exploration.clock import compilations
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
@@ -130,10 +130,10 @@ def test_a_sweep_over_numbers_compiles_once(name):
 
     first = decide(scoring_of_lambda1=1.0)
     decide(scoring_of_lambda1=16.0)  # what is compiled a step later, too
-    before = _compilations.count
+    before = compilations.count
     others = [decide(scoring_of_lambda1=x, lambda2=y) for x, y in [(4.0, 0.1), (999.5, 0.0)]]
     decide(radius=0.8, scoring_of_tolerance=1.0, scoring_of_max_range=3.0)
-    assert _compilations.count == before
+    assert compilations.count == before
     utility = [d.utilities["utility"] for d in (first, *others)]
     assert np.all(utility[2] > utility[1])
     assert np.all(utility[1] > utility[0])

@@ -158,7 +158,7 @@ def test_exported_poses_without_cameras_say_what_to_give(folder):
         read_transforms(folder)
 
 
-def test_depth_is_in_millimetres_unless_the_file_says_otherwise(folder):
+def test_depth_is_in_millimeters_unless_the_file_says_otherwise(folder):
     steps = np.arange(20, dtype=np.uint16).reshape(4, 5)  # half the image's size
     Image.fromarray(steps).save(folder / "depth.png")
     images = read_transforms(written(folder, **{"0.depth_file_path": "depth.png"}))

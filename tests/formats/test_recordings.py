@@ -46,7 +46,7 @@ def folder(tmp_path):
     return path
 
 
-def test_pixels_metres_and_intrinsics(folder):
+def test_pixels_meters_and_intrinsics(folder):
     recording = read_recording(folder)
     assert len(recording) == 3
     frame = recording.frame(1)

@@ -10,6 +10,7 @@ import pytest
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
 from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.ros.rtabmap_database import read_rtabmap_database
 from r3jax.formats.ros.rvl import unpack_rvl
 from r3jax.formats.validation.errors import ForeignFileError
 from tests.formats import rtabmap
@@ -119,6 +120,18 @@ def test_a_database_that_was_copied_in_part_says_so(tmp_path):
         path.write_bytes(whole[:-lost])
         with pytest.raises(FormatError, match=r"the database is cut off: .* copy it again"):
             open_capture(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"SQLite format 3\0", b"x" * 200, b"SQLite format 3\0" * 20]
+)
+def test_what_is_no_database_says_so(tmp_path, content):
+    path = tmp_path / "map.db"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match=r"map\.db: this is no database of RTAB-Map"):
+        open_capture(path)
+    with pytest.raises(FormatError, match=r"map\.db: this database cannot be read"):
+        read_rtabmap_database(path)
 
 
 def test_rvl_comes_back_and_damage_is_refused():

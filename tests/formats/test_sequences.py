@@ -1,4 +1,4 @@
-"""Replica-SLAM, TUM and 7-Scenes: pixels, metres, poses and intrinsics as their pages say."""
+"""Replica-SLAM, TUM and 7-Scenes: pixels, meters, poses and intrinsics as their pages say."""
 
 import io
 import json

@@ -146,7 +146,7 @@ def test_full_map_counts_what_it_drops():
     assert len(rows) == 8
 
 
-def test_resolution_of_a_scanner_is_points_per_metre():
+def test_resolution_of_a_scanner_is_points_per_meter():
     """Rays one step apart hit a sphere round the scanner as far apart as the resolution says."""
     step, distance = np.deg2rad(0.5), 2.0
     azimuth = step * (np.arange(NUM_POINTS) - 0.5 * NUM_POINTS)

@@ -45,7 +45,7 @@ def law_by_hand(modules: Modules) -> None:
     taken = taken_of(poses_along(np.array([0 * X, 4 * X]), np.array([X, Y])), module=module)
     cases = [
         (0 * X, X, 0.0),  # taken already
-        (0 * X, Y, 1.0),  # a quarter turn is a metre
+        (0 * X, Y, 1.0),  # a quarter turn is a meter
         (0 * X, -X, 2.0),
         (0 * X, X + Y, 0.5),
         (X, X, 1.0),

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r3jax.exploration.clock import _compilations
+from r3jax.exploration.clock import compilations
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.rivals import births
 from r3jax.rivals.births import grown, kept_rows, one_per_voxel, turned_to
@@ -88,12 +88,12 @@ def test_frames_compile_nothing_once_the_first_are_in():
     online = empty_online_map(frames[0].camera, settings, KEY)
     before = []
     for frame in frames:
-        before.append(_compilations.count)
+        before.append(compilations.count)
         online = add_frame(online, frame, 5.0, settings)
     assert online.scene.capacity == FIRST_CAPACITY
     assert before[1] > before[0]
     # Each frame has births, drawn frames and rows of its own.
-    assert _compilations.count == before[3]
+    assert compilations.count == before[3]
 
 
 def test_a_batch_is_the_latest_frames_and_earlier_ones_by_their_error():

@@ -211,7 +211,7 @@ def test_a_scan_without_a_ceiling_keeps_its_positions():
 
 
 def test_a_closed_cupboard_is_not_free_inside():
-    cupboard = ((2.5, 0.5, 0.0), (4.5, 2.5, 2.0))  # 2 m wide: its middle is a metre from any side
+    cupboard = ((2.5, 0.5, 0.0), (4.5, 2.5, 2.0))  # 2 m wide: its middle is a meter from any side
     quads = box_quads((0, 0, 0), ROOM, inward=True) + box_quads(*cupboard, inward=False)
     found = truth_of(quads).free_positions(SPACING, 0.3)
     assert len(found) > 10
@@ -248,7 +248,7 @@ def test_bad_settings_are_refused(spacing, margin, words):
 
 def test_a_world_too_large_is_refused():
     quads = [*furnished([]), quad((0, 0, -1.0), x=3000, y=3000)]
-    with pytest.raises(ValueError, match="is the unit metres"):
+    with pytest.raises(ValueError, match="is the unit meters"):
         truth_of(quads).free_positions(SPACING, 0.3)
 
 

@@ -14,7 +14,7 @@ from tests.simulators.rooms import facing_x
 
 CAMERA = Camera.from_fov(64, 64, 60.0)
 COLUMNS, ROWS = 6, 5
-"""Quads along y and z, a metre each; the wall spans y from -3 to 3 and z from -2.5 to 2.5."""
+"""Quads along y and z, a meter each; the wall spans y from -3 to 3 and z from -2.5 to 2.5."""
 
 
 def color_at(y, z):

@@ -164,7 +164,7 @@ def _at_start(step: _Step, start: np.ndarray, seed: int) -> Iterator[str]:
     if step.frame.captured:
         yield "it is captured on the way from nowhere: leave `captured` out"
     if step.frame.metres:
-        yield f"it comes after {step.frame.metres:g} metres: the path begins here"
+        yield f"it comes after {step.frame.metres:g} m: the path begins here"
 
 
 def _in_budget(step: _Step, terms: _Terms) -> Iterator[str]:

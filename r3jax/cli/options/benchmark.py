@@ -86,7 +86,7 @@ class MeshOptions:
     (--photos) y by default."""
 
     scale: float = 1.0
-    """Metres in a unit of the mesh files: 0.001 for files in millimeters."""
+    """Meters in a unit of the mesh files: 0.001 for files in millimeters."""
 
     cull_backfaces: bool = False
     """Look through faces seen from behind, as Habitat-Sim always does."""

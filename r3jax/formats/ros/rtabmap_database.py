@@ -76,6 +76,8 @@ def read_rtabmap_database(path: Path | str) -> PosedImages:
             no node with an image, depth, a camera and a pose.
     """
     path = Path(path)
+    with naming(path):
+        check_database(path)
     rows = _query(path, _NODES)
     columns = {row[1] for row in _query(path, "PRAGMA table_info(Data)")}
     has_confidence = "depth_confidence" in columns
@@ -123,7 +125,6 @@ def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
         FormatError: missing, no database, damaged, or without such tables.
     """
     with naming(path):
-        check_database(path)
         try:
             name = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
             with closing(sqlite3.connect(name, uri=True)) as connection:

@@ -114,7 +114,7 @@ class RaycastSimulator:
         if self._start is None:
             raise ValueError(
                 f"{self.world.name}: found no place with {start.PROMISED_CLEARANCE} m free all "
-                "round to start from; is the scale metres and the up axis right? Otherwise give "
+                "round to start from; is the scale meters and the up axis right? Otherwise give "
                 "a start_pose"
             )
         return self._start.copy()

@@ -327,13 +327,13 @@ def test_a_capture_without_any_depth_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("depth", "range_in_metres"), [(3.0, 5.0), (20.0, 20.0), (0.5, 1.25), (4.9, 5.0)]
+    ("depth", "range_in_meters"), [(3.0, 5.0), (20.0, 20.0), (0.5, 1.25), (4.9, 5.0)]
 )
-def test_a_capture_of_a_rooms_size_stays_as_it_is_and_others_are_scaled(depth, range_in_metres):
+def test_a_capture_of_a_rooms_size_stays_as_it_is_and_others_are_scaled(depth, range_in_meters):
     survey = survey_of(one_picture(np.full((36, 48), depth, np.float32)), AuditSettings(up="-y"))
-    assert survey.length(5.0) == pytest.approx(range_in_metres)
-    assert survey.alignment.scale == pytest.approx(5.0 / range_in_metres)
-    assert survey.length(survey.voxel_size) >= 0.01 * range_in_metres
+    assert survey.length(5.0) == pytest.approx(range_in_meters)
+    assert survey.alignment.scale == pytest.approx(5.0 / range_in_meters)
+    assert survey.length(survey.voxel_size) >= 0.01 * range_in_meters
 
 
 def test_a_median_depth_that_no_room_has_is_refused_unless_it_is_meant():

@@ -213,7 +213,7 @@ BROKEN = {
     ),
     "meters before the start": (
         lambda s: with_frame(s, 0, metres=0.5),
-        "line 2, frame 0: it comes after 0.5 metres",
+        "line 2, frame 0: it comes after 0.5 m:",
     ),
     "through the wall": (
         lambda s: moved(s, 2, (9.0, 0.0, 0.0), seconds=1e3, metres=1e3),

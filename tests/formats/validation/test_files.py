@@ -68,9 +68,3 @@ def test_a_database_is_as_long_as_it_says(tmp_path, page):
             check_database(path)
     path.write_bytes(whole + bytes(page))  # room that the header does not count yet
     check_database(path)
-
-
-def test_what_is_no_database_is_left_to_sqlite(tmp_path):
-    for content in (b"", b"SQLite format 3\0", b"x" * 200):
-        (tmp_path / "a.db").write_bytes(content)
-        check_database(tmp_path / "a.db")

@@ -21,7 +21,7 @@ def seen(world, pose=None, **settings):
 
 
 def textured_wall(texture, repeats=1.0, size=2.0):
-    """A wall of `size` metres at x = 2; the picture stands upright for a camera at the origin."""
+    """A wall of `size` meters at x = 2; the picture stands upright for a camera at the origin."""
     quad = ((2, 0.5 * size, -0.5 * size), (0, -size, 0), (0, 0, size))  # u right, v up
     world = world_of([quad], [Material(texture=texture)])
     return dataclasses.replace(world, face_uv=world.face_uv * repeats)

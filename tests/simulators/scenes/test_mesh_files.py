@@ -265,9 +265,9 @@ def test_faces_without_area(tmp_path):
         load_world(path)
 
 
-def test_a_world_in_millimetres_of_a_city(tmp_path):
+def test_a_world_in_millimeters_of_a_city(tmp_path):
     path = saved(tmp_path, trimesh.Trimesh(CORNERS * 1e6, FACES, process=False), "a.ply")
-    with pytest.raises(ValueError, match="unit is metres"):
+    with pytest.raises(ValueError, match="unit is meters"):
         load_world(path)
 
 
