@@ -374,6 +374,9 @@ def quality_rows(rows: Mapping[str, Row], records: Records) -> list[dict[str, st
             low = float(np.mean(np.percentile(values, 5, axis=1)))
             line[scene] = f"{values.mean():.2f} [{low:.1f}] / {np.mean(frames):.0f}"
         line["mean"] = f"{np.mean([values.mean() for values in mine.values()]):.2f}"
+        by_seed = np.mean([values.mean(axis=1) for values in mine.values()], axis=0)
+        if len(by_seed) > 1:
+            line["mean by seed"] = " / ".join(f"{value:.2f}" for value in by_seed)
         line["difference"] = _difference(mine, row.against, scores, label)
         lines.append(line)
     return lines

@@ -73,11 +73,13 @@ def test_a_line_per_row_by_hand():
     ]
     blind, seeing = quality_rows(ROWS, records)
     assert blind == {
-        "row": "blind", "flat": "16.00 [11.5] / 45", "mean": "16.00", "difference": "",
+        "row": "blind", "flat": "16.00 [11.5] / 45", "mean": "16.00",
+        "mean by seed": "15.00 / 17.00", "difference": "",
     }  # fmt: skip
     assert seeing["flat"] == f"21.00 [{np.mean([18.2, 20.2]):.1f}] / 100"
     assert seeing["difference"].startswith("+5.00 [")
     assert seeing["difference"].endswith("] to blind")
+    assert "mean by seed" not in quality_rows(ROWS, [r for r in records if r["seed"] == 0])[0]
 
 
 def test_what_rows_differ_in_on_purpose_is_no_unequal_term():
