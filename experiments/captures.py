@@ -224,7 +224,8 @@ def main(options: Options) -> Path:
     ]
     folder = options.out / NAME / options.size
     name = options.table if options.budget == "seconds" else f"{options.table}_by_views"
-    write_page(folder, name, rows, records, origin(f"experiments.{NAME}", records))
+    costs = cost_rows(cells, root) if options.clock == "wall" else []
+    write_page(folder, name, rows, records, origin(f"experiments.{NAME}", records), costs)
     if options.clock == "wall":
         write_submissions(folder / f"{name}_flights", cells, root)
     print(f"results  {folder}")
@@ -296,10 +297,30 @@ def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> d
     return {**record, **parts, "policy": label, "settings": {}}
 
 
+def cost_rows(cells: Mapping[str, Sequence[Cell]], root: Path) -> list[dict[str, str]]:
+    """A line per row: what its flights were charged for, medians of all scenes and seeds [s]."""
+    lines: list[dict[str, str]] = []
+    for label, own in cells.items():
+        steps = [step for cell in own for step in read_run(paths_of(root, cell).run).rows]
+        costs = {
+            "a decision": [s.charged["planning"] + s.hidden for s in steps if s.choice is not None],
+            "a frame into the map": [step.charged["mapping"] for step in steps],
+            "a look on the way": [s.charged["gaze"] for s in steps if "gaze" in s.charged],
+        }
+        medians = {name: f"{np.median(took):.3f}" if took else "" for name, took in costs.items()}
+        lines.append({"row": label} | medians)
+    return lines
+
+
 def write_page(
-    folder: Path, name: str, rows: Mapping[str, Row], records: Records, source: Origin
+    folder: Path,
+    name: str,
+    rows: Mapping[str, Row],
+    records: Records,
+    source: Origin,
+    costs: Sequence[dict[str, str]] = (),
 ) -> None:
-    """Writes a table for every snapshot, and the differences from the rows' references."""
+    """Writes a table for every snapshot, differences from the rows' references, and costs."""
     folder.mkdir(parents=True, exist_ok=True)
     records = with_short_names(records)
     page: list[str] = []
@@ -316,6 +337,11 @@ def write_page(
             "of the test views, then frames, means over seeds; and PSNR minus that of another row "
             "on the same test views, with its interval of 95 %",
             markdown_table(lines),
+        ]
+    if costs:
+        page += [
+            "**What this took here**, medians in seconds; a decision with the part that was hidden",
+            markdown_table(costs),
         ]
     # Models of other trainings are no points of one curve, and two points are none at all.
     if len(trainings) == 1 and len(rows) * len(snapshots_of(records)) > 2:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -127,7 +128,7 @@ def test_a_table_holds_the_times_that_were_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(captures, "read_records", lambda root, cells: found)
     monkeypatch.setattr(captures, "origin", lambda name, records: None)
     monkeypatch.setattr(
-        captures, "write_page", lambda folder, table, rows, records, source: written.extend(records)
+        captures, "write_page", lambda folder, name, rows, records, *_: written.extend(records)
     )
     captures.main(Options(table="gaze", rows=("blend",), work=tmp_path, out=tmp_path))
     assert [line["snapshot"] for line in written] == ["seconds:60"]
@@ -193,6 +194,34 @@ def test_what_was_flown_is_written_beside_a_table_of_the_wall_clock(tmp_path, mo
         for scene in ("flat", "hall")
         for seed in (0, 3)
     }
+
+
+def test_costs_are_medians_over_all_flights_of_a_row(tmp_path, monkeypatch):
+    """A decision counts what the flight hid; frames on the way hold none, though charged for it."""
+
+    def step(planning, hidden, mapping, gaze=None):
+        charged = {"planning": planning or 0.0, "mapping": mapping, "flight": 9.0}
+        looked = {} if gaze is None else {"gaze": gaze}
+        choice = None if planning is None else "a decision"
+        return SimpleNamespace(choice=choice, hidden=hidden, charged=charged | looked)
+
+    flights = iter([
+        [step(None, 0.0, 0.10), step(0.3, 0.0, 0.20), step(None, 0.0, 0.30, 0.01)],
+        [step(None, 0.0, 0.40), step(0.1, 0.8, 0.50, 0.03), step(0.2, 0.1, 0.66)],
+        [step(None, 0.0, 0.05)],
+    ])  # fmt: skip
+    monkeypatch.setattr(captures, "read_run", lambda _: SimpleNamespace(rows=next(flights)))
+    cell = Cell("flat", "a", "ours", 0, Conditions(), "b", 9)
+    assert captures.cost_rows({"seeing": [cell, cell], "at once": [cell]}, tmp_path) == [
+        {
+            "row": "seeing", "a decision": "0.300", "a frame into the map": "0.350",
+            "a look on the way": "0.020",
+        },
+        {
+            "row": "at once", "a decision": "", "a frame into the map": "0.050",
+            "a look on the way": "",
+        },
+    ]  # fmt: skip
 
 
 def test_a_row_is_drawn_in_the_color_of_its_policy(monkeypatch):
