@@ -39,7 +39,7 @@ def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Fi
     (seconds, meters), each seed is a faint point too.
 
     Args:
-        cells: records of one kind of snapshot (`views:N`, `seconds:S` or `metres:M`).
+        cells: records of one kind of snapshot (`views:N`, `seconds:S` or `meters:M`).
         x: of `equal_terms.EXPLORATION`.
         y: of `equal_terms.EXPLORATION`, or a metric, then its mean over the test views.
 

@@ -20,7 +20,7 @@ REFUSED = {
     "explore --scene mesh:nowhere.glb": "no such mesh file: nowhere.glb",
     "explore --scene habitat:nowhere.glb": "no such file for Habitat: nowhere.glb",
     "explore --scene flat --policy our-pano": "did you mean ours-pano?",
-    "explore --scene flat --budget hours:1": "use views:100, seconds:300 or metres:25",
+    "explore --scene flat --budget hours:1": "use views:100, seconds:300 or meters:25",
     "explore --scene flat --until psnr": "is not understood",
     "explore --scene flat --name a/b": "--name is the name of one folder",
     "explore --scene flat --name run": "the run exists already",

@@ -13,6 +13,11 @@ def test_the_text_of_a_budget_reads_back(unit, amount):
     assert parse_budget(str(Budget(unit, amount))) == Budget(unit, amount)
 
 
+def test_meters_are_spelled_as_here_or_as_in_files():
+    assert parse_budget("meters:25") == parse_budget("metres:25")
+    assert str(parse_budget("meters:25")) == "metres:25"
+
+
 NONSENSE = """
 views | views: | 100 | views:0 | views:-3 | views:2.5 | seconds:nan | metres:inf | minutes:3
 | views:ten | :5 | views:1:2

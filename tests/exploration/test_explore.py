@@ -124,7 +124,7 @@ def test_the_same_run_twice_writes_the_same_bytes(recorded, tmp_path):
 IMAGES = (".png", ".depth.png")
 
 
-@pytest.mark.parametrize("budget", ["seconds:2.5", "metres:1.0"])
+@pytest.mark.parametrize("budget", ["seconds:2.5", "meters:1.0"])
 def test_the_last_view_arrives_within_the_budget(budget):
     result = explore(BoxRoom(), Wander(), budget=budget, config=CONFIG)
     limit = parse_budget(budget)
@@ -166,7 +166,7 @@ def test_no_reachable_candidate_ends_the_run_with_the_reason(tmp_path):
 
 def test_a_policy_that_never_moves_ends_the_run():
     config = replace(CONFIG, max_still_views=3)
-    result = explore(BoxRoom(), Wander(reach=0.0), budget="metres:5", config=config)
+    result = explore(BoxRoom(), Wander(reach=0.0), budget="meters:5", config=config)
     assert result.reason is StopReason.STUCK
     assert len(result.rows) == 3
 

@@ -37,7 +37,7 @@ class Conditions:
     """
 
     budget: str = "views:60"
-    """Budget of every exploration: `views:N`, `seconds:S` or `metres:M`."""
+    """Budget of every exploration: `views:N`, `seconds:S` or `meters:M`."""
 
     snapshots: tuple[str, ...] = ()
     """Where a model is trained and evaluated, in any of these units; by default at the budget."""

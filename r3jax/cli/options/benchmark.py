@@ -189,7 +189,7 @@ class BenchmarkOptions(
     """Each makes an exploration and a training of its own."""
 
     budget: Annotated[str, tyro.conf.arg(metavar="BUDGET")] = "views:60"
-    """When every exploration stops: `views:N`, `seconds:S` of the mission clock, or `metres:M`."""
+    """When every exploration stops: `views:N`, `seconds:S` of the mission clock, or `meters:M`."""
 
     snapshots: Annotated[str | None, tyro.conf.arg(metavar="A,B")] = None
     """Where a model is trained and judged, for example `views:30,views:60`; by default at the

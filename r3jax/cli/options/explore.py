@@ -199,7 +199,7 @@ class ExploreOptions(
     yours is `module:Class`, a program in any language `exec:COMMAND`."""
 
     budget: Annotated[str | None, tyro.conf.arg(metavar="BUDGET")] = None
-    """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `metres:M`, or
+    """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `meters:M`, or
     `frames:N`, those captured on the way included."""
 
     until: Annotated[str | None, tyro.conf.arg(metavar="GOAL")] = None

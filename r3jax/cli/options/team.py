@@ -41,7 +41,7 @@ class TeamOptions(FolderOptions, DepthOptions, SceneOptions, MapOptions, RepeatO
 
     budget: Annotated[str | None, tyro.conf.arg(metavar="BUDGET")] = None
     """When each camera stops: `seconds:S` of its mission clock (120 by default), `views:N`,
-    `metres:M`."""
+    `meters:M`."""
 
     meet_every: float = 0.0
     """Seconds of the mission clock between two meetings; 0: they are always in touch."""
