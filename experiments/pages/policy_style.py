@@ -55,6 +55,7 @@ _POLICIES = {
     "fisherrf": ("#009E73", "H", "-."),
     "fisherrf-d-opt": ("#009E73", "*", ":"),
     "gauss-mi": ("#CC79A7", "s", "-."),
+    "r3con": ("#332288", "P", "-"),
     "active-gamer": ("#56B4E9", "v", "-"),
     "cover": ("#CC79A7", "D", "-"),
     "gavis": ("#882255", "H", "-"),

@@ -15,7 +15,8 @@ Cell = Mapping[str, Any]
 
 POLICIES = (
     "random", "uniform", "frontier", "unseen", "unseen-depth", "cover", "gavis", "active-gamer",
-    "active-gs-no-depth", "active-gs", "ours", "ours-pano", "ours-ahead",
+    "gauss-mi", "fisherrf", "fisherrf-d-opt", "active-gs-no-depth", "active-gs", "active-gs-online",
+    "r3con", "ours", "ours-pano", "ours-ahead",
 )  # fmt: skip
 """Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""
 
@@ -146,10 +147,12 @@ def scenes_of(cells: Sequence[Cell]) -> list[str]:
 def methods_of(cells: Sequence[Cell]) -> list[str]:
     """The methods in the order of tables, whatever the order of the records.
 
-    Policies go as in `POLICIES` (those it does not know first), their settings alphabetically.
+    Policies go as in `POLICIES` (those it does not know first), what is said of them in brackets,
+    such as their settings, alphabetically.
     """
     known = {policy: rank for rank, policy in enumerate(POLICIES)}
-    methods = {method_name(cell): known.get(cell["policy"], -1) for cell in cells}
+    names = {method_name(cell) for cell in cells}
+    methods = {name: known.get(name.partition(" (")[0], -1) for name in names}
     return sorted(methods, key=lambda method: (methods[method], method))
 
 

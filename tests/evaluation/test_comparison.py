@@ -81,6 +81,13 @@ def test_names_and_orders_do_not_depend_on_the_order_of_records():
     assert snapshots_of(cells) == ["seconds:20.5", "views:9", "views:30", "views:100"]
 
 
+def test_what_is_said_of_a_policy_in_brackets_stands_behind_it():
+    names = ["ours (submitted)", "r3con (captures)", "ours", "theirs (submitted)", "r3con"]
+    assert methods_of([record() | {"policy": name} for name in names]) == [
+        "theirs (submitted)", "r3con", "r3con (captures)", "ours", "ours (submitted)",
+    ]  # fmt: skip
+
+
 def test_scores_are_seeds_by_views():
     cells = [
         record(seed=2, psnr=[3.0, 4.0]),
