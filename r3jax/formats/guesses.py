@@ -71,7 +71,7 @@ def _of_database(path: Path) -> str:
     try:
         check_database(path)
     except ForeignFileError as error:
-        return str(error)
+        return f"{error}: copy it again"
     return (
         "this is no database of RTAB-Map: of COLMAP give the folder of a model (colmap mapper "
         f"--database_path {path} --image_path IMAGES --output_path OUT)"

@@ -59,6 +59,8 @@ def is_rtabmap_database(path: Path) -> bool:
     if path.suffix.lower() != ".db" or not path.is_file():
         return False
     try:
+        with naming(path):
+            check_database(path)
         names = {name for (name,) in _query(path, "SELECT name FROM sqlite_master")}
     except FormatError:
         return False

@@ -72,9 +72,7 @@ def check_database(path: str | Path) -> None:
     (valid_for,) = struct.unpack_from(">I", header, 92)
     whole = pages * (1 << 16 if page == 1 else page)  # 65,536 does not fit into two bytes
     if valid_for == changes and size < whole:
-        raise ForeignFileError(
-            f"the database is cut off: {size:,} of {whole:,} bytes are there; copy it again"
-        )
+        raise ForeignFileError(f"the database is cut off: {size:,} of {whole:,} bytes are there")
 
 
 def check_tree(folder: Path) -> None:

@@ -62,7 +62,7 @@ def check_scale(spec: str, scale: float | int) -> None:
         return
     if kind == "habitat":
         raise ValueError(f"scale={scale!r}: Habitat scales nothing, apply it to the mesh file")
-    raise ValueError(f"scale={scale!r} is for mesh files (mesh:<file>); {spec!r} has meters")
+    raise ValueError(f"scale={scale!r} is for mesh files (mesh:<file>); {spec!r} is in meters")
 
 
 def check_scene(spec: str, scale: float | int = 1.0) -> None:
