@@ -48,9 +48,12 @@ from r3jax.evaluation.comparison import (
 from r3jax.evaluation.statistics import paired_difference
 from r3jax.exploration.config import ClockName
 from r3jax.formats.submissions import submission_of_run, write_submission
-from r3jax.trace.reader import read_run
+from r3jax.trace.reader import Run, read_run
 
 NAME = "captures"
+
+Flights = Mapping[str, Sequence[tuple[Cell, Run]]]
+"""What was flown for each row: its cells, each with its run."""
 
 TableName = Literal[
     "modes", "rivals", "gaze", "spacing", "horizon", "sample", "turning", "r3con", "training"
@@ -224,10 +227,15 @@ def main(options: Options) -> Path:
     ]
     folder = options.out / NAME / options.size
     name = options.table if options.budget == "seconds" else f"{options.table}_by_views"
-    costs = cost_rows(cells, root) if options.clock == "wall" else []
-    write_page(folder, name, rows, records, origin(f"experiments.{NAME}", records), costs)
+    source, costs = origin(f"experiments.{NAME}", records), list[dict[str, str]]()
     if options.clock == "wall":
-        write_submissions(folder / f"{name}_flights", cells, root)
+        flights = {
+            label: [(cell, read_run(paths_of(root, cell).run)) for cell in own]
+            for label, own in cells.items()
+        }
+        costs = cost_rows(flights)
+        write_submissions(folder / f"{name}_flights", flights)
+    write_page(folder, name, rows, records, source, costs)
     print(f"results  {folder}")
     return folder
 
@@ -297,11 +305,11 @@ def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> d
     return {**record, **parts, "policy": label, "settings": {}}
 
 
-def cost_rows(cells: Mapping[str, Sequence[Cell]], root: Path) -> list[dict[str, str]]:
+def cost_rows(flights: Flights) -> list[dict[str, str]]:
     """A line per row: what its flights were charged for, medians of all scenes and seeds [s]."""
     lines: list[dict[str, str]] = []
-    for label, own in cells.items():
-        steps = [step for cell in own for step in read_run(paths_of(root, cell).run).rows]
+    for label, own in flights.items():
+        steps = [step for _, run in own for step in run.rows]
         costs = {
             "a decision": [s.charged["planning"] + s.hidden for s in steps if s.choice is not None],
             "a frame into the map": [step.charged["mapping"] for step in steps],
@@ -355,17 +363,17 @@ def _amount(snapshot: str) -> str:
     return f"{number} {'s' if unit == 'seconds' else unit}"
 
 
-def write_submissions(folder: Path, cells: Mapping[str, Sequence[Cell]], root: Path) -> None:
+def write_submissions(folder: Path, flights: Flights) -> None:
     """Writes the poses of every cell, a submission each, under the name of its row.
 
     No machine flies by the wall clock twice alike: with these files anybody can take the frames,
     train, and judge again.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for label, own in cells.items():
+    for label, own in flights.items():
         row = re.sub("[^0-9a-z.]+", "-", label)
-        for cell in own:
-            flown = submission_of_run(read_run(paths_of(root, cell).run))
+        for cell, run in own:
+            flown = submission_of_run(run)
             named = replace(flown, policy=flown.policy | {"name": label})
             write_submission(folder / f"{row}_{scene_title(cell.scene)}_{cell.seed}.jsonl", named)
 

@@ -176,14 +176,13 @@ def test_what_was_flown_is_written_beside_a_table_of_the_wall_clock(tmp_path, mo
         ]
         for policy in ("ours", "random")
     }
-    runs = {paths_of(tmp_path, cell).run: cell for own in cells.values() for cell in own}
-    monkeypatch.setattr(captures, "read_run", runs.__getitem__)
+    flights = {label: [(cell, cell) for cell in own] for label, own in cells.items()}
     monkeypatch.setattr(
         captures,
         "submission_of_run",
         lambda cell: make_submission(seed=cell.seed, policy={"name": "?", "version": cell.policy}),
     )
-    captures.write_submissions(tmp_path / "flights", cells, tmp_path)
+    captures.write_submissions(tmp_path / "flights", flights)
     written = {path.name: read_submission(path) for path in (tmp_path / "flights").iterdir()}
     assert {name: (file.policy, file.seed) for name, file in written.items()} == {
         f"{policy}-every-0.15-m_{scene}_{seed}.jsonl": (
@@ -196,8 +195,8 @@ def test_what_was_flown_is_written_beside_a_table_of_the_wall_clock(tmp_path, mo
     }
 
 
-def test_costs_are_medians_over_all_flights_of_a_row(tmp_path, monkeypatch):
-    """A decision counts what the flight hid; frames on the way hold none, though charged for it."""
+def test_costs_are_medians_over_all_flights_of_a_row():
+    """A decision counts what the flight hid of it; most frames come without one."""
 
     def step(planning, hidden, mapping, gaze=None):
         charged = {"planning": planning or 0.0, "mapping": mapping, "flight": 9.0}
@@ -205,14 +204,14 @@ def test_costs_are_medians_over_all_flights_of_a_row(tmp_path, monkeypatch):
         choice = None if planning is None else "a decision"
         return SimpleNamespace(choice=choice, hidden=hidden, charged=charged | looked)
 
-    flights = iter([
+    runs = [SimpleNamespace(rows=rows) for rows in (
         [step(None, 0.0, 0.10), step(0.3, 0.0, 0.20), step(None, 0.0, 0.30, 0.01)],
         [step(None, 0.0, 0.40), step(0.1, 0.8, 0.50, 0.03), step(0.2, 0.1, 0.66)],
         [step(None, 0.0, 0.05)],
-    ])  # fmt: skip
-    monkeypatch.setattr(captures, "read_run", lambda _: SimpleNamespace(rows=next(flights)))
+    )]  # fmt: skip
     cell = Cell("flat", "a", "ours", 0, Conditions(), "b", 9)
-    assert captures.cost_rows({"seeing": [cell, cell], "at once": [cell]}, tmp_path) == [
+    flights = {"seeing": [(cell, runs[0]), (cell, runs[1])], "at once": [(cell, runs[2])]}
+    assert captures.cost_rows(flights) == [
         {
             "row": "seeing", "a decision": "0.300", "a frame into the map": "0.350",
             "a look on the way": "0.020",
