@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r3jax.apps.report import style
+from r3jax.evaluation.comparison import policy_of
 
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Colors of groups that are no policies."""
@@ -83,7 +84,7 @@ def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
     seen: dict[str, int] = {}
     styles: dict[str, PolicyStyle] = {}
     for method in methods:
-        policy = method.partition(" (")[0]
+        policy = policy_of(method)
         color, marker, dashes = _POLICIES.get(policy, _UNKNOWN)
         variant = seen[policy] = seen.get(policy, -1) + 1
         fill = "full"

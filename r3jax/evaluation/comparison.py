@@ -36,6 +36,11 @@ def method_name(cell: Cell) -> str:
     return f"{cell['policy']} ({settings})" if settings else cell["policy"]
 
 
+def policy_of(method: str) -> str:
+    """The policy of a method, as `method_name` writes it."""
+    return method.partition(" (")[0]
+
+
 def shared_settings(cells: Sequence[Cell]) -> dict[str, Any]:
     """Settings that were given to the policies of all records alike, by name."""
     first = cells[0]["settings"]
@@ -152,7 +157,7 @@ def methods_of(cells: Sequence[Cell]) -> list[str]:
     """
     known = {policy: rank for rank, policy in enumerate(POLICIES)}
     names = {method_name(cell) for cell in cells}
-    methods = {name: known.get(name.partition(" (")[0], -1) for name in names}
+    methods = {name: known.get(policy_of(name), -1) for name in names}
     return sorted(methods, key=lambda method: (methods[method], method))
 
 
