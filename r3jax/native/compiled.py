@@ -11,6 +11,7 @@ from llvmlite import ir
 from numba import extending, njit, types
 from numba.core import cgutils
 
+from r3jax.native.borrowing import Borrowing
 from r3jax.native.one_piece import in_one_piece
 
 _Function = Callable[..., Any]
@@ -68,11 +69,12 @@ def _compiled_by(compiler: Any, function: _Function) -> _Function:
 def kernel(function: _Function) -> _Function:
     """Compiles a kernel to machine code, together with the handler that calls it.
 
-    The disk keeps the handler, in which the kernel is: `ffi.register_handlers`.
+    The disk keeps the handler, in which the kernel is: `ffi.register_handlers`. A kernel borrows
+    the arrays that it is given (`borrowing`), so it must not return one of them.
     Floating-point operations stay as written: two passes that must take the same decisions
     (counting and listing intersections, blending and its gradient) then do.
     """
-    return _compiled_by(njit(error_model="numpy", **_BARE), function)
+    return _compiled_by(njit(error_model="numpy", **_BARE, pipeline_class=Borrowing), function)
 
 
 def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Function]:

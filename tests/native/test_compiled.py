@@ -73,3 +73,41 @@ def test_what_python_calls_is_compiled_in_one_piece_by_any_thread():
     assert alone(1) == 3
     (overload,) = alone.overloads.values()
     assert not hasattr(overload.library, "_is_native")
+
+
+def test_a_kernel_counts_no_references_to_what_it_is_given():
+    @inlined
+    def length(row, room):
+        part = room[:2]
+        for k in range(2):
+            part[k] = row[k] * row[k]
+        return np.sqrt(part[0] + part[1])
+
+    def lengths(pair, room, found):
+        points, least = pair
+        for i in range(found.shape[0]):
+            row = found[i]
+            if row[1] > 0.5 and length(points[i], room) > least:
+                row[0] = length(points[i], room)
+
+    as_kernel, as_function = kernel(lengths), njit(lengths)
+
+    @njit
+    def called(points, weights):
+        given = points * 2.0  # owned by nobody but this function
+        found, other = np.zeros((2, len(points), 2))
+        found[:, 1], other[:, 1] = weights, weights
+        as_kernel((given, 0.5), np.empty(9), found)
+        as_function((given, 0.5), np.empty(9), other)
+        return given, found, other
+
+    points, weights = np.random.default_rng(0).random((2, 50, 2))
+    given, found, other = called(points, weights[:, 0])
+    np.testing.assert_array_equal(given, 2.0 * points)
+    np.testing.assert_array_equal(found, other)
+    assert 0 < np.count_nonzero(found[:, 0]) < 50
+    counts = [
+        sum(code.count("call void @NRT_decref") for code in function.inspect_llvm().values())
+        for function in (as_kernel, as_function)
+    ]
+    assert counts[0] == 0 < counts[1]
