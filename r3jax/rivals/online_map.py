@@ -198,41 +198,48 @@ def _with_births(online: OnlineMap, settings: MapSettings, rng: np.random.Genera
     return replace(online, scene=jax.tree.map(jnp.asarray, scene), marks=marks, shown=shown)
 
 
-class _Target(eqx.Module):
-    """A key frame to be trained on."""
-
-    rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float[np.ndarray, "h w"]
-    T_world_camera: Float[np.ndarray, "4 4"]
-
-
 @partial(jax.jit, static_argnames="settings")
-def _added_gradient(
+def _mean_gradient(
     config: RasterConfig,
     scene: GaussianScene,
     camera: Camera,
-    target: Any,
-    total: GaussianScene,
+    frames: Any,
+    num: Array,
     settings: MapSettings,
-) -> tuple[tuple[Array, GaussianScene], Array]:
-    """Color and depth error of a view, the sum of gradients with its own, and the overflow."""
+) -> tuple[tuple[GaussianScene, Float[Array, " F"]], Array]:
+    """Mean gradient of the first `num` key frames, color and depth error of each, overflow."""
 
-    def loss(scene: GaussianScene) -> tuple[Array, tuple[Array, Array]]:
-        seen, overflow = _show(config, scene, camera, target.T_world_camera)
-        rgb = target.rgb.astype(jnp.float32) / 255.0
+    def loss(scene: GaussianScene, i: Array) -> tuple[Array, tuple[Array, Array]]:
+        seen, overflow = _show(config, scene, camera, frames.T_world_camera[i])
         opaque = (seen.alpha > _OPAQUE).astype(jnp.float32)
-        valid = (target.depth > 0.0).astype(jnp.float32)
+        valid = (frames.depth[i] > 0.0).astype(jnp.float32)
+        rgb = frames.rgb[i].astype(jnp.float32) / 255.0
         color = _mean_over(jnp.mean(jnp.abs(seen.rgb - rgb), axis=-1), opaque)
-        depth = _mean_over(jnp.abs(seen.depth - target.depth), valid)
-        total = settings.color_weight * color + settings.depth_weight * depth
-        if settings.isotropy > 0.0:
-            sizes = jnp.exp(scene.log_scales)
-            uneven = jnp.mean(jnp.abs(sizes - sizes.mean(axis=1, keepdims=True)), axis=1)
-            total += settings.isotropy * _mean_over(uneven, scene.is_alive.astype(jnp.float32))
-        return total, (color + depth, overflow)
+        depth = _mean_over(jnp.abs(seen.depth - frames.depth[i]), valid)
+        weighted = settings.color_weight * color + settings.depth_weight * depth
+        return weighted, (color + depth, overflow)
 
-    gradient, (error, overflow) = jax.grad(loss, has_aux=True)(scene)
-    return (error, jax.tree.map(jnp.add, total, gradient)), overflow
+    def add_frame_of(i: Array, found: Any) -> Any:
+        total, errors, most = found
+        gradient, (error, overflow) = jax.grad(loss, has_aux=True)(scene, i)
+        total = jax.tree.map(jnp.add, total, gradient)
+        return total, errors.at[i].set(error), jnp.maximum(most, overflow)
+
+    nothing = jax.tree.map(jnp.zeros_like, scene), jnp.zeros(frames.error.shape), jnp.int32(0)
+    total, errors, most = jax.lax.fori_loop(0, num, add_frame_of, nothing)
+    gradient = jax.tree.map(lambda g: g / num, total)
+    if settings.isotropy > 0.0:
+        # The same for every frame: once is enough.
+        uneven = jax.grad(_unevenness)(scene)
+        gradient = jax.tree.map(lambda g, u: g + settings.isotropy * u, gradient, uneven)
+    return (gradient, errors), most
+
+
+def _unevenness(scene: GaussianScene) -> Float[Array, ""]:
+    """Mean difference between a Gaussian's sizes and their mean [m]."""
+    sizes = jnp.exp(scene.log_scales)
+    uneven = jnp.mean(jnp.abs(sizes - sizes.mean(axis=1, keepdims=True)), axis=1)
+    return _mean_over(uneven, scene.is_alive.astype(jnp.float32))
 
 
 def _mean_over(values: Array, mask: Array) -> Float[Array, ""]:
@@ -242,21 +249,17 @@ def _mean_over(values: Array, mask: Array) -> Float[Array, ""]:
 def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator) -> OnlineMap:
     """Takes the steps of Adam of one key frame."""
     scene, shown, error = online.scene, online.shown, online.frames.error.copy()
-    moments = empty_moments(scene)
+    moments, room = empty_moments(scene), settings.recent + settings.older
+    function = partial(_mean_gradient, settings=settings)
     for _ in range(settings.steps):
         batch = drawn_batch(error, settings, rng)
-        total = jax.tree.map(jnp.zeros_like, scene)
-        for number in batch:
-            frames = online.frames
-            target = _Target(
-                frames.rgb[number], frames.depth[number], frames.T_world_camera[number]
-            )
-            function = partial(_added_gradient, settings=settings)
-            found, total = with_room(function, scene, online.camera, target, total)
-            error[number] = float(found)
-        scene, moments, shown = _stepped(scene, moments, shown, total, len(batch), settings)
-    frames = replace(online.frames, error=error)
-    return replace(online, scene=scene, shown=shown, frames=frames)
+        # Always as many rows, the last ones unused: each number of them would compile anew.
+        rows = np.resize(batch, room)
+        frames = jax.tree.map(partial(np.take, indices=rows, axis=0), online.frames)
+        gradient, found = with_room(function, scene, online.camera, frames, len(batch))
+        error[batch] = np.asarray(found)[: len(batch)]
+        scene, moments, shown = _stepped(scene, moments, shown, gradient, settings)
+    return replace(online, scene=scene, shown=shown, frames=replace(online.frames, error=error))
 
 
 def drawn_batch(error: np.ndarray, settings: MapSettings, rng: np.random.Generator) -> list[int]:
@@ -275,12 +278,10 @@ def _stepped(
     scene: GaussianScene,
     moments: Moments,
     shown: Bool[Array, " n"],
-    total: GaussianScene,
-    num: Array,
+    gradient: GaussianScene,
     settings: MapSettings,
 ) -> tuple[GaussianScene, Moments, Bool[Array, " n"]]:
     """One step of Adam down the mean gradient of a batch."""
-    gradient = jax.tree.map(lambda g: g / num, total)
     if settings.flat:
         # The third axis of a disc has no size to learn.
         gradient = eqx.tree_at(
@@ -297,7 +298,7 @@ def _stepped(
     scene, moments = adam_update(scene, gradient, moments, rate, config, jnp.asarray(True))
     largest = jnp.log(settings.max_size)
     scene = eqx.tree_at(lambda s: s.log_scales, scene, jnp.minimum(scene.log_scales, largest))
-    return scene, moments, shown | (total.opacity_logits != 0.0)
+    return scene, moments, shown | (gradient.opacity_logits != 0.0)
 
 
 def _pruned(online: OnlineMap, settings: MapSettings) -> OnlineMap:

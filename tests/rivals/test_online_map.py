@@ -16,6 +16,7 @@ from r3jax.rivals.births import grown, kept_rows, one_per_voxel, turned_to
 from r3jax.rivals.online_map import (
     FIRST_CAPACITY,
     FIRST_ERROR,
+    _mean_gradient,
     add_frame,
     colored,
     drawn_batch,
@@ -23,6 +24,7 @@ from r3jax.rivals.online_map import (
     show,
 )
 from r3jax.rivals.settings import BALLS, DISCS, GAUSS_MI
+from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import rotation_rows
 from tests.exploration.toys import BoxRoom
 from tests.mutants import Modules, Mutant, assert_caught, each
@@ -94,6 +96,26 @@ def test_frames_compile_nothing_once_the_first_are_in():
     assert before[1] > before[0]
     # Each frame has births, drawn frames and rows of its own.
     assert compilations.count == before[3]
+
+
+def test_the_gradient_of_a_batch_is_the_mean_of_its_frames_and_of_no_other():
+    settings = replace(GAUSS_MI, image_width=32, steps=2)
+    online = mapped(settings, 3)
+
+    def gradient(rows, num):
+        frames = jax.tree.map(lambda x: x[np.array(rows)], online.frames)
+        (found, errors), _ = _mean_gradient(
+            RasterConfig(), online.scene, online.camera, frames, num, settings
+        )
+        return jax.tree.map(np.asarray, found), np.asarray(errors)
+
+    (one, error), (two, other) = gradient([0, 2], 1), gradient([1, 2], 1)
+    both, errors = gradient([0, 1], 2)
+    assert np.abs(one.means - two.means).max() > 1e-4
+    for a, b, mean in zip(*map(jax.tree.leaves, (one, two, both)), strict=True):
+        np.testing.assert_allclose(mean, (a + b) / 2.0, atol=1e-6 * np.abs(mean).max())
+    np.testing.assert_array_equal(errors, [error[0], other[0]])
+    assert error[1] == 0.0
 
 
 def test_a_batch_is_the_latest_frames_and_earlier_ones_by_their_error():
