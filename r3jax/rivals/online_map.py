@@ -15,17 +15,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.rivals.births import born_in, grown, kept_rows
 from r3jax.rivals.settings import MapSettings
 from r3jax.splatting.backend import find_backend
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.config import DILATION, FRUSTUM_MARGIN, NEAR, RasterConfig
 from r3jax.splatting.harmonics import C0
 from r3jax.splatting.information import with_room
-from r3jax.splatting.scene import GaussianScene, empty_scene
+from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene, empty_scene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.optimizer import Moments, adam_update, empty_moments
 from r3jax.splatting.views import fitted_size, load_views
@@ -38,6 +38,12 @@ FIRST_ERROR = 10.0
 
 _OPAQUE = 1e-3
 """Colors count where the map is more opaque than this."""
+
+_REACH = 3.4
+"""Standard deviations beyond which no Gaussian is drawn: alpha is below 1/255 there."""
+
+_LONGEST_STEP = 3.2
+"""Steps of Adam are at most so many learning rates long: (1 - beta1) / sqrt(1 - beta2)."""
 
 
 class Keyframes(eqx.Module):
@@ -198,41 +204,72 @@ def _with_births(online: OnlineMap, settings: MapSettings, rng: np.random.Genera
     return replace(online, scene=jax.tree.map(jnp.asarray, scene), marks=marks, shown=shown)
 
 
+def rows_in_view(
+    means: Float[np.ndarray, "n 3"], camera: Camera, T_world_camera: Any, settings: MapSettings
+) -> Int[np.ndarray, " r"]:
+    """Finds the Gaussians that a view may show while they are trained on a key frame.
+
+    Those within the planes of the image's edges, with room for the largest Gaussian, for what
+    the training may move it by, and for what the image of the smallest one is dilated by. The
+    planes are exact, the rest errs to the safe side: what is left out would have no gradient.
+
+    Args:
+        means: centers [m].
+        camera: of the view.
+        T_world_camera: its pose.
+        settings: largest Gaussian, learning rate and steps.
+    """
+    pose = np.asarray(T_world_camera, np.float32)
+    x, y, z = ((means - pose[:3, 3]) @ pose[:3, :3]).T
+    drift = np.sqrt(3.0) * _LONGEST_STEP * settings.rate_means * settings.steps
+    is_in = z > NEAR - drift
+    for along, focal, middle, size in (
+        (x, float(camera.fx), float(camera.cx), camera.width),
+        (y, float(camera.fy), float(camera.cy), camera.height),
+    ):
+        edges = np.array([-middle, size - middle]) / focal
+        # The Jacobian is taken at most this far outside, where it stretches a ball most.
+        stretch = np.hypot(1.0, np.abs(edges).max() + FRUSTUM_MARGIN * size / focal)
+        dilated = _REACH * np.sqrt(DILATION) / focal
+        for edge, outward in zip(edges, (-1.0, 1.0), strict=True):
+            room = _REACH * settings.max_size * stretch + drift * np.hypot(1.0, edge)
+            is_in &= outward * (along - edge * z) <= room + dilated * (z + drift)
+    return np.flatnonzero(is_in)
+
+
 @partial(jax.jit, static_argnames="settings")
-def _mean_gradient(
+def _gradient_of_view(
     config: RasterConfig,
     scene: GaussianScene,
     camera: Camera,
-    frames: Any,
-    num: Array,
+    frame: Any,
+    rows: Int[Array, " r"],
     settings: MapSettings,
-) -> tuple[tuple[GaussianScene, Float[Array, " F"]], Array]:
-    """Mean gradient of the first `num` key frames, color and depth error of each, overflow."""
+) -> tuple[tuple[GaussianScene, Float[Array, ""]], Array]:
+    """Gradient of a key frame's loss by some rows, its color and depth error, and the overflow."""
 
-    def loss(scene: GaussianScene, i: Array) -> tuple[Array, tuple[Array, Array]]:
-        seen, overflow = _show(config, scene, camera, frames.T_world_camera[i])
+    def loss(part: GaussianScene) -> tuple[Array, tuple[Array, Array]]:
+        seen, overflow = _show(config, part, camera, frame.T_world_camera)
+        rgb = frame.rgb.astype(jnp.float32) / 255.0
         opaque = (seen.alpha > _OPAQUE).astype(jnp.float32)
-        valid = (frames.depth[i] > 0.0).astype(jnp.float32)
-        rgb = frames.rgb[i].astype(jnp.float32) / 255.0
+        valid = (frame.depth > 0.0).astype(jnp.float32)
         color = _mean_over(jnp.mean(jnp.abs(seen.rgb - rgb), axis=-1), opaque)
-        depth = _mean_over(jnp.abs(seen.depth - frames.depth[i]), valid)
+        depth = _mean_over(jnp.abs(seen.depth - frame.depth), valid)
         weighted = settings.color_weight * color + settings.depth_weight * depth
         return weighted, (color + depth, overflow)
 
-    def add_frame_of(i: Array, found: Any) -> Any:
-        total, errors, most = found
-        gradient, (error, overflow) = jax.grad(loss, has_aux=True)(scene, i)
-        total = jax.tree.map(jnp.add, total, gradient)
-        return total, errors.at[i].set(error), jnp.maximum(most, overflow)
+    part = jax.tree.map(lambda x: x.at[rows].get(mode="clip"), scene)
+    logits = jnp.where(rows < scene.capacity, part.opacity_logits, DEAD_LOGIT)
+    part = eqx.tree_at(lambda s: s.opacity_logits, part, logits)
+    gradient, (error, overflow) = jax.grad(loss, has_aux=True)(part)
+    return (gradient, error), overflow
 
-    nothing = jax.tree.map(jnp.zeros_like, scene), jnp.zeros(frames.error.shape), jnp.int32(0)
-    total, errors, most = jax.lax.fori_loop(0, num, add_frame_of, nothing)
-    gradient = jax.tree.map(lambda g: g / num, total)
-    if settings.isotropy > 0.0:
-        # The same for every frame: once is enough.
-        uneven = jax.grad(_unevenness)(scene)
-        gradient = jax.tree.map(lambda g, u: g + settings.isotropy * u, gradient, uneven)
-    return (gradient, errors), most
+
+@partial(jax.jit, donate_argnums=0)
+def _added(total: GaussianScene, part: GaussianScene, rows: Int[Array, " r"]) -> GaussianScene:
+    """The total with a part added to its rows; those beyond its capacity go nowhere."""
+    add = lambda t, p: t.at[rows].add(p, mode="drop", unique_indices=True)
+    return jax.tree.map(add, total, part)
 
 
 def _unevenness(scene: GaussianScene) -> Float[Array, ""]:
@@ -248,18 +285,30 @@ def _mean_over(values: Array, mask: Array) -> Float[Array, ""]:
 
 def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator) -> OnlineMap:
     """Takes the steps of Adam of one key frame."""
-    scene, shown, error = online.scene, online.shown, online.frames.error.copy()
-    moments, room = empty_moments(scene), settings.recent + settings.older
-    function = partial(_mean_gradient, settings=settings)
+    scene, shown, frames, camera = online.scene, online.shown, online.frames, online.camera
+    moments, error = empty_moments(scene), frames.error.copy()
+    means, rows = np.asarray(scene.means)[: online.num_gaussians], dict[int, np.ndarray]()
+    function = partial(_gradient_of_view, settings=settings)
     for _ in range(settings.steps):
         batch = drawn_batch(error, settings, rng)
-        # Always as many rows, the last ones unused: each number of them would compile anew.
-        rows = np.resize(batch, room)
-        frames = jax.tree.map(partial(np.take, indices=rows, axis=0), online.frames)
-        gradient, found = with_room(function, scene, online.camera, frames, len(batch))
-        error[batch] = np.asarray(found)[: len(batch)]
-        scene, moments, shown = _stepped(scene, moments, shown, gradient, settings)
-    return replace(online, scene=scene, shown=shown, frames=replace(online.frames, error=error))
+        total = jax.tree.map(jnp.zeros_like, scene)
+        for number in batch:
+            frame = jax.tree.map(lambda x, number=number: x[number], frames)
+            if number not in rows:
+                found = rows_in_view(means, camera, frame.T_world_camera, settings)
+                rows[number] = _filled_up(found, scene.capacity)
+            gradient, found = with_room(function, scene, camera, frame, rows[number])
+            total, error[number] = _added(total, gradient, rows[number]), float(found)
+        scene, moments, shown = _stepped(scene, moments, shown, total, len(batch), settings)
+    return replace(online, scene=scene, shown=shown, frames=replace(frames, error=error))
+
+
+def _filled_up(rows: np.ndarray, capacity: int) -> Int[np.ndarray, " r"]:
+    """Rows to one of few lengths, as each compiles anew; the last ones are the capacity: none."""
+    length = FIRST_CAPACITY
+    while length < len(rows):
+        length *= 2
+    return np.pad(rows, (0, length - len(rows)), constant_values=capacity).astype(np.int32)
 
 
 def drawn_batch(error: np.ndarray, settings: MapSettings, rng: np.random.Generator) -> list[int]:
@@ -278,10 +327,15 @@ def _stepped(
     scene: GaussianScene,
     moments: Moments,
     shown: Bool[Array, " n"],
-    gradient: GaussianScene,
+    total: GaussianScene,
+    num: Array,
     settings: MapSettings,
 ) -> tuple[GaussianScene, Moments, Bool[Array, " n"]]:
-    """One step of Adam down the mean gradient of a batch."""
+    """One step of Adam down the mean gradient of a batch of `num` key frames."""
+    gradient = jax.tree.map(lambda g: g / num, total)
+    if settings.isotropy > 0.0:
+        uneven = jax.grad(_unevenness)(scene)
+        gradient = jax.tree.map(lambda g, u: g + settings.isotropy * u, gradient, uneven)
     if settings.flat:
         # The third axis of a disc has no size to learn.
         gradient = eqx.tree_at(
@@ -298,7 +352,7 @@ def _stepped(
     scene, moments = adam_update(scene, gradient, moments, rate, config, jnp.asarray(True))
     largest = jnp.log(settings.max_size)
     scene = eqx.tree_at(lambda s: s.log_scales, scene, jnp.minimum(scene.log_scales, largest))
-    return scene, moments, shown | (gradient.opacity_logits != 0.0)
+    return scene, moments, shown | (total.opacity_logits != 0.0)
 
 
 def _pruned(online: OnlineMap, settings: MapSettings) -> OnlineMap:

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from r3jax.exploration.clock import compilations
@@ -16,16 +18,19 @@ from r3jax.rivals.births import grown, kept_rows, one_per_voxel, turned_to
 from r3jax.rivals.online_map import (
     FIRST_CAPACITY,
     FIRST_ERROR,
-    _mean_gradient,
+    _added,
+    _gradient_of_view,
     add_frame,
     colored,
     drawn_batch,
     empty_online_map,
+    rows_in_view,
     show,
 )
 from r3jax.rivals.settings import BALLS, DISCS, GAUSS_MI
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import rotation_rows
+from r3jax.splatting.render import render
 from tests.exploration.toys import BoxRoom
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.splatting.clouds import random_cloud
@@ -98,24 +103,55 @@ def test_frames_compile_nothing_once_the_first_are_in():
     assert compilations.count == before[3]
 
 
-def test_the_gradient_of_a_batch_is_the_mean_of_its_frames_and_of_no_other():
-    settings = replace(GAUSS_MI, image_width=32, steps=2)
-    online = mapped(settings, 3)
+def test_the_rows_in_view_have_the_whole_gradient():
+    settings = replace(GAUSS_MI, image_width=32)
+    online = mapped(replace(settings, steps=2), 3)
+    num, capacity = online.num_gaussians, online.scene.capacity
+    sizes = []
+    for number in range(3):
+        frame = jax.tree.map(lambda x, number=number: x[number], online.frames)
+        means = np.asarray(online.scene.means)[:num]
+        some = rows_in_view(means, online.camera, frame.T_world_camera, settings)
+        found = []
+        for rows in (np.arange(capacity), np.pad(some, (0, 9), constant_values=capacity)):
+            (part, error), _ = _gradient_of_view(
+                RasterConfig(), online.scene, online.camera, frame, rows.astype(np.int32), settings
+            )
+            nothing = jax.tree.map(jnp.zeros_like, online.scene)
+            found.append((_added(nothing, part, rows.astype(np.int32)), error))
+        for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6 * float(jnp.abs(a).max()))
+        assert float(jnp.abs(found[0][0].means).max()) > 0.0
+        sizes.append(len(some))
+    assert max(sizes) < num  # not all of them
 
-    def gradient(rows, num):
-        frames = jax.tree.map(lambda x: x[np.array(rows)], online.frames)
-        (found, errors), _ = _mean_gradient(
-            RasterConfig(), online.scene, online.camera, frames, num, settings
-        )
-        return jax.tree.map(np.asarray, found), np.asarray(errors)
 
-    (one, error), (two, other) = gradient([0, 2], 1), gradient([1, 2], 1)
-    both, errors = gradient([0, 1], 2)
-    assert np.abs(one.means - two.means).max() > 1e-4
-    for a, b, mean in zip(*map(jax.tree.leaves, (one, two, both)), strict=True):
-        np.testing.assert_allclose(mean, (a + b) / 2.0, atol=1e-6 * np.abs(mean).max())
-    np.testing.assert_array_equal(errors, [error[0], other[0]])
-    assert error[1] == 0.0
+@hypothesis_settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 1 << 20), field=st.floats(40.0, 110.0))
+def test_no_row_out_of_view_has_a_gradient_wherever_training_moves_it(seed, field):
+    rng = np.random.default_rng(seed)
+    camera = Camera.from_fov(24, 16, field)
+    pose = np.asarray(pose_along(jnp.zeros(3), jnp.asarray(rng.normal(size=3), jnp.float32)))
+    scene = random_cloud(seed, 400, 0)
+    # All directions, mostly near: where a ball reaches far across the image's edge.
+    means = rng.normal(size=(400, 3)) * rng.uniform(0.02, 1.5, (400, 1))
+    shift = rng.normal(size=(400, 3))
+    shift *= GAUSS_MI.rate_means * GAUSS_MI.steps / np.abs(shift).max(axis=1, keepdims=True)
+    sizes = jnp.full((400, 3), np.log(GAUSS_MI.max_size))
+    moved = eqx.tree_at(
+        lambda s: (s.means, s.log_scales, s.opacity_logits), scene,
+        (jnp.asarray(means + shift, jnp.float32), sizes, jnp.full(400, 9.0)),
+    )  # fmt: skip
+
+    def brightness(scene):
+        seen = render(scene, camera, jnp.asarray(pose))
+        return seen.rgb.sum() + seen.alpha.sum()
+
+    gradient = jax.grad(brightness)(moved)
+    has_one = np.asarray(sum(jnp.abs(x.reshape(400, -1)).sum(1) for x in jax.tree.leaves(gradient)))
+    rows = rows_in_view(means.astype(np.float32), camera, pose, GAUSS_MI)
+    assert set(np.flatnonzero(has_one)) <= set(rows)
+    assert len(rows) < 400
 
 
 def test_a_batch_is_the_latest_frames_and_earlier_ones_by_their_error():
@@ -204,7 +240,7 @@ def test_a_map_grows_by_unused_rows():
         np.testing.assert_array_equal(a, b)
 
 
-@settings(max_examples=50, deadline=None)
+@hypothesis_settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 1 << 20), spacing=st.floats(0.02, 1.0))
 def test_one_point_is_drawn_for_each_voxel(seed, spacing):
     rng = np.random.default_rng(seed)
@@ -216,7 +252,7 @@ def test_one_point_is_drawn_for_each_voxel(seed, spacing):
     assert set(voxels) == {tuple(v) for v in np.floor(points[index] / spacing).astype(int)}
 
 
-@settings(max_examples=50, deadline=None)
+@hypothesis_settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 1 << 20))
 def test_quaternions_turn_the_z_axis_to_normals(seed):
     normals = np.random.default_rng(seed).normal(size=(5, 3))
