@@ -295,8 +295,8 @@ def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator)
         for number in batch:
             frame = jax.tree.map(lambda x, number=number: x[number], frames)
             if number not in rows:
-                found = rows_in_view(means, camera, frame.T_world_camera, settings)
-                rows[number] = _filled_up(found, scene.capacity)
+                in_view = rows_in_view(means, camera, frame.T_world_camera, settings)
+                rows[number] = _filled_up(in_view, scene.capacity)
             gradient, found = with_room(function, scene, camera, frame, rows[number])
             total, error[number] = _added(total, gradient, rows[number]), float(found)
         scene, moments, shown = _stepped(scene, moments, shown, total, len(batch), settings)
@@ -304,11 +304,12 @@ def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator)
 
 
 def _filled_up(rows: np.ndarray, capacity: int) -> Int[np.ndarray, " r"]:
-    """Rows to one of few lengths, as each compiles anew; the last ones are the capacity: none."""
+    """Rows to one of few lengths, as each compiles anew; the last ones lie beyond the capacity."""
     length = FIRST_CAPACITY
     while length < len(rows):
         length *= 2
-    return np.pad(rows, (0, length - len(rows)), constant_values=capacity).astype(np.int32)
+    beyond = capacity + np.arange(length - len(rows))
+    return np.concatenate([rows, beyond]).astype(np.int32)
 
 
 def drawn_batch(error: np.ndarray, settings: MapSettings, rng: np.random.Generator) -> list[int]:
