@@ -192,9 +192,7 @@ def _with_births(online: OnlineMap, settings: MapSettings, rng: np.random.Genera
         (np.asarray(seen.rgb), np.asarray(seen.depth), np.asarray(seen.alpha)), settings, rng,
     )  # fmt: skip
     more = len(born.means)
-    capacity = online.scene.capacity
-    while capacity < num + more:
-        capacity *= 2
+    capacity = max(online.scene.capacity, _length_for(num + more))
     scene, marks, shown = grown((online.scene, online.marks, online.shown), capacity)
     # On the host: on the device, every number of births would compile anew.
     scene, rows = jax.tree.map(np.array, scene), slice(num, num + more)
@@ -305,11 +303,16 @@ def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator)
 
 def _filled_up(rows: np.ndarray, capacity: int) -> Int[np.ndarray, " r"]:
     """Rows to one of few lengths, as each compiles anew; the last ones lie beyond the capacity."""
-    length = FIRST_CAPACITY
-    while length < len(rows):
-        length *= 2
-    beyond = capacity + np.arange(length - len(rows))
+    beyond = capacity + np.arange(_length_for(len(rows)) - len(rows))
     return np.concatenate([rows, beyond]).astype(np.int32)
+
+
+def _length_for(num: int) -> int:
+    """The first of the few lengths that holds so many rows."""
+    length = FIRST_CAPACITY
+    while length < num:
+        length *= 2
+    return length
 
 
 def drawn_batch(error: np.ndarray, settings: MapSettings, rng: np.random.Generator) -> list[int]:
