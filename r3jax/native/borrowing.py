@@ -50,7 +50,7 @@ class _BorrowArguments(FunctionPass):
 
     _name = "borrow_arguments"
 
-    def __init__(self) -> None:
+    def __init__(self) -> None:  # abstract in Numba's class
         super().__init__()
 
     def run_pass(self, state: Any) -> Any:

@@ -231,8 +231,8 @@ MUTANTS = [
     Mutant("compositing", "smaller(alpha, splat(ALPHA_MAX))", "alpha", images_agree),
     Mutant(
         "compositing",
-        "weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)\n    store",
-        "weight = before * alpha\n    store",
+        "return keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)",
+        "return before * alpha",
         images_agree,
     ),
     Mutant("compositing", "            return place", "            return first", gradients_agree),
@@ -275,7 +275,13 @@ MUTANTS = [
     Mutant("squares", "vv_dy3 = vv_dy2 * dy", "vv_dy3 = vv_dy2", squares_agree),
     Mutant("squares", "dx3, dx4 = dx2 * dx, dx2 * dx2", "dx3, dx4 = dx2, dx2 * dx2", squares_agree),
     Mutant(
-        "squares", "v = keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)", "pass", squares_agree
+        "compositing", "keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)", "v", squares_agree
+    ),
+    Mutant(
+        "squares",
+        "clear_tile(left, top, alpha.shape[1], alpha.shape[0], state)",
+        "state[:PIXELS], state[PIXELS:] = _ONE, _ZERO",
+        squares_agree,
     ),
     Mutant("squares", "slots[slot : slot + MOMENTS] = _ZERO", "pass", squares_agree),
     Mutant(
@@ -303,7 +309,7 @@ MUTANTS = [
     Mutant(
         "tallies",
         "load(state, 2 * PIXELS + k), weight, _ZERO",
-        "_ONE, weight, _ZERO",
+        "splat(np.float32(1.0)), weight, _ZERO",
         tallies_agree,
     ),
     Mutant(

@@ -67,16 +67,30 @@ def alpha_in_row(record, dx, across, slant, dy):
 
 
 @inlined
-def _blend_row(k, alpha, color, depth, state):
-    """Blends one Gaussian into a row of the tile's state.
+def in_tile(record, left, top, lanes):
+    """What a Gaussian's alpha in a tile takes: dx, A dx^2, B dx, and its center's row."""
+    dx = (record[at.CENTER_X] - (np.float32(left) + _HALF)) - lanes
+    y = record[at.CENTER_Y] - (np.float32(top) + _HALF)
+    return dx, record[at.A] * dx * dx, record[at.B] * dx, y
+
+
+@inlined
+def take_light(k, alpha, state):
+    """Takes a Gaussian's weight in a row of pixels from the light that passes, and returns it.
 
     The transmittance is 0 from where compositing stops: what follows then weighs nothing.
     """
-    red, green, blue = color
     before = load(state, k)
     behind = before - before * alpha
-    weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)
     store(state, k, keep_gt(behind, behind, TRANSMITTANCE_MIN))
+    return keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)
+
+
+@inlined
+def _blend_row(k, alpha, color, depth, state):
+    """Blends one Gaussian into a row of the tile's state."""
+    red, green, blue = color
+    weight = take_light(k, alpha, state)
     store(state, PIXELS + k, fma(weight, red, load(state, PIXELS + k)))
     store(state, 2 * PIXELS + k, fma(weight, green, load(state, 2 * PIXELS + k)))
     store(state, 3 * PIXELS + k, fma(weight, blue, load(state, 3 * PIXELS + k)))
@@ -94,7 +108,7 @@ def tile_is_finished(state):
 
 
 @inlined
-def _clear_tile(left, top, width, height, state):
+def clear_tile(left, top, width, height, state):
     """An empty tile: light passes the pixels of the image, and none beside it."""
     state[:] = _ZERO
     for y in range(min(TILE, height - top)):
@@ -112,12 +126,9 @@ def _composite_tile(first, last, left, top, records, list_ids, list_rows, state)
         if place + AHEAD < last:
             prefetch(flat, list_ids[place + AHEAD] * at.SIZE)
         record = records[list_ids[place]]
-        dx = (record[at.CENTER_X] - (np.float32(left) + _HALF)) - lanes
-        slant = record[at.B] * dx
-        across = record[at.A] * dx * dx
+        dx, across, slant, y = in_tile(record, left, top, lanes)
         color = record[at.RED], record[at.GREEN], record[at.BLUE]
         depth = record[at.DEPTH]
-        y = record[at.CENTER_Y] - (np.float32(top) + _HALF)
         rows = list_rows[place]
         for row in range(rows & 15, (rows >> 4) + 1):
             alpha = alpha_in_row(record, dx, across, slant, y - np.float32(row))
@@ -147,7 +158,7 @@ def composite_all(records, list_ids, list_rows, tile_starts, workers, rgb, depth
         tile = claim(next_tile)
         while tile < tile_ends.shape[0]:
             left, top = tile % columns * TILE, tile // columns * TILE
-            _clear_tile(left, top, alpha.shape[1], alpha.shape[0], state)
+            clear_tile(left, top, alpha.shape[1], alpha.shape[0], state)
             tile_ends[tile] = _composite_tile(
                 tile_starts[tile], tile_starts[tile + 1], left, top,
                 records, list_ids, list_rows, state,
@@ -174,6 +185,26 @@ def _read_tile(left, top, images, gradients, state):
             state[5 * PIXELS + k], state[6 * PIXELS + k] = g_depth[v, u], g_alpha[v, u]
 
 
+@inlined
+def gradient_by_alpha(k, free, alpha, weight, q, state):
+    """Alpha dL/dalpha in a row of pixels; what the Gaussian adds there leaves their total.
+
+    Args:
+        k: first pixel of the row.
+        free: alpha before it was cut off.
+        alpha: after.
+        weight: of the Gaussian.
+        q: see above.
+        state: of the tile; the total comes second.
+    """
+    passed = weight * q
+    rest = load(state, PIXELS + k) - passed
+    store(state, PIXELS + k, rest)
+    v = passed - quotient(alpha * rest, _ONE - alpha)
+    # Nothing flows where compositing has stopped, nor through the cut-off at 0.99.
+    return keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)
+
+
 @kernel
 def _gradient_of_tile(
     first, last, left, top, records, list_ids, list_slots, list_rows, state, slots
@@ -186,10 +217,7 @@ def _gradient_of_tile(
         if place + AHEAD < last:
             prefetch(flat, list_ids[place + AHEAD] * at.SIZE)
         record = records[list_ids[place]]
-        dx = (record[at.CENTER_X] - (np.float32(left) + _HALF)) - lanes
-        slant = record[at.B] * dx
-        across = record[at.A] * dx * dx
-        y = record[at.CENTER_Y] - (np.float32(top) + _HALF)
+        dx, across, slant, y = in_tile(record, left, top, lanes)
         v0, v1, v2 = zero, zero, zero
         red, green, blue, depth = zero, zero, zero, zero
         rows = list_rows[place]
@@ -198,22 +226,14 @@ def _gradient_of_tile(
             dy = y - np.float32(row)
             free = alpha_in_row(record, dx, across, slant, dy)
             alpha = smaller(free, splat(ALPHA_MAX))
-            before = load(state, k)
-            behind = before - before * alpha
-            weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)
-            store(state, k, keep_gt(behind, behind, TRANSMITTANCE_MIN))
+            weight = take_light(k, alpha, state)
             g_red, g_green = load(state, 2 * PIXELS + k), load(state, 3 * PIXELS + k)
             g_blue, g_depth = load(state, 4 * PIXELS + k), load(state, 5 * PIXELS + k)
             q = fma(g_red, record[at.RED], load(state, 6 * PIXELS + k))
             q = fma(g_green, record[at.GREEN], q)
             q = fma(g_blue, record[at.BLUE], q)
             q = fma(g_depth, record[at.DEPTH], q)
-            passed = weight * q
-            rest = load(state, PIXELS + k) - passed
-            store(state, PIXELS + k, rest)
-            v = passed - quotient(alpha * rest, _ONE - alpha)
-            # Nothing flows where compositing has stopped, nor through the cut-off at 0.99.
-            v = keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)
+            v = gradient_by_alpha(k, free, alpha, weight, q, state)
             v_dy = v * dy
             v0, v1, v2 = v0 + v, v1 + v_dy, fma(v_dy, dy, v2)
             red, green = fma(weight, g_red, red), fma(weight, g_green, green)

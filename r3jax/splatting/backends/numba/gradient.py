@@ -35,15 +35,24 @@ _HALF = np.float32(0.5)
 
 
 @inlined_fast
-def _sum_slots(start, count, slots, sums):
-    """Adds the gradients of a Gaussian's intersections, in their order; is there any but 0?"""
-    for k in range(10):
+def sum_slots(start, count, size, numbers, slots, sums):
+    """Adds up a Gaussian's intersections in their order; is any of the sums not 0?
+
+    Args:
+        start: its first intersection.
+        count: of its intersections.
+        size: floats in the slot of one.
+        numbers: how many of them count.
+        slots: of all intersections, one after the other.
+        sums: written; [numbers].
+    """
+    for k in range(numbers):
         sums[k] = ZERO
     for slot in range(start, start + count):
-        for k in range(10):
-            sums[k] += slots[slot * at.GRADIENT_SIZE + k]
+        for k in range(numbers):
+            sums[k] += slots[slot * size + k]
     some = False
-    for k in range(10):
+    for k in range(numbers):
         some |= sums[k] != ZERO
     return some
 
@@ -216,7 +225,7 @@ def _gradient_of_block(block, cloud, records, slots, view, size, g_cloud, g_view
     g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
     for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
         count, start = integers[i, at.COUNT], integers[i, at.START]
-        if count > 0 and _sum_slots(start, count, slots, sums):
+        if count > 0 and sum_slots(start, count, at.GRADIENT_SIZE, 10, slots, sums):
             _gradient_of_one(i, cloud, records[i], sums, view, size, room, g_cloud, g_view)
         else:
             g_means[i], g_quats[i], g_scales[i] = ZERO, ZERO, ZERO

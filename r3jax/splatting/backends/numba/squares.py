@@ -24,8 +24,11 @@ from r3jax.splatting.backends.numba.compositing import (
     AHEAD,
     ALPHA_MAX,
     PIXELS,
-    TRANSMITTANCE_MIN,
     alpha_in_row,
+    clear_tile,
+    gradient_by_alpha,
+    in_tile,
+    take_light,
 )
 from r3jax.splatting.backends.numba.gradient import (
     ROOM,
@@ -34,17 +37,13 @@ from r3jax.splatting.backends.numba.gradient import (
     conic_gradient,
     geometry_of,
     shape_gradient,
+    sum_slots,
 )
 from r3jax.splatting.backends.numba.lanes import (
     fma,
-    keep_ge,
-    keep_gt,
     lane_numbers,
-    load,
-    quotient,
     smaller,
     splat,
-    store,
     store12,
     sums_of_10,
 )
@@ -79,18 +78,13 @@ _HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
 def _read_tile(left, top, images, background, state):
     """Lays out a tile: transmittance 1, and the pixel's color over black less alpha background."""
     rgb, _, alpha = images
-    state[:PIXELS] = _ONE
-    state[PIXELS:] = _ZERO
+    # Pixels beside the image have no gradient.
+    clear_tile(left, top, alpha.shape[1], alpha.shape[0], state)
     for y in range(min(TILE, alpha.shape[0] - top)):
         for x in range(min(TILE, alpha.shape[1] - left)):
             v, u = top + y, left + x
             color = rgb[v, u, 0] + rgb[v, u, 1] + rgb[v, u, 2]
             state[PIXELS + TILE * y + x] = color - alpha[v, u] * background
-    # Pixels beside the image have no gradient.
-    for y in range(TILE):
-        for x in range(TILE):
-            if top + y >= alpha.shape[0] or left + x >= alpha.shape[1]:
-                state[TILE * y + x] = _ZERO
 
 
 @kernel
@@ -105,10 +99,7 @@ def _squares_of_tile(
         if place + AHEAD < last:
             prefetch(flat, list_ids[place + AHEAD] * at.SIZE)
         record = records[list_ids[place]]
-        dx = (record[at.CENTER_X] - (np.float32(left) + _HALF)) - lanes
-        slant = record[at.B] * dx
-        across = record[at.A] * dx * dx
-        y = record[at.CENTER_Y] - (np.float32(top) + _HALF)
+        dx, across, slant, y = in_tile(record, left, top, lanes)
         q = splat(record[at.RED] + record[at.GREEN] + record[at.BLUE] - background)
         vv0, vv1, vv2, vv3, vv4 = zero, zero, zero, zero, zero
         vw0, vw1, vw2, ww = zero, zero, zero, zero
@@ -118,16 +109,8 @@ def _squares_of_tile(
             dy = y - np.float32(row)
             free = alpha_in_row(record, dx, across, slant, dy)
             alpha = smaller(free, splat(ALPHA_MAX))
-            before = load(state, k)
-            behind = before - before * alpha
-            weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)
-            store(state, k, keep_gt(behind, behind, TRANSMITTANCE_MIN))
-            passed = weight * q
-            rest = load(state, PIXELS + k) - passed
-            store(state, PIXELS + k, rest)
-            v = passed - quotient(alpha * rest, _ONE - alpha)
-            # Nothing flows where compositing has stopped, nor through the cut-off at 0.99.
-            v = keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)
+            weight = take_light(k, alpha, state)
+            v = gradient_by_alpha(k, free, alpha, weight, q, state)
             vv, vw = v * v, v * weight
             vv_dy, vw_dy = vv * dy, vw * dy
             vv_dy2 = vv_dy * dy
@@ -175,17 +158,6 @@ def squares_of_all(lists, records, images, background, workers, slots):
 
 
 @inlined
-def _sum_moments(start, count, slots, sums):
-    """Sums the moments of a Gaussian's intersections up; is there any but 0?"""
-    for k in range(MOMENTS):
-        sums[k] = _ZERO
-    for slot in range(start, start + count):
-        for k in range(MOMENTS):
-            sums[k] += slots[slot * SLOT + k]
-    return sums[0] != _ZERO or sums[MOMENTS - 1] != _ZERO
-
-
-@inlined
 def _quadratic(columns, sums, parameter, first, last):
     """a^T M a for one parameter, a being its row of A; rounding takes none below 0."""
     total = _ZERO
@@ -230,7 +202,7 @@ def _squares_of_block(block, cloud, records, slots, view, size, squares):
     s_means, s_quats, s_scales, s_logits, s_sh = squares
     for i in range(block * at.BLOCK, min((block + 1) * at.BLOCK, records.shape[0])):
         count, start = integers[i, at.COUNT], integers[i, at.START]
-        if count == 0 or not _sum_moments(start, count, slots, sums):
+        if count == 0 or not sum_slots(start, count, SLOT, MOMENTS, slots, sums):
             s_means[i], s_quats[i], s_scales[i] = _ZERO, _ZERO, _ZERO
             s_logits[i], s_sh[i] = _ZERO, _ZERO
             continue

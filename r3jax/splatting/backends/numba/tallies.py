@@ -12,8 +12,10 @@ from r3jax.splatting.backends.numba.compositing import (
     AHEAD,
     ALPHA_MAX,
     PIXELS,
-    TRANSMITTANCE_MIN,
     alpha_in_row,
+    clear_tile,
+    in_tile,
+    take_light,
 )
 from r3jax.splatting.backends.numba.lanes import (
     fma,
@@ -22,24 +24,22 @@ from r3jax.splatting.backends.numba.lanes import (
     load,
     smaller,
     splat,
-    store,
     store12,
     sums_of_10,
 )
 from r3jax.splatting.backends.numba.passes import expect_writes
 from r3jax.splatting.config import TILE
 
-_HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
+_ZERO = np.float32(0.0)
 
 
 @inlined
 def _read_tile(left, top, value, counts, state):
     """Lays out a tile: transmittance 1 in the image and 0 beside it, the value, what counts."""
-    state[:] = _ZERO
+    clear_tile(left, top, value.shape[1], value.shape[0], state)
     for y in range(min(TILE, value.shape[0] - top)):
         for x in range(min(TILE, value.shape[1] - left)):
             k = TILE * y + x
-            state[k] = _ONE
             state[PIXELS + k] = value[top + y, left + x]
             state[2 * PIXELS + k] = counts[top + y, left + x]
 
@@ -56,10 +56,7 @@ def _tallies_of_tile(
         if place + AHEAD < last:
             prefetch(flat, list_ids[place + AHEAD] * at.SIZE)
         record = records[list_ids[place]]
-        dx = (record[at.CENTER_X] - (np.float32(left) + _HALF)) - lanes
-        slant = record[at.B] * dx
-        across = record[at.A] * dx * dx
-        y = record[at.CENTER_Y] - (np.float32(top) + _HALF)
+        dx, across, slant, y = in_tile(record, left, top, lanes)
         total, number = zero, zero
         rows = list_rows[place]
         for row in range(rows & 15, (rows >> 4) + 1):
@@ -67,9 +64,7 @@ def _tallies_of_tile(
             alpha = alpha_in_row(record, dx, across, slant, y - np.float32(row))
             alpha = smaller(alpha, splat(ALPHA_MAX))
             before = load(state, k)
-            behind = before - before * alpha
-            weight = keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)
-            store(state, k, keep_gt(behind, behind, TRANSMITTANCE_MIN))
+            weight = take_light(k, alpha, state)
             weight = keep_gt(keep_gt(weight, before, least[0]), weight, least[1])
             total = fma(weight, load(state, PIXELS + k), total)
             number = number + keep_gt(load(state, 2 * PIXELS + k), weight, _ZERO)
