@@ -237,7 +237,8 @@ def net_utility(
     """U_view of each candidate, from its utility and path length [C].
 
     U_view = utility / sum(utility) - lambda2 * path / sum(path), both sums over the reachable
-    candidates (as in Active-GS); a sum of 0 leaves its term out. Unreachable: -inf.
+    candidates; a sum of 0 leaves its term out. Unreachable: -inf. (Active-GS sums utilities over
+    all candidates, paths over the reachable ones.)
 
     Args:
         utility: of each candidate.
@@ -245,7 +246,7 @@ def net_utility(
         lambda2: weight of the path.
         among: utilities and paths of the candidates that the sums are over; None: these.
     """
-    # Shares of sums, as in Active-GS: utility and path become comparable without units.
+    # Shares of sums: utility and path become comparable without units.
     wholes = (utility, path) if among is None else among
     counts, is_reachable = np.isfinite(wholes[1]), np.isfinite(path)
     shares: list[np.ndarray] = []

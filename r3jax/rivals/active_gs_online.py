@@ -27,18 +27,15 @@ from r3jax.planning.greedy import Drawn, draw_lots
 from r3jax.planning.policies.active_gs.policy import EXPLORATION_WEIGHT, draw_views
 from r3jax.planning.policies.active_gs.regions import LOW_CONFIDENCE
 from r3jax.planning.policy import Situation
-from r3jax.rivals.online_map import OnlineMap, Seen, colored
+from r3jax.rivals.online_map import OnlineMap, Seen, colored, supported_by
 from r3jax.rivals.policy import OnlinePolicy, memory_of
 from r3jax.rivals.settings import DISCS
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.config import RasterConfig
-from r3jax.splatting.information import on_cpu, pixel_tallies, with_room
+from r3jax.splatting.information import with_room
 from r3jax.splatting.projection import rotation_rows
 from r3jax.splatting.scene import GaussianScene
-
-SUPPORT = 0.03
-"""A Gaussian that weighs more than this at a pixel is supported by its frame."""
 
 SURFACE_OPACITY = 0.7
 """Fainter Gaussians make no region of interest."""
@@ -57,21 +54,6 @@ def confidence(marks: Float[Array, "n 5"]) -> Float[Array, " n"]:
     """C of every Gaussian, from its supports, sum of view directions and score."""
     spread = safe_norm(marks[:, 1:4], axis=1) / jnp.maximum(marks[:, 0], 1.0)
     return jnp.clip(jnp.exp(1.0 - spread) * marks[:, 4], 0.0, 1.0)
-
-
-@jax.jit
-def _supported(
-    config: RasterConfig,
-    scene: GaussianScene,
-    camera: Camera,
-    pose: Float[Array, "4 4"],
-    depth: Float[Array, "h w"],
-) -> tuple[Bool[Array, " n"], Array]:
-    is_valid = (depth > 0.0).astype(jnp.float32)
-    tallies, overflow = pixel_tallies(
-        scene, camera, pose, is_valid, is_valid, config, least_weight=SUPPORT
-    )
-    return tallies[:, 1] > 0.0, overflow
 
 
 @jax.jit
@@ -166,13 +148,10 @@ class ActiveGSOnline(OnlinePolicy):
 
     def note(self, online: OnlineMap) -> OnlineMap:
         """Counts the latest frame for the Gaussians that it supports."""
-        pose = jnp.asarray(online.frames.T_world_camera[-1])
-        depth = jnp.asarray(online.frames.depth[-1])
-        arguments = on_cpu((online.scene, online.camera, pose, depth))
-        # Through the host, so that it may join arrays on an accelerator.
-        is_supported = jnp.asarray(np.asarray(with_room(_supported, *arguments)))
+        position = jnp.asarray(online.frames.T_world_camera[-1, :3, 3])
+        is_supported = jnp.asarray(supported_by(online, -1))
         reach = self.config.scoring.max_range
-        marks = support(online.marks, online.scene, pose[:3, 3], is_supported, reach)
+        marks = support(online.marks, online.scene, position, is_supported, reach)
         return replace(online, marks=marks)
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:

@@ -92,7 +92,7 @@ def is_wrong(
 ) -> np.ndarray:
     """Pixels of the wrong color, too little opacity, or a surface in front of the map's."""
     color, distance, alpha = seen
-    error = np.sum((color - rgb) ** 2, axis=-1)
+    error = np.mean((color - rgb) ** 2, axis=-1)
     return (
         (error > settings.birth_color)
         | (alpha < settings.birth_opacity)
@@ -128,8 +128,8 @@ def _rays(camera: Camera) -> np.ndarray:
     return np.stack([columns, rows, np.ones_like(columns)], axis=-1).reshape(-1, 3)
 
 
-Rows = tuple[GaussianScene, Array, Array]
-"""The scene, marks and flags: all that is kept per Gaussian."""
+Rows = tuple[GaussianScene, Array]
+"""The scene and the marks: all that is kept per Gaussian."""
 
 
 def grown(rows: Rows, capacity: int) -> Rows:

@@ -14,7 +14,7 @@ Left out: the box round an object, to which the published utility and update are
 actions, as all policies here choose among the same hundred candidates; its 1050 steps before the
 first plan, its densification by gradients and the pruning below an opacity of 0.7.
 
-Shape symbols: C candidates; n Gaussians; h w pixels; F poses so far.
+Shape symbols: C candidates; n Gaussians; h w pixels; V poses so far.
 """
 
 from dataclasses import dataclass, field, replace
@@ -26,7 +26,10 @@ from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.geometry.numerics import safe_norm
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import Candidates
+from r3jax.planning.decision import Decision, PlanInfo, PlannerState
 from r3jax.planning.greedy import draw_lots
 from r3jax.planning.policy import Situation
 from r3jax.rivals.online_map import OnlineMap, Seen, colored, show
@@ -81,8 +84,8 @@ def evidence(
     seen: Seen, rgb: Float[Array, "h w 3"], depth: Float[Array, "h w"]
 ) -> Float[Array, "h w"]:
     """-ln l of every pixel: l = 1.7 (0.95 color error + 0.05 depth error), at least 1e-4."""
-    has_color = seen.rgb.sum(axis=-1) > 0.01
-    has_depth = (seen.depth > 0.01) & (depth > 0.01)
+    # By the photo, whatever the map shows there: where it shows nothing it is wrong.
+    has_color, has_depth = rgb.sum(axis=-1) > 0.01, depth > 0.01
     color = jnp.where(has_color, jnp.mean(jnp.abs(seen.rgb - rgb), axis=-1), 0.0)
     distance = jnp.where(has_depth, jnp.abs(seen.depth - depth), 0.0)
     loss = LOSS_FACTOR * (0.95 * color + 0.05 * distance)
@@ -132,14 +135,15 @@ def novelty(pose: np.ndarray, before: np.ndarray) -> float:
 
     Args:
         pose: of the view on offer, [4, 4].
-        before: poses so far, [F, 4, 4]; with five or fewer no view is held back.
+        before: poses so far, [V, 4, 4]; with five or fewer no view is held back. As published, the
+            first of all is not asked.
     """
     if len(before) <= 5:
         return 1.0
-    for back in range(1, len(before)):
+    for back in range(1, len(before) - 1):
         earlier = before[-1 - back]
-        is_near = np.linalg.norm(pose[:3, 3] - earlier[:3, 3]) <= SAME_PLACE
-        if is_near and angle_between(pose, earlier) <= SAME_DIRECTION:
+        is_near = np.linalg.norm(pose[:3, 3] - earlier[:3, 3]) < SAME_PLACE
+        if is_near and angle_between(pose, earlier) < SAME_DIRECTION:
             return 1.0 - 0.95**back
     return 1.0
 
@@ -185,7 +189,35 @@ class GaussMI(OnlinePolicy):
         sums = with_room(_scores, online.scene, camera, online.marks, poses)
         scale = PUBLISHED_PIXELS / (camera.width * camera.height)
         whole = np.floor(scale * np.asarray(sums, np.float64))
-        before = online.frames.T_world_camera.astype(np.float64)
+        # Frames on the way were not decided on: they hold no view back.
+        before = np.concatenate([online.frames.T_world_camera[:1], online.chosen])
         factor = [novelty(pose, before) for pose in np.asarray(poses, np.float64)]
         lots = draw_lots(len(candidates.valid), key=key)
         return candidates, {"utility": whole / 1000.0 * np.asarray(factor)} | lots
+
+    def conclude(
+        self,
+        situation: Situation,
+        candidates: Candidates,
+        utilities: dict[str, np.ndarray],
+        best: int,
+    ) -> OnlineMap:
+        """The map, and that this view was decided on."""
+        del utilities
+        online, pose = memory_of(situation), np.asarray(candidates.T_world_camera[best], np.float64)
+        return replace(online, chosen=np.concatenate([online.chosen, pose[None]]))
+
+    def reconsider(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        planned: Decision,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
+        """Decides again; the view that was planned is not one that was decided on."""
+        online = state.memory
+        state = replace(state, memory=replace(online, chosen=online.chosen[:-1]))
+        return super().reconsider(state, map_state, grid, T_world_camera, planned, key=key)

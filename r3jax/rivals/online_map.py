@@ -24,7 +24,7 @@ from r3jax.rivals.settings import MapSettings
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.config import DILATION, FRUSTUM_MARGIN, NEAR, RasterConfig
 from r3jax.splatting.harmonics import C0
-from r3jax.splatting.information import with_room
+from r3jax.splatting.information import on_cpu, pixel_tallies, with_room
 from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene, empty_scene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.optimizer import Moments, adam_update, empty_moments
@@ -41,6 +41,9 @@ _OPAQUE = 1e-3
 
 _REACH = 3.4
 """Standard deviations beyond which no Gaussian is drawn: alpha is below 1/255 there."""
+
+SUPPORT = 0.03
+"""A key frame sees a Gaussian that weighs more than this at one of its pixels with depth."""
 
 _LONGEST_STEP = 3.2
 """Steps of Adam are at most so many learning rates long: (1 - beta1) / sqrt(1 - beta2)."""
@@ -74,11 +77,11 @@ class OnlineMap(eqx.Module):
     marks: Float[Array, "n m"]
     """Numbers that a rival keeps per Gaussian."""
 
-    shown: Bool[Array, " n"]
-    """True where a training view has shown the Gaussian."""
-
     frames: Keyframes
     """All frames so far."""
+
+    chosen: Float[np.ndarray, "V 4 4"]
+    """T_world_camera of the views that were decided on, for a rival that asks for them."""
 
     camera: Camera
     """Camera of the key frames."""
@@ -108,13 +111,13 @@ def empty_online_map(
     return OnlineMap(
         scene=empty_scene(FIRST_CAPACITY, 0),
         marks=jnp.zeros((FIRST_CAPACITY, num_marks)),
-        shown=jnp.zeros(FIRST_CAPACITY, dtype=bool),
         frames=Keyframes(
             rgb=np.zeros((0, height, width, 3), np.uint8),
             depth=np.zeros((0, height, width), np.float32),
             T_world_camera=np.zeros((0, 4, 4), np.float32),
             error=np.zeros(0, np.float32),
         ),
+        chosen=np.zeros((0, 4, 4)),
         camera=camera.resized(width, height),
         seed=np.asarray(jax.random.key_data(key) if is_typed else key),
     )
@@ -193,13 +196,13 @@ def _with_births(online: OnlineMap, settings: MapSettings, rng: np.random.Genera
     )  # fmt: skip
     more = len(born.means)
     capacity = max(online.scene.capacity, _length_for(num + more))
-    scene, marks, shown = grown((online.scene, online.marks, online.shown), capacity)
+    scene, marks = grown((online.scene, online.marks), capacity)
     # On the host: on the device, every number of births would compile anew.
     scene, rows = jax.tree.map(np.array, scene), slice(num, num + more)
     scene.means[rows], scene.quats[rows] = born.means, born.quats
     scene.log_scales[rows], scene.opacity_logits[rows] = born.log_scales, 0.0
     scene.sh[rows, 0] = (born.colors - 0.5) / C0
-    return replace(online, scene=jax.tree.map(jnp.asarray, scene), marks=marks, shown=shown)
+    return replace(online, scene=jax.tree.map(jnp.asarray, scene), marks=marks)
 
 
 def rows_in_view(
@@ -283,7 +286,7 @@ def _mean_over(values: Array, mask: Array) -> Float[Array, ""]:
 
 def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator) -> OnlineMap:
     """Takes the steps of Adam of one key frame."""
-    scene, shown, frames, camera = online.scene, online.shown, online.frames, online.camera
+    scene, frames, camera = online.scene, online.frames, online.camera
     moments, error = empty_moments(scene), frames.error.copy()
     means, rows = np.asarray(scene.means)[: online.num_gaussians], dict[int, np.ndarray]()
     function = partial(_gradient_of_view, settings=settings)
@@ -297,8 +300,8 @@ def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator)
                 rows[number] = _filled_up(in_view, scene.capacity)
             gradient, found = with_room(function, scene, camera, frame, rows[number])
             total, error[number] = _added(total, gradient, rows[number]), float(found)
-        scene, moments, shown = _stepped(scene, moments, shown, total, len(batch), settings)
-    return replace(online, scene=scene, shown=shown, frames=replace(frames, error=error))
+        scene, moments = _stepped(scene, moments, total, len(batch), settings)
+    return replace(online, scene=scene, frames=replace(frames, error=error))
 
 
 def _filled_up(rows: np.ndarray, capacity: int) -> Int[np.ndarray, " r"]:
@@ -316,13 +319,20 @@ def _length_for(num: int) -> int:
 
 
 def drawn_batch(error: np.ndarray, settings: MapSettings, rng: np.random.Generator) -> list[int]:
-    """Draws the key frames of a step: the latest, and earlier ones by their last error [F]."""
+    """Draws the key frames of a step: the latest, and some earlier ones.
+
+    Args:
+        error: last error of each key frame [F].
+        settings: how many of each, and whether by their errors.
+        rng: what is drawn.
+    """
     num = len(error)
     recent = list(range(max(0, num - settings.recent), num))
     earlier = num - len(recent)
     share = error[:earlier].astype(np.float64) + 1e-9
     size = min(settings.older, earlier)
-    drawn = rng.choice(earlier, size, replace=False, p=share / share.sum()) if size else []
+    odds = share / share.sum() if settings.by_error else None
+    drawn = rng.choice(earlier, size, replace=False, p=odds) if size else []
     return [*recent, *(int(number) for number in drawn)]
 
 
@@ -330,16 +340,16 @@ def drawn_batch(error: np.ndarray, settings: MapSettings, rng: np.random.Generat
 def _stepped(
     scene: GaussianScene,
     moments: Moments,
-    shown: Bool[Array, " n"],
     total: GaussianScene,
     num: Array,
     settings: MapSettings,
-) -> tuple[GaussianScene, Moments, Bool[Array, " n"]]:
+) -> tuple[GaussianScene, Moments]:
     """One step of Adam down the mean gradient of a batch of `num` key frames."""
     gradient = jax.tree.map(lambda g: g / num, total)
     if settings.isotropy > 0.0:
         uneven = jax.grad(_unevenness)(scene)
-        gradient = jax.tree.map(lambda g, u: g + settings.isotropy * u, gradient, uneven)
+        weight = settings.isotropy / num  # beside the sum, of which this is the mean
+        gradient = jax.tree.map(lambda g, u: g + weight * u, gradient, uneven)
     if settings.flat:
         # The third axis of a disc has no size to learn.
         gradient = eqx.tree_at(
@@ -356,15 +366,37 @@ def _stepped(
     scene, moments = adam_update(scene, gradient, moments, rate, config, jnp.asarray(True))
     largest = jnp.log(settings.max_size)
     scene = eqx.tree_at(lambda s: s.log_scales, scene, jnp.minimum(scene.log_scales, largest))
-    return scene, moments, shown | (total.opacity_logits != 0.0)
+    return scene, moments
+
+
+@jax.jit
+def _supported(
+    config: RasterConfig, scene: GaussianScene, camera: Camera, pose: Array, depth: Array
+) -> tuple[Bool[Array, " n"], Array]:
+    is_valid = (depth > 0.0).astype(jnp.float32)
+    tallies, overflow = pixel_tallies(
+        scene, camera, pose, is_valid, is_valid, config, least_weight=SUPPORT
+    )
+    return tallies[:, 1] > 0.0, overflow
+
+
+def supported_by(online: OnlineMap, number: int) -> Bool[np.ndarray, " n"]:
+    """Finds the Gaussians that a key frame sees, by the map as it is."""
+    frames = online.frames
+    frame = jnp.asarray(frames.T_world_camera[number]), jnp.asarray(frames.depth[number])
+    # To the host, so that it may join arrays on an accelerator.
+    return np.asarray(with_room(_supported, *on_cpu((online.scene, online.camera, *frame))))
 
 
 def _pruned(online: OnlineMap, settings: MapSettings) -> OnlineMap:
-    """Drops what is faint, and what no training view has shown; the rest moves up."""
+    """Drops what is faint, and what no key frame sees any more; the rest moves up."""
     opaque = jax.nn.sigmoid(online.scene.opacity_logits) >= settings.prune_opacity
-    keep = np.asarray(online.scene.is_alive & opaque & online.shown)
-    scene, marks, shown = kept_rows((online.scene, online.marks, online.shown), keep)
-    return replace(online, scene=scene, marks=marks, shown=shown)
+    is_seen = np.zeros(online.scene.capacity, dtype=bool)
+    for number in range(len(online.frames)):
+        is_seen |= supported_by(online, number)
+    keep = np.asarray(online.scene.is_alive & opaque) & is_seen
+    scene, marks = kept_rows((online.scene, online.marks), keep)
+    return replace(online, scene=scene, marks=marks)
 
 
 def colored(scene: GaussianScene, values: Float[Array, " n"]) -> GaussianScene:

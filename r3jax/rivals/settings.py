@@ -23,7 +23,7 @@ class MapSettings:
     """Larger ones are cut down to this [m]."""
 
     birth_color: float = 0.25
-    """Squared color error, summed over channels, above which a pixel gets a new Gaussian."""
+    """Squared color error, mean of the channels, above which a pixel gets a new Gaussian."""
 
     birth_opacity: float = 0.5
     """Rendered opacity below which it does."""
@@ -38,7 +38,10 @@ class MapSettings:
     """Latest key frames in every batch."""
 
     older: int = 5
-    """Earlier ones in it, drawn in proportion to the last error of each."""
+    """Earlier ones in it, drawn at random."""
+
+    by_error: bool = True
+    """Draws them in proportion to the last error of each; False: all alike."""
 
     color_weight: float = 1.0
     """Weight of the mean absolute error of colors."""
@@ -47,7 +50,8 @@ class MapSettings:
     """Weight of that of depths [1/m]."""
 
     isotropy: float = 0.0
-    """Weight of the mean difference between a Gaussian's sizes and their mean [1/m]."""
+    """Weight of the mean difference between a Gaussian's sizes and their mean [1/m], beside the sum
+    of the losses of a batch."""
 
     rate_means: float = 5e-4
     """Learning rate of the centers [m]."""
@@ -68,7 +72,7 @@ class MapSettings:
     """Key frames between two prunings."""
 
     prune_opacity: float = 0.1
-    """What is fainter than this is pruned, and what no training view has shown."""
+    """What is fainter than this is pruned, and what no key frame sees any more."""
 
 
 DISCS = MapSettings()
@@ -78,6 +82,7 @@ BALLS = MapSettings(flat=False)
 """The same map of balls, for FisherRF, which brings no online map of its own."""
 
 GAUSS_MI = MapSettings(
-    flat=False, steps=20, recent=8, older=2, color_weight=0.9, depth_weight=0.1, isotropy=10.0
-)
+    flat=False, steps=20, recent=8, older=2, by_error=False, color_weight=0.9, depth_weight=0.1,
+    isotropy=10.0,
+)  # fmt: skip
 """GauSS-MI: 20 steps per key frame over a window of 8 and 2 older ones, with its loss."""

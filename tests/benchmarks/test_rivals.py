@@ -24,8 +24,7 @@ def room_map(num_gaussians: int, capacity: int, num_frames: int = 24):
     scene = room_cloud(num_gaussians)
     sizes = jnp.full((num_gaussians, 3), np.log(0.01))
     scene = eqx.tree_at(lambda s: (s.sh, s.log_scales), scene, (scene.sh[:, :1], sizes))
-    shown = jnp.ones(num_gaussians, dtype=bool)
-    scene, marks, shown = grown((scene, jnp.zeros((num_gaussians, 0)), shown), capacity)
+    scene, marks = grown((scene, jnp.zeros((num_gaussians, 0))), capacity)
     rng = np.random.default_rng(0)
     angles = 0.3 * np.arange(num_frames)
     ahead = np.stack([np.cos(angles), np.sin(angles), -0.2 * np.ones(num_frames)], axis=1)
@@ -36,7 +35,7 @@ def room_map(num_gaussians: int, capacity: int, num_frames: int = 24):
         T_world_camera=np.stack(poses).astype(np.float32),
         error=np.ones(num_frames, np.float32),
     )
-    return replace(online, scene=scene, marks=marks, shown=shown, frames=frames)
+    return replace(online, scene=scene, marks=marks, frames=frames)
 
 
 @pytest.mark.parametrize(

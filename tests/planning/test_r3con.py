@@ -97,6 +97,16 @@ def test_utility_is_all_round_and_the_direction_comes_after(decided):
         assert 0.0 < seen <= 1.0
 
 
+def test_what_sees_no_voxel_does_not_raise_the_weight_of_paths():
+    state, grid = known()
+    near = ScoringConfig(zbuffer_size=32, panorama_size=32, max_range=0.05)
+    policy = make_policy("r3con", num_candidates=60, scoring=near)
+    first = policy.init(CAMERA, grid, key=KEY)
+    decision, _, _ = policy.decide(first, state, grid, pose_at(here()), key=KEY)
+    assert np.all(decision.utilities["rendering"] == 0.0)
+    assert np.all(decision.utilities["mean_lack"] == 0.0)
+
+
 def test_parts_can_be_exchanged_one_by_one(decided):
     """A path weight given replaces the adaptive one; the cone's sum replaces that of all round."""
     total = R3con(R3conConfig(path_weight=0.5)).weigh(candidates())

@@ -31,17 +31,24 @@ def sides_by_hand(modules: Modules) -> None:
 
 
 def evidence_by_hand(modules: Modules) -> None:
-    """A loss of 0.588 is where belief turns into doubt; 1e-4 is the floor after the factor."""
-    rgb = jnp.full((1, 4, 3), 0.9)
-    depth = jnp.array([[2.0, 2.0, 0.0, 2.0]])
+    """A loss of 0.588 is where belief turns into doubt; 1e-4 is the floor after the factor.
+
+    The photo tells where there is a loss: a map that shows nothing is wrong, a black photo tells
+    of nothing.
+    """
+    rgb = jnp.full((1, 6, 3), 0.9).at[0, 5].set(0.0)
+    depth = jnp.array([[2.0, 2.0, 0.0, 2.0, 2.0, 0.0]])
     off = 0.588 / 0.95
-    shown = np.array([[0.9 - off] * 3, [0.9] * 3, [0.9] * 3, [0.9] * 3], np.float32)
-    seen = Seen(jnp.asarray(shown)[None], jnp.array([[2.0, 2.0, 5.0, 1.0]]), jnp.ones((1, 4)))
+    shown = np.array([[0.9 - off] * 3, *[[0.9] * 3] * 3, [0.0] * 3, [0.4] * 3], np.float32)
+    distance = jnp.array([[2.0, 2.0, 5.0, 1.0, 0.0, 3.0]])
+    seen = Seen(jnp.asarray(shown)[None], distance, jnp.ones((1, 6)))
     found = np.asarray(modules["gauss_mi"].evidence(seen, rgb, depth))[0]
     assert found[0] == pytest.approx(-np.log(1.7 * 0.588), abs=1e-5)
     assert abs(found[0]) < 1e-3
     np.testing.assert_allclose(found[1:3], -np.log(1e-4), rtol=1e-6)  # no depth: no depth error
     assert found[3] == pytest.approx(-np.log(1.7 * 0.05), rel=1e-5)
+    assert found[4] == pytest.approx(-np.log(1.7 * (0.95 * 0.9 + 0.05 * 2.0)), rel=1e-5)
+    assert found[5] == pytest.approx(-np.log(1e-4), rel=1e-6)
 
 
 def belief_by_hand(modules: Modules) -> None:
@@ -93,6 +100,8 @@ def novelty_by_hand(modules: Modules) -> None:
     turned = np.asarray(look_at(poses[2, :3, 3], poses[2, :3, 3] + [1.0, 5.0, 0.0]))  # 11.3 degrees
     assert novelty(turned, poses) == 1.0
     assert novelty(poses[2], poses[:5]) == 1.0  # five poses: nothing is held back
+    assert novelty(poses[1], poses) == pytest.approx(1.0 - 0.95**5)
+    assert novelty(poses[0], poses) == 1.0  # the first of all is not asked
 
 
 LAWS = [sides_by_hand, evidence_by_hand, belief_by_hand, utility_is_brute_force, novelty_by_hand]
@@ -122,7 +131,10 @@ MUTANTS = [
     Mutant("gauss_mi", "jnp.maximum(-x, 0.0)", "jnp.maximum(x, 0.0)", sides_by_hand),
     Mutant("gauss_mi", "LOSS_FACTOR, LEAST_LOSS = 1.7, 1e-4", "LOSS_FACTOR, LEAST_LOSS = 1.0, 1e-4",
            evidence_by_hand),
-    Mutant("gauss_mi", "& (depth > 0.01)", "", evidence_by_hand),
+    Mutant("gauss_mi", "rgb.sum(axis=-1) > 0.01, depth > 0.01",
+           "rgb.sum(axis=-1) > 0.01, depth >= 0.0", evidence_by_hand),
+    Mutant("gauss_mi", "= rgb.sum(axis=-1) > 0.01,", "= seen.rgb.sum(axis=-1) > 0.01,",
+           evidence_by_hand),
     Mutant("gauss_mi", "tallies[:, 1] >= LEAST_PIXELS", "tallies[:, 1] >= 0.0", belief_by_hand),
     Mutant("gauss_mi", "change = jnp.clip(GAIN * weights * tallies[:, :1], -LIMIT, LIMIT)",
            "change = GAIN * weights * tallies[:, :1]", belief_by_hand),
@@ -130,7 +142,8 @@ MUTANTS = [
            "doubt, offsets = 1.0 - reliability(marks)", utility_is_brute_force),
     Mutant("gauss_mi", "for back in range(1,", "for back in range(0,", novelty_by_hand),
     Mutant("gauss_mi", "if len(before) <= 5:", "if len(before) <= 4:", novelty_by_hand),
-    Mutant("gauss_mi", "<= SAME_DIRECTION", "<= 2.0 * SAME_DIRECTION", novelty_by_hand),
+    Mutant("gauss_mi", "len(before) - 1)", "len(before))", novelty_by_hand),
+    Mutant("gauss_mi", "< SAME_DIRECTION", "< 2.0 * SAME_DIRECTION", novelty_by_hand),
 ]  # fmt: skip
 
 

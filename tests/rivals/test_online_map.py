@@ -20,17 +20,21 @@ from r3jax.rivals.online_map import (
     FIRST_ERROR,
     _added,
     _gradient_of_view,
+    _pruned,
+    _stepped,
     add_frame,
     colored,
     drawn_batch,
     empty_online_map,
     rows_in_view,
     show,
+    supported_by,
 )
 from r3jax.rivals.settings import BALLS, DISCS, GAUSS_MI
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import rotation_rows
 from r3jax.splatting.render import render
+from r3jax.splatting.training.optimizer import empty_moments
 from tests.exploration.toys import BoxRoom
 from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.splatting.clouds import random_cloud
@@ -162,14 +166,55 @@ def test_a_batch_is_the_latest_frames_and_earlier_ones_by_their_error():
         batch = drawn_batch(error, DISCS, rng)
         assert batch[:3] == [8, 9, 10]
         assert sorted(batch[3:]) == [1, 3, 4, 6, 7]  # those of error 0 are not drawn
-    assert len(drawn_batch(np.ones(30), GAUSS_MI, rng)) == 10
+    # GauSS-MI draws its two earlier ones whatever their errors.
+    drawn = [drawn_batch(np.append(np.zeros(4), np.ones(9)), GAUSS_MI, rng) for _ in range(60)]
+    assert all(batch[:8] == list(range(5, 13)) for batch in drawn)
+    assert {number for batch in drawn for number in batch[8:]} == {0, 1, 2, 3, 4}
+
+
+def test_sizes_are_evened_out_beside_the_sum_of_the_losses():
+    """Where the losses have no gradient, what is left is that of the unevenness, by batch."""
+    scene = random_cloud(0, 6, 0)
+    nothing = jax.tree.map(jnp.zeros_like, scene)
+
+    def unevenness(log_scales):
+        sizes = jnp.exp(log_scales)
+        return jnp.mean(jnp.abs(sizes - sizes.mean(axis=1, keepdims=True)))
+
+    slope = jax.grad(unevenness)(scene.log_scales)
+    assert float(jnp.abs(slope).max()) > 1e-3
+    for num in (1, 10):
+        _, moments = _stepped(scene, empty_moments(scene), nothing, num, GAUSS_MI)
+        # Adam's first moment: a tenth of the gradient.
+        np.testing.assert_allclose(moments.mean.log_scales, slope / num, rtol=1e-4, atol=1e-8)
+
+
+def test_what_no_key_frame_sees_any_more_is_pruned():
+    online = mapped(DISCS, 4)
+    scene, seen = online.scene, np.zeros(online.scene.capacity, dtype=bool)
+    for number in range(4):
+        seen |= supported_by(online, number)
+    gone, faint = np.flatnonzero(seen)[[5, 9]]
+    # The one is now behind all cameras, which look along +x and turn by 0.6; the other is faint.
+    means = scene.means.at[gone].set(jnp.array([-50.0, 0.0, 0.0]))
+    logits = scene.opacity_logits.at[faint].set(-4.0)
+    changed = eqx.tree_at(lambda s: (s.means, s.opacity_logits), scene, (means, logits))
+    online = replace(online, scene=changed)
+    expected = np.asarray(scene.is_alive) & np.asarray(jax.nn.sigmoid(logits) >= 0.1)
+    expected &= np.any([supported_by(online, number) for number in range(4)], axis=0)
+    assert not expected[[gone, faint]].any()
+    pruned = _pruned(online, DISCS)
+    assert pruned.num_gaussians == expected.sum() > 1000
+    kept = np.asarray(pruned.scene.means)[: pruned.num_gaussians]
+    np.testing.assert_array_equal(kept, np.asarray(means)[expected])
 
 
 def births_by_hand(modules: Modules) -> None:
     """Each of the three reasons just beyond its threshold, and just short of it."""
     rgb, depth = np.full((1, 6, 3), 0.5, np.float32), np.full((1, 6), 2.0, np.float32)
-    off = np.sqrt(0.25 / 3.0)
-    color = rgb + np.array([off + 1e-3, off - 1e-3, 0, 0, 0, 0])[None, :, None]
+    # The mean of the three channels: one that is off by 0.7 is not enough.
+    color = rgb + np.array([0.501, 0.499, 0, 0, 0, 0])[None, :, None]
+    color[0, 5, 0] += 0.7
     distance = np.array([[2.0, 2.0, 2.0, 2.0, 2.11, 2.09]])
     alpha = np.array([[1.0, 1.0, 0.49, 0.51, 1.0, 1.0]])
     found = modules["births"].is_wrong(rgb, depth, (color, distance, alpha), DISCS)
@@ -208,14 +253,13 @@ def discs_lie_on_their_wall(modules: Modules) -> None:
 
 def rows_move_whole(modules: Modules) -> None:
     scene = random_cloud(1, 6, 0)
-    marks, shown = jnp.arange(12.0).reshape(6, 2) + 1.0, jnp.array([True, False] * 3)
+    marks = jnp.arange(12.0).reshape(6, 2) + 1.0
     keep = np.array([False, True, True, False, True, False])
-    kept, moved, flags = modules["births"].kept_rows((scene, marks, shown), keep)
+    kept, moved = modules["births"].kept_rows((scene, marks), keep)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         a, b = np.asarray(getattr(kept, name)), np.asarray(getattr(scene, name))
         np.testing.assert_array_equal(a[:3], b[keep])
     np.testing.assert_array_equal(moved, [[3, 4], [5, 6], [9, 10], [0, 0], [0, 0], [0, 0]])
-    assert flags.tolist() == [False, True, True, False, False, False]
     assert np.asarray(kept.is_alive).tolist() == [True] * 3 + [False] * 3
 
 
@@ -228,14 +272,11 @@ def test_births_and_rows_are_right(law):
 
 
 def test_a_map_grows_by_unused_rows():
-    scene, marks, shown = grown(
-        (random_cloud(1, 6, 0), jnp.ones((6, 2)), jnp.ones(6, dtype=bool)), 16
-    )
+    scene, marks = grown((random_cloud(1, 6, 0), jnp.ones((6, 2))), 16)
     assert scene.capacity == 16
     assert int(scene.is_alive.sum()) == 6
     assert float(marks.sum()) == 12.0
-    assert int(shown.sum()) == 6
-    back, *_ = kept_rows((scene, marks, shown), np.asarray(scene.is_alive))
+    back, _ = kept_rows((scene, marks), np.asarray(scene.is_alive))
     for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(scene), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -272,6 +313,8 @@ def test_values_are_composited_by_their_weights():
 
 MUTANTS = [
     Mutant("births", "(error > settings.birth_color)", "(error > 1.1 * settings.birth_color)",
+           births_by_hand),
+    Mutant("births", "np.mean((color - rgb) ** 2, axis=-1)", "np.max((color - rgb) ** 2, axis=-1)",
            births_by_hand),
     Mutant("births", "depth - distance < -settings.birth_depth * depth",
            "distance - depth < -settings.birth_depth * depth", births_by_hand),

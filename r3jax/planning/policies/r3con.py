@@ -8,7 +8,9 @@ Candidates are centers of cells within 2 m, none at the frontier, and the presen
 The field of view plays no part in the utility: the direction is chosen afterwards, the axis round
 which a cone of half the smaller field of view holds the greatest sum. The weight of the path falls
 as the place becomes well rendered. Re-implemented from the facts on this project's map, whose R it
-takes; nothing is copied. As there, every unexplored cell counts, however often it was looked at.
+takes; nothing is copied. A cell that is neither free nor occupied counts, however often it was
+looked at. There a cell that was touched once never counts again, and scenes with missing surfaces
+have a stored mask of what can be seen at all, an oracle that is left out here.
 
 Shape symbols: C candidates; B bins of the panorama.
 """
@@ -116,7 +118,8 @@ class R3con(GreedyPolicy):
         return turned, {
             "exploration": cells,
             "rendering": lack,
-            "mean_lack": np.where(voxels > 0.0, lack / np.maximum(voxels, 1.0), 1.0),
+            # What sees no voxel does not raise the weight of paths.
+            "mean_lack": lack / np.maximum(voxels, 1.0),
             "utility": all_round if self.config.all_round else in_cone,
         }
 
