@@ -61,7 +61,8 @@ class Chooser(Protocol):
         Args:
             memory: what `observe` returned.
             known: map, grid and frames of the photos chosen so far.
-            model: the radiance field in training, as it is now; not to be kept.
+            model: the radiance field in training, as it is now, with the harmonics that are trained
+                so far; not to be kept.
             poses: of the candidates, [K, 4, 4].
             key: randomness of this choice.
         """

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -184,7 +185,11 @@ class _Choice:
             key = jax.random.fold_in(jax.random.key(self.seed), len(self.chosen))
             begin = time.perf_counter()
             scores = self.chooser.score(
-                self.memory, self.known, scene, self.pool.poses[candidates], key=key
+                self.memory,
+                self.known,
+                self._as_trained(scene, step),
+                self.pool.poses[candidates],
+                key=key,
             )
             self.seconds.append(time.perf_counter() - begin)
             self._take(int(candidates[np.argmax(scores)]))
@@ -206,6 +211,16 @@ class _Choice:
         self.chosen.append(number)
         self.known = self.known.shown(frame)
         self.memory = self.chooser.observe(self.memory, self.known, frame)
+
+    def _as_trained(self, scene: GaussianScene, step: int) -> GaussianScene:
+        """The scene with the harmonics that are in training at a step.
+
+        The others are 0 and would get no gradient; but by how a pixel would move with them they
+        would count as what is known least.
+        """
+        every = self.terms.train_config(self.seed).schedule().sh_every
+        degree = min(step // every, scene.sh_degree)
+        return eqx.tree_at(lambda s: s.sh, scene, scene.sh[:, : (degree + 1) ** 2])
 
     def _newborn(self, scene: GaussianScene) -> GaussianScene:
         """Gaussians on what the latest photo shows and the scene has not."""

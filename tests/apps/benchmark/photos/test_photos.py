@@ -67,7 +67,7 @@ class Spy:
     """Takes the last candidate, and notes what it was given."""
 
     def __init__(self):
-        self.observed, self.asked = [], []
+        self.observed, self.asked, self.harmonics = [], [], []
 
     def begin(self, known):
         assert not known.chosen
@@ -84,6 +84,7 @@ class Spy:
         assert isinstance(model, GaussianScene)
         # A part of what the model is now: it must have been trained since the last choice.
         self.asked.append((memory, poses, np.asarray(model.means[:20]), key))
+        self.harmonics.append(model.sh.shape[1])
         return np.arange(len(poses))
 
 
@@ -107,6 +108,14 @@ def test_a_chooser_sees_the_chosen_photos_the_model_and_poses(pool, spied):
     means = [means for _, _, means, _ in spy.asked]
     assert np.any(means[0] != means[1])
     assert np.any(means[1] != means[2])
+
+
+def test_a_chooser_sees_the_harmonics_that_are_trained(spied):
+    """The others are 0 still: gradients by them would tell of nothing that is in the model."""
+    every = TERMS.train_config(1).schedule().sh_every
+    degrees = [min((n + 1) * TERMS.every // every, 3) for n in range(TERMS.choose)]
+    assert spied[0].harmonics == [(degree + 1) ** 2 for degree in degrees]
+    assert degrees[0] < 3
 
 
 def test_the_photos_that_judge_are_judged(pool, spied):
