@@ -79,7 +79,7 @@ DISCS = MapSettings()
 """Active-GS: mapper/incremental.yaml."""
 
 BALLS = MapSettings(flat=False)
-"""The same map of balls, for FisherRF, which brings no online map of its own."""
+"""The same map of balls, for FisherRF's rule for photos, which brings no online map of its own."""
 
 GAUSS_MI = MapSettings(
     flat=False, steps=20, recent=8, older=2, by_error=False, color_weight=0.9, depth_weight=0.1,
