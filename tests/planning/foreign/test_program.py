@@ -1,5 +1,6 @@
 """Programs: what dies, hangs, or talks nonsense is told in a sentence, and nothing goes on."""
 
+import select
 import shlex
 import sys
 import time
@@ -76,6 +77,28 @@ def test_what_goes_wrong_is_told_and_the_program_ended(code, says):
     with pytest.raises(PolicyError, match=says):
         program.ask(Message("decide"), 20.0)
     assert not is_running(pid)
+
+
+@pytest.mark.parametrize(
+    ("code", "count"),
+    [
+        ("receive(); send(TEXT); time.sleep(0.1); send(TEXT); receive(); send(TEXT)", 20),
+        ("receive(); send(TEXT); time.sleep(0.1); send(b'hi'); receive(); send(TEXT)", 2),
+    ],
+)
+def test_an_answer_before_its_question_is_refused(code, count):
+    """One message too many would be the answer to the next question, and so on."""
+    program = Program(python(code), 0.0)
+    assert program.ask(Message("decide"), 20.0).kind == "a"
+    assert select.select([program._process.stdout], [], [], 20.0)[0]
+    with pytest.raises(PolicyError, match=f"it sent {count} bytes before it was asked"):
+        program.ask(Message("decide"), 20.0)
+
+
+def test_an_answer_to_half_a_question_is_refused():
+    """The other half would be the beginning of the next question."""
+    with pytest.raises(PolicyError, match="it sent 20 bytes before it was asked"):
+        asked("sys.stdin.buffer.read(8); send(TEXT); time.sleep(60)", x="y" * 1_000_000)
 
 
 def test_a_program_that_hangs_is_given_up_with_what_it_started():

@@ -112,7 +112,7 @@ class Program:
         Raises:
             TimeoutError: it is past `end` on the monotonic clock.
             EOFError: the program has closed its output.
-            MessageError: what comes is no message.
+            MessageError: what comes is no message, or comes before the question is sent.
         """
         streams = self._process.stdin, self._process.stdout, self._process.stderr
         into, out, errors = (pipe.fileno() for pipe in streams if pipe is not None)
@@ -129,7 +129,7 @@ class Program:
                     selector.unregister(errors)
                 if out in ready:
                     inbox += (chunk := os.read(out, _CHUNK))
-                    if _is_whole(inbox):
+                    if _is_whole(inbox, not left):
                         return bytes(inbox)
                     if not chunk:
                         raise EOFError
@@ -158,18 +158,26 @@ class Program:
         return f"ended with code {code}"
 
 
-def _is_whole(inbox: bytearray) -> bool:
+def _is_whole(inbox: bytearray, asked: bool) -> bool:
     """Whether a message is there.
 
+    Args:
+        inbox: what has come.
+        asked: the question is sent to its end.
+
     Raises:
-        MessageError: too long, or more than one.
+        MessageError: too long, more than one, or before the question.
     """
-    if len(inbox) < PREFIX.size:
-        return False
-    length = length_of(bytes(inbox[: PREFIX.size]))
-    if len(inbox) > length:
-        raise MessageError(f"{len(inbox) - length} bytes more than one message were sent")
-    return len(inbox) == length
+    is_short = len(inbox) < PREFIX.size
+    missing = (PREFIX.size if is_short else length_of(bytes(inbox[: PREFIX.size]))) - len(inbox)
+    if missing < 0:
+        raise MessageError(f"{-missing} bytes more than one message were sent")
+    if inbox and not asked:  # taken for the answer, it would shift all later ones by one
+        raise MessageError(
+            f"it sent {len(inbox)} bytes before it was asked: send one message for each question, "
+            "after reading it, and print to the standard error"
+        )
+    return missing == 0
 
 
 def _write(into: int, left: memoryview) -> int:
