@@ -73,7 +73,7 @@ class Program:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 bufsize=0,
-                # A group of its own: what it starts is ended with it, and Ctrl-C is the loop's.
+                # A group of its own: it is ended with the program, and Ctrl-C is the loop's.
                 start_new_session=True,
             )
         except OSError as error:
@@ -208,7 +208,7 @@ def _wait(process: "subprocess.Popen[bytes]") -> int | None:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Ends a program and what it has started."""
+    """Ends a program and its group: what it has started, but for what has left the group."""
     for pipe in (process.stdin, process.stdout):
         assert pipe is not None
         pipe.close()
