@@ -61,6 +61,9 @@ def test_a_program_answers_and_ends_with_its_input():
         ("raise ValueError('no weights')", "ended with code 1; it said: .*no weights"),
         ("receive(); os.kill(os.getpid(), 9)", "was killed by SIGKILL, perhaps for its memory"),
         ("receive(); os.close(1); time.sleep(60)", "closed its output and went on"),
+        ("os.close(0); time.sleep(60)", "closed its input and went on"),
+        ("receive(); os.close(0); time.sleep(60)", "closed its input and went on"),
+        ("receive(); os.close(0); sys.exit(4)", "ended with code 4"),
         ("print('Loading ...', flush=True); time.sleep(60)", "print to the standard error"),
         (
             "receive(); send(b'\\x02\\0\\0\\0\\0\\0\\0\\0[]'); time.sleep(60)",
@@ -123,6 +126,14 @@ def test_a_program_that_does_not_read_is_given_up():
     program = Program(python("time.sleep(600)"), 0.0)
     with pytest.raises(PolicyError, match=r"within 0\.5 s"):
         program.ask(Message("decide", {"x": "y" * 1_000_000}), 0.5)
+
+
+@pytest.mark.parametrize("end", ["os.close(0); time.sleep(60)", "os._exit(0)"])
+def test_an_answer_counts_though_the_input_is_closed_after_it(end):
+    code = "import fcntl\n"  # on Linux all of the answer fits into the pipe, and waits there
+    code += "hasattr(fcntl, 'F_SETPIPE_SZ') and fcntl.fcntl(1, fcntl.F_SETPIPE_SZ, 1 << 20)\n"
+    code += f"receive(); send(kind='last', text='x' * 1_000_000); {end}"
+    assert len(asked(code).fields["text"]) == 1_000_000
 
 
 def test_a_program_may_say_much_on_its_standard_error():

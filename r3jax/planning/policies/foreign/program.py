@@ -97,8 +97,8 @@ class Program:
             return decode(self._exchange(encode(message), time.monotonic() + seconds))
         except TimeoutError:
             reason = f"gave no answer to `{message.kind}` within {seconds:g} s"
-        except EOFError:
-            reason = self._death()
+        except EOFError as error:
+            reason = self._death(str(error))
         except MessageError as error:
             reason = f"sent no answer to `{message.kind}`: {error}"
         self.close()
@@ -111,7 +111,7 @@ class Program:
 
         Raises:
             TimeoutError: it is past `end` on the monotonic clock.
-            EOFError: the program has closed its output.
+            EOFError: the program has closed its `input` or its `output`, as the text says.
             MessageError: what comes is no message, or comes before the question is sent.
         """
         streams = self._process.stdin, self._process.stdout, self._process.stderr
@@ -132,11 +132,13 @@ class Program:
                     if _is_whole(inbox, not left):
                         return bytes(inbox)
                     if not chunk:
-                        raise EOFError
-                if into in ready:
-                    left = left[_write(into, left) :]
+                        raise EOFError("output")
+                elif into in ready:  # an answer comes first: it may close its input after that
                     if not left:
-                        selector.unregister(into)
+                        raise EOFError("input")
+                    left = left[_write(into, left) :]
+                    if not left:  # there is nothing to read: ready once nobody is at the other end
+                        selector.modify(into, selectors.EVENT_READ)
 
     def _listen(self, errors: int) -> bool:
         """Keeps the end of what the program says; False once it says nothing more."""
@@ -144,15 +146,15 @@ class Program:
         self._said = (self._said + said)[-_TAIL:]
         return bool(said)
 
-    def _death(self) -> str:
-        """How the program ended."""
+    def _death(self, closed: str) -> str:
+        """How the program ended, or what it closed instead: its `input` or its `output`."""
         code = _wait(self._process)
         assert self._process.stderr is not None
         with contextlib.suppress(BlockingIOError):
             while self._listen(self._process.stderr.fileno()):
                 pass
         if code is None:
-            return "closed its output and went on"
+            return f"closed its {closed} and went on"
         if code < 0:
             return f"was killed by {signal.Signals(-code).name}, perhaps for its memory"
         return f"ended with code {code}"
@@ -191,7 +193,7 @@ def _write(into: int, left: memoryview) -> int:
     except BlockingIOError:
         return 0
     except BrokenPipeError:
-        raise EOFError from None
+        raise EOFError("input") from None
 
 
 def _wait(process: "subprocess.Popen[bytes]") -> int | None:
