@@ -34,6 +34,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.robot.motion import Motion, motion_of_record
 from r3jax.trace.errors import RunError
+from r3jax.trace.paths import paths_to
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow, rigid_pose, shortest_floats, table_of
 
@@ -217,43 +218,19 @@ def submission_of_run(run: Run) -> Submission:
 
 def _frames_of(rows: Sequence[StepRow]) -> tuple[SubmittedFrame, ...]:
     """The frames of a trace, each with the piece of the path that leads to it."""
-    frames: list[SubmittedFrame] = []
-    waypoints, begin = np.zeros((0, 3)), 0.0
-    for number, row in enumerate(rows):
-        path = None
-        if number > 0:
-            before = rows[number - 1]
-            if row.choice is not None:  # where frames are captured it stands in the first one's row
-                waypoints, begin = row.choice.waypoints.astype(np.float64), before.metres
-            piece = piece_of_path(waypoints, before.metres - begin, row.metres - begin)
-            # Exactly from frame to frame: lengths along the path are rounded.
-            piece[0], piece[-1] = before.pose[:3, 3], row.pose[:3, 3]
-            path = piece if len(piece) > 2 else None
-        frames.append(
-            SubmittedFrame(
-                frame=row.step,
-                pose=row.pose,
-                seconds=row.seconds,
-                mapping=row.charged.get("mapping", 0.0),
-                metres=row.metres,
-                path=path,
-                captured=row.captured,
-                sha256=row.sha256,
-            )
+    return tuple(
+        SubmittedFrame(
+            frame=row.step,
+            pose=row.pose,
+            seconds=row.seconds,
+            mapping=row.charged.get("mapping", 0.0),
+            metres=row.metres,
+            path=None if path is None or len(path) == 2 else path,  # straight
+            captured=row.captured,
+            sha256=row.sha256,
         )
-    return tuple(frames)
-
-
-def piece_of_path(waypoints: np.ndarray, begin: float, end: float) -> np.ndarray:
-    """Cuts the piece between two lengths [m] out of a path over waypoints [K, 3], [L, 3] [m]."""
-    if len(waypoints) < 2:
-        return np.zeros((2, 3))
-    steps = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-    done = np.concatenate([[0.0], np.cumsum(steps)])
-    # Bends at the very ends of the piece are its ends.
-    between = (done > begin + 1e-4) & (done < end - 1e-4)
-    at = np.concatenate([[begin], done[between], [end]])
-    return np.stack([np.interp(at, done, waypoints[:, axis]) for axis in range(3)], axis=1)
+        for row, path in zip(rows, paths_to(rows), strict=True)
+    )
 
 
 def write_submission(path: Path, submission: Submission) -> None:

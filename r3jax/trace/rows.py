@@ -113,6 +113,12 @@ class StepRow:
     hidden: float = 0.0
     """Planning of this row's decision that the flight before it hid: not on the clock [s]."""
 
+    @property
+    def begins_run(self) -> bool:
+        """True if the camera did not fly to the view: a run begins, be it within a merged one."""
+        flown = self.choice is not None or self.captured or self.charged.get("flight", 0.0) > 0.0
+        return not flown
+
 
 @dataclass(frozen=True)
 class EndRow:
@@ -147,16 +153,6 @@ def make_choice(decision: Decision, info: PlanInfo) -> Choice:
         num_reachable=info.num_reachable,
         top=top,
     )
-
-
-def path_between(before: StepRow, row: StepRow) -> np.ndarray:
-    """Waypoints of the path from one row's view to the next one's, [K, 3] float32 [m].
-
-    Straight between frames that were captured on the way.
-    """
-    if row.choice is None or row.captured or len(row.choice.waypoints) < 2:
-        return np.stack([before.pose[:3, 3], row.pose[:3, 3]])
-    return row.choice.waypoints
 
 
 def finite_or_none(value: float) -> float | None:

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from r3jax.apps.runs.merge import merge_runs
 from r3jax.exploration import explore
 from r3jax.exploration.captures import Rules, begin_leg, points_along
 from r3jax.exploration.config import ExplorationConfig
@@ -24,6 +25,7 @@ from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import MOTIONS, Motion
 from r3jax.trace.header import camera_fields, policy_fields
 from r3jax.trace.images import stored_form
+from r3jax.trace.paths import paths_to
 from r3jax.trace.reader import read_run
 from r3jax.trace.rows import from_json, to_json
 from r3jax.trace.writer import RunWriter
@@ -270,6 +272,34 @@ def test_another_policy_takes_over_on_the_way(tmp_path):
     np.testing.assert_allclose(
         result.rows[at].choice.waypoints[0], run.rows[-1].pose[:3, 3], atol=1e-6
     )
+
+
+class Corners(Wander):
+    """Flies along one axis after the other."""
+
+    def decide(self, state, map_state, grid, T_world_camera, *, key):
+        decision, *more = super().decide(state, map_state, grid, T_world_camera, key=key)
+        (a, _, _), (_, y, z) = decision.waypoints[::-1]
+        way = np.array([decision.waypoints[0], [a, y, z], decision.waypoints[1]])
+        return decision_to(decision.T_world_camera, way), *more
+
+
+def test_the_paths_of_a_merged_run_are_as_long_as_flown(tmp_path):
+    """The first run ends on the way; nothing is flown from there to where the second begins."""
+    for name, seed in (("a", 0), ("b", 1)):
+        record(tmp_path / name, Corners(reach=1.2), AHEAD, "frames:9", seed=seed)
+    parts = [read_run(tmp_path / name) for name in "ab"]
+    assert parts[0].rows[-1].captured
+    merge_runs(parts, tmp_path / "merged")
+    rows = read_run(tmp_path / "merged").rows
+    paths = list(paths_to(rows))
+    assert [i for i, path in enumerate(paths) if path is None] == [0, 9]
+    assert any(len(path) > 2 for path in paths if path is not None)
+    lengths = [
+        0.0 if path is None else np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        for path in paths
+    ]
+    np.testing.assert_allclose(np.cumsum(lengths), [row.metres for row in rows], atol=1e-4)
 
 
 @pytest.mark.parametrize("name", quick_and_full(MOTIONS, ["gimbal"]))

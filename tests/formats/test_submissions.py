@@ -1,7 +1,6 @@
 """Submissions as files: what is written is read, what is damaged is refused and said where."""
 
 import dataclasses
-import itertools
 import json
 
 import numpy as np
@@ -16,7 +15,6 @@ from r3jax.formats.submissions import (
     SubmittedFrame,
     content_hash,
     parse_submission,
-    piece_of_path,
     read_submission,
     submission_text,
     write_submission,
@@ -162,20 +160,3 @@ def test_what_is_wrong_is_said_with_its_line(data, says, tmp_path):
     (tmp_path / "theirs.jsonl").write_bytes(data)
     with pytest.raises(FormatError, match=r"theirs\.jsonl: "):
         read_submission(tmp_path / "theirs.jsonl")
-
-
-@given(
-    arrays(np.float64, (4, 3), elements=st.floats(-3.0, 3.0, width=16)),
-    st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4),
-)
-def test_the_pieces_of_a_path_are_the_path(waypoints, shares):
-    length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
-    cuts = length * np.sort([0.0, *shares, 1.0])
-    pieces = [piece_of_path(waypoints, a, b) for a, b in itertools.pairwise(cuts)]
-    np.testing.assert_allclose(pieces[0][0], waypoints[0], atol=1e-9)
-    np.testing.assert_allclose(pieces[-1][-1], waypoints[-1], atol=1e-9)
-    for before, after in itertools.pairwise(pieces):
-        np.testing.assert_allclose(before[-1], after[0], atol=1e-9)
-    lengths = [np.linalg.norm(np.diff(piece, axis=0), axis=1).sum() for piece in pieces]
-    # Bends within a tenth of a millimeter of an end are left to it.
-    np.testing.assert_allclose(lengths, np.diff(cuts), atol=1e-3)

@@ -1,8 +1,12 @@
 """Small runs for the tests of the trace."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.exploration.captures import points_along
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.header import RunHeader, camera_fields
@@ -65,3 +69,41 @@ def make_view(step: int) -> tuple[StepRow, Frame]:
         coverage=Coverage(10 * step, 4096, 0, 5 * step, 0.01 * step, 9, 0.5, 0.25),
     )
     return row, frame
+
+
+def make_flight(
+    legs: Sequence[tuple[np.ndarray, int]], before: StepRow | None = None
+) -> list[StepRow]:
+    """The rows of a run along paths, each over waypoints and in so many pieces, without frames.
+
+    A path is moved to where the one before ended. With `before`, the last row of a run, the rows
+    are those behind it in a merged run.
+    """
+    row, _ = make_view(0)
+    step, metres = (0, 0.0) if before is None else (before.step + 1, before.metres)
+    row = replace(row, step=step, metres=metres, charged={"flight": 0.0})
+    if legs:
+        row = replace(row, pose=_placed(row.pose, legs[0][0][0]))
+    rows = [row]
+    for waypoints, num in legs:
+        way = (waypoints - waypoints[0] + row.pose[:3, 3]).astype(np.float32)
+        length = float(np.linalg.norm(np.diff(way.astype(np.float64), axis=0), axis=1).sum())
+        for number, place in enumerate(points_along(way.astype(np.float64), num), 1):
+            pose = _placed(row.pose, place)
+            row = replace(
+                row,
+                step=row.step + 1,
+                pose=pose,
+                choice=Choice(pose, 1.0, way, length, 1, 1) if number == 1 else None,
+                metres=row.metres + length / num,
+                charged={"flight": 1.0},
+                captured=number < num,
+            )
+            rows.append(row)
+    return rows
+
+
+def _placed(pose: np.ndarray, place: np.ndarray) -> np.ndarray:
+    pose = pose.copy()
+    pose[:3, 3] = place
+    return pose

@@ -1,6 +1,5 @@
 """The figures of a run. Each function makes one `matplotlib` figure from what was recorded."""
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,8 +15,9 @@ from r3jax.apps.report.pictures import BEYOND, PanoramaPicture, floor_picture
 from r3jax.apps.report.summary import map_row_bytes, stage_times
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.trace.paths import paths_to
 from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow, path_between
+from r3jax.trace.rows import StepRow
 
 _DOT, _CAPTURED_DOT = 26, 8
 """Areas of the marks of views, and of frames that were captured on the way [pt^2]."""
@@ -98,9 +98,9 @@ def _draw_path(axes: Axes, rows: Sequence[StepRow]) -> None:
     """Draws the paths from view to view in the order of acquisition."""
     segments: list[np.ndarray] = []
     colors: list[int] = []
-    for before, row in itertools.pairwise(rows):
-        if row.choice is not None or before.captured:  # else another run of a merged one begins
-            segments.append(path_between(before, row)[:, :2])
+    for row, path in zip(rows, paths_to(rows), strict=True):
+        if path is not None:
+            segments.append(path[:, :2])
             colors.append(row.step)
     edge = LineCollection(segments, linewidths=4.0, colors="white", capstyle="round")
     lines = LineCollection(segments, linewidths=2.0, cmap=style.PATH_MAP, capstyle="round")

@@ -3,7 +3,6 @@
 Shape symbols: n points or Gaussians; s segments; C candidates.
 """
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,8 +11,9 @@ from r3jax.apps.viewer.color_maps import ORDER, paint
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.harmonics import C0
 from r3jax.splatting.scene import GaussianScene
+from r3jax.trace.paths import paths_to
 from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow, path_between
+from r3jax.trace.rows import StepRow
 
 POINT_BUDGET = 200_000
 """Recorded points that are drawn at most."""
@@ -26,15 +26,16 @@ def path_segments(rows: Sequence[StepRow], num_views: int) -> tuple[np.ndarray, 
     """The path that the camera flew, segment by segment.
 
     Args:
-        rows: of the trace, as many as are to be drawn.
+        rows: of the trace from the first one on, as many as are to be drawn.
         num_views: of the whole run, over which the colors run.
 
     Returns:
         Ends [s, 2, 3] float32 [m], and their colors by order [s, 2, 3] uint8.
     """
     ends, order = [np.zeros((0, 2, 3))], [np.zeros(0)]
-    for before, row in itertools.pairwise(rows):
-        path = path_between(before, row)
+    for row, path in zip(rows, paths_to(rows), strict=True):
+        if path is None:
+            continue
         ends.append(np.stack([path[:-1], path[1:]], axis=1))
         order.append(np.full(len(path) - 1, row.step / max(num_views - 1, 1)))
     colors = paint(np.concatenate(order), ORDER)

@@ -49,9 +49,9 @@ def why_no_choice(row: StepRow) -> str:
     """Why no decision stands with a view."""
     if row.captured:
         return "captured on the way"
-    if row.charged.get("flight"):
-        return "the end of a path: what was chosen stands with its first frame"
-    return "the start: nothing was chosen"
+    if row.begins_run:
+        return "the start: nothing was chosen"
+    return "the end of a path: what was chosen stands with its first frame"
 
 
 class Timeline:

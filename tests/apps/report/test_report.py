@@ -10,9 +10,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 
 from r3jax.apps.forecast.forecast import forecast_map
 from r3jax.apps.report import style
+from r3jax.apps.report.figures import plan_figure
 from r3jax.apps.report.pictures import floor_picture, panorama_picture
 from r3jax.apps.report.reasons import COLORS, reasons_figure, shares_of, utility_by_cause
 from r3jax.apps.report.report import write_report
@@ -30,7 +32,7 @@ from r3jax.trace.header import camera_fields
 from r3jax.trace.reader import read_run
 from r3jax.trace.writer import RunWriter
 from tests.exploration.toys import BoxRoom, Wander
-from tests.trace.runs import make_header, make_view
+from tests.trace.runs import make_flight, make_header, make_view
 
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=4)
 
@@ -71,6 +73,21 @@ def test_the_page_stands_alone(reported):
     files = {path.read_bytes() for path in page.parent.glob("*.png")}
     assert {base64.b64decode(image) for image in images} == files
     assert len(files) == 7
+
+
+def test_the_path_from_above_is_as_long_as_flown(reported):
+    """The first of two merged runs ends on the way, and a frame lies behind each corner."""
+    run, result, _ = reported
+    corner = np.array([[1.0, 1.0, 1.3], [1.3, 1.0, 1.3], [1.3, 1.5, 1.3]])
+    first = make_flight([(corner, 2), (corner, 4)])[:-1]
+    rows = [*first, *make_flight([(corner[::-1], 2)], first[-1])]
+    merged = dataclasses.replace(run, rows=tuple(rows))
+    axes = plan_figure(merged, result.state.map_state, result.state.grid).axes[0]
+    drawn = [lines for lines in axes.collections if isinstance(lines, LineCollection)]
+    assert len(drawn) == 2  # the path and its white edge
+    for lines in drawn:
+        steps = np.concatenate([np.diff(line, axis=0) for line in lines.get_segments()])
+        assert np.linalg.norm(steps, axis=1).sum() == pytest.approx(rows[-1].metres, rel=1e-5)
 
 
 @pytest.mark.full

@@ -17,6 +17,7 @@ from r3jax.apps.viewer.overlays import (
 )
 from r3jax.geometry.cameras import Camera, invert_pose, pose_along, project, transform
 from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
+from tests.trace.runs import make_flight
 
 number = st.floats(-1.0, 1.0).filter(lambda x: abs(x) > 1e-3)
 
@@ -76,6 +77,16 @@ def test_the_path_goes_through_every_view_in_order(run):
     assert length == pytest.approx(rows[-1].metres, rel=1e-4)
     assert colors.shape == segments.shape
     assert len(path_segments(rows[:1], len(rows))[0]) == 0
+
+
+def test_no_path_leads_from_run_to_run_and_corners_on_the_way_stay():
+    corner = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 1.0], [0.3, 0.5, 1.0]])
+    first = make_flight([(corner, 4), (corner, 2)])[:-1]  # ends on the way
+    rows = [*first, *make_flight([(corner + 2.0, 1)], first[-1])]
+    segments, colors = path_segments(rows, len(rows))
+    length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum()
+    assert length == pytest.approx(rows[-1].metres, rel=1e-5)
+    assert colors.shape == segments.shape
 
 
 @pytest.mark.full
