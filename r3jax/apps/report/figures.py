@@ -27,15 +27,16 @@ _NEVER_SEEN = "#9ca3af"
 
 
 def progress_figure(run: Run) -> Figure:
-    """Coverage and mean renderability against views and against seconds."""
+    """Coverage and mean renderability against views, or frames, and against seconds."""
     figure = style.new_figure(10.0, 5.6)
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
-    views = np.arange(1, len(run.rows) + 1)
+    numbers = np.arange(1, len(run.rows) + 1)
+    unit = "frames" if any(row.captured for row in run.rows) else "views"
     seconds = np.array([row.seconds for row in run.rows])
     known = np.array([100.0 * row.coverage.known_share for row in run.rows])
     mean = np.array([row.coverage.mean_renderability for row in run.rows])
     arrival = np.array([row.coverage.arrival_renderability for row in run.rows])
-    for column, (x, label) in enumerate([(views, "views"), (seconds, "mission clock [s]")]):
+    for column, (x, label) in enumerate([(numbers, unit), (seconds, "mission clock [s]")]):
         top = style.dress(axes[0, column], y="explored [% of the box]" if column == 0 else "")
         top.plot(x, known, color=style.ACCENT, linewidth=2.0, marker="o", markersize=2.5)
         top.set_ylim(0.0, max(10.0, 1.12 * known.max()))
@@ -54,7 +55,7 @@ def progress_figure(run: Run) -> Figure:
             label="each view just before it was mapped",
         )
         below.set_ylim(0.0, 1.0)
-    axes[0, 0].set_title("Against views", fontsize=11, loc="left", fontweight="bold")
+    axes[0, 0].set_title(f"Against {unit}", fontsize=11, loc="left", fontweight="bold")
     axes[0, 1].set_title("Against time", fontsize=11, loc="left", fontweight="bold")
     # Below the axes: anywhere inside, it covers the curves of some run.
     figure.legend(*axes[1, 0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=2,

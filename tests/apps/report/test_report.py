@@ -14,7 +14,7 @@ from matplotlib.collections import LineCollection
 
 from r3jax.apps.forecast.forecast import forecast_map
 from r3jax.apps.report import style
-from r3jax.apps.report.figures import plan_figure
+from r3jax.apps.report.figures import plan_figure, progress_figure
 from r3jax.apps.report.pictures import floor_picture, panorama_picture
 from r3jax.apps.report.reasons import COLORS, reasons_figure, shares_of, utility_by_cause
 from r3jax.apps.report.report import write_report
@@ -73,6 +73,15 @@ def test_the_page_stands_alone(reported):
     files = {path.read_bytes() for path in page.parent.glob("*.png")}
     assert {base64.b64decode(image) for image in images} == files
     assert len(files) == 7
+
+
+def test_progress_counts_frames_where_there_are_some_on_the_way(reported):
+    run, _, _ = reported
+    rows = (*run.rows[:-1], dataclasses.replace(run.rows[-1], captured=True))
+    for told, unit in ((run, "views"), (dataclasses.replace(run, rows=rows), "frames")):
+        above, _, below, _ = progress_figure(told).axes
+        assert above.get_title(loc="left") == f"Against {unit}"
+        assert below.get_xlabel() == unit
 
 
 def test_the_path_from_above_is_as_long_as_flown(reported):
