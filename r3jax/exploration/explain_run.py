@@ -17,6 +17,7 @@ from r3jax.exploration.captures import scoring_on_the_way
 from r3jax.exploration.replay import (
     check_decided_alone,
     config_of,
+    is_decided_apart,
     planner_config_of,
     states_of,
 )
@@ -25,6 +26,7 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.decision import explain_path, initial_state
 from r3jax.planning.gaze.turning import count_look
 from r3jax.scoring.explain import Explanation
+from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
 
@@ -82,10 +84,17 @@ def explain_run(
         on the way, it stands in the first row of the path, as the choice does.
 
     Raises:
-        RunError: the run was merged, a setting of it is not known, a frame is missing or broken.
+        RunError: the run was merged, or is a fork of one that was or that flew in a team; a
+            setting of it is not known, a frame is missing or broken.
     """
     # First: rebuilding the map takes minutes, and would show a map nobody decided on.
     check_decided_alone(run)
+    if is_decided_apart(run):
+        raise RunError(
+            run.path,
+            "it took views over from a merged run or one of a team, and those were not decided on "
+            "its own map",
+        )
     config, scoring = planner_config_of(run), scoring_on_the_way(config_of(run))
     after_views = iter(states_of(run) if states is None else states)
     memory, before = None, None

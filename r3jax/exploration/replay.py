@@ -187,6 +187,11 @@ def check_decided_alone(run: Run) -> None:
         raise RunError(run.path, "it flew in a team, and decided on what others had seen, too")
 
 
+def is_decided_apart(run: Run) -> bool:
+    """True for a fork of which some views were decided on another map than its frames give."""
+    return bool((run.header.parent or {}).get("decided_apart", False))
+
+
 def _nothing_known(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
     config = config_of(runs[0])
     return empty_map(config.capacity, config.voxel_size, config.num_bins), grid_before(runs)

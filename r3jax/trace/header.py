@@ -78,8 +78,9 @@ class RunHeader:
 
     parent: dict[str, Any] | None = None
     """What else a run rests on: `forked` from a run, `views` of it, the run's own policy from view
-    `decided_from` on; or `merged` runs with `merged_views` each; or the `team` of runs, folders
-    side by side, in which this is number `member`, and that met every `meet_every` seconds."""
+    `decided_from` on, and `decided_apart` if that run was merged or of a team; or `merged` runs
+    with `merged_views` each; or the `team` of runs, folders side by side, in which this is number
+    `member`, and that met every `meet_every` seconds."""
 
     @property
     def is_merged(self) -> bool:

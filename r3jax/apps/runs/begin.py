@@ -1,8 +1,11 @@
 """Runs begun, gone on with, and forked: everything that `explore` is called with."""
 
-import dataclasses
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from r3jax.apps.runs.settings import (
     RunSettings,
@@ -12,6 +15,7 @@ from r3jax.apps.runs.settings import (
     settings_of_run,
 )
 from r3jax.exploration.loop import Result
+from r3jax.exploration.replay import is_decided_apart
 from r3jax.exploration.step import check_world
 from r3jax.formats.nerfstudio import write_transforms
 from r3jax.formats.points import voxel_points, write_points
@@ -19,7 +23,9 @@ from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import motion_of
 from r3jax.simulators.base import Simulator
 from r3jax.trace.header import package_versions, policy_fields
+from r3jax.trace.paths import piece_of_path
 from r3jax.trace.reader import Run, read_run
+from r3jax.trace.rows import StepRow
 from r3jax.trace.writer import RunWriter
 
 
@@ -79,8 +85,8 @@ def resume_run(path: Path, budget: str | None = None, until: str | None = None) 
     settings = settings_of_run(run).with_limits(budget, until)
     header = None
     if (budget, until) != (None, None):
-        config = dataclasses.asdict(settings.config)
-        header = dataclasses.replace(run.header, budget=str(settings.budget), config=config)
+        config = asdict(settings.config)
+        header = replace(run.header, budget=str(settings.budget), config=config)
     simulator = open_run_scene(run)
     recorder, run = RunWriter.resume(path, header)
     return Expedition(settings, simulator, recorder, run.header.seed, run, _decided_from(run))
@@ -106,20 +112,25 @@ def fork_run(
         raise ValueError(f"--at must lie between 1 and the run's {len(run.rows)} views, got {at}")
     simulator = open_run_scene(run)
     fields = policy_fields(settings.policy)
-    # What a team's policy decided on is not known from the run's own frames.
-    is_same = fields == run.header.policy and not run.header.is_of_team
-    decided_from = _decided_from(run) if is_same else at
-    header = dataclasses.replace(
+    # Asked again, a policy must know what it knew: of a merged run and of a team's that is not
+    # known from the frames.
+    is_alone = not (run.header.is_merged or run.header.is_of_team)
+    is_same = is_alone and fields == run.header.policy
+    decided_from = min(_decided_from(run), at) if is_same else at
+    parent: dict[str, Any] = {"forked": str(run.path), "views": at, "decided_from": decided_from}
+    if not is_alone or is_decided_apart(run):
+        parent["decided_apart"] = True
+    header = replace(
         run.header,
         policy=fields,
         budget=str(settings.budget),
-        config=dataclasses.asdict(settings.config),
+        config=asdict(settings.config),
         packages=package_versions(),
-        parent={"forked": str(run.path), "views": at, "decided_from": decided_from},
+        parent=parent,
     )
     recorder = RunWriter(path, header, overwrite=overwrite)
     try:
-        for row in run.rows[:at]:
+        for row in run.rows[:at] if is_same else _as_flown(run.rows[:at]):
             run.frame(row.step)  # says what is wrong with it
             recorder.adopt(row, run, row.step)
         recorded = read_run(recorder.path)
@@ -138,6 +149,24 @@ def _refuse_half_a_fork(run: Run) -> None:
             f"{run.path} was cut off when it had {len(run.rows)} of the {wanted} views that it "
             f"takes over from {parent['forked']}: fork again, with --overwrite"
         )
+
+
+def _as_flown(rows: Sequence[StepRow]) -> list[StepRow]:
+    """The rows; where a path was left on the way, with no more of it than was flown.
+
+    Who takes over is told the path, and must not take for visited what lies ahead.
+    """
+    flown = list(rows)
+    begins = [number for number, row in enumerate(rows) if row.choice is not None]
+    for number, after in zip(begins, [*begins[1:], len(rows)], strict=True):
+        choice = rows[number].choice
+        assert choice is not None
+        length = rows[after - 1].metres - rows[number - 1].metres
+        if length < choice.length - 1e-4:  # totals are rounded
+            piece = piece_of_path(choice.waypoints.astype(np.float64), 0.0, length)
+            cut = replace(choice, waypoints=piece.astype(np.float32), length=length)
+            flown[number] = replace(rows[number], choice=cut)
+    return flown
 
 
 def _decided_from(run: Run) -> int:
