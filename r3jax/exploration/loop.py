@@ -14,7 +14,14 @@ from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.recording import continued, record_end, record_view
-from r3jax.exploration.state import LoopState, Mission, Stop, StopReason, TakenView
+from r3jax.exploration.state import (
+    LoopState,
+    Mission,
+    Stop,
+    StopReason,
+    TakenView,
+    in_words,
+)
 from r3jax.exploration.step import start_state, step
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import LivesOutside, Policy
@@ -142,7 +149,7 @@ def _go(
             on_view(output, state.planner)
     # The view under way is dropped; if its row is on the disk already, a resume finds it there.
     except KeyboardInterrupt:
-        stop = Stop(StopReason.INTERRUPTED, f"interrupted by the user after {len(rows)} views")
+        stop = Stop(StopReason.INTERRUPTED, f"interrupted by the user after {in_words(rows)}")
     # Before `Exception`, of which it is one: a full disk ends a run without being its failure.
     except RecordingStopped as error:
         stop = Stop(StopReason.RECORDING_STOPPED, str(error))

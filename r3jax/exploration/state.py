@@ -1,7 +1,7 @@
 """What a run carries from view to view, and what it leaves behind."""
 
 import enum
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,6 +63,16 @@ COMPLETE = frozenset(
 """Ends that belong to the result; after any other an exploration is not over."""
 
 
+def in_words(rows: Sequence[StepRow]) -> str:
+    """Says how many views and frames on the way the rows of a run hold."""
+    captured = sum(row.captured for row in rows)
+    return _in_words(len(rows) - captured, captured)
+
+
+def _in_words(chosen: int, captured: int) -> str:
+    return f"{chosen} views" + (f" and {captured} frames on the way" if captured else "")
+
+
 @dataclass(frozen=True)
 class PlannedAhead:
     """A decision that is made while the camera flies, for when it arrives."""
@@ -120,6 +130,11 @@ class LoopState:
     def chosen(self) -> int:
         """Views that were chosen, and the one at the start."""
         return self.views - self.captured
+
+    @property
+    def in_words(self) -> str:
+        """Views, and frames on the way where there are any."""
+        return _in_words(self.chosen, self.captured)
 
     @property
     def map_state(self) -> MapState:

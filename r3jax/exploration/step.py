@@ -292,7 +292,7 @@ def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
     """The policy's reason, in words."""
     return Stop(
         StopReason(info.outcome.value),
-        f"after {state.views} views the policy {state.planner.policy.name!r} drew "
+        f"after {state.in_words} the policy {state.planner.policy.name!r} drew "
         f"{info.num_candidates} candidates, {info.num_reachable} of them reachable through "
         "known free space",
     )
@@ -300,8 +300,7 @@ def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
 
 def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float) -> Stop | None:
     """Why a view that costs so much more must not be taken: it must arrive within the budget."""
-    way = f" and {state.captured} frames on the way" if state.captured else ""
-    spent = f"{state.chosen} views{way}, {state.seconds:.1f} s, {state.metres:.1f} m"
+    spent = f"{state.in_words}, {state.seconds:.1f} s, {state.metres:.1f} m"
     if not mission.budget.allows(
         views=state.chosen + 1,
         frames=state.views + 1,

@@ -255,6 +255,30 @@ def test_an_interrupt_that_nobody_catches_is_no_traceback(part, monkeypatch, cap
     assert "r3jax: interrupted" in capsys.readouterr().err
 
 
+def test_views_and_frames_on_the_way_are_counted_apart(room, tmp_path, capsys):
+    """Three views and some frames between them, twice."""
+    for name, seed in (("a", "0"), ("b", "1")):
+        words = ["--name", name, "--seed", seed, "--capture-every", "0.1", "--gaze", "ahead"]
+        assert explore(room, tmp_path, *words) == 0
+    captured = [len(read_run(tmp_path / name).rows) - 3 for name in ("a", "b")]
+    assert min(captured) > 0
+    counts = [f"3 views and {num} frames on the way" for num in captured]
+    capsys.readouterr()
+    assert main_without_report(["explore", "--resume", str(tmp_path / "a")]) == 0
+    assert f"goes on behind {counts[0]} of" in capsys.readouterr().err
+    assert main(["merge", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    assert f"{counts[0]} + {counts[1]}, " in capsys.readouterr().err
+    assert main(["forecast", str(tmp_path / "a")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    start = lines.index("views  frames   mean   p10   p50")
+    told = [line.split() for line in lines[start + 1 : start + 4]]
+    assert [words[0] for words in told] == ["1", "2", "3"]
+    assert told[-1][1] == str(3 + captured[0])
+    fork = ["explore", "--fork", str(tmp_path / "a"), "--at", "99"]
+    assert main_without_report(fork) == 2
+    assert f"the run's {3 + captured[0]} frames, got 99" in capsys.readouterr().err
+
+
 def test_runs_of_different_terms_do_not_merge(room, runs, tmp_path, capsys):
     assert explore(room, tmp_path, "--max-range", "3") == 0
     assert main(["merge", str(runs / "part"), str(tmp_path / "box")]) == 2

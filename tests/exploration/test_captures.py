@@ -1,6 +1,7 @@
 """Frames on the way: where they are, what they cost, and what they never do to a run."""
 
 import json
+import re
 import shutil
 from dataclasses import asdict, replace
 from itertools import pairwise
@@ -341,6 +342,26 @@ def test_views_are_those_that_were_chosen_and_frames_are_all(result):
     # A mission that may last longer begins the same way: it flies until the time is over.
     for row, more in zip(by_time.rows, result.rows, strict=False):
         assert to_json(row) == to_json(more)
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [(CONFIG, "after 6 views"), (AHEAD, r"after \d views and \d frames on the way")],
+)
+def test_an_interrupted_run_counts_views_and_frames_apart(config, says):
+    simulator = BoxRoom()
+    render = simulator.render
+
+    def interrupted(pose):
+        if len(simulator.rendered) == 6:
+            raise KeyboardInterrupt
+        return render(pose)
+
+    simulator.render = interrupted
+    result = explore(simulator, Wander(reach=1.2), budget="frames:9", config=config)
+    assert re.fullmatch(f"interrupted by the user {says}", result.message)
+    if config.captures:
+        assert sum(map(int, re.findall(r"\d", result.message))) == 6
 
 
 @pytest.mark.parametrize("look", ["elsewhere", "behind the loop's back"])

@@ -27,27 +27,39 @@ class Outlook:
     calibration: Calibration | None = None
     """What to believe; None: what comes with the package."""
 
-    views: list[int] = field(default_factory=list[int])
-    """Views taken, of each forecast."""
+    frames: list[int] = field(default_factory=list[int])
+    """Frames taken before each forecast, those on the way included."""
 
     forecasts: list[Forecast] = field(default_factory=list[Forecast])
+
+    @property
+    def views(self) -> list[int]:
+        """Views taken before each forecast."""
+        return [int(self._views_by_frame()[frames - 1]) for frames in self.frames]
+
+    def _views_by_frame(self) -> np.ndarray:
+        """Views up to each frame of the run, that frame included."""
+        return np.cumsum([not row.captured for row in self.run.rows])
 
     def watch(
         self, states: Iterable[tuple[MapState, OccupancyGrid]]
     ) -> Iterator[tuple[MapState, OccupancyGrid]]:
-        """Passes on the map and the grid after each view, and takes a forecast of some of them."""
-        total = len(self.run.rows)
-        wanted = set(np.unique(np.linspace(0, total, self.num + 1).round().astype(int)[1:]))
-        for views, (map_state, grid) in enumerate(states, start=1):
-            if views in wanted:
-                self.add(views, map_state, grid)
+        """Passes on the map and the grid after each frame, and takes a forecast of some of them."""
+        counts = self._views_by_frame()
+        total = max(counts, default=0)
+        views = np.linspace(0, total, self.num + 1).round()[1:]
+        # At the views; after the last one also what was captured behind it.
+        wanted = {*(np.searchsorted(counts, views[views < total]) + 1), len(counts)}
+        for frames, (map_state, grid) in enumerate(states, start=1):
+            if frames in wanted:
+                self.add(frames, map_state, grid)
             yield map_state, grid
 
-    def add(self, views: int, map_state: MapState, grid: OccupancyGrid) -> None:
-        """The forecast after so many views, if there is none yet."""
-        if views not in self.views:
+    def add(self, frames: int, map_state: MapState, grid: OccupancyGrid) -> None:
+        """The forecast after so many frames, if there is none yet."""
+        if frames not in self.frames:
             reach = config_of(self.run).max_range
-            self.views.append(views)
+            self.frames.append(frames)
             self.forecasts.append(
                 forecast_map(
                     map_state,

@@ -109,7 +109,9 @@ def fork_run(
             that is there.
     """
     if not 1 <= at <= len(run.rows):
-        raise ValueError(f"--at must lie between 1 and the run's {len(run.rows)} views, got {at}")
+        raise ValueError(
+            f"--at must lie between 1 and the run's {len(run.rows)} {_unit(run)}, got {at}"
+        )
     simulator = open_run_scene(run)
     fields = policy_fields(settings.policy)
     # Asked again, a policy must know what it knew: of a merged run and of a team's that is not
@@ -146,9 +148,13 @@ def _refuse_half_a_fork(run: Run) -> None:
     wanted = parent.get("views", 0) if "forked" in parent else 0
     if len(run.rows) < wanted:
         raise ValueError(
-            f"{run.path} was cut off when it had {len(run.rows)} of the {wanted} views that it "
-            f"takes over from {parent['forked']}: fork again, with --overwrite"
+            f"{run.path} was cut off when it had {len(run.rows)} of the {wanted} {_unit(run)} that "
+            f"it takes over from {parent['forked']}: fork again, with --overwrite"
         )
+
+
+def _unit(run: Run) -> str:
+    return "frames" if any(row.captured for row in run.rows) else "views"
 
 
 def _as_flown(rows: Sequence[StepRow]) -> list[StepRow]:

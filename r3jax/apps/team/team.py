@@ -334,7 +334,7 @@ def _decided_by(state: LoopState, policy: Policy) -> LoopState:
 def _stop_all(flying: list[_Flying], reason: StopReason, why: str) -> None:
     for me in flying:
         if me.stop is None:
-            message = f"{why}, after {me.state.views} views"
+            message = f"{why}, after {me.state.in_words}"
             flying[me.number] = replace(me, stop=Stop(reason, message))
 
 

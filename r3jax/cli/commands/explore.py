@@ -17,7 +17,7 @@ from r3jax.cli.from_options import policy_of_options, run_settings, scene_settin
 from r3jax.cli.options import ExploreOptions
 from r3jax.cli.progress import RunProgress, Stages
 from r3jax.exploration.loop import Result, explore
-from r3jax.exploration.state import StopReason, TakenView
+from r3jax.exploration.state import StopReason, TakenView, in_words
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import PolicyError
 from r3jax.planning.robot.motion import motion_of
@@ -119,7 +119,10 @@ def _expedition(options: ExploreOptions, console: Console) -> Expedition:
             expedition = resume_run(options.resume, options.budget, options.until)
         assert expedition.recorded is not None
         warn_of_versions(console, expedition.recorded)
-        console.say(f"goes on behind view {len(expedition.recorded.rows)} of {options.resume}")
+        rows = expedition.recorded.rows
+        captures = any(row.captured for row in rows)
+        behind = in_words(rows) if captures else f"view {len(rows)}"
+        console.say(f"goes on behind {behind} of {options.resume}")
         return expedition
     if options.fork is not None:
         assert options.at is not None
@@ -169,9 +172,8 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
         console.say(f"the report could not be written: {one_line(error)}")
         return
     last, state = result.rows[-1], result.state
-    way = f" and {state.captured} frames on the way" if state.captured else ""
     console.say(
-        f"{state.chosen} views{way}, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
+        f"{state.in_words}, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
         f"{100 * last.coverage.known_share:.0f} % of the box explored, mean renderability "
         f"{last.coverage.mean_renderability:.2f}",
     )

@@ -41,10 +41,13 @@ def run_forecast(options: ForecastOptions) -> int:
         f"PSNR of free-space views [dB], calibrated on {calibration.source}; intervals hold "
         f"{100 * LEVEL:.0f} % of its errors in scenes that it had not seen",
     )
-    out.print("views   mean   p10   p50", style="bold")
-    for views, forecast in zip(outlook.views, outlook.forecasts, strict=True):
+    captures = outlook.frames != outlook.views
+    out.print(f"views  {'frames  ' * captures} mean   p10   p50", style="bold")
+    steps = zip(outlook.views, outlook.frames, outlook.forecasts, strict=True)
+    for views, frames, forecast in steps:
         mean, low, middle = (forecast.value(name) for name in ("mean", "p10", "p50"))
-        out.say(f"{views:5d}  {mean:5.1f} {low:5.1f} {middle:5.1f}")
+        all_frames = f"{frames:6d}  " * captures
+        out.say(f"{views:5d}  {all_frames}{mean:5.1f} {low:5.1f} {middle:5.1f}")
     for line in outlook_lines(outlook):
         out.say(line)
     if options.plot is not None:

@@ -5,6 +5,7 @@ from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import MergeOptions
 from r3jax.cli.progress import Stages
+from r3jax.exploration.state import in_words
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import read_run
 
@@ -27,8 +28,8 @@ def run_merge(options: MergeOptions) -> int:
             )
     except (RunError, OSError) as error:
         raise UserError(one_line(error)) from error
-    views = " + ".join(str(len(run.rows)) for run in runs)
-    console.say(f"{views} views, {int(map_state.num_occupied)} voxels")
+    views = " + ".join(in_words(run.rows) for run in runs)
+    console.say(f"{views}, {int(map_state.num_occupied)} voxels")
     console.say(f"merged    {out}")
     console.next("train", out)
     return 0

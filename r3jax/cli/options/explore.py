@@ -50,7 +50,8 @@ class ContinueOptions:
     """Try another --policy from a view of a run on; the scene and the sensor are the run's."""
 
     at: Annotated[int | None, tyro.conf.arg(metavar="VIEW")] = None
-    """Number of the view that the fork takes anew; those before it are kept."""
+    """Number of the view that the fork takes anew; those before it are kept. Frames on the way
+    count as views here."""
 
 
 @dataclass(frozen=True, kw_only=True)

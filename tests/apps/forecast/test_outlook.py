@@ -157,6 +157,19 @@ def test_an_outlook_watches_a_replay(whole, reached):
     assert outlook.views == [3, 6, 9]
 
 
+@pytest.mark.full
+def test_frames_on_the_way_are_no_views(whole):
+    """Of nine frames four were captured, the last one too: the first, 4th, 5th, 7th, 8th chose."""
+    run = read_run(whole[1])
+    captured = (1, 2, 5, 8)
+    rows = tuple(dataclasses.replace(row, captured=row.step in captured) for row in run.rows)
+    outlook = Outlook(dataclasses.replace(run, rows=rows))
+    for _ in outlook.watch(states_of(run)):
+        pass
+    assert outlook.frames == [1, 4, 5, 7, 9]
+    assert outlook.views == [1, 2, 3, 4, 5]
+
+
 def test_a_goal_that_nobody_checks_is_refused():
     config = dataclasses.replace(CONFIG, until="psnr:20")
     with pytest.raises(ValueError, match=r"config\.until is 'psnr:20', is_enough is not given"):
