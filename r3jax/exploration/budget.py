@@ -35,6 +35,11 @@ class Budget:
         short = f"{self.amount:g}"
         return f"{self.unit}:{short if float(short) == self.amount else repr(self.amount)}"
 
+    @property
+    def shown(self) -> str:
+        """As a user writes it: files spell meters otherwise."""
+        return str(self).replace("metres", "meters")
+
 
 def parse_budget(text: str) -> Budget:
     """Reads `views:N`, `frames:N`, `seconds:S` or `meters:M`.
@@ -42,7 +47,7 @@ def parse_budget(text: str) -> Budget:
     Raises:
         ValueError: anything else, an amount that is not positive, views or frames not whole.
     """
-    example = "use views:100, seconds:300 or meters:25"
+    example = "use views:100, seconds:300 or meters:25; frames:100 counts those on the way as well"
     unit, separator, amount_text = text.strip().partition(":")
     if unit == "meters":
         unit = "metres"  # as recorded runs and submissions spell it

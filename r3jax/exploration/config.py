@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from r3jax.mapping.config import MappingConfig
+from r3jax.planning.robot.motion import LEAST_RATE
 from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 
 ClockName = Literal["wall", "model"]
@@ -75,8 +76,8 @@ class ExplorationConfig(MappingConfig):
     way. None: the camera is blind on the way, unless `capture_rate` says otherwise."""
 
     capture_rate: float | None = None
-    """Frames per second of the flight [Hz], instead of `capture_every`: at speed v the pieces are
-    at most v / rate long."""
+    """Frames per second of the way [Hz], instead of `capture_every`: at speed v the pieces are at
+    most v / rate long. While the camera turns at the end of a path there is no frame."""
 
     gaze: GazeName = "panorama"
     """Where the camera looks when it captures a frame on the way."""
@@ -120,8 +121,10 @@ class ExplorationConfig(MappingConfig):
         """Refuses what cannot work."""
         super().__post_init__()
         # Written so that NaN fails, too: it would make every flight time and the clock NaN.
-        if not 0.0 < self.speed < math.inf:
-            raise ValueError(f"speed must be positive, got {self.speed}")
+        if not LEAST_RATE <= self.speed < math.inf:
+            raise ValueError(
+                f"speed must be positive and finite, at least {LEAST_RATE:g}, got {self.speed}"
+            )
         # Two of them divide the number of views: a zero would fail a run after its first view.
         for name in ("num_probes", "checkpoint_every", "max_still_views", "until_every"):
             if getattr(self, name) < 1:

@@ -307,7 +307,9 @@ def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float)
         seconds=state.seconds + seconds,
         metres=state.metres + metres,
     ):
-        return Stop(StopReason.BUDGET, f"{spent}: the next view would exceed {mission.budget}")
+        return Stop(
+            StopReason.BUDGET, f"{spent}: the next view would exceed {mission.budget.shown}"
+        )
     # A policy that only turns spends no meters: such a budget alone would never end the run.
     if state.still_views >= mission.config.max_still_views:
         return Stop(

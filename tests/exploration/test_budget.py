@@ -16,6 +16,8 @@ def test_the_text_of_a_budget_reads_back(unit, amount):
 def test_meters_are_spelled_as_here_or_as_in_files():
     assert parse_budget("meters:25") == parse_budget("metres:25")
     assert str(parse_budget("meters:25")) == "metres:25"
+    assert parse_budget("metres:25").shown == "meters:25"
+    assert parse_budget("frames:25").shown == "frames:25"
 
 
 NONSENSE = """
@@ -29,6 +31,7 @@ def test_nonsense_is_refused_with_an_example(text):
     with pytest.raises(ValueError, match="budget") as caught:
         parse_budget(text)
     assert "views" in str(caught.value)
+    assert "frames:" in str(caught.value)
 
 
 def test_a_budget_limits_its_own_unit_only():

@@ -384,6 +384,7 @@ def test_each_frame_is_taken_once_where_the_loop_says():
         ({"capture_every": 0.3, "capture_rate": 5.0}, "not both"),
         ({"capture_every": 0.01}, "at least 0.05 m"),
         ({"capture_rate": 0.0}, "capture_rate must be positive"),
+        ({"speed": 1e-310}, "speed must be positive and finite, at least 0.001"),
         ({"exposure": -1.0}, "exposure must be"),
         ({"blur": 0.0}, "blur must be positive"),
     ],

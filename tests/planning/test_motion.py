@@ -31,6 +31,7 @@ from r3jax.trace.header import settings_of
         ({"elevations": (10.0, -10.0)}, "elevations 10 to -10 are upside down"),
         ({"body": -0.1}, "body must be a finite length"),
         ({"speed": 0.0}, "speed must be positive and finite"),
+        ({"speed": 1e-310}, "speed must be positive and finite, at least 0.001"),
         ({"turn_per_meter": math.nan}, "turn_per_meter must be positive and finite"),
         ({"turn_rate": 30.0}, "turn_rate weighs turns against ways: give the speed"),
     ],

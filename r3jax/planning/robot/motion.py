@@ -13,6 +13,10 @@ from r3jax.formats.validation.choices import did_you_mean
 UNLIMITED = (-math.inf, math.inf)
 """Heights of a robot that may be at any [m]."""
 
+LEAST_RATE = 1e-3
+"""Least speed [m/s], turn rate [deg/s] and turn per meter [deg/m]: what is slower stands still, and
+flight times overflow."""
+
 _LEVEL = 90.0
 """Elevation of a camera that looks straight up [deg]."""
 
@@ -86,9 +90,10 @@ class Motion:
             raise ValueError(f"body must be a finite length >= 0 [m], got {self.body}")
         for name in ("speed", "turn_rate", "turn_per_meter"):
             value = getattr(self, name)
-            if value is not None and not 0.0 < value < math.inf:
+            if value is not None and not LEAST_RATE <= value < math.inf:
                 raise ValueError(
-                    f"{name} must be positive and finite, got {value}; leave it out for no limit"
+                    f"{name} must be positive and finite, at least {LEAST_RATE:g}, got {value}; "
+                    "leave it out for no limit"
                 )
         if self.turn_rate is not None and self.speed is None:
             raise ValueError("turn_rate weighs turns against ways: give the speed [m/s] too")
