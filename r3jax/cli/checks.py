@@ -28,7 +28,7 @@ from r3jax.cli.options import (
     ViewOptions,
 )
 from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig
 from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.names import parse_topics
 from r3jax.planning.policies import check_policy
@@ -111,8 +111,8 @@ def _(options: ExploreOptions) -> None:
         _check_policy(options.policy)
     if options.budget is not None:
         parse_budget(options.budget)
-    loop_of_options(options)
-    motion_of_options(options)
+    config, motion = loop_of_options(options), motion_of_options(options)
+    _check_captures(options, config, motion)
 
 
 @_check.register
@@ -327,6 +327,35 @@ def loop_of_options(options: ExploreOptions) -> ExplorationConfig:
         config = dataclasses.replace(config, capacity=LEAST_CAPACITY)
     config.check_scales()
     return config
+
+
+def _check_captures(options: ExploreOptions, config: ExplorationConfig, motion: Motion) -> None:
+    """Refuses settings of the frames on the way that would be ignored, or not be kept.
+
+    Raises:
+        ValueError: names one, and says what to add or leave out.
+    """
+    default = ExploreOptions()
+    for name in ("gaze", "exposure", "blur"):
+        if getattr(options, name) != getattr(default, name) and not config.captures:
+            raise ValueError(
+                f"--{name} is for frames on the way: add --capture-every or --capture-rate, or "
+                "leave it out"
+            )
+    if options.blur != default.blur and options.exposure == 0.0:
+        raise ValueError("--blur does nothing while nothing blurs: add --exposure, or leave it out")
+    # The default is no wish: a camera that is fixed looks ahead.
+    if motion.fixed_camera and options.gaze not in (default.gaze, "ahead"):
+        raise ValueError(
+            f"--gaze {options.gaze} turns the camera, and that of --motion {options.motion} is "
+            "fixed and looks ahead: leave one of them out"
+        )
+    largest = (motion.speed or config.speed) / LEAST_PIECE
+    if config.capture_rate is not None and config.capture_rate > largest * (1.0 + 1e-9):
+        raise ValueError(
+            f"--capture-rate must be at most {largest:g} Hz at this speed, one frame every "
+            f"{LEAST_PIECE:g} m, got {config.capture_rate:g}"
+        )
 
 
 def motion_of_options(options: ExploreOptions) -> Motion:

@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from r3jax.cli.checks import loop_of_options
+from r3jax.cli.checks import check_options, loop_of_options
+from r3jax.cli.errors import UserError
 from r3jax.cli.main import main
 from r3jax.cli.options import ExploreOptions
 from r3jax.cli.options.parsing import whole_number
@@ -21,11 +22,20 @@ REFUSED = {
     "explore --scene habitat:nowhere.glb": "no such file for Habitat: nowhere.glb",
     "explore --scene flat --policy our-pano": "did you mean ours-pano?",
     "explore --scene flat --budget hours:1": "use views:100, seconds:300 or meters:25",
+    "explore --scene flat --budget frames:1.5": "frames:100",
     "explore --scene flat --until psnr": "is not understood",
     "explore --scene flat --name a/b": "--name is the name of one folder",
     "explore --scene flat --name run": "the run exists already",
     "explore --scene flat --heights 1 2": "heights 1 to 2 m above the start leave out the start",
     "explore --scene flat --speed 0": "speed must be positive",
+    "explore --scene flat --gaze blend": "--gaze is for frames on the way: add --capture-every",
+    "explore --scene flat --exposure 0.01": "--exposure is for frames on the way",
+    "explore --scene flat --blur 2": "--blur is for frames on the way",
+    "explore --scene flat --capture-every 0.3 --blur 2": "add --exposure, or leave it out",
+    "explore --scene flat --capture-every 0.3 --motion ground --gaze blend": "is fixed and looks",
+    "explore --scene flat --capture-rate 21": "at most 20 Hz at this speed",
+    "explore --scene flat --capture-rate 11 --motion ground": "at most 10 Hz at this speed",
+    "explore --scene flat --speed 1e-310": "speed must be positive and finite, at least 0.001",
     "explore --resume nowhere": "nowhere: there is no such folder",
     "explore --fork run": "--fork RUN and --at VIEW belong together",
     "team --scene ofice": "did you mean office?",
@@ -77,6 +87,13 @@ def test_names_budgets_and_paths_are_refused_before_jax_is_imported(tmp_path):
     for line, words in zip(lines, REFUSED.values(), strict=True):
         assert line.startswith("r3jax: ")
         assert words in line
+
+
+def test_the_largest_capture_rate_is_one_frame_every_voxel():
+    """0.7 / 0.05 is a little less than 14."""
+    check_options(ExploreOptions(scene="flat", name="none", speed=0.7, capture_rate=14.0))
+    with pytest.raises(UserError, match="at most 14 Hz"):
+        check_options(ExploreOptions(scene="flat", name="none", speed=0.7, capture_rate=14.1))
 
 
 def test_a_map_that_may_grow_begins_with_room():

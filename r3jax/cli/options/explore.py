@@ -110,7 +110,8 @@ class CaptureOptions:
     """Capture frames on the way from view to view, at most so far apart [m]; by default none."""
 
     capture_rate: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
-    """The same by frames per second of the flight [Hz]."""
+    """The same by frames per second of the way [Hz]; none is taken while the camera turns at its
+    end."""
 
     gaze: Literal["ahead", "blend", "panorama", "planned"] = "panorama"
     """Where the camera looks on the way: `ahead`: along the path; `blend`: it turns evenly from
