@@ -95,27 +95,9 @@ def check_equal_terms(cells: Sequence[Cell], *, one_snapshot: bool = True) -> No
     """
     if not cells:
         raise ValueError("there are no records")
-    everywhere: dict[str, Callable[[Cell], object]] = {
-        "the format": lambda cell: cell["format"],
-        "the clock": lambda cell: cell["clock"],
-        "the resolution of exploration": lambda cell: cell["resolution"],
-        "the resolution of the test views": lambda cell: cell["test_views"]["resolution"],
-    }
-    everywhere["the network of LPIPS"] = lambda cell: cell["lpips_network"]
-    for name in sorted({name for cell in cells for name in cell["sensing"]}):
-        everywhere[f"the exploration's {name}"] = lambda cell, name=name: cell["sensing"].get(name)
-    if one_snapshot:
-        everywhere["the snapshot"] = lambda cell: cell["snapshot"]
-    for name in sorted({name for cell in cells for name in cell["training"]} - {"seed"}):
-        everywhere[f"training {name}"] = lambda cell, name=name: cell["training"].get(name)
-    in_a_scene: dict[str, Callable[[Cell], object]] = {
-        "the scene's hash": lambda cell: cell["scene_hash"],
-        "the hash of the test views": lambda cell: cell["test_views"]["hash"],
-        "the list of test views": lambda cell: list(cell["views"]["view"]),
-    }
-    _check_same(cells, everywhere)
+    _check_same(cells, terms_of, () if one_snapshot else ("the snapshot",))
     for scene in scenes_of(cells):
-        _check_same([cell for cell in cells if cell["scene"] == scene], in_a_scene)
+        _check_same([cell for cell in cells if cell["scene"] == scene], terms_in_scene)
     seen: set[str] = set()
     for cell in cells:
         if (name := _describe(cell)) in seen:
@@ -123,15 +105,51 @@ def check_equal_terms(cells: Sequence[Cell], *, one_snapshot: bool = True) -> No
         seen.add(name)
 
 
-def _check_same(cells: Sequence[Cell], terms: Mapping[str, Callable[[Cell], object]]) -> None:
-    first = cells[0]
-    for what, of in terms.items():
-        for other in cells[1:]:
-            if of(other) != of(first):
+def terms_of(cell: Cell) -> dict[str, object]:
+    """The terms of a record that all of a table must share, by the names that errors give them."""
+    sensing, training = (dict(sorted(cell[name].items())) for name in ("sensing", "training"))
+    training.pop("seed", None)
+    return {
+        "the format": cell["format"],
+        "the clock": cell["clock"],
+        "the resolution of exploration": cell["resolution"],
+        "the resolution of the test views": cell["test_views"]["resolution"],
+        "the network of LPIPS": cell["lpips_network"],
+        **{f"the exploration's {name}": value for name, value in sensing.items()},
+        "the snapshot": cell["snapshot"],
+        **{f"training {name}": value for name, value in training.items()},
+    }
+
+
+def terms_in_scene(cell: Cell) -> dict[str, object]:
+    """The same of what only those of one scene must share."""
+    return {
+        "the scene's hash": cell["scene_hash"],
+        "the hash of the test views": cell["test_views"]["hash"],
+        "the list of test views": list(cell["views"]["view"]),
+    }
+
+
+def differing(first: Mapping[str, object], other: Mapping[str, object]) -> list[str]:
+    """Lists the terms that are not the same; one that an old record lacks counts as None."""
+    names = dict.fromkeys((*first, *other))
+    return [name for name in names if first.get(name) != other.get(name)]
+
+
+def _check_same(
+    cells: Sequence[Cell],
+    terms: Callable[[Cell], Mapping[str, object]],
+    left_out: Sequence[str] = (),
+) -> None:
+    first = terms(cells[0])
+    for cell in cells[1:]:
+        other = terms(cell)
+        for name in differing(first, other):
+            if name not in left_out:
                 raise ValueError(
-                    f"records cannot be compared: {what} is {_short(of(first))} for "
-                    f"{_describe(first)}, but {_short(of(other))} for {_describe(other)}. Make "
-                    "one table for each, or run the cells again on equal terms."
+                    f"records cannot be compared: {name} is {_short(first.get(name))} for "
+                    f"{_describe(cells[0])}, but {_short(other.get(name))} for {_describe(cell)}. "
+                    "Make one table for each, or run the cells again on equal terms."
                 )
 
 

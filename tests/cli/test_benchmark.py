@@ -1,5 +1,6 @@
 """`r3jax benchmark`, as a user meets it: a table at the end, nothing done twice, mistakes named."""
 
+import io
 import json
 import os
 
@@ -7,8 +8,11 @@ import pytest
 
 from r3jax.apps.benchmark import run_cell as running
 from r3jax.apps.benchmark.record import CELLS
+from r3jax.cli.commands.benchmark import beside, print_results
+from r3jax.cli.console import Console
 from r3jax.cli.main import main
 from tests.box_room import write_room
+from tests.evaluation.records import record
 
 SMALL = {"policies": "random,frontier", "budget": "views:3", "clock": "model", "resolution": 32}
 SMALL |= {"train-resolution": 32, "iterations": 30, "gaussians": 200, "capacity": 400}
@@ -50,8 +54,8 @@ def test_every_cell_and_snapshot_has_its_line(finished):
     ]
     assert {r["settings"]["num_candidates"] for r in records} == {10}
     assert len({r["test_views"]["hash"] for r in records}) == 1
-    for record in records:
-        assert (finished / record["run"] / "run.json").exists()
+    for found in records:
+        assert (finished / found["run"] / "run.json").exists()
 
 
 @pytest.mark.full
@@ -133,3 +137,34 @@ def test_a_folder_that_cannot_be_written_gets_one_line(room, tmp_path, capsys):
     (tmp_path / "file").touch()
     assert benchmark(room, tmp_path / "file" / "out") == 2
     assert f"{os.sep}file" in capsys.readouterr().err
+
+
+def submitted(name, version=0, **changes):
+    """The record of a submission; another `version` is a corrected one of the same name."""
+    return record(views=6, **changes) | {"policy": f"{name} (submitted)", "commit": str(version)}
+
+
+def shown(records):
+    console = Console(file=io.StringIO(), width=200)
+    print_results(console, records)
+    return console.file.getvalue()
+
+
+def test_a_corrected_submission_does_not_keep_others_from_their_table():
+    alice, corrected, bob = submitted("alice"), submitted("alice", 1), submitted("bob")
+    chosen = beside([bob], [alice, corrected, bob])
+    assert chosen == [bob, alice, corrected]
+    told = shown(chosen)
+    assert told.count("alice (submitted)") == 2
+    assert "table 2 on the same terms" in told
+    assert beside([corrected], [alice, corrected, bob]) == [corrected, alice, bob]
+
+
+def test_submissions_on_different_terms_have_tables_of_their_own():
+    bob, carol = submitted("bob"), submitted("carol", resolution=512)
+    near, far = submitted("dave", resolution=512), submitted("erin", resolution=128)
+    chosen = beside([bob, carol], [near, far])
+    assert chosen == [bob, carol, near]  # on the terms of one that was asked for
+    told = shown(chosen)
+    assert "the resolution of exploration: 256" in told
+    assert "the resolution of exploration: 512" in told

@@ -11,16 +11,15 @@ import jax
 import numpy as np
 
 from r3jax.apps.benchmark.conditions import snapshot_slug
+from r3jax.apps.benchmark.groups import headed_groups
 from r3jax.apps.benchmark.record import machine, read_records
 from r3jax.apps.benchmark.reference_images import path_of_images, read_reference_images
 from r3jax.apps.benchmark.tables import full_title, metric_named, notes
 from r3jax.evaluation.comparison import (
     Cell,
-    check_equal_terms,
     methods_of,
     scenes_of,
     scores_by_method,
-    snapshots_of,
     view_values,
     with_short_names,
 )
@@ -84,32 +83,11 @@ def write_site(
         raise ValueError(f"{root} holds no records: run the benchmark first")
     (page.parent / "pictures").mkdir(parents=True, exist_ok=True)
     parts = [_speed(on_stage)]
-    for snapshot in snapshots_of(records):
-        chosen = [record for record in records if record["snapshot"] == snapshot]
-        for group in groups_on_equal_terms(chosen):
-            parts += [f"<h2>{_text(snapshot)}</h2>", *_tables(group), *_papers(group)]
-            parts += _worst_views(root, group, page.parent, on_stage)
+    for heading, group in headed_groups(records):
+        parts += [f"<h2>{_text(heading)}</h2>", *_tables(group), *_papers(group)]
+        parts += _worst_views(root, group, page.parent, on_stage)
     write_atomic(page, _PAGE.substitute(body="\n".join(parts)).encode())
     return page
-
-
-def groups_on_equal_terms(records: Sequence[Cell]) -> list[list[Cell]]:
-    """Records of one snapshot in groups that may share a table, each as large as it can be.
-
-    One that is there twice (the same method, scene and seed) begins a group of its own.
-    """
-    groups: list[list[Cell]] = []
-    for record in records:
-        for group in groups:
-            try:
-                check_equal_terms([*group, record])
-            except ValueError:
-                continue
-            group.append(record)
-            break
-        else:
-            groups.append([record])
-    return groups
 
 
 def _text(value: object) -> str:

@@ -19,6 +19,7 @@ from r3jax.apps.benchmark.engines.local import (
     visible_gpus,
 )
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
+from r3jax.apps.benchmark.groups import headed_groups, on_equal_terms
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
 from r3jax.apps.benchmark.record import collect, read_records
 from r3jax.apps.benchmark.site import write_site
@@ -38,7 +39,6 @@ from r3jax.cli.console import (
 from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import BenchmarkOptions
-from r3jax.evaluation.comparison import check_equal_terms, snapshots_of
 from r3jax.formats.submissions import Submission, read_submission
 
 _SHOWN = 20
@@ -78,8 +78,18 @@ def run_benchmark(options: BenchmarkOptions) -> int:
         with BenchmarkProgress(console, len(cells), len(left), options.out) as progress:
             interrupted = _run(options, left, parameters, progress.on_event)
         collected = collect(options.out)
+        _show(console, options, cells)
     except (ValueError, OSError, ImportError) as error:
         raise UserError(one_line(error)) from error
+    console.say(f"records  {collected}")
+    code = _conclude(console, progress.failures, interrupted)
+    if code == 0:
+        console.next("view", paths_of(options.out, cells[0]).run)
+    return code
+
+
+def _show(console: Console, options: BenchmarkOptions, cells: Sequence[Cell]) -> None:
+    """Prints the tables of what was done, those of submissions with the records beside them."""
     records = read_records(options.out, cells)
     for line in _images_again(records):
         console.say(line)
@@ -87,11 +97,6 @@ def run_benchmark(options: BenchmarkOptions) -> int:
         records = beside(records, read_records(options.out))
     if records:
         print_results(Console(), records)
-    console.say(f"records  {collected}")
-    code = _conclude(console, progress.failures, interrupted)
-    if code == 0:
-        console.next("view", paths_of(options.out, cells[0]).run)
-    return code
 
 
 def _write_site(console: Console, root: Path, folder: Path) -> int:
@@ -206,11 +211,8 @@ def beside(
             for record in records
             if all(record[name] == other[name] for name in ("scene", "snapshot", "budget"))
         ]
-        if other not in chosen and alike:
-            try:
-                check_equal_terms([alike[0], other])
-            except ValueError:  # another sensor or training: a table of its own
-                continue
+        # Others would be in a table of their own, which nobody asked for.
+        if other not in chosen and any(on_equal_terms(record, other) for record in alike):
             chosen.append(other)
     return chosen
 
@@ -388,12 +390,14 @@ def print_results(console: Console, records: Sequence[dict[str, Any]]) -> None:
 
     Args:
         console: where to.
-        records: of one benchmark, as `benchmark.record.read_records` gives them.
+        records: of one benchmark, as `benchmark.record.read_records` gives them; what is not on
+            equal terms, or has a name that is there already, gets a table of its own.
     """
     notes: dict[str, None] = {}
-    for snapshot in snapshots_of(records):
-        chosen = [record for record in records if record["snapshot"] == snapshot]
-        table = quality_table(chosen)
+    for heading, group in headed_groups(records):
+        table = quality_table(group, heading)
+        # Not as the table's own title, which is broken where the table ends.
+        console.print(heading, style="italic")
         console.print(_for_terminal(table))
         notes |= dict.fromkeys(table.notes)
     for note in notes:
@@ -401,7 +405,7 @@ def print_results(console: Console, records: Sequence[dict[str, Any]]) -> None:
 
 
 def _for_terminal(table: Table) -> ConsoleTable:
-    shown = ConsoleTable(*table.heads, title=table.title, box=None, title_justify="left")
+    shown = ConsoleTable(*table.heads, box=None)
     for column in table.columns:
         shown.add_column(column, justify="right", no_wrap=True)
     last = None

@@ -9,7 +9,7 @@ from PIL import Image
 
 from r3jax.apps.benchmark.record import read_records
 from r3jax.apps.benchmark.reference_images import load_reference_images
-from r3jax.apps.benchmark.site import groups_on_equal_terms, probe, write_site
+from r3jax.apps.benchmark.site import probe, write_site
 from r3jax.cli.main import main
 from r3jax.evaluation.comparison import scores_by_method
 from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
@@ -67,12 +67,17 @@ def test_records_that_lie_alone_make_a_page_without_pictures(tmp_path):
     assert "+2.9" in text
 
 
-def test_records_of_other_terms_have_a_table_of_their_own():
-    same = benchmark(("ours", "random"), scenes=("flat",), seeds=(0, 1), views=6)
-    other = record("ours", views=6, clock="wall")
-    twice = record("ours", seed=0, snapshot=60, views=6)
-    groups = groups_on_equal_terms([*same, other, twice])
-    assert [len(group) for group in groups] == [4, 1, 1]
+def test_tables_of_other_terms_are_told_apart(tmp_path):
+    records = [
+        record(views=6), record(views=6, clock="wall"), record(views=6) | {"budget": "views:30"},
+    ]  # fmt: skip
+    text = write_site(written(tmp_path / "out", records), tmp_path / "site").read_text()
+    heads = re.findall(r"<h2>(.*?)</h2>", text)
+    assert heads == [
+        "views:30, the clock: model",
+        "views:30, the clock: wall",
+        "views:30, the clock: model, table 2 on the same terms: it has a record of the same name",
+    ]
 
 
 def test_a_probe_takes_some_time():
