@@ -36,10 +36,15 @@ PAPER_LEAD = ("ours-pano", "active-gs", "views:300", 2.9, "arXiv 2601.07484")
 """What the paper reports of one method minus another at a budget, mean PSNR [dB], and its source;
 docs/results/views.md has it beside ours."""
 
+_GENERATOR = '<meta name="generator" content="r3jax benchmark">'
+_MARKS = (_GENERATOR, "</style></head><body>\n<h1>r3jax benchmark</h1>\n")
+"""What tells a page of ours: the second, those that were written before there was the first."""
+
 _PAGE = Template(
     """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
+$generator
 <title>r3jax benchmark</title>
 <style>
  body { font: 15px/1.5 system-ui, sans-serif; color: #1f2937; max-width: 1060px; margin: 24px auto;
@@ -72,12 +77,12 @@ def write_site(
         The page.
 
     Raises:
-        ValueError: there are no records, one is damaged, or the folder holds something else.
+        ValueError: there are no records, one is damaged, or the folder holds something else, of
+            which nothing is touched.
         OSError: the disk is full, not writable, ...
     """
     page = Path(folder) / "index.html"
-    if page.parent.is_dir() and any(page.parent.iterdir()) and not page.exists():
-        raise ValueError(f"{folder} holds something that is no page: give another folder")
+    _check_own(page)
     records = read_records(root)
     if not records:
         raise ValueError(f"{root} holds no records: run the benchmark first")
@@ -86,8 +91,26 @@ def write_site(
     for heading, group in headed_groups(records):
         parts += [f"<h2>{_text(heading)}</h2>", *_tables(group), *_papers(group)]
         parts += _worst_views(root, group, page.parent, on_stage)
-    write_atomic(page, _PAGE.substitute(body="\n".join(parts)).encode())
+    write_atomic(page, _PAGE.substitute(generator=_GENERATOR, body="\n".join(parts)).encode())
     return page
+
+
+def _check_own(page: Path) -> None:
+    """Refuses a folder that holds anything but an earlier page.
+
+    Raises:
+        ValueError: it does.
+        OSError: it cannot be read.
+    """
+    if not page.parent.is_dir() or not any(page.parent.iterdir()):
+        return
+    # A pipe of that name would wait for a writer.
+    text = page.read_text(errors="replace") if page.is_file() else ""
+    if not any(mark in text for mark in _MARKS):
+        raise ValueError(
+            f"{page.parent} holds something that is no page of a benchmark, which stays as it is: "
+            "give another folder"
+        )
 
 
 def _text(value: object) -> str:

@@ -90,7 +90,7 @@ def test_a_page_is_not_written_over_something_else(tmp_path, capsys):
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     words = ["benchmark", "--site", str(tmp_path / "mine"), "--out", str(out)]
     assert main(words) == 2
-    assert "holds something that is no page" in capsys.readouterr().err
+    assert "holds something that is no page of a benchmark" in capsys.readouterr().err
     assert main([*words, "--budget", "views:9"]) == 2
     assert "--site takes these from the records" in capsys.readouterr().err
     empty = ["benchmark", "--site", str(tmp_path / "site"), "--out", str(tmp_path / "none")]
@@ -98,3 +98,31 @@ def test_a_page_is_not_written_over_something_else(tmp_path, capsys):
     assert "holds no records" in capsys.readouterr().err
     assert main(["benchmark", "--site", str(tmp_path / "site"), "--out", str(out)]) == 0
     assert (tmp_path / "site" / "index.html").exists()
+
+
+PAGES = {
+    "of somebody else": "<!doctype html><title>my home</title>",
+    "that tells of one": "<title>r3jax benchmark</title><h1>r3jax benchmark</h1>",
+    "in no encoding": "\xff\xfe",
+}
+
+
+@pytest.mark.parametrize("text", PAGES.values(), ids=PAGES)
+def test_a_page_that_is_not_ours_stays(tmp_path, text):
+    out, home = written(tmp_path / "out", [record(views=6)]), tmp_path / "home"
+    home.mkdir()
+    (home / "index.html").write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match="no page of a benchmark, which stays as it is"):
+        write_site(out, home)
+    assert (home / "index.html").read_bytes() == text.encode("latin-1")
+    assert [path.name for path in home.iterdir()] == ["index.html"]
+
+
+def test_a_page_of_an_earlier_version_is_replaced(tmp_path):
+    out = written(tmp_path / "out", [record(views=6)])
+    page = write_site(out, tmp_path / "site")
+    earlier, count = re.subn(r"<meta name=.generator.*\n", "", page.read_text())
+    assert count == 1
+    page.write_text(earlier)
+    write_site(out, tmp_path / "site")
+    assert "generator" in page.read_text()
