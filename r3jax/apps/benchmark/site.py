@@ -14,7 +14,7 @@ from r3jax.apps.benchmark.conditions import snapshot_slug
 from r3jax.apps.benchmark.groups import headed_groups
 from r3jax.apps.benchmark.record import machine, read_records
 from r3jax.apps.benchmark.reference_images import path_of_images, read_reference_images
-from r3jax.apps.benchmark.tables import full_title, metric_named, notes
+from r3jax.apps.benchmark.tables import full_title, notes
 from r3jax.evaluation.comparison import (
     Cell,
     methods_of,
@@ -23,14 +23,12 @@ from r3jax.evaluation.comparison import (
     view_values,
     with_short_names,
 )
-from r3jax.evaluation.scores import Metric
+from r3jax.evaluation.scores import METRICS, Metric
 from r3jax.evaluation.statistics import Scores, mean_over_scenes, paired_difference
 from r3jax.files import write_atomic
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.render import render
 from r3jax.trace.images import encode_png
-
-_METRICS = ("psnr", "ssim", "lpips")
 
 PAPER_LEAD = ("ours-pano", "active-gs", "views:300", 2.9, "arXiv 2601.07484")
 """What the paper reports of one method minus another at a budget, mean PSNR [dB], and its source;
@@ -85,7 +83,10 @@ def write_site(
     _check_own(page)
     records = read_records(root)
     if not records:
-        raise ValueError(f"{root} holds no records: run the benchmark first")
+        raise ValueError(
+            f"{root} holds no records of explorations: run the benchmark first (those of --photos "
+            "are no part of the page)"
+        )
     (page.parent / "pictures").mkdir(parents=True, exist_ok=True)
     parts = [_speed(on_stage)]
     for heading, group in headed_groups(records):
@@ -125,8 +126,8 @@ def _tables(group: Sequence[Cell]) -> list[str]:
     """A table for each metric: methods x scenes and their mean, with 95 % intervals."""
     told, group = notes(group), with_short_names(group)
     parts: list[str] = []
-    for name in _METRICS:
-        metric, scores = metric_named(name), scores_by_method(group, name)
+    for metric in METRICS:
+        scores = scores_by_method(group, metric.name)
         if not scores:
             continue
         scenes = scenes_of(group)

@@ -10,8 +10,10 @@ from PIL import Image
 from r3jax.apps.benchmark.record import read_records
 from r3jax.apps.benchmark.reference_images import load_reference_images
 from r3jax.apps.benchmark.site import probe, write_site
+from r3jax.apps.benchmark.tables import full_title
 from r3jax.cli.main import main
 from r3jax.evaluation.comparison import scores_by_method
+from r3jax.evaluation.scores import METRICS
 from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
 from tests.evaluation.records import benchmark, record
 
@@ -64,6 +66,11 @@ def test_records_that_lie_alone_make_a_page_without_pictures(tmp_path):
     lead = paired_difference(chosen["ours-pano"], chosen["active-gs"])
     assert f"{lead.value:+.2f} [{lead.low:+.2f}, {lead.high:+.2f}]" in text
     assert "arXiv 2601.07484" in text
+    for metric in METRICS:
+        found = mean_over_scenes(scores_by_method(records, metric.name)["ours-pano"])
+        assert f"<tr><th>{full_title(metric)}</th>" in text
+        low, high = (f"{end:.{metric.decimals}f}" for end in (found.low, found.high))
+        assert f"{found.value:.{metric.decimals}f} [{low}, {high}]" in text
     assert "+2.9" in text
 
 
@@ -95,7 +102,9 @@ def test_a_page_is_not_written_over_something_else(tmp_path, capsys):
     assert "--site takes these from the records" in capsys.readouterr().err
     empty = ["benchmark", "--site", str(tmp_path / "site"), "--out", str(tmp_path / "none")]
     assert main(empty) == 2
-    assert "holds no records" in capsys.readouterr().err
+    told = " ".join(capsys.readouterr().err.split())
+    assert "holds no records of explorations" in told
+    assert "those of --photos are no part of the page" in told
     assert main(["benchmark", "--site", str(tmp_path / "site"), "--out", str(out)]) == 0
     assert (tmp_path / "site" / "index.html").exists()
 
