@@ -425,12 +425,16 @@ def seeds_of(options: BenchmarkOptions) -> tuple[int, ...]:
     """The seeds of a benchmark.
 
     Raises:
-        ValueError: not whole numbers.
+        ValueError: not whole numbers, or one that no training takes.
     """
     try:
-        return tuple(int(seed) for seed in words(options.seeds))
+        seeds = tuple(int(seed) for seed in words(options.seeds))
     except ValueError:
         raise ValueError(f"--seeds are whole numbers with commas, got {options.seeds!r}") from None
+    for seed in seeds:
+        if not 0 <= seed < 1 << 31:
+            raise ValueError(f"--seeds must lie between 0 and 2^31 - 1, got {seed}")
+    return seeds
 
 
 def _check_run(path: Path) -> None:

@@ -43,6 +43,8 @@ REFUSED = {
     "team --resume run": "there is no such folder",
     "benchmark --scenes flat,ofice": "did you mean office?",
     "benchmark --policies ours,cvoer": "did you mean cover?",
+    "benchmark --seeds 0,-1": "--seeds must lie between 0 and 2^31 - 1, got -1",
+    f"benchmark --seeds 0,{1 << 31}": "--seeds must lie between 0 and 2^31 - 1, got 2147483648",
     "benchmark --snapshots views:x": "'x' is not a number",
     "train nowhere": "nowhere: there is no such folder",
     "train runs --resolution 3": "--resolution must be at least 16",

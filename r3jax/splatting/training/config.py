@@ -141,6 +141,8 @@ class TrainConfig(eqx.Module):
         for name in ("iterations", "num_gaussians", "views_per_step", "refine_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 <= self.seed < 1 << 31:
+            raise ValueError(f"seed must lie between 0 and 2^31 - 1, got {self.seed}")
         if self.iterations * self.views_per_step >= 1 << 31:
             raise ValueError(
                 f"{self.iterations} iterations of {self.views_per_step} views each are more than "

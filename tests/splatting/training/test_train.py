@@ -189,6 +189,8 @@ def test_what_cannot_be_trained_on_is_refused(views):
     ("changes", "message"),
     [
         ({"iterations": 0}, "iterations must be at least 1"),
+        ({"seed": -1}, "seed must lie between 0 and 2.31 - 1, got -1"),
+        ({"seed": 1 << 31}, "seed must lie between 0 and 2.31 - 1, got 2147483648"),
         ({"capacity": 10}, "no room for the 300"),
         ({"strategy": "magic"}, "vanilla or mcmc"),
         ({"background": "green"}, "black, white or random"),
