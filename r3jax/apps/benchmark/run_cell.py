@@ -88,15 +88,19 @@ def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> 
     run = _finished_run(paths.run) or _explore(cell, root, paths, on_stage)
     reference = load_reference_images(root, cell)
     failures: list[str] = []
+    tracebacks: list[str] = []
     for snapshot in left:
         stage: OnStage = lambda what, snapshot=snapshot: on_stage(f"{snapshot}: {what}")
         try:
             _do_snapshot(cell, root, run, reference, snapshot, stage)
         except Exception as error:  # the other snapshots may work
-            traceback.print_exc()
             failures.append(f"{snapshot}: {type(error).__name__}: {error}")
+            tracebacks.append(f"\n{snapshot}: {traceback.format_exc()}")
     if failures:
-        raise CellError("; ".join(failures))
+        failure = CellError("; ".join(failures))
+        # A note is no part of the message, but stands in error.txt.
+        failure.add_note("".join(tracebacks))
+        raise failure
 
 
 @contextlib.contextmanager

@@ -179,7 +179,10 @@ def test_a_snapshot_that_fails_leaves_the_others_and_a_reason(room, tmp_path, ca
     with pytest.raises(CellError, match="views:1: ViewsError: one view only"):
         run_cell(cell, tmp_path)
     assert snapshots_left(tmp_path, cell) == ("views:1",)
-    assert "ViewsError" in paths_of(tmp_path, cell).error.read_text()
+    told = paths_of(tmp_path, cell).error.read_text()
+    assert "ViewsError: one view only" in told
+    assert "in _train\n" in told  # where it failed, not only that it did
+    assert "Traceback" not in "".join(capsys.readouterr())
 
 
 @pytest.mark.full
