@@ -4,13 +4,17 @@ import dataclasses
 import functools
 import hashlib
 import json
+import os
 import re
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from r3jax.apps.benchmark.conditions import Conditions, snapshot_slug
 from r3jax.planning.config import FORMER_SETTINGS
+from r3jax.planning.policies.foreign.commands import COMMAND, words_of
+from r3jax.planning.registry import policy_class
 from r3jax.trace.header import plain_settings, settings_of
 
 IDENTITY_VERSION = 1
@@ -68,6 +72,9 @@ class Cell:
     submission: str | None = None
     """Hash of the submission whose frames are taken again; None: the policy explores."""
 
+    sources: dict[str, str] = field(default_factory=dict[str, str])
+    """What `sources_of` the policy was when the cell was planned."""
+
     @property
     def scene_name(self) -> str:
         """What tables call the scene: a mesh file without folder and suffix."""
@@ -115,7 +122,33 @@ def identity(cell: Cell) -> dict[str, Any]:
         "exploration": {k: v for k, v in exploration.items() if (k, v) not in _LATER.items()},
         "training": cell.conditions.train_config(cell.seed).as_record(),
         "test_views": {"hash": cell.test_views_hash, "count": cell.num_test_views},
-    } | ({} if cell.submission is None else {"submission": cell.submission})
+    } | {name: value for name in ("submission", "sources") if (value := getattr(cell, name))}
+
+
+def sources_of(policy: str) -> dict[str, str]:
+    """Finds the SHA-256 of the files that the rule of a policy is in, by what names them.
+
+    These are the words of a command that are files, or the module of a class; what they import in
+    turn is not followed. None for a policy of this package.
+
+    Raises:
+        ValueError: there is no such policy.
+        OSError: a file cannot be read.
+    """
+    if policy.startswith(COMMAND):
+        files = {word: word for word in words_of(policy.removeprefix(COMMAND))}
+    else:
+        module = policy_class(policy).__module__
+        if module.partition(".")[0] == "r3jax":
+            return {}
+        files = {module: getattr(sys.modules[module], "__file__", None) or ""}
+    # Not `Path.is_file`, which raises for a word that no file can be called, such as a program.
+    return {name: _file_hash(path) for name, path in files.items() if os.path.isfile(path)}
+
+
+def _file_hash(path: str) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclass(frozen=True)

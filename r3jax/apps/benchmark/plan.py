@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.apps.benchmark.cells import Cell, snapshots_left
+from r3jax.apps.benchmark.cells import Cell, snapshots_left, sources_of
 from r3jax.apps.benchmark.conditions import Conditions
 from r3jax.apps.benchmark.reference_images import (
     FOLDER,
@@ -77,6 +77,7 @@ def make_plan(
             raise ValueError(f"{name} holds something twice: {', '.join(map(str, given))}")
     for policy in request.policies:  # what can be checked quickly comes before the scenes
         request.conditions.policy(policy, request.settings)
+    sources = {policy: sources_of(policy) for policy in request.policies}
     cells: list[Cell] = []
     for scene in request.scenes:
         view_set = prepare_scene(request, scene, root, on_stage)
@@ -94,6 +95,7 @@ def make_plan(
                     up=request.up,
                     scale=request.scale,
                     cull_backfaces=request.cull_backfaces,
+                    sources=sources[policy],
                 )
             )
     return tuple(cells)

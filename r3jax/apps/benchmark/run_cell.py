@@ -18,7 +18,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.apps.benchmark.cells import Cell, CellPaths, identity, paths_of, snapshots_left
+from r3jax.apps.benchmark.cells import (
+    Cell,
+    CellPaths,
+    identity,
+    paths_of,
+    snapshots_left,
+    sources_of,
+)
 from r3jax.apps.benchmark.record import make_record, write_record
 from r3jax.apps.benchmark.reference_images import ReferenceImages, load_reference_images
 from r3jax.apps.benchmark.retake import retake
@@ -135,6 +142,11 @@ def _explore(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> Run
     simulator = _open(cell)
     if cell.submission is not None:
         return _retake(cell, load_submission(root, cell.submission), simulator, paths, on_stage)
+    if sources_of(cell.policy) != cell.sources:
+        raise CellError(
+            f"the source of the policy {cell.policy} has changed since the benchmark was planned: "
+            "start again"
+        )
     policy = conditions.policy(cell.policy, cell.settings)
     header = _header(cell, simulator, policy_fields(policy))
     on_stage("exploring")

@@ -1,11 +1,19 @@
 """Cells: what makes another one, what does not, and which conditions are refused."""
 
 import dataclasses
+import hashlib
+import sys
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from r3jax.apps.benchmark.cells import Cell, identity, paths_of, snapshots_left
+from r3jax.apps.benchmark import plan
+from r3jax.apps.benchmark.cells import Cell, identity, paths_of, snapshots_left, sources_of
 from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.evaluation.test_views import ViewSet
+from r3jax.planning.policies import REGISTERED
 from r3jax.planning.registry import policy_names
 from r3jax.planning.robot.motion import MOTIONS, Motion
 from tests.apps.benchmark.tiny import CONDITIONS, SETTINGS
@@ -20,6 +28,7 @@ CHANGES = {
     "num_test_views": 99,
     "settings": SETTINGS | {"lambda2": 0.25},
     "submission": "e" * 64,
+    "sources": {"my_policy.py": "f" * 64},
 }
 
 CONDITION_CHANGES = {
@@ -170,3 +179,55 @@ def test_a_motion_is_another_cell_and_a_camera_that_flies_is_not():
 
 def test_without_snapshots_the_budget_is_one():
     assert Conditions(budget="metres:5").snapshots == ("metres:5",)
+
+
+@pytest.mark.parametrize("name", policy_names())
+def test_cells_of_policies_of_this_package_keep_their_names(name):
+    assert sources_of(name) == {}
+    assert "sources" not in identity(CELL)
+
+
+def sha256(text):
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@given(rules=st.lists(st.text("ab"), min_size=2, max_size=2, unique=True))
+def test_an_edited_program_is_another_policy(tmp_path_factory, rules):
+    script = tmp_path_factory.mktemp("policy") / "mine.py"
+    command = f"exec:{sys.executable} -u {script} --gain 2 {'x' * 300}"
+    found = []
+    for rule in rules:
+        script.write_text(rule)
+        found.append(sources_of(command))
+        assert found[-1][str(script)] == sha256(rule)
+        assert set(found[-1]) == {sys.executable, str(script)}
+    assert found[0] != found[1]
+
+
+def test_an_edited_module_is_another_policy(tmp_path, monkeypatch):
+    path = tmp_path / "policy_of_mine.py"
+    path.write_text("class Mine:\n    name = 'mine'\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = sources_of("policy_of_mine:Mine")
+    assert found == {"policy_of_mine": sha256(path.read_text())}
+    path.write_text("class Mine:\n    name = 'mine'  # edited\n")
+    assert sources_of("policy_of_mine:Mine") != found
+    monkeypatch.setitem(REGISTERED, "mine", sys.modules["policy_of_mine"].Mine)
+    assert sources_of("mine") == sources_of("policy_of_mine:Mine")
+    assert sources_of("r3jax.planning.policies.random:Random") == {}
+
+
+def test_a_benchmark_with_an_edited_program_has_other_cells(tmp_path, monkeypatch):
+    views = ViewSet("flat", "a" * 64, (1.0, 1.0, 1.0), 0.1, None, np.zeros((1, 3)), ("+x",))
+    monkeypatch.setattr(plan, "prepare_scene", lambda *_: views)
+    script = tmp_path / "mine.py"
+    request = plan.Request(
+        ("flat",), (f"exec:{sys.executable} {script}", "random"), (0,), CONDITIONS
+    )
+    names = []
+    for rule in ("left", "right"):
+        script.write_text(rule)
+        names.append([cell.name for cell in plan.make_plan(request, tmp_path)])
+    (left, random), (right, same) = names
+    assert left != right
+    assert random == same

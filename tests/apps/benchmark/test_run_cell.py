@@ -212,6 +212,13 @@ def test_a_scene_that_changed_meanwhile_is_refused(room, tmp_path):
         run_cell(other, tmp_path)
 
 
+def test_a_policy_that_changed_meanwhile_is_refused(room, tmp_path):
+    (cell,) = make_cells(room, tmp_path)
+    planned = dataclasses.replace(cell, sources={"my_policy.py": "0" * 64})
+    with pytest.raises(CellError, match="the source of the policy random has changed"):
+        run_cell(planned, tmp_path)
+
+
 def test_two_processes_do_not_work_on_one_cell(room, tmp_path, monkeypatch):
     (cell,) = make_cells(room, tmp_path)
     folder = paths_of(tmp_path, cell).folder
