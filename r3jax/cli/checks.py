@@ -145,7 +145,10 @@ def _(options: BenchmarkOptions) -> None:
         _refuse_others(options, "--submission", _WITH_SUBMISSION)
         for path in options.submission:
             if not path.is_file():
-                raise UserError(f"{path}: there is no such file")
+                what = "there is no such file"
+                if path.is_dir():
+                    what = "this is a folder; a submission is a file"
+                raise UserError(f"{path}: {what}")
         if options.scenes != BenchmarkOptions.scenes and not options.scenes.startswith("mesh:"):
             raise ValueError("--scenes tells where the mesh of a submission lies: mesh:<file>")
     elif options.check:

@@ -45,6 +45,7 @@ REFUSED = {
     "benchmark --policies ours,cvoer": "did you mean cover?",
     "benchmark --seeds 0,-1": "--seeds must lie between 0 and 2^31 - 1, got -1",
     f"benchmark --seeds 0,{1 << 31}": "--seeds must lie between 0 and 2^31 - 1, got 2147483648",
+    "benchmark --submission runs --check": "runs: this is a folder; a submission is a file",
     "benchmark --snapshots views:x": "'x' is not a number",
     "train nowhere": "nowhere: there is no such folder",
     "train runs --resolution 3": "--resolution must be at least 16",

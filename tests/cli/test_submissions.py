@@ -123,3 +123,10 @@ def test_a_submission_is_not_written_over_a_file(exported, capsys):
     assert main(["export", str(run), "--format", "submission", "--out", str(exported)]) == 2
     assert "something is there already" in capsys.readouterr().err
     assert exported.read_bytes() == before
+
+
+def test_a_submission_may_be_written_into_a_new_folder(exported, tmp_path):
+    path = tmp_path / "a" / "b" / "box.jsonl"
+    words = ["export", str(exported.parent / "box"), "--format", "submission", "--out", str(path)]
+    assert main(words) == 0
+    assert path.read_bytes() == exported.read_bytes()

@@ -47,6 +47,7 @@ def run_export(options: ExportOptions) -> int:
 def _write_submission(console: Console, run: Run, out: Path) -> int:
     """Writes the poses of a run, and says how they are judged."""
     submission = submission_of_run(run)
+    out.parent.mkdir(parents=True, exist_ok=True)
     write_submission(out, submission)
     console.say(f"{len(submission.frames)} frames, {out.stat().st_size / 1000:.0f} kB")
     console.say(f"exported  {out}")
