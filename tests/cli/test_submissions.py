@@ -130,3 +130,25 @@ def test_a_submission_may_be_written_into_a_new_folder(exported, tmp_path):
     words = ["export", str(exported.parent / "box"), "--format", "submission", "--out", str(path)]
     assert main(words) == 0
     assert path.read_bytes() == exported.read_bytes()
+
+
+def test_a_corrected_submission_and_other_terms_break_no_table(exported, tmp_path, capsys):
+    policy, scene = header(exported)["policy"], header(exported)["scene"]
+    last = json.loads(exported.read_text().splitlines()[-1])
+    for name in ("corrected", "bob", "carol"):
+        (tmp_path / name).mkdir()
+    corrected = damaged(exported, tmp_path / "corrected", -1, seconds=last["seconds"] + 0.5)
+    bob = damaged(exported, tmp_path / "bob", 0, policy=policy | {"name": "bob"})
+    carol = damaged(
+        exported, tmp_path / "carol", 0,
+        policy=policy | {"name": "carol"}, scene=scene | {"noise": 0.0},
+    )  # fmt: skip
+    words = ["benchmark", *JUDGING, "--out", str(tmp_path / "out"), "--submission"]
+    for paths in ([exported], [corrected]):
+        assert main([*words, *map(str, paths)]) == 0
+    capsys.readouterr()
+    assert main([*words, str(bob), str(carol)]) == 0
+    told = capsys.readouterr().out
+    assert told.count("random (submitted)") == 2
+    assert "table 2 on the same terms" in told
+    assert "the exploration's noise: 0.0" in told
