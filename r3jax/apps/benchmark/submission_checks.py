@@ -130,16 +130,34 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
     heights = motion.heights_from(float(start[2, 3]))
     terms = _Terms(parse_budget(submission.budget), submission.config, motion, heights)
     problems: list[Problem] = []
-    for step in _steps(submission):
-        texts = [
-            *_in_budget(step, terms),
-            *_within_limits(step, terms),
-            *_in_free_space(step, truth),
-            *(_at_start(step, start, submission.seed) if step.frame.frame == 0 else ()),
-            *(_in_time(step, terms) if step.frame.frame > 0 else ()),
-        ]
-        problems += [Problem(step.frame.frame, text) for text in texts]
+    for leg in _legs(submission):
+        of_leg = [*_on_the_way(leg, terms)]
+        for step in leg:
+            texts = [
+                *_in_budget(step, terms),
+                *_within_limits(step, terms),
+                *_in_free_space(step, truth),
+                *(_at_start(step, start, submission.seed) if step.frame.frame == 0 else ()),
+                *(_in_time(step, terms) if step.frame.frame > 0 else ()),
+            ]
+            of_leg += [Problem(step.frame.frame, text) for text in texts]
+        problems += sorted(of_leg, key=lambda problem: problem.frame or 0)
     return problems
+
+
+def _legs(submission: Submission) -> Iterator[list[_Step]]:
+    """The frames on the way to each view that was chosen, and that view.
+
+    The last leg may end on its way, as a run does that has spent its budget there.
+    """
+    leg: list[_Step] = []
+    for step in _steps(submission):
+        leg.append(step)
+        if not step.frame.captured:
+            yield leg
+            leg = []
+    if leg:
+        yield leg
 
 
 def _steps(submission: Submission) -> Iterator[_Step]:
@@ -165,6 +183,30 @@ def _at_start(step: _Step, start: np.ndarray, seed: int) -> Iterator[str]:
         yield "it is captured on the way from nowhere: leave `captured` out"
     if step.frame.metres:
         yield f"it comes after {step.frame.metres:g} m: the path begins here"
+
+
+def _on_the_way(leg: list[_Step], terms: _Terms) -> Iterator[Problem]:
+    """There are no more frames on the way than the loop takes, nor closer together."""
+    captured = [step for step in leg if step.frame.captured]
+    if not captured:
+        return
+    first, num = captured[0].frame.frame, len(captured)
+    if not terms.config.captures:
+        told = "`exploration` in line 1 has neither `capture_every` nor `capture_rate`"
+        yield Problem(first, f"it is captured on the way, but {told}: leave `captured` out")
+        return
+    # Of the path itself: `metres` may say more than was flown.
+    length, longest = sum(step.length for step in leg), terms.config.piece_at(terms.speed)
+    if num == len(leg) - 1 and length < num * _less(longest):
+        told = f"{num} frames are captured on the {length:.3f} m to frame {leg[-1].frame.frame}"
+        yield Problem(first, f"{told}, one each {longest:g} m are allowed: capture fewer")
+    # The loop cuts a path into the fewest equal pieces that are not too long: where there are n + 1
+    # of them or more, they are longer than n / (n + 1) of the longest one.
+    least = longest * num / (num + 1)
+    for step in captured:
+        if step.length < _less(least):
+            told = f"it is captured {step.length:.3f} m after the frame before"
+            yield Problem(step.frame.frame, f"{told}: keep {least:.3f} m on this leg")
 
 
 def _in_budget(step: _Step, terms: _Terms) -> Iterator[str]:

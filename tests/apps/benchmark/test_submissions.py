@@ -2,11 +2,14 @@
 
 import dataclasses
 import functools
+import math
 import re
 import shutil
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from r3jax.apps.benchmark import run_cell as module
 from r3jax.apps.benchmark import submission_checks
@@ -24,9 +27,10 @@ from r3jax.apps.benchmark.submitted import (
 from r3jax.apps.runs.begin import begin_run
 from r3jax.apps.runs.settings import RunSettings, SceneSettings
 from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig
 from r3jax.exploration.loop import explore
 from r3jax.formats.submissions import (
+    SubmittedFrame,
     content_hash,
     read_submission,
     submission_of_run,
@@ -39,6 +43,7 @@ from r3jax.trace.errors import RunError
 from r3jax.trace.images import frame_hash, stored_form
 from r3jax.trace.reader import read_run
 from tests.apps.benchmark.tiny import CONDITIONS
+from tests.formats.test_submissions import make_submission
 from tests.mutants import Mutant, assert_caught, each
 
 
@@ -190,6 +195,18 @@ def looking(submission, number, direction, **changes):
     return with_frame(submission, number, pose=pose, **changes)
 
 
+def on_a_line(submission, *metres, **loop):
+    """The first frame, and further ones so far along x from it; all but the last are captured."""
+    first, frames = submission.frames[0], submission.frames[:1]
+    for number, x in enumerate(metres, start=1):
+        pose = first.pose.copy()
+        pose[0, 3] += x
+        captured = number < len(metres)
+        frames += (SubmittedFrame(number, pose, first.seconds + number, 0.02, captured=captured),)
+    exploration = submission.exploration | loop
+    return dataclasses.replace(submission, frames=frames, exploration=exploration)
+
+
 def with_motion(submission, **settings):
     return dataclasses.replace(submission, motion=settings)
 
@@ -198,6 +215,22 @@ BROKEN = {
     "another scene": (
         lambda s: dataclasses.replace(s, scene=s.scene | {"hash": "f" * 64}),
         r"line 1: the scene .* has the hash \w{12} here, f{12} in the submission",
+    ),
+    "captures that are not allowed": (
+        lambda s: with_frame(s, 1, captured=True),
+        "line 3, frame 1: it is captured on the way, but `exploration` in line 1 has neither",
+    ),
+    "more captures than there are pieces": (
+        lambda s: on_a_line(s, 0.5, 0.8, 1.2, 1.4, capture_every=0.5),
+        "line 3, frame 1: 3 frames are captured on the 1.400 m to frame 4, one each 0.5 m are",
+    ),
+    "captures at one place": (
+        lambda s: on_a_line(s, 0.5, 0.5, 1.6, capture_every=0.5),
+        "line 4, frame 2: it is captured 0.000 m after the frame before: keep 0.333 m on this leg",
+    ),
+    "captures at one place on a leg that does not end": (
+        lambda s: with_frame(on_a_line(s, 0.5, 0.9, 1.2, capture_rate=2.0), 3, captured=True),
+        "line 5, frame 3: it is captured 0.300 m after the frame before: keep 0.375 m on this leg",
     ),
     "another start": (
         lambda s: moved(s, 0, (0.05, 0.0, 0.0)),
@@ -342,6 +375,33 @@ def law_time(modules, submission, scene) -> None:
     assert least(first, second, 2.0, config=ahead) == pytest.approx(2.0 + turn + shorter)
 
 
+@given(st.floats(0.01, 5.0), st.floats(LEAST_PIECE, 2.0), st.integers(1, 3))
+def test_a_leg_has_the_pieces_that_the_loop_makes_of_it_and_no_more(length, every, more):
+    num = max(1, math.ceil(length / every - 1e-6))
+
+    def problems(pieces, taken):
+        metres = length * np.arange(1, pieces + 1) / pieces
+        made = on_a_line(make_submission(1), *metres[:taken], capture_every=every)
+        last = dataclasses.replace(made.frames[-1], captured=taken < pieces)
+        made = dataclasses.replace(made, frames=(*made.frames[:-1], last))
+        heights = made.robot.heights_from(1.0)
+        terms = submission_checks._Terms(
+            parse_budget(made.budget), made.config, made.robot, heights
+        )
+        return [
+            p
+            for leg in submission_checks._legs(made)
+            for p in submission_checks._on_the_way(leg, terms)
+        ]
+
+    for taken in range(1, num + 1):
+        assert problems(num, taken) == []
+    assume(length > 1e-3)
+    # A leg of n times the longest piece may be cut once more by rounding.
+    assume(length / every < num - 1e-3)
+    assert problems(num + more, num + more) != []
+
+
 CHAIN = ("r3jax.apps.benchmark.submission_checks",)
 CHECKS = "submission_checks"
 MUTANTS = [
@@ -371,6 +431,9 @@ MUTANTS = [
     Mutant(CHECKS, "else max(flight, turning)", "else flight + turning", law_time),
     Mutant(CHECKS, "step.turn / rate", "0.0 * step.turn / rate", law_time),
     Mutant(CHECKS, "if step.before.captured or", "if", law_time),
+    Mutant(CHECKS, "if not terms.config.captures:", "if False:", law_rules),
+    Mutant(CHECKS, "length < num * _less(longest)", "length < 0.0", law_rules),
+    Mutant(CHECKS, "if step.length < _less(least)", "if step.length < 0.0", law_rules),
     Mutant(CHECKS, "if terms.config.plan_while_moving else", "if False else", law_time),
 ]  # fmt: skip
 
