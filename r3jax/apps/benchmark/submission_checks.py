@@ -137,6 +137,7 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
                 *_in_budget(step, terms),
                 *_within_limits(step, terms),
                 *_in_free_space(step, truth),
+                *_is_mapped(step, terms),
                 *(_at_start(step, start, submission.seed) if step.frame.frame == 0 else ()),
                 *(_in_time(step, terms) if step.frame.frame > 0 else ()),
             ]
@@ -181,6 +182,8 @@ def _at_start(step: _Step, start: np.ndarray, seed: int) -> Iterator[str]:
         )
     if step.frame.captured:
         yield "it is captured on the way from nowhere: leave `captured` out"
+    if step.frame.seconds < _less(step.frame.mapping):
+        yield f"`seconds` is {step.frame.seconds:g}, less than its mapping: the clock begins at 0"
     if step.frame.metres:
         yield f"it comes after {step.frame.metres:g} m: the path begins here"
 
@@ -256,6 +259,14 @@ def _in_free_space(step: _Step, truth: GroundTruth) -> Iterator[str]:
         )
 
 
+def _is_mapped(step: _Step, terms: _Terms) -> Iterator[str]:
+    """Mapping takes its time."""
+    mapping, least = step.frame.mapping, terms.cost("mapping")
+    if mapping < _less(least):
+        clock = f"on the model clock it takes {least:g} s" if least else "it takes no less than 0 s"
+        yield f"`mapping` is {mapping:g} s, {clock}"
+
+
 def _in_time(step: _Step, terms: _Terms) -> Iterator[str]:
     """The path begins and ends at the views, and the clock leaves time for it."""
     ends = np.stack([step.before.position, step.frame.position])
@@ -265,9 +276,6 @@ def _in_time(step: _Step, terms: _Terms) -> Iterator[str]:
     flown = step.metres - step.metres_before
     if flown < _less(step.length):
         yield f"`metres` grows by {flown:.4f}, the path has {step.length:.4f} m: count all of it"
-    mapping = terms.cost("mapping")
-    if step.frame.mapping < _less(mapping):
-        yield f"`mapping` is {step.frame.mapping:g} s, on the model clock it takes {mapping:g} s"
     needed, why = _least_seconds(step, terms, max(flown, step.length))
     if step.seconds < _less(needed):
         yield (

@@ -248,6 +248,20 @@ BROKEN = {
         lambda s: with_frame(s, 0, metres=0.5),
         "line 2, frame 0: it comes after 0.5 m:",
     ),
+    "a clock that begins before the start": (
+        lambda s: with_frame(s, 0, seconds=-1000.0),
+        "line 2, frame 0: `seconds` is -1000, less than its mapping",
+    ),
+    "a start that is mapped before it is seen": (
+        lambda s: with_frame(s, 0, mapping=-5.0),
+        "line 2, frame 0: `mapping` is -5 s, on the model clock it takes 0.02 s",
+    ),
+    "mapping in less than no time": (
+        lambda s: with_frame(
+            dataclasses.replace(s, exploration=s.exploration | {"clock": "wall"}), 0, mapping=-5.0
+        ),
+        "line 2, frame 0: `mapping` is -5 s, it takes no less than 0 s",
+    ),
     "through the wall": (
         lambda s: moved(s, 2, (9.0, 0.0, 0.0), seconds=1e3, metres=1e3),
         "line 4, frame 2: its path runs through a surface",
@@ -420,7 +434,7 @@ MUTANTS = [
     Mutant(CHECKS, "if room < CLEARANCE", "if room < 0.0", law_rules),
     Mutant(CHECKS, "step.path[[0, -1]] - ends", "step.path[[-1, -1]] - ends[1]", law_rules),
     Mutant(CHECKS, "if flown < _less(step.length)", "if flown < 0.0", law_rules),
-    Mutant(CHECKS, "if step.frame.mapping < _less(mapping)", "if step.frame.mapping < 0.0",
+    Mutant(CHECKS, "if mapping < _less(least)", "if mapping < 0.0",
            law_rules),
     Mutant(CHECKS, "if step.seconds < _less(needed)", "if step.seconds < 0.0", law_rules),
     Mutant(CHECKS, "self.frame.seconds - self.frame.mapping - self.before.seconds",
@@ -431,6 +445,7 @@ MUTANTS = [
     Mutant(CHECKS, "else max(flight, turning)", "else flight + turning", law_time),
     Mutant(CHECKS, "step.turn / rate", "0.0 * step.turn / rate", law_time),
     Mutant(CHECKS, "if step.before.captured or", "if", law_time),
+    Mutant(CHECKS, "if step.frame.seconds < _less(step.frame.mapping)", "if False", law_rules),
     Mutant(CHECKS, "if not terms.config.captures:", "if False:", law_rules),
     Mutant(CHECKS, "length < num * _less(longest)", "length < 0.0", law_rules),
     Mutant(CHECKS, "if step.length < _less(least)", "if step.length < 0.0", law_rules),
