@@ -148,7 +148,7 @@ def begin_leg(decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, ru
         places=decision.T_world_camera[None, :3, 3],
         lengths=np.array([decision.length]),
         seconds=np.array([rules.flight(decision)]),
-        turning=Turning(*ends, np.array([np.inf]), _elevations(rules.motion)),
+        turning=Turning(*ends, np.array([np.inf]), elevations_of(rules.motion)),
     )
 
 
@@ -156,28 +156,40 @@ def _in_pieces(
     num: int, decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: Rules
 ) -> Leg:
     """The leg of a path in `num` pieces, two or more."""
-    config, motion = rules.config, rules.motion
     places = points_along(decision.waypoints, num)
     places[-1] = decision.T_world_camera[:3, 3]
     flight = rules.flight(decision)
     piece = min(decision.length / rules.speed, flight) / num
     seconds = np.full(num, piece)
     seconds[-1] = flight - (num - 1) * piece
-    allowed = np.full(num, np.inf)
-    if config.exposure > 0.0:  # the chosen view is taken at rest
-        allowed[:-1] = config.blur * piece / (float(rules.camera.focal) * config.exposure)
-    if motion.turn_rate is not None:
-        allowed = np.minimum(allowed, math.radians(motion.turn_rate) * seconds)
-    if motion.turn_per_meter is not None:
-        stops = np.concatenate([T_world_camera[None, :3, 3], places])
-        straight = np.linalg.norm(np.diff(stops, axis=0), axis=1)
-        allowed = np.minimum(allowed, math.radians(motion.turn_per_meter) * straight)
+    stops = np.concatenate([T_world_camera[None, :3, 3], places])
     ends = direction_of(T_world_camera), direction_of(decision.T_world_camera)
-    turning = Turning(*ends, allowed, _elevations(motion))
+    turning = Turning(*ends, allowed_turns(stops, seconds, rules), elevations_of(rules.motion))
     return Leg(decision, info, places, np.full(num, decision.length / num), seconds, turning)
 
 
-def _elevations(motion: Motion) -> tuple[float, float]:
+def allowed_turns(stops: np.ndarray, seconds: np.ndarray, rules: Rules) -> np.ndarray:
+    """Largest turn on each piece of a path, [n] [rad]; inf: any.
+
+    Args:
+        stops: where the pieces begin and end, [n + 1, 3] [m].
+        seconds: time for each piece, [n] [s].
+        rules: what limits turns.
+    """
+    config, motion = rules.config, rules.motion
+    allowed = np.full(len(seconds), np.inf)
+    if config.exposure > 0.0:  # the chosen view is taken at rest
+        allowed[:-1] = config.blur * seconds[:-1] / (float(rules.camera.focal) * config.exposure)
+    if motion.turn_rate is not None:
+        allowed = np.minimum(allowed, math.radians(motion.turn_rate) * seconds)
+    if motion.turn_per_meter is not None:
+        straight = np.linalg.norm(np.diff(stops, axis=0), axis=1)
+        allowed = np.minimum(allowed, math.radians(motion.turn_per_meter) * straight)
+    return allowed
+
+
+def elevations_of(motion: Motion) -> tuple[float, float]:
+    """Lowest and highest elevation of a line of sight [rad]."""
     low, high = np.radians(motion.elevations)
     return float(low), float(high)
 

@@ -4,6 +4,7 @@ Every rule is one that the loop keeps by itself for a policy that runs here. The
 possible from outside: how a policy came to its views is its own affair.
 """
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from r3jax.exploration.budget import Budget, parse_budget
+from r3jax.exploration.captures import Rules, allowed_turns, elevations_of
 from r3jax.exploration.clock import model_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.formats.submissions import Submission, SubmittedFrame
-from r3jax.geometry.cameras import angle_between
+from r3jax.geometry.cameras import Camera, angle_between
+from r3jax.planning.gaze.turning import Turning, along, direction_of, turn
 from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import Motion
 from r3jax.simulators.base import Simulator
@@ -58,6 +61,9 @@ class _Terms:
     motion: Motion
     heights: tuple[float, float]
     """Lowest and highest place of the camera [m], world."""
+
+    camera: Camera
+    """Of every frame."""
 
     @property
     def speed(self) -> float:
@@ -128,10 +134,11 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
     motion, truth = submission.robot, GroundTruth(simulator)
     start = begin_at(motion, simulator.start_pose)
     heights = motion.heights_from(float(start[2, 3]))
-    terms = _Terms(parse_budget(submission.budget), submission.config, motion, heights)
+    budget, camera = parse_budget(submission.budget), submission.intrinsics
+    terms = _Terms(budget, submission.config, motion, heights, camera)
     problems: list[Problem] = []
     for leg in _legs(submission):
-        of_leg = [*_on_the_way(leg, terms)]
+        of_leg = [*_on_the_way(leg, terms), *_looks_ahead(leg, terms)]
         for step in leg:
             texts = [
                 *_in_budget(step, terms),
@@ -210,6 +217,41 @@ def _on_the_way(leg: list[_Step], terms: _Terms) -> Iterator[Problem]:
         if step.length < _less(least):
             told = f"it is captured {step.length:.3f} m after the frame before"
             yield Problem(step.frame.frame, f"{told}: keep {least:.3f} m on this leg")
+
+
+def _looks_ahead(leg: list[_Step], terms: _Terms) -> Iterator[Problem]:
+    """On the way a fixed camera looks along it, as nearly as the loop lets it turn.
+
+    Where a leg does not end, nobody knows what the camera must be able to turn to.
+    """
+    if not terms.motion.fixed_camera or leg[-1].frame.captured:
+        return
+    turning = _turning_on(leg, terms)
+    low, high = turning.elevations
+    for piece, (step, after) in enumerate(itertools.pairwise(leg)):
+        now = direction_of(step.before.pose)
+        azimuth, elevation = along(after.frame.position - step.frame.position, now)
+        wanted = np.array([azimuth, np.clip(elevation, low, high)])
+        off = math.degrees(turn(direction_of(step.frame.pose), wanted))
+        least = math.degrees(turn(turning.nearest(piece, now, wanted), wanted))
+        if off > least + _SAME_ANGLE:
+            told = f"it looks {off:.1f} degrees off the way to the next frame"
+            text = f"{told}, a fixed camera at most {least:.1f}: look ahead"
+            yield Problem(step.frame.frame, text)
+
+
+def _turning_on(leg: list[_Step], terms: _Terms) -> Turning:
+    """How far the camera can turn between the frames of a leg: as the loop has it."""
+    begin, end, motion = leg[0].before, leg[-1].frame, terms.motion
+    seconds = np.array([step.length for step in leg]) / terms.speed
+    # To the chosen view the robot turns after it has flown.
+    seconds[-1] += motion.turning(angle_between(begin.pose.astype(np.float64), end.pose))
+    stops = np.stack([begin.position, *(step.frame.position for step in leg)])
+    allowed = allowed_turns(stops, seconds, Rules(terms.config, motion, terms.camera))
+    # Rounded, a turn that the loop takes for too long may seem to fit.
+    allowed *= 1.0 - 1e-4
+    ends = direction_of(begin.pose), direction_of(end.pose)
+    return Turning(*ends, allowed, elevations_of(motion))
 
 
 def _in_budget(step: _Step, terms: _Terms) -> Iterator[str]:

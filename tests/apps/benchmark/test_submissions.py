@@ -156,6 +156,8 @@ def explored(room, out, motion="free", policy="random", **loop):
         ("ground", "random", {}),
         ("gimbal", "random", {"capture_rate": 4.0}),
         ("handheld", "random", {}),
+        ("handheld", "random", {"capture_every": 0.2}),
+        ("ground", "random", {"capture_every": 0.3, "exposure": 0.02}),
     ],
 )
 def test_what_the_loop_does_keeps_the_rules_and_is_seen_again(room, tmp_path, motion, policy, loop):
@@ -239,6 +241,11 @@ BROKEN = {
     "a start that looks elsewhere": (
         lambda s: looking(s, 0, (0.0, 1.0, 0.2)),
         "line 2, frame 0: it lies 0.000 m and .* degrees from the scene's start",
+    ),
+    "a fixed camera that looks aside": (
+        lambda s: with_motion(on_a_line(s, 0.4, 0.7, capture_every=0.4), fixed_camera=True),
+        r"line 3, frame 1: it looks \d+\.\d degrees off the way to the next frame, a fixed camera "
+        "at most 0.0",
     ),
     "a start on the way": (
         lambda s: with_frame(s, 0, captured=True),
@@ -366,7 +373,11 @@ def law_time(modules, submission, scene) -> None:
     checks = modules["submission_checks"]
     robot = with_motion(submission, speed=1.0, turn_rate=10.0)
     terms = checks._Terms(
-        parse_budget(robot.budget), robot.config, robot.robot, robot.robot.heights_from(1.0)
+        parse_budget(robot.budget),
+        robot.config,
+        robot.robot,
+        robot.robot.heights_from(1.0),
+        robot.intrinsics,
     )
     first, second, third = robot.frames[:3]
 
@@ -398,15 +409,9 @@ def test_a_leg_has_the_pieces_that_the_loop_makes_of_it_and_no_more(length, ever
         made = on_a_line(make_submission(1), *metres[:taken], capture_every=every)
         last = dataclasses.replace(made.frames[-1], captured=taken < pieces)
         made = dataclasses.replace(made, frames=(*made.frames[:-1], last))
-        heights = made.robot.heights_from(1.0)
-        terms = submission_checks._Terms(
-            parse_budget(made.budget), made.config, made.robot, heights
-        )
-        return [
-            p
-            for leg in submission_checks._legs(made)
-            for p in submission_checks._on_the_way(leg, terms)
-        ]
+        checks, settings = submission_checks, (made.config, made.robot, (-9.0, 9.0))
+        terms = checks._Terms(parse_budget(made.budget), *settings, made.intrinsics)
+        return [p for leg in checks._legs(made) for p in checks._on_the_way(leg, terms)]
 
     for taken in range(1, num + 1):
         assert problems(num, taken) == []
@@ -446,6 +451,7 @@ MUTANTS = [
     Mutant(CHECKS, "step.turn / rate", "0.0 * step.turn / rate", law_time),
     Mutant(CHECKS, "if step.before.captured or", "if", law_time),
     Mutant(CHECKS, "if step.frame.seconds < _less(step.frame.mapping)", "if False", law_rules),
+    Mutant(CHECKS, "if off > least + _SAME_ANGLE", "if off < 0.0", law_rules),
     Mutant(CHECKS, "if not terms.config.captures:", "if False:", law_rules),
     Mutant(CHECKS, "length < num * _less(longest)", "length < 0.0", law_rules),
     Mutant(CHECKS, "if step.length < _less(least)", "if step.length < 0.0", law_rules),
