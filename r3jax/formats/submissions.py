@@ -10,6 +10,7 @@ write such a file, in whatever language, can be judged by `r3jax benchmark --sub
 Shape symbols: K waypoints.
 """
 
+import codecs
 import dataclasses
 import hashlib
 import json
@@ -286,8 +287,8 @@ def parse_submission(data: bytes) -> Submission:
     Raises:
         ForeignFileError: as `read_submission` says.
     """
-    lines = data.split(b"\n")
-    if lines and not lines[-1].strip():
+    lines = data.removeprefix(codecs.BOM_UTF8).split(b"\n")
+    while lines and not lines[-1].strip():
         lines.pop()
     if not lines:
         raise ForeignFileError("the file is empty: its first line should say what it is")
@@ -295,15 +296,26 @@ def parse_submission(data: bytes) -> Submission:
     header: dict[str, Any] = {}
     for number, line in enumerate(lines, start=1):
         try:
+            plain = _object_of(line, is_end=number == len(lines) and not data.endswith(b"\n"))
             if number == 1:
-                header = _header_of(parse_json(line))
+                header = _header_of(plain)
             else:
-                frames.append(_frame_of(parse_json(line), len(frames)))
+                frames.append(_frame_of(plain, len(frames)))
         except ForeignFileError as error:
             raise ForeignFileError(f"line {number}: {error}") from None
     if not frames:
         raise ForeignFileError("there are no frames: each takes a line after the first one")
     return build(Submission, header, frames=tuple(frames))
+
+
+def _object_of(line: bytes, *, is_end: bool) -> Any:
+    """What a line holds; `is_end`: no line feed follows."""
+    text = line.strip()
+    if not text:
+        raise ForeignFileError("the line is empty")
+    if is_end and text.startswith(b"{") and not text.endswith(b"}"):
+        raise ForeignFileError("the file is cut off: its last line is not whole")
+    return parse_json(line)
 
 
 def _header_of(plain: Any) -> dict[str, Any]:
@@ -313,7 +325,7 @@ def _header_of(plain: Any) -> dict[str, Any]:
     check_version(plain.get("version"), VERSION)
     if plain.get("protocol") != PROTOCOL:
         raise ForeignFileError(
-            f"protocol {plain.get('protocol')!s:.20}, this package judges by protocol {PROTOCOL}: "
+            f"protocol {plain.get('protocol')!r:.20}, this package judges by protocol {PROTOCOL}: "
             "export the run again, or use the r3jax of that protocol"
         )
     fields = {k: v for k, v in plain.items() if k not in ("format", "version", "protocol")}
@@ -358,6 +370,8 @@ def _check_settings(name: str, plain: dict[str, Any], kind: type) -> None:
 def _frame_of(plain: Any, number: int) -> SubmittedFrame:
     """A frame of its line; `number` is that of the frame that comes next."""
     known: dict[str, Any] = plain if isinstance(plain, dict) else {}
+    if known and known.get("pose") is None:
+        raise ForeignFileError("the frame lacks `pose`")
     ready: dict[str, Any] = {"pose": rigid_pose("pose", known.get("pose"))}
     if known.get("path") is not None:
         ready["path"] = table_of("path", known["path"], (-1, 3))

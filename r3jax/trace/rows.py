@@ -231,7 +231,11 @@ def table_of(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     """
     try:
         with np.errstate(over="ignore"):  # too large for float32: found with the infinities
-            table = np.asarray(values, dtype=np.float32)
+            found = np.asarray(values)
+            # Checked first: a text such as "1" would become a number.
+            if found.dtype.kind not in "iuf":
+                raise TypeError(found.dtype)
+            table = found.astype(np.float32)
     except (ValueError, TypeError):
         raise ForeignFileError(f"`{name}` must be a table of numbers") from None
     # An empty list has one axis; a path without waypoints has two.

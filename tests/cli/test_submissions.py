@@ -58,7 +58,7 @@ def test_a_check_says_all_that_is_wrong_and_fails(exported, tmp_path, capsys):
     told = " ".join(capsys.readouterr().err.split())
     assert "damaged.jsonl, line 3, frame 1: `mapping` is 0 s" in told
     assert "damaged.jsonl, line 3, frame 1: it arrives" in told
-    assert "torn.jsonl: line 4: this is not JSON" in told
+    assert "torn.jsonl: line 4: the file is cut off" in told
     assert "3 frames, all in order" in told
 
 

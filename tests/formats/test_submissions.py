@@ -146,7 +146,14 @@ MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (changed(3, pose=SCALED), "line 4: `pose`: the pose is not rigid"),
         (changed(3, pose=MIRRORED), "line 4: `pose`: the pose mirrors"),
         (changed(3, pose=[[1.0]]), "line 4: `pose` has the shape"),
-        (changed(3, pose=...), "line 4: `pose` must be a table|has the shape"),
+        (changed(3, pose=...), "line 4: the frame lacks `pose`"),
+        (changed(3, pose=None), "line 4: the frame lacks `pose`"),
+        (changed(3, pose=[[str(x) for x in row] for row in np.eye(4)]), "line 4: `pose` must be a"),
+        (changed(0, protocol="1"), "line 1: protocol '1', this package judges by protocol 1"),
+        (changed(3)[:-40], "line 4: the file is cut off: its last line is not whole"),
+        (changed(3)[:-40] + b"\n", r"line 4: this is not JSON \([^(:]*, column \d+\)$"),
+        (changed(3).replace(b"\n", b"\n \n", 1), "line 2: the line is empty"),
+        (b"\n\n", "the file is empty"),
         (changed(3, seconds="late"), "line 4: `seconds` must be float"),
         (changed(3, path=[[0.0, 0.0, 0.0]]), "line 4: `path` needs two waypoints"),
         (changed(3, shutter=1), "line 4: the SubmittedFrame has an unknown 'shutter'"),
@@ -160,3 +167,9 @@ def test_what_is_wrong_is_said_with_its_line(data, says, tmp_path):
     (tmp_path / "theirs.jsonl").write_bytes(data)
     with pytest.raises(FormatError, match=r"theirs\.jsonl: "):
         read_submission(tmp_path / "theirs.jsonl")
+
+
+def test_a_byte_order_mark_and_empty_lines_at_the_end_change_nothing():
+    data = changed(1)
+    odd = b"\xef\xbb\xbf" + data + b"\r\n\n \n"
+    assert_same(parse_submission(odd), parse_submission(data))

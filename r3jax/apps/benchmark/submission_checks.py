@@ -262,7 +262,9 @@ def _in_budget(step: _Step, terms: _Terms) -> Iterator[str]:
         views=step.views, frames=frames, seconds=arrival, metres=step.metres
     ):
         spent_of_it = f"{spent[terms.budget.unit]:g} {terms.budget.unit}"
-        yield f"it takes {spent_of_it}, beyond the budget {terms.budget}: end before it"
+        told = f"it takes {spent_of_it}, beyond the budget {terms.budget}: end before it"
+        # Records spell the unit as those before them did; people give it as `meters`.
+        yield told.replace("metres", "meters")
 
 
 def _within_limits(step: _Step, terms: _Terms) -> Iterator[str]:

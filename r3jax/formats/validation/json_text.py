@@ -39,6 +39,10 @@ def parse_json(data: bytes | str) -> Any:
         raise ForeignFileError("the JSON is nested too deeply") from None
     except ForeignFileError:
         raise
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, " if "\n" in error.doc else ""
+        told = f"this is not JSON ({error.msg}, {where}column {error.colno})"
+        raise ForeignFileError(told) from None
     except ValueError as error:
         raise ForeignFileError(f"this is not JSON ({error})"[:300]) from None
     return value

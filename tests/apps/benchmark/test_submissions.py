@@ -313,6 +313,10 @@ BROKEN = {
         lambda s: dataclasses.replace(s, budget="seconds:0.5"),
         "line 3, frame 1: it takes .* seconds, beyond the budget seconds:0.5",
     ),
+    "beyond the budget of meters": (
+        lambda s: dataclasses.replace(s, budget="meters:0.01"),
+        "line 3, frame 1: it takes .* meters, beyond the budget meters:0.01",
+    ),
     "a slower robot": (
         lambda s: with_motion(s, speed=0.2),
         "line 3, frame 1: it arrives .* at 0.2 m/s",
