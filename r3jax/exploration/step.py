@@ -97,12 +97,13 @@ def start_state(
     return LoopState(0, planner, pose)
 
 
-def check_world(bounds: np.ndarray, cell_size: float) -> None:
+def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-size") -> None:
     """Refuses a world that is too small, too flat or too large to be explored.
 
     Args:
         bounds: its box, [2, 3] [m].
         cell_size: edge of a cell of the coarse grid [m].
+        setting: where the user said so.
 
     Raises:
         ValueError: says what is odd, and which scale would mend it.
@@ -126,7 +127,7 @@ def check_world(bounds: np.ndarray, cell_size: float) -> None:
     if not cells <= MAX_CELLS:
         raise ValueError(
             f"{size}: {cells:.2g} cells of {cell_size:g} m, more than {MAX_CELLS:.0e}"
-            f"{hint or '; give a larger --cell-size, or cut the mesh'}"
+            f"{hint or f'; give a larger {setting}, or cut the mesh'}"
         )
 
 

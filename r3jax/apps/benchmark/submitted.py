@@ -10,6 +10,7 @@ from r3jax.apps.benchmark.cells import Cell
 from r3jax.apps.benchmark.conditions import OWN_OF_LOOP, Conditions
 from r3jax.apps.benchmark.plan import Request, prepare_scene
 from r3jax.apps.benchmark.submission_checks import Problem, check_submission
+from r3jax.exploration.step import check_world
 from r3jax.formats.submissions import (
     Submission,
     content_hash,
@@ -49,10 +50,26 @@ def open_submitted(submission: Submission) -> Simulator:
 def problems_of(submission: Submission) -> list[Problem]:
     """Lists what keeps a submission from being judged: rules of the protocol that it breaks."""
     try:
+        _check_terms(submission)
         _ = conditions_of(submission, Conditions(train_resolution=16))
-        return check_submission(submission, open_submitted(submission))
+        simulator = open_submitted(submission)
+        check_world(simulator.bounds, submission.config.cell_size, "`exploration.cell_size`")
+        return check_submission(submission, simulator)
     except (ValueError, ImportError) as error:
         return [Problem(None, str(error))]
+
+
+def _check_terms(submission: Submission) -> None:
+    """Refuses what no map or training could be made of.
+
+    Raises:
+        ValueError: names the field.
+    """
+    if not 0 <= submission.seed < 1 << 31:
+        raise ValueError(f"`seed` must lie between 0 and 2^31 - 1, got {submission.seed}")
+    if len(submission.frames) < 2:
+        raise ValueError("a model is trained on two frames at least, and there is one")
+    submission.config.check_scales()
 
 
 def conditions_of(

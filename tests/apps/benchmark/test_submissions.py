@@ -482,6 +482,22 @@ def test_what_cannot_be_opened_is_a_problem_too(submission):
     assert "square images" in str(problem)
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda s: {"frames": s.frames[:1]}, "two frames at least"),
+        (lambda s: {"seed": 1 << 31}, "`seed` must lie between 0 and 2"),
+        (lambda s: {"scene": s.scene | {"max_range": 1e9}}, "max_range must be at most"),
+        (lambda s: {"exploration": s.exploration | {"voxel_size": 3.0}}, "voxel_size"),
+        (lambda s: {"exploration": s.exploration | {"cell_size": 1e-3}}, "exploration.cell_size"),
+    ],
+)
+def test_terms_that_no_training_could_keep_are_a_problem(submission, change, told):
+    (problem,) = problems_of(dataclasses.replace(submission, **change(submission)))
+    assert problem.frame is None
+    assert told in str(problem)
+
+
 def test_the_terms_are_those_of_the_exploration(submission):
     base = Conditions(resolution=512, iterations=30, gaussians=200, capacity=400, lpips="none")
     base = dataclasses.replace(base, train_resolution=48)
