@@ -14,7 +14,7 @@ Left out: the box round an object, to which the published utility and update are
 actions, as all policies here choose among the same hundred candidates; its 1050 steps before the
 first plan, its densification by gradients and the pruning below an opacity of 0.7.
 
-Shape symbols: C candidates; n Gaussians; h w pixels; V poses so far.
+Shape symbols: C candidates; n Gaussians; h w pixels; F frames so far.
 """
 
 from dataclasses import dataclass, field, replace
@@ -26,10 +26,7 @@ from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.geometry.numerics import safe_norm
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import Candidates
-from r3jax.planning.decision import Decision, PlanInfo, PlannerState
 from r3jax.planning.greedy import draw_lots
 from r3jax.planning.policy import Situation
 from r3jax.rivals.online_map import OnlineMap, Seen, colored, show
@@ -135,8 +132,8 @@ def novelty(pose: np.ndarray, before: np.ndarray) -> float:
 
     Args:
         pose: of the view on offer, [4, 4].
-        before: poses so far, [V, 4, 4]; with five or fewer no view is held back. As published, the
-            first of all is not asked.
+        before: poses of all frames so far, [F, 4, 4]; with five or fewer no view is held back. As
+            published, the first of all is not asked.
     """
     if len(before) <= 5:
         return 1.0
@@ -189,35 +186,7 @@ class GaussMI(OnlinePolicy):
         sums = with_room(_scores, online.scene, camera, online.marks, poses)
         scale = PUBLISHED_PIXELS / (camera.width * camera.height)
         whole = np.floor(scale * np.asarray(sums, np.float64))
-        # Frames on the way were not decided on: they hold no view back.
-        before = np.concatenate([online.frames.T_world_camera[:1], online.chosen])
+        before = online.frames.T_world_camera.astype(np.float64)
         factor = [novelty(pose, before) for pose in np.asarray(poses, np.float64)]
         lots = draw_lots(len(candidates.valid), key=key)
         return candidates, {"utility": whole / 1000.0 * np.asarray(factor)} | lots
-
-    def conclude(
-        self,
-        situation: Situation,
-        candidates: Candidates,
-        utilities: dict[str, np.ndarray],
-        best: int,
-    ) -> OnlineMap:
-        """The map, and that this view was decided on."""
-        del utilities
-        online, pose = memory_of(situation), np.asarray(candidates.T_world_camera[best], np.float64)
-        return replace(online, chosen=np.concatenate([online.chosen, pose[None]]))
-
-    def reconsider(
-        self,
-        state: PlannerState,
-        map_state: MapState,
-        grid: OccupancyGrid,
-        T_world_camera: np.ndarray,
-        planned: Decision,
-        *,
-        key: Array,
-    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """Decides again; the view that was planned is not one that was decided on."""
-        online = state.memory
-        state = replace(state, memory=replace(online, chosen=online.chosen[:-1]))
-        return super().reconsider(state, map_state, grid, T_world_camera, planned, key=key)

@@ -80,9 +80,6 @@ class OnlineMap(eqx.Module):
     frames: Keyframes
     """All frames so far."""
 
-    chosen: Float[np.ndarray, "V 4 4"]
-    """T_world_camera of the views that were decided on, for a rival that asks for them."""
-
     camera: Camera
     """Camera of the key frames."""
 
@@ -117,7 +114,6 @@ def empty_online_map(
             T_world_camera=np.zeros((0, 4, 4), np.float32),
             error=np.zeros(0, np.float32),
         ),
-        chosen=np.zeros((0, 4, 4)),
         camera=camera.resized(width, height),
         seed=np.asarray(jax.random.key_data(key) if is_typed else key),
     )
