@@ -164,6 +164,8 @@ class GreedyPolicy(ABC):
         """
         finite = np.isfinite(planned.utilities["path"])
         total = np.where(finite, planned.utilities["total"], -np.inf)
+        # A policy that ranks fewer (`ours-ahead`: where its best paths begin) fills up with the
+        # first that were drawn.
         best = np.argsort(-total, kind="stable")[:RECONSIDERED]
         poses = planned.candidates[best]
         # One shape whatever was on offer, so that it compiles once.
