@@ -37,8 +37,13 @@ class Budget:
 
     @property
     def shown(self) -> str:
-        """As a user writes it: files spell meters otherwise."""
-        return str(self).replace("metres", "meters")
+        """As a user writes it."""
+        return as_written(str(self))
+
+
+def as_written(text: str) -> str:
+    """Spells meters in a text as users do, where files spell them otherwise."""
+    return text.replace("metres", "meters")
 
 
 def parse_budget(text: str) -> Budget:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -118,6 +119,11 @@ class StepRow:
         """True if the camera did not fly to the view: a run begins, be it within a merged one."""
         flown = self.choice is not None or self.captured or self.charged.get("flight", 0.0) > 0.0
         return not flown
+
+
+def unit_of(rows: Iterable[StepRow]) -> str:
+    """Names what rows count: views, or frames where some were captured on the way."""
+    return "frames" if any(row.captured for row in rows) else "views"
 
 
 @dataclass(frozen=True)

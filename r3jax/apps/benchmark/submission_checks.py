@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.exploration.budget import Budget, parse_budget
+from r3jax.exploration.budget import Budget, as_written, parse_budget
 from r3jax.exploration.captures import Rules, allowed_turns, elevations_of
 from r3jax.exploration.clock import model_clock
 from r3jax.exploration.config import ExplorationConfig
@@ -263,8 +263,7 @@ def _in_budget(step: _Step, terms: _Terms) -> Iterator[str]:
     ):
         spent_of_it = f"{spent[terms.budget.unit]:g} {terms.budget.unit}"
         told = f"it takes {spent_of_it}, beyond the budget {terms.budget}: end before it"
-        # Records spell the unit as those before them did; people give it as `meters`.
-        yield told.replace("metres", "meters")
+        yield as_written(told)
 
 
 def _within_limits(step: _Step, terms: _Terms) -> Iterator[str]:

@@ -35,7 +35,8 @@ class Outlook:
     @property
     def views(self) -> list[int]:
         """Views taken before each forecast."""
-        return [int(self._views_by_frame()[frames - 1]) for frames in self.frames]
+        counts = self._views_by_frame()
+        return [int(counts[frames - 1]) for frames in self.frames]
 
     def _views_by_frame(self) -> np.ndarray:
         """Views up to each frame of the run, that frame included."""

@@ -17,7 +17,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.paths import paths_to
 from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow
+from r3jax.trace.rows import StepRow, unit_of
 
 _DOT, _CAPTURED_DOT = 26, 8
 """Areas of the marks of views, and of frames that were captured on the way [pt^2]."""
@@ -31,7 +31,7 @@ def progress_figure(run: Run) -> Figure:
     figure = style.new_figure(10.0, 5.6)
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
     numbers = np.arange(1, len(run.rows) + 1)
-    unit = "frames" if any(row.captured for row in run.rows) else "views"
+    unit = unit_of(run.rows)
     seconds = np.array([row.seconds for row in run.rows])
     known = np.array([100.0 * row.coverage.known_share for row in run.rows])
     mean = np.array([row.coverage.mean_renderability for row in run.rows])

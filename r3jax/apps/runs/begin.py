@@ -25,7 +25,7 @@ from r3jax.simulators.base import Simulator
 from r3jax.trace.header import package_versions, policy_fields
 from r3jax.trace.paths import piece_of_path
 from r3jax.trace.reader import Run, read_run
-from r3jax.trace.rows import StepRow
+from r3jax.trace.rows import StepRow, unit_of
 from r3jax.trace.writer import RunWriter
 
 
@@ -110,7 +110,7 @@ def fork_run(
     """
     if not 1 <= at <= len(run.rows):
         raise ValueError(
-            f"--at must lie between 1 and the run's {len(run.rows)} {_unit(run)}, got {at}"
+            f"--at must lie between 1 and the run's {len(run.rows)} {unit_of(run.rows)}, got {at}"
         )
     simulator = open_run_scene(run)
     fields = policy_fields(settings.policy)
@@ -148,13 +148,10 @@ def _refuse_half_a_fork(run: Run) -> None:
     wanted = parent.get("views", 0) if "forked" in parent else 0
     if len(run.rows) < wanted:
         raise ValueError(
-            f"{run.path} was cut off when it had {len(run.rows)} of the {wanted} {_unit(run)} that "
-            f"it takes over from {parent['forked']}: fork again, with --overwrite"
+            f"{run.path} was cut off when it had {len(run.rows)} of the {wanted} "
+            f"{unit_of(run.rows)} that it takes over from {parent['forked']}: fork again, with "
+            "--overwrite"
         )
-
-
-def _unit(run: Run) -> str:
-    return "frames" if any(row.captured for row in run.rows) else "views"
 
 
 def _as_flown(rows: Sequence[StepRow]) -> list[StepRow]:

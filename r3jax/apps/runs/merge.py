@@ -12,7 +12,7 @@ from r3jax.trace.checkpoints import map_tables
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import RunHeader, package_versions
 from r3jax.trace.reader import Run, read_run
-from r3jax.trace.rows import StepRow
+from r3jax.trace.rows import StepRow, unit_of
 from r3jax.trace.writer import RunWriter
 
 
@@ -81,7 +81,7 @@ def _check_apart(runs: list[Run]) -> None:
 
 def _header(runs: list[Run]) -> RunHeader:
     views = [views for run in runs for views in parts_of(run)]
-    unit = "frames" if any(row.captured for run in runs for row in run.rows) else "views"
+    unit = unit_of(row for run in runs for row in run.rows)
     return dataclasses.replace(
         runs[0].header,
         budget=f"{unit}:{sum(views)}",

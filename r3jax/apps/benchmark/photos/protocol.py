@@ -183,13 +183,10 @@ class _Choice:
         if len(self.chosen) < self.terms.first + self.terms.choose:
             candidates = nearest_photos(self.pool, self.chosen, self.terms.nearest)
             key = jax.random.fold_in(jax.random.key(self.seed), len(self.chosen))
+            model = self._as_trained(scene, step)
             begin = time.perf_counter()
             scores = self.chooser.score(
-                self.memory,
-                self.known,
-                self._as_trained(scene, step),
-                self.pool.poses[candidates],
-                key=key,
+                self.memory, self.known, model, self.pool.poses[candidates], key=key
             )
             self.seconds.append(time.perf_counter() - begin)
             self._take(int(candidates[np.argmax(scores)]))
