@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +162,7 @@ def _as_flown(rows: Sequence[StepRow]) -> list[StepRow]:
     """
     flown = list(rows)
     begins = [number for number, row in enumerate(rows) if row.choice is not None]
-    for number, after in zip(begins, [*begins[1:], len(rows)], strict=True):
+    for number, after in pairwise([*begins, len(rows)]):
         choice = rows[number].choice
         assert choice is not None
         length = rows[after - 1].metres - rows[number - 1].metres

@@ -105,6 +105,16 @@ def test_who_takes_over_on_the_way_is_not_told_what_lies_ahead(runs, tmp_path):
     assert (runs / "0" / "trace.jsonl").read_bytes().startswith(same)
 
 
+def test_another_policy_may_take_over_from_the_start(runs, tmp_path):
+    run = read_run(runs / "0")
+    settings = settings_of_run(run)
+    other = make_policy("random", **vars(settings.policy.config))
+    settings = dataclasses.replace(settings, policy=other)
+    fork = go(fork_run(run, 1, settings, tmp_path / "fork"), 3)
+    np.testing.assert_array_equal(fork.rows[0].pose, run.rows[0].pose)
+    assert len(fork.rows) == 3
+
+
 def test_a_fork_of_a_fork_decides_from_where_it_leaves_it(runs, tmp_path):
     run = read_run(runs / "0")
     settings = settings_of_run(run)
