@@ -93,7 +93,7 @@ def _(options: ExploreOptions) -> None:
     if options.resume is not None and options.fork is not None:
         raise ValueError("--resume goes on with a run, --fork begins another one: give one of them")
     if (options.at is None) != (options.fork is None):
-        raise ValueError("--fork RUN and --at VIEW belong together")
+        raise ValueError("--fork RUN and --at FRAME belong together")
     if options.resume is not None:
         _refuse_others(options, "--resume", _WITH_RESUME)
         _check_run(options.resume)

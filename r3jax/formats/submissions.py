@@ -323,7 +323,7 @@ def _header_of(plain: Any) -> dict[str, Any]:
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         raise ForeignFileError(f"this is no submission (no format {FORMAT!r})")
     check_version(plain.get("version"), VERSION)
-    if plain.get("protocol") != PROTOCOL:
+    if (type(plain.get("protocol")), plain.get("protocol")) != (int, PROTOCOL):
         raise ForeignFileError(
             f"protocol {plain.get('protocol')!r:.20}, this package judges by protocol {PROTOCOL}: "
             "export the run again, or use the r3jax of that protocol"

@@ -37,7 +37,7 @@ REFUSED = {
     "explore --scene flat --capture-rate 11 --motion ground": "at most 10 Hz at this speed",
     "explore --scene flat --speed 1e-310": "speed must be positive and finite, at least 0.001",
     "explore --resume nowhere": "nowhere: there is no such folder",
-    "explore --fork run": "--fork RUN and --at VIEW belong together",
+    "explore --fork run": "--fork RUN and --at FRAME belong together",
     "team --scene ofice": "did you mean office?",
     "team --scene flat --policy ours fronteer": "did you mean frontier?",
     "team --resume run": "there is no such folder",

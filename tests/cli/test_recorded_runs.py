@@ -104,7 +104,7 @@ def test_a_fork_that_is_cut_off_goes_on(runs, tmp_path):
         (["--resume", "{part}", "--fork", "{part}", "--at", "1"], "give one of them"),
         (["--resume", "{part}", "--budget", "views:0"], "budget"),
         (["--resume", "{part}/frames"], "not a run"),
-        (["--fork", "{part}"], "--fork RUN and --at VIEW belong together"),
+        (["--fork", "{part}"], "--fork RUN and --at FRAME belong together"),
         (["--fork", "{part}", "--at", "4"], "between 1 and the run's 3 views, got 4"),
         (["--fork", "{part}", "--at", "1", "--scene", "flat"], "leave them out: --scene"),
         ([], "give a --scene"),

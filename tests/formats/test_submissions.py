@@ -150,6 +150,7 @@ MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (changed(3, pose=None), "line 4: the frame lacks `pose`"),
         (changed(3, pose=[[str(x) for x in row] for row in np.eye(4)]), "line 4: `pose` must be a"),
         (changed(0, protocol="1"), "line 1: protocol '1', this package judges by protocol 1"),
+        (changed(0, protocol=True), "line 1: protocol True, this package judges by protocol 1"),
         (changed(3)[:-40], "line 4: the file is cut off: its last line is not whole"),
         (changed(3)[:-40] + b"\n", r"line 4: this is not JSON \([^(:]*, column \d+\)$"),
         (changed(3).replace(b"\n", b"\n \n", 1), "line 2: the line is empty"),

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r3jax.exploration.budget import as_written
 from r3jax.trace.reader import Run
 
 STAGES = {
@@ -81,7 +82,7 @@ def summary(run: Run) -> dict[str, str]:
     texts = {
         "scene": str(header.scene.get("name", "?")),
         "policy": str(header.policy.get("name", "?")),
-        "budget": header.budget,
+        "budget": as_written(header.budget),
         "seed": str(header.seed),
         "outcome": run.outcome,
         "views": count_of_views(run),

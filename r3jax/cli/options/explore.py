@@ -47,11 +47,11 @@ class ContinueOptions:
     """Go on with a run that was cut off; all settings are its own. Another --budget extends it."""
 
     fork: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Try another --policy from a view of a run on; the scene and the sensor are the run's."""
+    """Try another --policy from a frame of a run on; the scene and the sensor are the run's."""
 
-    at: Annotated[int | None, tyro.conf.arg(metavar="VIEW")] = None
-    """Number of the view that the fork takes anew; those before it are kept. Frames on the way
-    count as views here."""
+    at: Annotated[int | None, tyro.conf.arg(metavar="FRAME")] = None
+    """Number of the frame that the fork takes anew; those before it are kept. Without frames on the
+    way every frame is a view."""
 
 
 @dataclass(frozen=True, kw_only=True)

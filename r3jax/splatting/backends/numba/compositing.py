@@ -187,7 +187,7 @@ def _read_tile(left, top, images, gradients, state):
 
 @inlined
 def gradient_by_alpha(k, free, alpha, weight, q, state):
-    """Alpha dL/dalpha in a row of pixels; what the Gaussian adds there leaves their total.
+    """Computes alpha dL/dalpha in a row of pixels, and takes the Gaussian off their total.
 
     Args:
         k: first pixel of the row.
