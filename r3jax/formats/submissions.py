@@ -323,9 +323,10 @@ def _header_of(plain: Any) -> dict[str, Any]:
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         raise ForeignFileError(f"this is no submission (no format {FORMAT!r})")
     check_version(plain.get("version"), VERSION)
-    if (type(plain.get("protocol")), plain.get("protocol")) != (int, PROTOCOL):
+    protocol = plain.get("protocol")
+    if type(protocol) is not int or protocol != PROTOCOL:  # True equals 1
         raise ForeignFileError(
-            f"protocol {plain.get('protocol')!r:.20}, this package judges by protocol {PROTOCOL}: "
+            f"protocol {protocol!r:.20}, this package judges by protocol {PROTOCOL}: "
             "export the run again, or use the r3jax of that protocol"
         )
     fields = {k: v for k, v in plain.items() if k not in ("format", "version", "protocol")}

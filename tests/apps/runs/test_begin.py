@@ -56,6 +56,13 @@ def go(expedition, num):
     return read_run(expedition.recorder.path)
 
 
+def of_another_policy(run):
+    """The settings of a run, for a fork by another policy than its own."""
+    settings = settings_of_run(run)
+    other = make_policy("random", **vars(settings.policy.config))
+    return dataclasses.replace(settings, policy=other)
+
+
 def test_a_fork_of_a_merged_run_goes_on_where_the_camera_is(runs, tmp_path):
     run = read_run(runs / "merged")
     at = on_the_way(run, 9)
@@ -85,9 +92,7 @@ def test_what_a_merged_run_was_after_is_not_told_by_its_forks_either(runs, tmp_p
 def test_who_takes_over_on_the_way_is_not_told_what_lies_ahead(runs, tmp_path):
     run = read_run(runs / "0")
     at = on_the_way(run, 2)
-    settings = settings_of_run(run)
-    other = make_policy("random", **vars(settings.policy.config))
-    settings = dataclasses.replace(settings, policy=other)
+    settings = of_another_policy(run)
     with fork_run(run, at, settings, tmp_path / "fork").recorder:
         fork = read_run(tmp_path / "fork")
     begin = max(row.step for row in run.rows[:at] if row.choice is not None)
@@ -107,9 +112,7 @@ def test_who_takes_over_on_the_way_is_not_told_what_lies_ahead(runs, tmp_path):
 
 def test_another_policy_may_take_over_from_the_start(runs, tmp_path):
     run = read_run(runs / "0")
-    settings = settings_of_run(run)
-    other = make_policy("random", **vars(settings.policy.config))
-    settings = dataclasses.replace(settings, policy=other)
+    settings = of_another_policy(run)
     fork = go(fork_run(run, 1, settings, tmp_path / "fork"), 3)
     np.testing.assert_array_equal(fork.rows[0].pose, run.rows[0].pose)
     assert len(fork.rows) == 3
@@ -117,9 +120,7 @@ def test_another_policy_may_take_over_from_the_start(runs, tmp_path):
 
 def test_a_fork_of_a_fork_decides_from_where_it_leaves_it(runs, tmp_path):
     run = read_run(runs / "0")
-    settings = settings_of_run(run)
-    other = make_policy("random", **vars(settings.policy.config))
-    settings = dataclasses.replace(settings, policy=other)
+    settings = of_another_policy(run)
     with fork_run(run, 5, settings, tmp_path / "late").recorder:
         late = read_run(tmp_path / "late")
     with fork_run(late, 3, settings, tmp_path / "early").recorder:
