@@ -8,10 +8,14 @@ A table is a list of rows, each a policy under settings that differ from the sui
 compared on the same test views with the row that it changes. The mission clock is the model's: a
 decision 0.3 s, one reconsidered on arrival 0.05 s, a frame 0.02 s, a gaze 0.01 s, 1 m/s, turns for
 nothing; or, with `--clock wall`, what all of this takes on this machine, which then has nothing
-else to do, and the poses of every flight are kept beside the table. Whoever does not look or plan
-on the way flies as published. With `--budget views` the views that a policy chose are counted, and
-frames on the way come on top. What is done in `--work` is not done again, and what differs in its
-training only is not flown again.
+else to do. Whoever does not look or plan on the way flies as published. With `--budget views` the
+views that a policy chose are counted, and frames on the way come on top. What is done in `--work`
+is not done again, and what differs in its training only is not flown again.
+
+Beside a table lie its records, and the poses of flights that no machine flies twice alike. So
+another machine, or another day, adds a seed:
+
+    python -m experiments.captures rivals --size small --seeds 0 1 2 --kept results/captures/small
 """
 
 import re
@@ -34,10 +38,10 @@ from experiments.pages.artifacts import (
 )
 from experiments.pages.benchmark_figures import curve_figure
 from experiments.suite import Options as SuiteOptions
-from experiments.suite import Records, origin, request_of, run_cells
-from r3jax.apps.benchmark.cells import Cell, paths_of
+from experiments.suite import Records, origin, request_of, run_cells, take_over
+from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
 from r3jax.apps.benchmark.plan import make_plan
-from r3jax.apps.benchmark.record import read_records
+from r3jax.apps.benchmark.record import read_records, write_records
 from r3jax.evaluation.comparison import (
     check_equal_terms,
     scene_title,
@@ -210,32 +214,56 @@ class Options(SuiteOptions):
     clock: ClockName = "model"
     """`model`: the same run on every machine, whatever else it does. `wall`: measured."""
 
+    kept: tuple[Path, ...] = ()
+    """Folders of this table as it was made elsewhere: what has a record there is not run again."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the table."""
+        return self.out / NAME / self.size
+
+    @property
+    def name(self) -> str:
+        """What the table's files are called."""
+        return self.table if self.budget == "seconds" else f"{self.table}_by_views"
+
+    @property
+    def records(self) -> str:
+        """File of the table's records."""
+        return f"{self.name}_records.jsonl"
+
+    @property
+    def flights(self) -> str:
+        """Folder of the poses of its flights."""
+        return f"{self.name}_flights"
+
+    @property
+    def is_repeatable(self) -> bool:
+        """Whether another machine flies the same: not by a clock, nor by a map that it trains."""
+        return self.clock == "model" and self.table != "rivals"
+
 
 def main(options: Options) -> Path:
     """Runs what is left of the cells, writes the page, and returns the folder of the results."""
     rows = rows_of(options)
-    root = options.work / f"{options.size}-{options.budget}"
-    root.mkdir(parents=True, exist_ok=True)
+    root, folder = options.work / f"{options.size}-{options.budget}", options.folder
+    for path in (root, folder):
+        path.mkdir(parents=True, exist_ok=True)
     cells = {label: cells_of(options, row, root) for label, row in rows.items()}
-    run_in_turn([cell for own in cells.values() for cell in own], root, options)
-    records = [
-        as_line(record, label, rows)
-        for label, own in cells.items()
-        for record in read_records(root, own)
-        # A cell may have been judged at other times, too, when another table asked for it.
-        if record["snapshot"] in own[0].conditions.snapshots
-    ]
-    folder = options.out / NAME / options.size
-    name = options.table if options.budget == "seconds" else f"{options.table}_by_views"
-    source, costs = origin(f"experiments.{NAME}", records), list[dict[str, str]]()
-    if options.clock == "wall":
-        flights = {
-            label: [(cell, read_run(paths_of(root, cell).run)) for cell in own]
-            for label, own in cells.items()
-        }
-        costs = cost_rows(flights)
-        write_submissions(folder / f"{name}_flights", flights)
-    write_page(folder, name, rows, records, source, costs)
+    every = [cell for own in cells.values() for cell in own]
+    take_over([kept / options.records for kept in options.kept], root, every)
+    run_in_turn(every, root, options)
+    found = {label: records_of(root, own) for label, own in cells.items()}
+    write_records(folder / options.records, [record for own in found.values() for record in own])
+    records = [as_line(record, label, rows) for label, own in found.items() for record in own]
+    costs = list[dict[str, str]]()
+    if not options.is_repeatable:
+        flights = flights_of(root, cells)
+        costs = cost_rows(flights) if options.clock == "wall" else costs
+        elsewhere = [kept / options.flights for kept in options.kept]
+        take_submissions(folder / options.flights, elsewhere, cells)
+        write_submissions(folder / options.flights, flights)
+    write_page(folder, options.name, rows, records, origin(f"experiments.{NAME}", records), costs)
     print(f"results  {folder}")
     return folder
 
@@ -275,6 +303,8 @@ def run_in_turn(cells: Sequence[Cell], root: Path, options: Options) -> None:
     unique = {cell.identity_hash: cell for cell in cells}
     flown: dict[str, Cell] = {}
     for cell in unique.values():
+        if not (paths_of(root, cell).run.exists() or snapshots_left(root, cell)):
+            continue  # done elsewhere
         first = flown.setdefault(_flight(cell), cell)
         run, other = paths_of(root, cell).run, paths_of(root, first).run
         if first is not cell and not run.exists():
@@ -293,6 +323,20 @@ def _flight(cell: Cell) -> str:
         cell.conditions, train_resolution=16, iterations=1, gaussians=1, capacity=1, trainer={}
     )
     return replace(cell, conditions=conditions).identity_hash
+
+
+def records_of(root: Path, cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """The records of a row's cells at the times that the table asks for, not those of another's."""
+    asked = cells[0].conditions.snapshots
+    return [record for record in read_records(root, cells) if record["snapshot"] in asked]
+
+
+def flights_of(root: Path, cells: Mapping[str, Sequence[Cell]]) -> Flights:
+    """What was flown here for each row."""
+    return {
+        label: [(cell, read_run(run)) for cell in own if (run := paths_of(root, cell).run).exists()]
+        for label, own in cells.items()
+    }
 
 
 def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> dict[str, Any]:
@@ -329,7 +373,6 @@ def write_page(
     costs: Sequence[dict[str, str]] = (),
 ) -> None:
     """Writes a table for every snapshot, differences from the rows' references, and costs."""
-    folder.mkdir(parents=True, exist_ok=True)
     records = with_short_names(records)
     page: list[str] = []
     trainings = {str(row.training): row.training for row in rows.values()}
@@ -366,16 +409,33 @@ def _amount(snapshot: str) -> str:
 def write_submissions(folder: Path, flights: Flights) -> None:
     """Writes the poses of every cell, a submission each, under the name of its row.
 
-    No machine flies by the wall clock twice alike: with these files anybody can take the frames,
-    train, and judge again.
+    No machine flies by the wall clock, or with a map that it trains, twice alike: with these files
+    anybody can take the frames, train, and judge again.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for label, own in flights.items():
-        row = re.sub("[^0-9a-z.]+", "-", label)
         for cell, run in own:
             flown = submission_of_run(run)
             named = replace(flown, policy=flown.policy | {"name": label})
-            write_submission(folder / f"{row}_{scene_title(cell.scene)}_{cell.seed}.jsonl", named)
+            write_submission(folder / _submission(label, cell), named)
+
+
+def take_submissions(
+    folder: Path, others: Sequence[Path], cells: Mapping[str, Sequence[Cell]]
+) -> None:
+    """Copies the poses of cells that were flown elsewhere from the folders of those tables."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for label, own in cells.items():
+        for cell in own:
+            to = folder / _submission(label, cell)
+            for path in (other / to.name for other in others):
+                if path.exists() and path.resolve() != to.resolve():
+                    shutil.copyfile(path, to)
+
+
+def _submission(label: str, cell: Cell) -> str:
+    row = re.sub("[^0-9a-z.]+", "-", label)
+    return f"{row}_{scene_title(cell.scene)}_{cell.seed}.jsonl"
 
 
 def frames_figure(records: Records) -> Figure:

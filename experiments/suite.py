@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from experiments.pages.artifacts import Origin, joint_origin
-from r3jax.apps.benchmark.cells import Cell
+from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
 from r3jax.apps.benchmark.conditions import Conditions
 from r3jax.apps.benchmark.engines.local import Event, run_in_processes
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
-from r3jax.apps.benchmark.record import collect, read_records
+from r3jax.apps.benchmark.record import collect, read_lines, read_records, write_record
 from r3jax.evaluation.comparison import method_name, methods_of, scenes_of
 from r3jax.planning.registry import policy_names
 from r3jax.simulators.scenes.registry import scene_names
@@ -202,6 +202,31 @@ def run_cells(cells: Sequence[Cell], root: Path, *, engine: str = "local", jobs:
     collect(root)
     if failed:
         raise SystemExit(f"failed: {', '.join(failed)}; see error.txt in {root / 'cells'}")
+
+
+def take_over(files: Sequence[Path], root: Path, cells: Sequence[Cell]) -> None:
+    """Puts records that were made elsewhere where those of these cells lie: they are done then.
+
+    A cell's folder is named by the scene, the settings, the seed and all else that its results
+    depend on but the version of the code, so a record of other terms finds no place.
+
+    Args:
+        files: as `record.write_records` writes them.
+        root: folder of the benchmark.
+        cells: whose records are wanted; one that is there stays.
+
+    Raises:
+        ValueError: a line is no record.
+        OSError: a file cannot be read.
+    """
+    found = {(r["run"], r["snapshot"]): r for file in files for r in read_lines(file)}
+    for cell in cells:
+        paths = paths_of(root, cell)
+        for snapshot in snapshots_left(root, cell):
+            record = found.get((paths.run.relative_to(root).as_posix(), snapshot))
+            if record is not None:
+                paths.folder.mkdir(parents=True, exist_ok=True)
+                write_record(paths.record(snapshot), record)
 
 
 def origin(module: str, records: Records) -> Origin:

@@ -12,10 +12,12 @@ from experiments import captures
 from experiments.captures import TABLES, Options, Row, as_line, quality_rows, rows_of, run_in_turn
 from experiments.pages.artifacts import Origin
 from experiments.suite import request_of
-from r3jax.apps.benchmark.cells import Cell, paths_of
+from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
 from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.record import read_lines, write_record
 from r3jax.formats.submissions import read_submission
 from r3jax.planning.registry import make_policy
+from tests.evaluation.records import record as benchmark_record
 from tests.formats.test_submissions import make_submission
 
 ROWS = {
@@ -151,6 +153,7 @@ def test_a_table_counts_views_where_they_are_the_budget(tmp_path, monkeypatch):
         captures, "origin", lambda name, records: Origin("a command", "none", "abc")
     )
     monkeypatch.setattr(captures, "write_submissions", lambda *given: pages.append(given))
+    monkeypatch.setattr(captures, "take_submissions", lambda *given: pages.append(given))
     options = Options(
         table="gaze", rows=("blend",), size="small", scenes=("flat",), seeds=(3,),
         budget="views", snapshots=(30,), work=tmp_path / "work", out=tmp_path / "out",
@@ -160,7 +163,7 @@ def test_a_table_counts_views_where_they_are_the_budget(tmp_path, monkeypatch):
     assert (cell.conditions.budget, cell.conditions.clock) == ("views:30", "model")
     assert cell.conditions.loop["capture_every"] == 0.3
     assert {path.name for path in folder.iterdir()} == {
-        "gaze_by_views.md", "gaze_by_views_views_30.csv",
+        "gaze_by_views.md", "gaze_by_views_records.jsonl", "gaze_by_views_views_30.csv",
     }  # fmt: skip
     assert "**After 30 views**" in (folder / "gaze_by_views.md").read_text()
     assert not pages  # the model's clock flies the same on every machine
@@ -193,6 +196,50 @@ def test_what_was_flown_is_written_beside_a_table_of_the_wall_clock(tmp_path, mo
         for scene in ("flat", "hall")
         for seed in (0, 3)
     }
+
+
+def test_what_another_machine_made_is_not_run_again(tmp_path, monkeypatch):
+    """A table of two seeds from records and poses of one that was made elsewhere."""
+    terms = Options(table="rivals", rows=("gavis",), size="small", scenes=("flat",), out=tmp_path)
+    monkeypatch.setattr(captures, "run_cells", lambda cells, root, **_: run.extend(cells))
+    monkeypatch.setattr(captures, "submission_of_run", lambda cell: make_submission(seed=1))
+    monkeypatch.setattr(captures, "read_run", lambda path: path)
+    monkeypatch.setattr(captures, "cost_rows", lambda flights: [])
+    run = []
+
+    def fly(options, seed, psnr):
+        """Leaves what a run of that seed would leave."""
+        root = options.work / "small-seconds"
+        row = captures.TABLES["rivals"]["gavis"]
+        (cell,) = captures.cells_of(replace(options, seeds=(seed,)), row, root)
+        paths_of(root, cell).run.mkdir(parents=True)
+        for snapshot in cell.conditions.snapshots:
+            made = benchmark_record("gavis", "flat", seed, psnr=psnr) | {"snapshot": snapshot}
+            made["run"] = paths_of(root, cell).run.relative_to(root).as_posix()
+            write_record(paths_of(root, cell).record(snapshot), made)
+
+    there = replace(terms, seeds=(0,), clock="wall", work=tmp_path / "a", out=tmp_path / "there")
+    fly(there, 0, [10.0, 12.0])
+    kept = captures.main(there)
+    flight = "rivals_flights/gavis_flat_0.jsonl"
+    (kept / flight).write_text("as it was flown there")
+
+    here = replace(there, seeds=(0, 1), work=tmp_path / "b", out=tmp_path / "here", kept=(kept,))
+    fly(here, 1, [20.0, 22.0])
+    run.clear()
+    folder = captures.main(here)
+    assert all(snapshots_left(here.work / "small-seconds", cell) == () for cell in run)
+    assert "11.00 / 21.00" in (folder / "rivals.md").read_text()
+    assert (folder / flight).read_text() == "as it was flown there"
+    assert (folder / "rivals_flights/gavis_flat_1.jsonl").exists()
+    assert [(r["seed"], r["snapshot"]) for r in read_lines(folder / "rivals_records.jsonl")] == [
+        (seed, f"seconds:{seconds}") for seed in (0, 1) for seconds in (30, 60)
+    ]
+    # A table may take over what it holds itself.
+    before = (folder / "rivals_records.jsonl").read_text()
+    assert captures.main(replace(here, work=tmp_path / "c", kept=(folder,))) == folder
+    assert (folder / "rivals_records.jsonl").read_text() == before
+    assert (folder / flight).read_text() == "as it was flown there"
 
 
 def test_costs_are_medians_over_all_flights_of_a_row():

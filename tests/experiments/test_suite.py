@@ -1,6 +1,7 @@
 """The benchmark's tables and figures from records by hand; the sizes of the suite."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,10 @@ from PIL import Image
 
 from experiments import degeneracy, quality_over_budget, replica_dense
 from experiments.pages.artifacts import Origin
-from experiments.suite import Options, request_of
+from experiments.suite import Options, request_of, take_over
+from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
+from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.record import read_records, write_record, write_records
 from r3jax.planning.registry import policy_names
 from r3jax.trace.writer import RunWriter
 from tests.evaluation.records import record
@@ -54,6 +58,25 @@ def test_every_size_is_a_benchmark_that_can_run(size, unit):
     shorter = request_of(Options(size=size, snapshots=(5, 20)), unit).conditions
     assert shorter.snapshots == (f"{unit}:5", f"{unit}:20")
     assert shorter.budget == f"{unit}:20"
+
+
+def test_records_of_other_terms_find_no_place(tmp_path):
+    """What a cell lacks is taken over from a file; what it has stays, and others change nothing."""
+    conditions = Conditions(snapshots=("views:30", "views:60"))
+    cells = [Cell("flat", "a", "ours", seed, conditions, "b", 9) for seed in (0, 1)]
+
+    def made(cell, snapshot, psnr):
+        run = paths_of(tmp_path, cell).run.relative_to(tmp_path).as_posix()
+        return record("ours", "flat", cell.seed, snapshot, psnr=psnr) | {"run": run}
+
+    longer = replace(cells[1], conditions=replace(conditions, iterations=9))
+    elsewhere = [made(cells[0], 30, [1.0]), made(cells[0], 60, [2.0]), made(longer, 30, [3.0])]
+    write_records(tmp_path / "records.jsonl", elsewhere)
+    paths_of(tmp_path, cells[0]).folder.mkdir(parents=True)
+    write_record(paths_of(tmp_path, cells[0]).record("views:30"), made(cells[0], 30, [9.0]))
+    take_over([tmp_path / "records.jsonl"], tmp_path, cells)
+    assert [r["views"]["psnr"] for r in read_records(tmp_path, cells)] == [[9.0], [2.0]]
+    assert [snapshots_left(tmp_path, cell) for cell in cells] == [(), conditions.snapshots]
 
 
 def test_tables_hold_the_last_snapshot(records, tmp_path):

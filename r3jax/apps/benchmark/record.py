@@ -181,20 +181,7 @@ def _read_record(path: Path) -> dict[str, Any]:
         ValueError: it is damaged, or a newer version of this package wrote it.
     """
     try:
-        record = parse_json(read_bytes(path, _MAX_BYTES))
-        if isinstance(record, dict):
-            check_version(record.get("format"), FORMAT)
-            record = unsealed(record)
-        check_fields("record", record, _KINDS)
-        for name, kinds in _PARTS.items():
-            check_fields(name, record[name], kinds)
-        snapshot_order(record["snapshot"])
-        run = PurePosixPath(record["run"])
-        if run.is_absolute() or ".." in run.parts or "\0" in record["run"]:
-            raise ForeignFileError(f"its run {record['run'][:80]!r} lies outside of the benchmark")
-        lengths = {len(column) for column in record["views"].values() if column is not None}
-        if len(lengths) != 1:
-            raise ForeignFileError(f"the columns of `views` differ in length: {sorted(lengths)}")
+        return _parse_record(read_bytes(path, _MAX_BYTES))
     except VersionError as error:
         raise ValueError(f"{path} has {error}") from None
     except ValueError as error:
@@ -202,15 +189,65 @@ def _read_record(path: Path) -> dict[str, Any]:
             f"{path} is no record of a benchmark ({error!s:.300}): delete it and start the "
             "benchmark again, it makes what is missing"
         ) from None
+
+
+def _parse_record(text: bytes) -> dict[str, Any]:
+    """A record from its line.
+
+    Raises:
+        VersionError: a newer version of this package wrote it.
+        ValueError: it is damaged.
+    """
+    record = parse_json(text)
+    if isinstance(record, dict):
+        check_version(record.get("format"), FORMAT)
+        record = unsealed(record)
+    check_fields("record", record, _KINDS)
+    for name, kinds in _PARTS.items():
+        check_fields(name, record[name], kinds)
+    snapshot_order(record["snapshot"])
+    run = PurePosixPath(record["run"])
+    if run.is_absolute() or ".." in run.parts or "\0" in record["run"]:
+        raise ForeignFileError(f"its run {record['run'][:80]!r} lies outside of the benchmark")
+    lengths = {len(column) for column in record["views"].values() if column is not None}
+    if len(lengths) != 1:
+        raise ForeignFileError(f"the columns of `views` differ in length: {sorted(lengths)}")
     return record
 
 
 def collect(root: Path) -> Path:
     """Writes all records of a benchmark to one file, and returns its path."""
     path = Path(root) / CELLS
-    lines = [json.dumps(record, separators=(",", ":")) + "\n" for record in read_records(root)]
-    write_atomic(path, "".join(lines).encode())
+    write_records(path, read_records(root))
     return path
+
+
+def write_records(path: Path, records: Iterable[dict[str, Any]]) -> None:
+    """Writes records to one file, one a line.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    lines = [json.dumps(record, separators=(",", ":")) + "\n" for record in records]
+    write_atomic(path, "".join(lines).encode())
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Reads the records of a file that `write_records` wrote.
+
+    Raises:
+        ValueError: a line is no record; the message says which.
+        OSError: the file cannot be read.
+    """
+    records: list[dict[str, Any]] = []
+    for number, line in enumerate(read_bytes(path, _MAX_BYTES).splitlines(), start=1):
+        try:
+            records.append(_parse_record(line))
+        except ValueError as error:
+            raise ValueError(
+                f"{path}, line {number}, is no record of a benchmark ({error!s:.300})"
+            ) from None
+    return records
 
 
 @functools.cache
