@@ -40,11 +40,12 @@ def main():
     send(kind="hello", protocol=1, name="least-looked-at")
     seen = np.zeros((0, 3))
     while (message := receive()) is not None:
-        _, arrays = message
+        question, arrays = message
         if "T_world_camera" in arrays:  # frames since the last question; rgb and depth beside it
             seen = np.concatenate([seen, arrays["T_world_camera"][:, :3, 2]])
         looked = np.exp(4.0 * (arrays["direction"] @ seen.T)).sum(axis=1)
-        send(kind="candidate", index=int(np.argmin(np.log(looked) + 0.5 * arrays["path"])))
+        best = int(np.argmin(np.log(looked) + 0.5 * arrays["path"]))
+        send(kind="candidate", index=best, view=question["view"])
 
 
 if __name__ == "__main__":

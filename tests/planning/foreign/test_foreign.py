@@ -209,6 +209,10 @@ while True:
         ("receive(); send(kind='view', position=[1, 1, 1])", "`direction` must be list"),
         ("receive(); send(kind='view', position=[1, 1, 1], direction=[0, 0, 0])", "length 0"),
         ("receive(); send(kind='jump')", "'jump' is no answer: send `candidate`"),
+        (
+            "for _ in range(2): receive(); send(kind='candidate', index=0, view=1)",
+            "asked for view 2 and answered for view 1: send one message for each question",
+        ),
         ("receive(); raise SystemExit('no weights')", "ended with code 1; it said: no weights"),
         ("receive(); import time; time.sleep(60)", "no answer to `decide` within 1 s"),
     ],

@@ -193,6 +193,12 @@ class Foreign:
             question = Message("decide", {"view": seen, "seed": _seed(ask_key)})
             question.arrays.update(_surroundings(grid, travel, pose, offered, path))
             answer = self._answer(session, seen, question)
+        asked = answer.fields.get("view", seen)
+        if asked != seen:  # one too many, which came too late to be told from the answer otherwise
+            raise self._refused(
+                session, f"was asked for view {seen} and answered for view {asked!r:.20}: "
+                "send one message for each question"
+            )  # fmt: skip
         try:
             chosen = _view_of(answer, offered, travel, limits)
         except ForeignFileError as error:
