@@ -15,7 +15,7 @@ is not done again, and what differs in its training only is not flown again.
 Beside a table lie its records, and the poses of flights that no machine flies twice alike. So
 another machine, or another day, adds a seed:
 
-    python -m experiments.captures rivals --size small --seeds 0 1 2 --kept results/captures/small
+    python -m experiments.captures rivals --size small --seeds 0 1 2 --kept rivals_records.jsonl
 """
 
 import re
@@ -214,9 +214,6 @@ class Options(SuiteOptions):
     clock: ClockName = "model"
     """`model`: the same run on every machine, whatever else it does. `wall`: measured."""
 
-    kept: tuple[Path, ...] = ()
-    """Folders of this table as it was made elsewhere: what has a record there is not run again."""
-
     @property
     def folder(self) -> Path:
         """Folder of the table."""
@@ -251,7 +248,7 @@ def main(options: Options) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     cells = {label: cells_of(options, row, root) for label, row in rows.items()}
     every = [cell for own in cells.values() for cell in own]
-    take_over([kept / options.records for kept in options.kept], root, every)
+    take_over(options.kept, root, every)
     run_in_turn(every, root, options)
     found = {label: records_of(root, own) for label, own in cells.items()}
     write_records(folder / options.records, [record for own in found.values() for record in own])
@@ -260,7 +257,7 @@ def main(options: Options) -> Path:
     if not options.is_repeatable:
         flights = flights_of(root, cells)
         costs = cost_rows(flights) if options.clock == "wall" else costs
-        elsewhere = [kept / options.flights for kept in options.kept]
+        elsewhere = [kept.parent / options.flights for kept in options.kept]
         take_submissions(folder / options.flights, elsewhere, cells)
         write_submissions(folder / options.flights, flights)
     write_page(folder, options.name, rows, records, origin(f"experiments.{NAME}", records), costs)

@@ -7,6 +7,7 @@ from experiments.pages.artifacts import Origin, write_markdown
 from experiments.pages.comparison_tables import difference_table, tail_table
 from experiments.pages.table_formats import to_csv, to_latex, to_markdown
 from experiments.suite import Options, Records, origin, run_suite
+from r3jax.apps.benchmark.record import write_records
 from r3jax.apps.benchmark.tables import Table, quality_table
 from r3jax.evaluation.comparison import methods_of, snapshots_of
 from r3jax.files import write_atomic
@@ -19,6 +20,8 @@ def make_tables(options: Options, name: str, unit: Literal["views", "seconds"]) 
     """Runs the cells of one kind of budget, writes the tables, and returns their folder."""
     _, records = run_suite(options, unit)
     folder = options.out / name / options.size
+    folder.mkdir(parents=True, exist_ok=True)
+    write_records(folder / f"{name}_records.jsonl", records)
     write_tables(folder, name, records, origin(f"experiments.{name}", records))
     print(f"results  {folder}")
     return folder
@@ -33,7 +36,6 @@ def write_tables(folder: Path, name: str, records: Records, origin: Origin) -> N
         records: of all snapshots.
         origin: command, machine, commit.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     last = snapshots_of(records)[-1]
     tables = tables_of([record for record in records if record["snapshot"] == last])
     for kind, table in tables.items():

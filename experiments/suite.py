@@ -54,6 +54,9 @@ class Options:
     jobs: int = 1
     """Cells at a time; more than one slow each other's wall clock down."""
 
+    kept: tuple[Path, ...] = ()
+    """Files of records that lie beside a table made elsewhere: these cells are not run again."""
+
 
 @dataclass(frozen=True)
 class _Size:
@@ -158,6 +161,7 @@ def run_requests(
     root = options.work / f"{options.size}-{unit}"
     root.mkdir(parents=True, exist_ok=True)
     cells = [cell for request in requests for cell in make_plan(request, root)]
+    take_over(options.kept, root, cells)
     run_cells(cells, root, engine=options.engine, jobs=options.jobs)
     return root, cells, read_records(root, cells)
 

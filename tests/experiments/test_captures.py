@@ -220,11 +220,17 @@ def test_what_another_machine_made_is_not_run_again(tmp_path, monkeypatch):
 
     there = replace(terms, seeds=(0,), clock="wall", work=tmp_path / "a", out=tmp_path / "there")
     fly(there, 0, [10.0, 12.0])
-    kept = captures.main(there)
-    flight = "rivals_flights/gavis_flat_0.jsonl"
-    (kept / flight).write_text("as it was flown there")
+    made_there = captures.main(there)
+    name, flight = "rivals_records.jsonl", "rivals_flights/gavis_flat_0.jsonl"
+    (made_there / flight).write_text("as it was flown there")
 
-    here = replace(there, seeds=(0, 1), work=tmp_path / "b", out=tmp_path / "here", kept=(kept,))
+    here = replace(
+        there,
+        seeds=(0, 1),
+        work=tmp_path / "b",
+        out=tmp_path / "here",
+        kept=(made_there / name,),
+    )
     fly(here, 1, [20.0, 22.0])
     run.clear()
     folder = captures.main(here)
@@ -232,13 +238,13 @@ def test_what_another_machine_made_is_not_run_again(tmp_path, monkeypatch):
     assert "11.00 / 21.00" in (folder / "rivals.md").read_text()
     assert (folder / flight).read_text() == "as it was flown there"
     assert (folder / "rivals_flights/gavis_flat_1.jsonl").exists()
-    assert [(r["seed"], r["snapshot"]) for r in read_lines(folder / "rivals_records.jsonl")] == [
+    assert [(r["seed"], r["snapshot"]) for r in read_lines(folder / name)] == [
         (seed, f"seconds:{seconds}") for seed in (0, 1) for seconds in (30, 60)
     ]
     # A table may take over what it holds itself.
-    before = (folder / "rivals_records.jsonl").read_text()
-    assert captures.main(replace(here, work=tmp_path / "c", kept=(folder,))) == folder
-    assert (folder / "rivals_records.jsonl").read_text() == before
+    before = (folder / name).read_text()
+    assert captures.main(replace(here, work=tmp_path / "c", kept=(folder / name,))) == folder
+    assert (folder / name).read_text() == before
     assert (folder / flight).read_text() == "as it was flown there"
 
 
