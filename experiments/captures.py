@@ -37,11 +37,13 @@ from experiments.pages.artifacts import (
     write_markdown,
 )
 from experiments.pages.benchmark_figures import curve_figure
+from experiments.pages.comparison_tables import ause_of_renderability
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import Records, origin, request_of, run_cells, take_over
 from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
 from r3jax.apps.benchmark.plan import make_plan
 from r3jax.apps.benchmark.record import read_records, write_records
+from r3jax.apps.benchmark.tables import metric_named
 from r3jax.evaluation.comparison import (
     check_equal_terms,
     scene_title,
@@ -450,7 +452,7 @@ def _as_method(label: str) -> str:
 
 
 def quality_rows(rows: Mapping[str, Row], records: Records) -> list[dict[str, str]]:
-    """A line per row: every scene, the mean over them, and the difference from another row."""
+    """A line per row: every scene, the mean over them, AUSE, and the difference from another."""
     scores = scores_by_method(records, "psnr")
     lines: list[dict[str, str]] = []
     for label, row in rows.items():
@@ -468,6 +470,8 @@ def quality_rows(rows: Mapping[str, Row], records: Records) -> list[dict[str, st
         by_seed = np.mean([values.mean(axis=1) for values in mine.values()], axis=0)
         if len(by_seed) > 1:
             line["mean by seed"] = " / ".join(f"{value:.2f}" for value in by_seed)
+        area = ause_of_renderability(records, label, list(mine), metric_named("psnr"))
+        line["AUSE of R"] = "" if area is None else f"{area:.2f}"
         line["difference"] = _difference(mine, row.against, scores, label)
         lines.append(line)
     return lines

@@ -99,7 +99,7 @@ def tail_table(
         shares = [tails[m].poor if m in tails else None for m in methods]
         share = Metric("", "", 1, lower_is_better=True)
         columns[f"views < {POOR_PSNR:g} dB [%]"] = ranked(shares, share)
-    areas = {m: _ause_of_renderability(cells, m, scenes, shown) for m in complete}
+    areas = {m: ause_of_renderability(cells, m, scenes, shown) for m in complete}
     if any(area is not None for area in areas.values()):
         ause = Metric("", "", 2, lower_is_better=True)
         columns["AUSE of R"] = ranked([areas.get(m) for m in methods], ause)
@@ -113,7 +113,7 @@ def tail_table(
     )
 
 
-def _ause_of_renderability(
+def ause_of_renderability(
     cells: Sequence[Cell], method: str, scenes: Sequence[str], metric: Metric
 ) -> float | None:
     """Relative AUSE of R within a model: mean over seeds, then over scenes.

@@ -77,12 +77,22 @@ def test_a_line_per_row_by_hand():
     blind, seeing = quality_rows(ROWS, records)
     assert blind == {
         "row": "blind", "flat": "16.00 [11.5] / 45", "mean": "16.00",
-        "mean by seed": "15.00 / 17.00", "difference": "",
+        "mean by seed": "15.00 / 17.00", "AUSE of R": "", "difference": "",
     }  # fmt: skip
     assert seeing["flat"] == f"21.00 [{np.mean([18.2, 20.2]):.1f}] / 100"
     assert seeing["difference"].startswith("+5.00 [")
     assert seeing["difference"].endswith("] to blind")
     assert "mean by seed" not in quality_rows(ROWS, [r for r in records if r["seed"] == 0])[0]
+
+
+def test_ause_tells_how_well_r_ranks_the_test_views():
+    """Nothing where R has the order of the errors; 2 where it has the opposite one, 1 is chance."""
+    psnr = [10.0, 20.0, 30.0]
+    for order, area in (([0.1, 0.2, 0.3], "0.00"), ([0.3, 0.2, 0.1], "2.00")):
+        ranked = record("blind", 0, psnr, 4)
+        ranked["views"]["renderability"] = order
+        (line,) = quality_rows({"blind": ROWS["blind"]}, [ranked])
+        assert line["AUSE of R"] == area
 
 
 def test_what_rows_differ_in_on_purpose_is_no_unequal_term():

@@ -1,6 +1,6 @@
 """Takes the frames of a submission again: a run folder as the exploration itself leaves it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,10 @@ def retake(
     grid = first_grid(np.asarray(simulator.bounds, np.float64), [pose], config)
     radians = metres = seconds = 0.0
     with RunWriter(path, header, overwrite=True) as recorder:
-        for frame, way in zip(submission.frames, submission.paths(), strict=True):
+        paths = submission.paths()
+        for frame, way, choice in zip(
+            submission.frames, paths, _choices(submission.frames, paths), strict=True
+        ):
             taken = stored_form(simulator.render(frame.pose.astype(np.float64)))
             arrival = view_renderability(map_state, taken.camera, taken.T_world_camera)
             map_state, grid = add_frame(map_state, grid, taken, config)
@@ -61,7 +64,7 @@ def retake(
                 step=frame.frame,
                 pose=frame.pose,
                 sha256=frame_hash(taken),
-                choice=_choice(frame, way, length),
+                choice=choice,
                 seconds=frame.seconds,
                 metres=metres,
                 radians=radians,
@@ -87,9 +90,24 @@ def retake(
         recorder.finish(submission.outcome, "the frames of a submission, taken again")
 
 
-def _choice(frame: SubmittedFrame, way: np.ndarray, length: float) -> Choice | None:
-    """What is known of the choice of a view: where it led; nothing was on offer."""
-    if frame.frame == 0 or frame.captured:
-        return None
-    waypoints = way.astype(np.float32)
-    return Choice(frame.pose, 0.0, waypoints, length, num_candidates=0, num_reachable=0)
+def _choices(
+    frames: Sequence[SubmittedFrame], paths: Sequence[np.ndarray]
+) -> list[Choice | None]:
+    """What is known of the choice of each view: the path to it; nothing was on offer.
+
+    As in a trace, it stands with the first frame that was taken on the path.
+    """
+    choices: list[Choice | None] = [None] * len(frames)
+    first = 1
+    for last in range(1, len(frames)):
+        if frames[last].captured and last + 1 < len(frames):
+            continue  # on the way to a view
+        pieces = [path[1:] for path in paths[first : last + 1]]
+        whole = np.concatenate([paths[first][:1], *pieces])
+        length = float(np.linalg.norm(np.diff(whole, axis=0), axis=1).sum())
+        waypoints = whole.astype(np.float32)
+        choices[first] = Choice(
+            frames[last].pose, 0.0, waypoints, length, num_candidates=0, num_reachable=0
+        )
+        first = last + 1
+    return choices
