@@ -90,9 +90,7 @@ def retake(
         recorder.finish(submission.outcome, "the frames of a submission, taken again")
 
 
-def _choices(
-    frames: Sequence[SubmittedFrame], paths: Sequence[np.ndarray]
-) -> list[Choice | None]:
+def _choices(frames: Sequence[SubmittedFrame], paths: Sequence[np.ndarray]) -> list[Choice | None]:
     """What is known of the choice of each view: the path to it; nothing was on offer.
 
     As in a trace, it stands with the first frame that was taken on the path.
