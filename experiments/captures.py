@@ -18,7 +18,6 @@ another machine, or another day, adds a seed:
     python -m experiments.captures rivals --size small --seeds 0 1 2 --kept rivals_records.jsonl
 """
 
-import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,6 +28,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from experiments.flights import keep_flights
 from experiments.pages.artifacts import (
     Origin,
     markdown_table,
@@ -46,20 +46,15 @@ from r3jax.apps.benchmark.record import read_records, write_records
 from r3jax.apps.benchmark.tables import metric_named
 from r3jax.evaluation.comparison import (
     check_equal_terms,
-    scene_title,
     scores_by_method,
     snapshots_of,
     with_short_names,
 )
 from r3jax.evaluation.statistics import paired_difference
 from r3jax.exploration.config import ClockName
-from r3jax.formats.submissions import submission_of_run, write_submission
-from r3jax.trace.reader import Run, read_run
+from r3jax.trace.reader import read_run
 
 NAME = "captures"
-
-Flights = Mapping[str, Sequence[tuple[Cell, Run]]]
-"""What was flown for each row: its cells, each with its run."""
 
 TableName = Literal[
     "modes", "rivals", "gaze", "spacing", "horizon", "sample", "turning", "r3con", "training"
@@ -255,13 +250,10 @@ def main(options: Options) -> Path:
     found = {label: records_of(root, own) for label, own in cells.items()}
     write_records(folder / options.records, [record for own in found.values() for record in own])
     records = [as_line(record, label, rows) for label, own in found.items() for record in own]
-    costs = list[dict[str, str]]()
+    costs = cost_rows(root, cells) if options.clock == "wall" else []
     if not options.is_repeatable:
-        flights = flights_of(root, cells)
-        costs = cost_rows(flights) if options.clock == "wall" else costs
         elsewhere = [kept.parent / options.flights for kept in options.kept]
-        take_submissions(folder / options.flights, elsewhere, cells)
-        write_submissions(folder / options.flights, flights)
+        keep_flights(folder / options.flights, root, cells, elsewhere)
     write_page(folder, options.name, rows, records, origin(f"experiments.{NAME}", records), costs)
     print(f"results  {folder}")
     return folder
@@ -330,14 +322,6 @@ def records_of(root: Path, cells: Sequence[Cell]) -> list[dict[str, Any]]:
     return [record for record in read_records(root, cells) if record["snapshot"] in asked]
 
 
-def flights_of(root: Path, cells: Mapping[str, Sequence[Cell]]) -> Flights:
-    """What was flown here for each row."""
-    return {
-        label: [(cell, read_run(run)) for cell in own if (run := paths_of(root, cell).run).exists()]
-        for label, own in cells.items()
-    }
-
-
 def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> dict[str, Any]:
     """A record under its row's name; what rows differ in on purpose is no unequal term."""
     compared = {name for row in rows.values() for name in (*row.loop, *row.training)}
@@ -348,11 +332,12 @@ def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> d
     return {**record, **parts, "policy": label, "settings": {}}
 
 
-def cost_rows(flights: Flights) -> list[dict[str, str]]:
+def cost_rows(root: Path, cells: Mapping[str, Sequence[Cell]]) -> list[dict[str, str]]:
     """A line per row: what its flights were charged for, medians of all scenes and seeds [s]."""
     lines: list[dict[str, str]] = []
-    for label, own in flights.items():
-        steps = [step for _, run in own for step in run.rows]
+    for label, own in cells.items():
+        runs = [run for cell in own if (run := paths_of(root, cell).run).exists()]
+        steps = [step for run in runs for step in read_run(run).rows]
         costs = {
             "a decision": [s.charged["planning"] + s.hidden for s in steps if s.choice is not None],
             "a frame into the map": [step.charged["mapping"] for step in steps],
@@ -403,38 +388,6 @@ def write_page(
 def _amount(snapshot: str) -> str:
     unit, _, number = snapshot.partition(":")
     return f"{number} {'s' if unit == 'seconds' else unit}"
-
-
-def write_submissions(folder: Path, flights: Flights) -> None:
-    """Writes the poses of every cell, a submission each, under the name of its row.
-
-    No machine flies by the wall clock, or with a map that it trains, twice alike: with these files
-    anybody can take the frames, train, and judge again.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    for label, own in flights.items():
-        for cell, run in own:
-            flown = submission_of_run(run)
-            named = replace(flown, policy=flown.policy | {"name": label})
-            write_submission(folder / _submission(label, cell), named)
-
-
-def take_submissions(
-    folder: Path, others: Sequence[Path], cells: Mapping[str, Sequence[Cell]]
-) -> None:
-    """Copies the poses of cells that were flown elsewhere from the folders of those tables."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for label, own in cells.items():
-        for cell in own:
-            to = folder / _submission(label, cell)
-            for path in (other / to.name for other in others):
-                if path.exists() and path.resolve() != to.resolve():
-                    shutil.copyfile(path, to)
-
-
-def _submission(label: str, cell: Cell) -> str:
-    row = re.sub("[^0-9a-z.]+", "-", label)
-    return f"{row}_{scene_title(cell.scene)}_{cell.seed}.jsonl"
 
 
 def frames_figure(records: Records) -> Figure:

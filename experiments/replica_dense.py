@@ -3,10 +3,11 @@
 from pathlib import Path
 from typing import Literal
 
+from experiments.flights import keep_flights
 from experiments.pages.artifacts import Origin, write_markdown
 from experiments.pages.comparison_tables import difference_table, tail_table
 from experiments.pages.table_formats import to_csv, to_latex, to_markdown
-from experiments.suite import Options, Records, origin, run_suite
+from experiments.suite import Options, Records, origin, request_of, run_requests
 from r3jax.apps.benchmark.record import write_records
 from r3jax.apps.benchmark.tables import Table, quality_table
 from r3jax.evaluation.comparison import methods_of, snapshots_of
@@ -17,11 +18,14 @@ REFERENCE = "ours-pano"
 
 
 def make_tables(options: Options, name: str, unit: Literal["views", "seconds"]) -> Path:
-    """Runs the cells of one kind of budget, writes the tables, and returns their folder."""
-    _, records = run_suite(options, unit)
+    """Runs the cells of one kind of budget, and returns the folder of tables, records and poses."""
+    root, cells, records = run_requests(options, unit, [request_of(options, unit)])
     folder = options.out / name / options.size
     folder.mkdir(parents=True, exist_ok=True)
     write_records(folder / f"{name}_records.jsonl", records)
+    by_policy = {cell.policy: [c for c in cells if c.policy == cell.policy] for cell in cells}
+    elsewhere = [kept.parent / f"{name}_flights" for kept in options.kept]
+    keep_flights(folder / f"{name}_flights", root, by_policy, elsewhere)
     write_tables(folder, name, records, origin(f"experiments.{name}", records))
     print(f"results  {folder}")
     return folder

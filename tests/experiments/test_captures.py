@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from experiments import captures
+from experiments import captures, flights
 from experiments.captures import TABLES, Options, Row, as_line, quality_rows, rows_of, run_in_turn
 from experiments.pages.artifacts import Origin
 from experiments.suite import request_of
 from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
 from r3jax.apps.benchmark.conditions import Conditions
 from r3jax.apps.benchmark.record import read_lines, write_record
-from r3jax.formats.submissions import read_submission
 from r3jax.planning.registry import make_policy
 from tests.evaluation.records import record as benchmark_record
 from tests.formats.test_submissions import make_submission
@@ -162,8 +161,7 @@ def test_a_table_counts_views_where_they_are_the_budget(tmp_path, monkeypatch):
     monkeypatch.setattr(
         captures, "origin", lambda name, records: Origin("a command", "none", "abc")
     )
-    monkeypatch.setattr(captures, "write_submissions", lambda *given: pages.append(given))
-    monkeypatch.setattr(captures, "take_submissions", lambda *given: pages.append(given))
+    monkeypatch.setattr(captures, "keep_flights", lambda *given: pages.append(given))
     options = Options(
         table="gaze", rows=("blend",), size="small", scenes=("flat",), seeds=(3,),
         budget="views", snapshots=(30,), work=tmp_path / "work", out=tmp_path / "out",
@@ -179,42 +177,13 @@ def test_a_table_counts_views_where_they_are_the_budget(tmp_path, monkeypatch):
     assert not pages  # the model's clock flies the same on every machine
 
 
-def test_what_was_flown_is_written_beside_a_table_of_the_wall_clock(tmp_path, monkeypatch):
-    """One file for each row, scene and seed: that cell's run, called as its row."""
-    cells = {
-        f"{policy}, every 0.15 m": [
-            Cell(scene, "a", policy, seed, Conditions(), "b", 9)
-            for scene in ("flat", "mesh:../scenes/hall.glb")
-            for seed in (0, 3)
-        ]
-        for policy in ("ours", "random")
-    }
-    flights = {label: [(cell, cell) for cell in own] for label, own in cells.items()}
-    monkeypatch.setattr(
-        captures,
-        "submission_of_run",
-        lambda cell: make_submission(seed=cell.seed, policy={"name": "?", "version": cell.policy}),
-    )
-    captures.write_submissions(tmp_path / "flights", flights)
-    written = {path.name: read_submission(path) for path in (tmp_path / "flights").iterdir()}
-    assert {name: (file.policy, file.seed) for name, file in written.items()} == {
-        f"{policy}-every-0.15-m_{scene}_{seed}.jsonl": (
-            {"name": f"{policy}, every 0.15 m", "version": policy},
-            seed,
-        )
-        for policy in ("ours", "random")
-        for scene in ("flat", "hall")
-        for seed in (0, 3)
-    }
-
-
 def test_what_another_machine_made_is_not_run_again(tmp_path, monkeypatch):
     """A table of two seeds from records and poses of one that was made elsewhere."""
     terms = Options(table="rivals", rows=("gavis",), size="small", scenes=("flat",), out=tmp_path)
     monkeypatch.setattr(captures, "run_cells", lambda cells, root, **_: run.extend(cells))
-    monkeypatch.setattr(captures, "submission_of_run", lambda cell: make_submission(seed=1))
-    monkeypatch.setattr(captures, "read_run", lambda path: path)
-    monkeypatch.setattr(captures, "cost_rows", lambda flights: [])
+    monkeypatch.setattr(flights, "submission_of_run", lambda run: make_submission(seed=1))
+    monkeypatch.setattr(flights, "read_run", lambda path: path)
+    monkeypatch.setattr(captures, "cost_rows", lambda root, cells: [])
     run = []
 
     def fly(options, seed, psnr):
@@ -258,7 +227,7 @@ def test_what_another_machine_made_is_not_run_again(tmp_path, monkeypatch):
     assert (folder / flight).read_text() == "as it was flown there"
 
 
-def test_costs_are_medians_over_all_flights_of_a_row():
+def test_costs_are_medians_over_all_flights_of_a_row(tmp_path, monkeypatch):
     """A decision counts what the flight hid of it; most frames come without one."""
 
     def step(planning, hidden, mapping, gaze=None):
@@ -267,14 +236,27 @@ def test_costs_are_medians_over_all_flights_of_a_row():
         choice = None if planning is None else "a decision"
         return SimpleNamespace(choice=choice, hidden=hidden, charged=charged | looked)
 
-    runs = [SimpleNamespace(rows=rows) for rows in (
-        [step(None, 0.0, 0.10), step(0.3, 0.0, 0.20), step(None, 0.0, 0.30, 0.01)],
-        [step(None, 0.0, 0.40), step(0.1, 0.8, 0.50, 0.03), step(0.2, 0.1, 0.66)],
-        [step(None, 0.0, 0.05)],
-    )]  # fmt: skip
-    cell = Cell("flat", "a", "ours", 0, Conditions(), "b", 9)
-    flights = {"seeing": [(cell, runs[0]), (cell, runs[1])], "at once": [(cell, runs[2])]}
-    assert captures.cost_rows(flights) == [
+    def flown(policy, seed, rows):
+        cell = Cell("flat", "a", policy, seed, Conditions(), "b", 9)
+        run = paths_of(tmp_path, cell).run
+        if rows:
+            run.mkdir(parents=True)
+            runs[run] = SimpleNamespace(rows=rows)
+        return cell
+
+    runs = {}
+    monkeypatch.setattr(captures, "read_run", runs.get)
+    cells = {
+        "seeing": [
+            flown("ours", 0, [step(None, 0, 0.10), step(0.3, 0, 0.20), step(None, 0, 0.30, 0.01)]),
+            flown(
+                "ours", 1, [step(None, 0, 0.40), step(0.1, 0.8, 0.5, 0.03), step(0.2, 0.1, 0.66)]
+            ),
+            flown("ours", 2, []),  # flown on another machine
+        ],
+        "at once": [flown("random", 0, [step(None, 0, 0.05)])],
+    }
+    assert captures.cost_rows(tmp_path, cells) == [
         {
             "row": "seeing", "a decision": "0.300", "a frame into the map": "0.350",
             "a look on the way": "0.020",
@@ -313,10 +295,3 @@ def test_two_points_are_no_curve(tmp_path, monkeypatch):
         page = (tmp_path / "gaze.md").read_text()
         assert ("gaze_by_frames.png" in page) == (len(snapshots) == 2)
     assert drawn == [4]
-
-
-def test_the_flights_that_stand_in_the_results_are_read_by_this_version():
-    files = sorted((Path(captures.__file__).parent / "results").rglob("*_flights/*.jsonl"))
-    assert files
-    for path in files:
-        assert path.stem.endswith(f"_{read_submission(path).seed}"), path

@@ -60,6 +60,28 @@ def test_every_size_is_a_benchmark_that_can_run(size, unit):
     assert shorter.budget == f"{unit}:20"
 
 
+def test_a_table_of_equal_views_keeps_its_records_and_poses(tmp_path, monkeypatch):
+    """Flights are called as their policy; those of another machine come from beside its table."""
+    cells = [
+        Cell(scene, "a", policy, 0, Conditions(), "b", 9)
+        for policy in ("ours", "random")
+        for scene in ("flat", "office")
+    ]
+    made = [record(cell.policy, cell.scene, 0, 30) for cell in cells]
+    monkeypatch.setattr(replica_dense, "run_requests", lambda *_: (tmp_path / "a", cells, made))
+    there = tmp_path / "there/some_flights"
+    there.mkdir(parents=True)
+    names = {f"{cell.policy}_{cell.scene}_0.jsonl" for cell in cells}
+    for name in names:
+        (there / name).write_text(name)
+    options = Options(kept=(tmp_path / "there/some_records.jsonl",), out=tmp_path / "out")
+    folder = replica_dense.make_tables(options, "some", "views")
+    assert {path.name: path.read_text() for path in (folder / "some_flights").iterdir()} == {
+        name: name for name in names
+    }
+    assert len((folder / "some_records.jsonl").read_text().splitlines()) == len(cells)
+
+
 def test_records_of_other_terms_find_no_place(tmp_path):
     """What a cell lacks is taken over from a file; what it has stays, and others change nothing."""
     conditions = Conditions(snapshots=("views:30", "views:60"))

@@ -1,0 +1,74 @@
+"""The poses beside a table: of every flight, called as its row, copied where flown elsewhere."""
+
+from pathlib import Path
+
+import pytest
+
+from experiments import flights
+from r3jax.apps.benchmark.cells import Cell, paths_of
+from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.formats.submissions import read_submission
+from tests.formats.test_submissions import make_submission
+
+
+@pytest.fixture
+def flown(tmp_path, monkeypatch):
+    """A function that leaves what a run of the cell would leave."""
+    runs = {}
+
+    def fly(cell):
+        run = paths_of(tmp_path, cell).run
+        run.mkdir(parents=True)
+        runs[run] = make_submission(seed=cell.seed, policy={"name": "?", "version": cell.policy})
+        return cell
+
+    monkeypatch.setattr(flights, "read_run", lambda path: path)
+    monkeypatch.setattr(flights, "submission_of_run", runs.get)
+    return fly
+
+
+def a_cell(policy, seed, scene="flat"):
+    return Cell(scene, "a", policy, seed, Conditions(), "b", 9)
+
+
+def test_every_flight_is_written_once_under_the_name_of_its_row(tmp_path, flown):
+    cells = {
+        f"{policy}, every 0.15 m": [
+            flown(a_cell(policy, seed, scene))
+            for scene in ("flat", "mesh:../scenes/hall.glb")
+            for seed in (0, 3)
+        ]
+        for policy in ("ours", "random")
+    }
+    flights.keep_flights(tmp_path / "flights", tmp_path, cells)
+    written = {path.name: read_submission(path) for path in (tmp_path / "flights").iterdir()}
+    assert {name: (file.policy, file.seed) for name, file in written.items()} == {
+        f"{policy}-every-0.15-m_{scene}_{seed}.jsonl": (
+            {"name": f"{policy}, every 0.15 m", "version": policy},
+            seed,
+        )
+        for policy in ("ours", "random")
+        for scene in ("flat", "hall")
+        for seed in (0, 3)
+    }
+
+
+def test_poses_of_another_table_are_copied_where_nothing_was_flown(tmp_path, flown):
+    """A flight of here goes before one of there, and a table may be given its own folder."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    there.mkdir()
+    for seed in (0, 1):
+        (there / f"ours_flat_{seed}.jsonl").write_text(f"flown there, {seed}")
+    cells = {"ours": [a_cell("ours", 0), flown(a_cell("ours", 1)), a_cell("ours", 2)]}
+    for elsewhere in ([tmp_path / "absent", there], [here]):
+        flights.keep_flights(here, tmp_path, cells, elsewhere)
+        assert {path.name for path in here.iterdir()} == {"ours_flat_0.jsonl", "ours_flat_1.jsonl"}
+        assert (here / "ours_flat_0.jsonl").read_text() == "flown there, 0"
+        assert read_submission(here / "ours_flat_1.jsonl").policy["version"] == "ours"
+
+
+def test_the_flights_that_stand_in_the_results_are_read_by_this_version():
+    files = sorted((Path(flights.__file__).parent / "results").rglob("*_flights/*.jsonl"))
+    assert files
+    for path in files:
+        assert path.stem.endswith(f"_{read_submission(path).seed}"), path
