@@ -78,7 +78,8 @@ import numpy as np
 example.receive()
 example.send(kind="hello", protocol=1)
 while (message := example.receive()) is not None:
-    example.send(kind="candidate", index=int(np.argmax(message[1]["position"][:, 2])))
+    best = int(np.argmax(message[1]["position"][:, 2]))
+    example.send(kind="candidate", index=best, view=message[0]["view"])
 """
 
 
@@ -211,8 +212,14 @@ while True:
         ("receive(); send(kind='jump')", "'jump' is no answer: send `candidate`"),
         (
             "for _ in range(2): receive(); send(kind='candidate', index=0, view=1)",
-            "asked for view 2 and answered for view 1: send one message for each question",
+            "asked for view 2: its answer is for view 1: .* send one message for each question",
         ),
+        (
+            "receive(); [send(kind='candidate', index=0) for _ in range(2)]; receive()",
+            "for view 1: |before it was asked|more than one message",
+        ),
+        ("receive(); send(kind='done', view=True)", "its answer is for view True"),
+        ("receive(); asked.clear(); send(kind='done')", "its answer lacks `view`"),
         ("receive(); raise SystemExit('no weights')", "ended with code 1; it said: no weights"),
         ("receive(); import time; time.sleep(60)", "no answer to `decide` within 1 s"),
     ],

@@ -1,9 +1,9 @@
 """Programs: what dies, hangs, or talks nonsense is told in a sentence, and nothing goes on."""
 
-import select
 import shlex
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -82,20 +82,59 @@ def test_what_goes_wrong_is_told_and_the_program_ended(code, says):
     assert not is_running(pid)
 
 
-@pytest.mark.parametrize(
-    ("code", "count"),
-    [
-        ("receive(); send(TEXT); time.sleep(0.1); send(TEXT); receive(); send(TEXT)", 20),
-        ("receive(); send(TEXT); time.sleep(0.1); send(b'hi'); receive(); send(TEXT)", 2),
-    ],
-)
-def test_an_answer_before_its_question_is_refused(code, count):
-    """One message too many would be the answer to the next question, and so on."""
+TICKS = """
+import threading
+gaps = [0.0]
+def tick():
+    last = time.monotonic()
+    while True:
+        time.sleep(0.001)
+        now = time.monotonic()
+        gaps[0], last = max(gaps[0], now - last), now
+threading.Thread(target=tick, daemon=True).start()
+"""
+"""Runs beside the answers, and notes for how long it could not."""
+
+
+def test_nothing_is_computed_between_questions():
+    code = TICKS + "while True: receive(); time.sleep(0.05); send(kind='a', gap=gaps[0])"
     program = Program(python(code), 0.0)
-    assert program.ask(Message("decide"), 20.0).kind == "a"
-    assert select.select([program._process.stdout], [], [], 20.0)[0]
-    with pytest.raises(PolicyError, match=f"it sent {count} bytes before it was asked"):
-        program.ask(Message("decide"), 20.0)
+    program.ask(Message("decide"), 20.0)
+    time.sleep(0.5)
+    gap = program.ask(Message("decide"), 20.0).fields["gap"]
+    program.close()
+    assert gap >= 0.5
+
+
+def test_what_a_program_has_started_is_paused_and_ended_with_it():
+    """On Linux: also a daemon that has left its group, and its parent."""
+    daemon = "import os, time; os.setsid(); os.fork() and os._exit(0); "
+    daemon += "print(os.getpid(), flush=True); time.sleep(600)"
+    code = f"""
+made = subprocess.Popen([sys.executable, '-c', {daemon!r}], stdout=subprocess.PIPE)
+pid = int(made.stdout.readline())
+made.wait()
+while True: receive(); send(kind='a', pid=pid)
+"""
+    if sys.platform != "linux":
+        pytest.skip("only Linux tells what a process has started")
+    program = Program(python(code), 0.0)
+    pid = program.ask(Message("decide"), 20.0).fields["pid"]
+    assert eventually(lambda: state_of(pid) == state_of(program._process.pid) == "T")
+    assert program.ask(Message("decide"), 20.0).fields["pid"] == pid
+    program.close()
+    assert eventually(lambda: not is_running(pid))
+
+
+def state_of(pid):
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+def eventually(holds):
+    end = time.monotonic() + 5.0
+    while not holds() and time.monotonic() < end:
+        time.sleep(0.01)
+    return holds()
 
 
 def test_an_answer_to_half_a_question_is_refused():
@@ -115,10 +154,7 @@ def test_a_program_that_hangs_is_given_up_with_what_it_started():
         program.ask(Message("decide"), 1.0)
     assert time.monotonic() - begin < 10.0
     child = int(str(told.value).rpartition("child ")[2])
-    end = time.monotonic() + 5.0
-    while is_running(child) and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not is_running(child)
+    assert eventually(lambda: not is_running(child))
     assert not is_running(pid)
 
 

@@ -193,16 +193,11 @@ class Foreign:
             question = Message("decide", {"view": seen, "seed": _seed(ask_key)})
             question.arrays.update(_surroundings(grid, travel, pose, offered, path))
             answer = self._answer(session, seen, question)
-        asked = answer.fields.get("view", seen)
-        if asked != seen:  # one too many, which came too late to be told from the answer otherwise
-            raise self._refused(
-                session, f"was asked for view {seen} and answered for view {asked!r:.20}: "
-                "send one message for each question"
-            )  # fmt: skip
         try:
+            _check_view(answer, seen)
             chosen = _view_of(answer, offered, travel, limits)
         except ForeignFileError as error:
-            raise self._refused(session, f"chose view {seen}: {error}") from None
+            raise self._refused(session, f"was asked for view {seen}: {error}") from None
         if chosen is None:
             info = PlanInfo(DecisionOutcome.NO_CANDIDATE, len(path), len(path), stopwatch.seconds)
             return None, state, info
@@ -319,6 +314,20 @@ def _surroundings(
         "cells": free.astype(np.uint8) + np.uint8(2) * occupied.astype(np.uint8),
         "stops": (travel.goals & travel.safe).astype(np.uint8),
     }
+
+
+def _check_view(answer: Message, seen: int) -> None:
+    """Refuses an answer to another question: one message too many would shift all later ones.
+
+    Raises:
+        ForeignFileError: it names another view, or none.
+    """
+    view: Any = answer.fields.get("view")
+    if type(view) is not int or view != seen:
+        named = f"is for view {view!r:.20}" if "view" in answer.fields else "lacks `view`"
+        raise ForeignFileError(
+            f"its answer {named}: repeat the question's, and send one message for each question"
+        )
 
 
 def _view_of(

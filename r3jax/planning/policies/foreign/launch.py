@@ -13,7 +13,7 @@ import sys
 CANNOT = 125
 """Exit code where a limit cannot be set, or there is no such program."""
 
-_PARENT_DEATH_SIGNAL = 1
+_PARENT_DEATH_SIGNAL, _ADOPT_ORPHANS = 1, 36
 _NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
 
 
@@ -32,8 +32,12 @@ def main(memory: int, network: str, command: list[str]) -> None:
             resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
         if network == "none":
             leave_network()
-        if sys.platform == "linux":  # a parent that is killed ends its programs, hung ones too
-            ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+        if sys.platform == "linux":
+            system = ctypes.CDLL(None)
+            # A parent that is killed ends its programs, hung and paused ones too.
+            system.prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+            # What the program starts stays below it, so that it is found and paused.
+            system.prctl(_ADOPT_ORPHANS, 1)
         os.execvp(command[0], command)
     except (OSError, ValueError, AttributeError) as error:
         print(f"{command[0]}: {error}", file=sys.stderr)

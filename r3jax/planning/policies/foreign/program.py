@@ -1,4 +1,4 @@
-"""A program that answers messages: started under limits, asked with a time limit, always ended."""
+"""A program that answers messages: started under limits, runs only while asked, always ended."""
 
 import contextlib
 import functools
@@ -50,7 +50,7 @@ def limits_memory() -> bool:
 
 
 class Program:
-    """A running program."""
+    """A program, paused between an answer and the next question: what it computes is charged."""
 
     def __init__(self, command: str, memory: float) -> None:
         """Starts it.
@@ -82,6 +82,7 @@ class Program:
             assert pipe is not None
             os.set_blocking(pipe.fileno(), False)
         self._said = b""
+        self._paused: dict[int, int] = {}
         self.close = weakref.finalize(self, _end, self._process)
 
     def ask(self, message: Message, seconds: float) -> Message:
@@ -93,8 +94,11 @@ class Program:
         """
         if not self.close.alive:
             raise PolicyError(f"the program {self.command!r} has ended")
+        _signal_all(self._process, self._paused, signal.SIGCONT)
         try:
-            return decode(self._exchange(encode(message), time.monotonic() + seconds))
+            answer = decode(self._exchange(encode(message), time.monotonic() + seconds))
+            self._paused = _pause(self._process)
+            return answer
         except TimeoutError:
             reason = f"gave no answer to `{message.kind}` within {seconds:g} s"
         except EOFError as error:
@@ -210,13 +214,62 @@ def _wait(process: "subprocess.Popen[bytes]") -> int | None:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Ends a program and its group: what it has started, but for what has left the group."""
+    """Ends a program and its group, and, on Linux, what it has started and has left the group."""
+    started = _pause(process)  # so that nothing is started meanwhile
+    _signal_all(process, started, signal.SIGCONT)
     for pipe in (process.stdin, process.stdout):
         assert pipe is not None
         pipe.close()
     _wait(process)  # the end of its input is its sign to go
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
+    started |= _descendants(process.pid)
+    _signal_all(process, started, signal.SIGKILL)
     process.wait()
     assert process.stderr is not None
     process.stderr.close()
+
+
+def _pause(process: "subprocess.Popen[bytes]") -> dict[int, int]:
+    """Stops a program and all that `_end` ends; what has been started, as `_descendants` has it."""
+    _signal_all(process, {}, signal.SIGSTOP)
+    started = _descendants(process.pid)
+    _signal_all(process, started, signal.SIGSTOP)
+    return started
+
+
+def _signal_all(process: "subprocess.Popen[bytes]", started: dict[int, int], signum: int) -> None:
+    """Signals a program, its group, and what it has started, as `_descendants` has it."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signum)
+    for pid, birth in started.items():
+        if (now := _stat(pid)) is not None and now[1] == birth:  # the number is not another's yet
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signum)
+
+
+def _descendants(ancestor: int) -> dict[int, int]:
+    """When each process began that descends from another; none on systems that are not Linux.
+
+    What loses its parent becomes the program's own child, as `launch.py` has it, for as long as
+    the program is there.
+    """
+    numbers = [int(path.name) for path in Path("/proc").glob("[0-9]*")]
+    table = {pid: stat for pid in numbers if (stat := _stat(pid)) is not None}
+    children: dict[int, list[int]] = {}
+    for pid, (parent, _) in table.items():
+        children.setdefault(parent, []).append(pid)
+    found, left = dict[int, int](), [ancestor]
+    while left:
+        for pid in children.get(left.pop(), []):
+            found[pid] = table[pid][1]
+            left.append(pid)
+    return found
+
+
+def _stat(pid: int) -> tuple[int, int] | None:
+    """A process's parent, and when it began [ticks since the system did]; None: it has ended."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return None
+    fields = text.rpartition(b")")[2].split()  # its name, in brackets, may hold anything
+    return int(fields[1]), int(fields[19])
