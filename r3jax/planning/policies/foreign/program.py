@@ -214,7 +214,7 @@ def _wait(process: "subprocess.Popen[bytes]") -> int | None:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Ends a program and its group, and, on Linux, what it has started and has left the group."""
+    """Ends a program and its group, and, on Linux, what it has started outside of the group."""
     started = _pause(process)  # so that nothing is started meanwhile
     _signal_all(process, started, signal.SIGCONT)
     for pipe in (process.stdin, process.stdout):
@@ -229,7 +229,7 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
 
 
 def _pause(process: "subprocess.Popen[bytes]") -> dict[int, int]:
-    """Stops a program and all that `_end` ends; what has been started, as `_descendants` has it."""
+    """Stops a program and all that it has started; returns the latter as `_descendants` does."""
     _signal_all(process, {}, signal.SIGSTOP)
     started = _descendants(process.pid)
     _signal_all(process, started, signal.SIGSTOP)
