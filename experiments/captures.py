@@ -227,11 +227,6 @@ class Options(SuiteOptions):
         return f"{self.name}_records.jsonl"
 
     @property
-    def flights(self) -> str:
-        """Folder of the poses of its flights."""
-        return f"{self.name}_flights"
-
-    @property
     def is_repeatable(self) -> bool:
         """Whether another machine flies the same: not by a clock, nor by a map that it trains."""
         return self.clock == "model" and self.table != "rivals"
@@ -252,8 +247,7 @@ def main(options: Options) -> Path:
     records = [as_line(record, label, rows) for label, own in found.items() for record in own]
     costs = cost_rows(root, cells) if options.clock == "wall" else []
     if not options.is_repeatable:
-        elsewhere = [kept.parent / options.flights for kept in options.kept]
-        keep_flights(folder / options.flights, root, cells, elsewhere)
+        keep_flights(folder, options.name, root, cells, options.kept)
     write_page(folder, options.name, rows, records, origin(f"experiments.{NAME}", records), costs)
     print(f"results  {folder}")
     return folder

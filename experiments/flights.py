@@ -14,32 +14,35 @@ from r3jax.trace.reader import read_run
 
 def keep_flights(
     folder: Path,
+    name: str,
     root: Path,
     cells: Mapping[str, Sequence[Cell]],
-    elsewhere: Sequence[Path] = (),
+    kept: Sequence[Path] = (),
 ) -> None:
     """Writes the poses of every cell, a submission each, under the name of its row.
 
     Args:
-        folder: where to.
+        folder: of the table.
+        name: of the table; the poses lie in `<name>_flights`.
         root: folder of the benchmark.
         cells: of each row.
-        elsewhere: such folders of other tables; poses of a cell that was not flown here are copied
-            from there.
+        kept: files that lie beside tables of the same name that were made elsewhere; poses of a
+            cell that was not flown here are copied from beside them.
 
     Raises:
         ValueError: a run is damaged.
         OSError: a file cannot be read or written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    here, *others = (path / f"{name}_flights" for path in (folder, *(file.parent for file in kept)))
+    here.mkdir(parents=True, exist_ok=True)
     for label, own in cells.items():
         for cell in own:
-            path, run = folder / _file_name(label, cell), paths_of(root, cell).run
+            path, run = here / _file_name(label, cell), paths_of(root, cell).run
             if run.exists():
                 flown = submission_of_run(read_run(run))
                 write_submission(path, replace(flown, policy=flown.policy | {"name": label}))
                 continue
-            for there in (other / path.name for other in elsewhere):
+            for there in (other / path.name for other in others):
                 if there.exists() and there.resolve() != path.resolve():
                     shutil.copyfile(there, path)
 

@@ -24,8 +24,7 @@ def make_tables(options: Options, name: str, unit: Literal["views", "seconds"]) 
     folder.mkdir(parents=True, exist_ok=True)
     write_records(folder / f"{name}_records.jsonl", records)
     by_policy = {cell.policy: [c for c in cells if c.policy == cell.policy] for cell in cells}
-    elsewhere = [kept.parent / f"{name}_flights" for kept in options.kept]
-    keep_flights(folder / f"{name}_flights", root, by_policy, elsewhere)
+    keep_flights(folder, name, root, by_policy, options.kept)
     write_tables(folder, name, records, origin(f"experiments.{name}", records))
     print(f"results  {folder}")
     return folder

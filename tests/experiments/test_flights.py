@@ -40,8 +40,8 @@ def test_every_flight_is_written_once_under_the_name_of_its_row(tmp_path, flown)
         ]
         for policy in ("ours", "random")
     }
-    flights.keep_flights(tmp_path / "flights", tmp_path, cells)
-    written = {path.name: read_submission(path) for path in (tmp_path / "flights").iterdir()}
+    flights.keep_flights(tmp_path, "some", tmp_path, cells)
+    written = {path.name: read_submission(path) for path in (tmp_path / "some_flights").iterdir()}
     assert {name: (file.policy, file.seed) for name, file in written.items()} == {
         f"{policy}-every-0.15-m_{scene}_{seed}.jsonl": (
             {"name": f"{policy}, every 0.15 m", "version": policy},
@@ -55,13 +55,14 @@ def test_every_flight_is_written_once_under_the_name_of_its_row(tmp_path, flown)
 
 def test_poses_of_another_table_are_copied_where_nothing_was_flown(tmp_path, flown):
     """A flight of here goes before one of there, and a table may be given its own folder."""
-    there, here = tmp_path / "there", tmp_path / "here"
-    there.mkdir()
+    there, here = (tmp_path / name / "some_flights" for name in ("there", "here"))
+    there.mkdir(parents=True)
     for seed in (0, 1):
         (there / f"ours_flat_{seed}.jsonl").write_text(f"flown there, {seed}")
     cells = {"ours": [a_cell("ours", 0), flown(a_cell("ours", 1)), a_cell("ours", 2)]}
-    for elsewhere in ([tmp_path / "absent", there], [here]):
-        flights.keep_flights(here, tmp_path, cells, elsewhere)
+    for others in (["absent", "there"], ["here"]):
+        kept = [tmp_path / other / "some_records.jsonl" for other in others]
+        flights.keep_flights(tmp_path / "here", "some", tmp_path, cells, kept)
         assert {path.name for path in here.iterdir()} == {"ours_flat_0.jsonl", "ours_flat_1.jsonl"}
         assert (here / "ours_flat_0.jsonl").read_text() == "flown there, 0"
         assert read_submission(here / "ours_flat_1.jsonl").policy["version"] == "ours"

@@ -3,7 +3,6 @@
 import shlex
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,7 @@ from r3jax.planning.policies.foreign.commands import short_name, words_of
 from r3jax.planning.policies.foreign.messages import Message
 from r3jax.planning.policies.foreign.program import Program, network
 from r3jax.planning.policy import PolicyError
-from tests.planning.foreign.children import is_running
+from tests.planning.foreign.children import is_running, state_of
 
 BEGIN = """
 import json, os, socket, struct, subprocess, sys, time
@@ -124,10 +123,6 @@ while True: receive(); send(kind='a', pid=pid)
     assert program.ask(Message("decide"), 20.0).fields["pid"] == pid
     program.close()
     assert eventually(lambda: not is_running(pid))
-
-
-def state_of(pid):
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
 def eventually(holds):
