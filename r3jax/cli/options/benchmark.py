@@ -180,7 +180,8 @@ class BenchmarkOptions(
     )
 
     scenes: Annotated[str, tyro.conf.arg(metavar="A,B")] = "flat,office"
-    """Embedded scenes by name, or `mesh:<file>`, with commas between."""
+    """Comma-separated scenes: embedded ones by name, `mesh:<file>`, `replica:<name>`,
+    `habitat:<file>`."""
 
     policies: Annotated[str, tyro.conf.arg(metavar="A,B")] = "ours,ours-pano,frontier,random"
     """Who chooses the views, with commas between: names, `module:Class`, `exec:COMMAND`."""

@@ -194,7 +194,8 @@ class ExploreOptions(
     )
 
     scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE")] = None
-    """Embedded scene by name, or `mesh:<file>` (GLB, PLY, OBJ); `r3jax info` lists them."""
+    """Embedded scene by name (`r3jax info` lists them), `mesh:<file>` (GLB, PLY, OBJ),
+    `replica:<name>`, or `habitat:<file>` (GLB, PLY, stage config)."""
 
     policy: Annotated[str | None, tyro.conf.arg(metavar="POLICY")] = None
     """Who chooses the next view: `ours-pano` by default; `r3jax policies` lists them. A class of

@@ -25,7 +25,8 @@ class TeamOptions(FolderOptions, DepthOptions, SceneOptions, MapOptions, RepeatO
     )
 
     scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE")] = None
-    """Embedded scene by name, or `mesh:<file>` (GLB, PLY, OBJ); `r3jax info` lists them."""
+    """Embedded scene by name (`r3jax info` lists them), `mesh:<file>` (GLB, PLY, OBJ),
+    `replica:<name>`, or `habitat:<file>` (GLB, PLY, stage config)."""
 
     cameras: int = 2
     """How many fly at the same time."""

@@ -1,13 +1,13 @@
-"""Habitat-Sim 0.3.x as a simulator, for who wants its images instead of the ray caster's.
+"""Habitat-Sim 0.3.x as a simulator: its images instead of the ray caster's.
 
-Habitat-Sim is not on the Python package index, so there is no extra for it; it comes from conda:
+Habitat-Sim comes from conda or from source, never from the Python package index, so it is no extra;
+`docs/howto/habitat.md` installs the two together. No display is needed, and no GPU.
 
-    conda install habitat-sim headless -c conda-forge -c aihabitat
+A process holds one simulator of Habitat: a second one aborts it. Scenes with the same file, camera
+and device share it; another one takes its place, and the first is loaded again (15 to 30 s) when it
+renders next. `HabitatSimulator.close` frees its memory earlier.
 
-or, where these packages do not fit (r3jax needs Python 3.11 and NumPy 2), from source:
-https://github.com/facebookresearch/habitat-sim. No display is needed, and no GPU.
-
-Surfaces are shown in their stored colors, without lights. Three of Habitat's ways matter here:
+Surfaces are shown in their stored colors, without lights. Three habits of Habitat matter here:
 faces are seen from their front only; lines are drawn, which no ray meets; and a mesh without a
 material (any PLY, so also Replica's) is shown dark and tinted by a default material, a mean of 84
 of 255 off, though its depth is right. Of a PLY the colors are therefore the ray caster's, as
@@ -25,9 +25,10 @@ import os
 import subprocess
 import sys
 import warnings
+import weakref
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -116,7 +117,12 @@ class HabitatSimulator:
         self._is_same_world = False
         if gpu_device_id is None:
             gpu_device_id = default_gpu_device()
-        self._habitat = _Habitat(library, stage.file, self._camera, fov, gpu_device_id)
+        size = self._camera.height, self._camera.width
+        self._habitat = _shared_habitat(library, stage.file, size, fov, gpu_device_id)
+
+    def close(self) -> None:
+        """Frees Habitat's memory and graphics context; the next render loads the scene again."""
+        self._habitat.close()
 
     @property
     def camera(self) -> Camera:
@@ -134,7 +140,7 @@ class HabitatSimulator:
 
         Raises:
             ValueError: no place has half a meter free all round, or Habitat shows another place
-                there than the mesh file has, so that it cannot be said what is free.
+                there than the mesh file has, or not the faces of it that surround the start.
         """
         pose = self._mesh.start_pose
         if not self._is_same_world:
@@ -177,30 +183,79 @@ class HabitatSimulator:
         return self._habitat.observe(position, rotation_of(wxyz))
 
     def _check_same_world(self, pose: np.ndarray) -> None:
-        """Refuses a Habitat that shows something else than the mesh does from `pose` [4, 4]."""
-        mesh = self._mesh.with_camera(self._camera, max_range=None)
-        known = np.asarray(mesh.render(pose).depth)
-        known = np.where(np.isfinite(known), known, np.float32(0.0))
+        """Refuses a Habitat that shows something else than the mesh file has from `pose` [4, 4]."""
         found = self._observe(pose)[1]
-        is_seen = (known > 0.0) | (found > 0.0)
-        is_same = np.abs(found - known)[is_seen] < _SAME_PLACE
-        if is_same.size and is_same.mean() < _MIN_AGREEMENT:
+        agreement = self._agreement(found, pose, cull_back_faces=True)
+        if agreement < _MIN_AGREEMENT:
             raise ValueError(
-                f"Habitat and the mesh file agree on {is_same.mean():.0%} of what the start sees: "
+                f"Habitat and the mesh file agree on {agreement:.0%} of the start's view: "
                 "Habitat shows another world, or the same turned. Do up and front in the stage "
                 "config name the axes of a GLB (a PLY is never turned), and do the faces have "
                 "their front inside the rooms?"
             )
+        agreement = self._agreement(found, pose, cull_back_faces=False)
+        if agreement < _MIN_AGREEMENT:
+            raise ValueError(
+                f"Habitat shows {agreement:.0%} of the surfaces around the start: it draws faces "
+                "from their front only, and here most fronts face outward. Flip the normals of "
+                "the mesh, or use the ray caster, which sees both sides: mesh:<file>"
+            )
+
+    def _agreement(self, found: np.ndarray, pose: np.ndarray, *, cull_back_faces: bool) -> float:
+        """Share of the pixels with a surface in which Habitat's depth [H, W] is the mesh's."""
+        mesh = self._mesh.with_camera(self._camera, max_range=None, cull_back_faces=cull_back_faces)
+        known = np.asarray(mesh.render(pose).depth)
+        known = np.where(np.isfinite(known), known, np.float32(0.0))
+        is_seen = (known > 0.0) | (found > 0.0)
+        is_same = np.abs(found - known)[is_seen] < _SAME_PLACE
+        return float(is_same.mean()) if is_same.size else 1.0
+
+
+def _shared_habitat(
+    library: tuple[Any, Any, Any], file: Path, size: tuple[int, int], fov: float, gpu: int
+) -> "_Habitat":
+    """Returns the simulator of a scene, camera and device, opened: an existing one if there is."""
+    key = file, size, fov, gpu
+    habitat = _SHARED.get(key)
+    if habitat is None:
+        habitat = _SHARED[key] = _Habitat(library, file, size, fov, gpu)
+    habitat.open()
+    return habitat
 
 
 class _Habitat:
-    """The calls to Habitat-Sim: one agent with two sensors in its origin."""
+    """One scene in Habitat-Sim: an agent with two sensors in its origin."""
+
+    _current: ClassVar["weakref.ref[_Habitat] | None"] = None
+    """The only one of the process that is open: two graphics contexts end it."""
 
     def __init__(
-        self, library: tuple[Any, Any, Any], file: Path, camera: Camera, fov: float, gpu: int
+        self,
+        library: tuple[Any, Any, Any],
+        file: Path,
+        size: tuple[int, int],
+        fov: float,
+        gpu: int,
     ) -> None:
-        """Starts it on a scene's file; `fov` is the horizontal field of view [deg]."""
-        habitat_sim, magnum, self._quaternion = library
+        """Notes a scene's file, the images' (height, width) and horizontal field of view [deg]."""
+        self._library, self._settings = library, (file, size, fov, gpu)
+        self._simulator: Any = None
+
+    def close(self) -> None:
+        """Ends the simulator, if it is open."""
+        if self._simulator is not None:
+            self._simulator.close(destroy=True)
+            self._simulator = None
+
+    def open(self) -> None:
+        """Starts the simulator unless it is open, after closing the process's other one."""
+        if self._simulator is not None:
+            return
+        other = None if _Habitat._current is None else _Habitat._current()
+        if other is not None:
+            other.close()
+        habitat_sim, magnum, _ = self._library
+        file, size, fov, gpu = self._settings
         settings = habitat_sim.SimulatorConfiguration()
         settings.scene_id = str(file)
         settings.gpu_device_id = gpu
@@ -212,16 +267,16 @@ class _Habitat:
             sensor.uuid = name
             sensor.sensor_type = kind
             sensor.sensor_subtype = habitat_sim.SensorSubType.PINHOLE
-            sensor.resolution = [camera.height, camera.width]
+            sensor.resolution = list(size)
             sensor.hfov = magnum.Deg(fov)
             sensor.position = [0.0, 0.0, 0.0]  # by default 1.5 m above the agent
             sensors.append(sensor)
         agent = habitat_sim.agent.AgentConfiguration()
         agent.sensor_specifications = sensors
         agent.action_space = {}
-        self._new_state = habitat_sim.AgentState
         with _without_noise():
             self._simulator = habitat_sim.Simulator(habitat_sim.Configuration(settings, [agent]))
+        _Habitat._current = weakref.ref(self)
 
     def observe(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Colors [H, W, 3] uint8 and z-depth [H, W] float32 from a place in Habitat's world.
@@ -232,12 +287,20 @@ class _Habitat:
             position: of the camera [3] [m].
             rotation: its OpenGL axes in Habitat's world, [3, 3].
         """
-        state = self._new_state()
+        self.open()
+        habitat_sim, _, quaternion = self._library
+        state = habitat_sim.AgentState()
         state.position = position
-        state.rotation = self._quaternion.from_rotation_matrix(rotation)
+        state.rotation = quaternion.from_rotation_matrix(rotation)
         self._simulator.get_agent(0).set_state(state)
         seen = self._simulator.get_sensor_observations()
         return np.asarray(seen["rgb"])[..., :3], np.asarray(seen["depth"], np.float32)
+
+
+_SHARED: weakref.WeakValueDictionary[tuple[Path, tuple[int, int], float, int], _Habitat] = (
+    weakref.WeakValueDictionary()
+)
+"""Simulators by file, image size, field of view and device; one ends with its last user."""
 
 
 @contextlib.contextmanager
@@ -295,7 +358,7 @@ def _import_habitat() -> tuple[Any, Any, Any]:
         raise ImportError(
             f"Habitat-Sim cannot be imported ({error}). It is not on the Python package index: "
             "conda install habitat-sim headless -c conda-forge -c aihabitat, then install r3jax in "
-            "that environment; or use the ray caster, which needs nothing: mesh:<file>, "
-            "replica:<name>"
+            "that environment (docs/howto/habitat.md); or use the ray caster, which needs nothing: "
+            "mesh:<file>, replica:<name>"
         ) from error
     return habitat_sim, magnum, quaternion

@@ -119,14 +119,26 @@ class RaycastSimulator:
             )
         return self._start.copy()
 
-    def with_camera(self, camera: Camera, *, max_range: float | int | None) -> "RaycastSimulator":
-        """The same world in the same light through another camera; nothing is built again.
+    def with_camera(
+        self,
+        camera: Camera,
+        *,
+        max_range: float | int | None,
+        cull_back_faces: bool | None = None,
+    ) -> "RaycastSimulator":
+        """Returns the same world in the same light through another camera; nothing is built again.
+
+        Args:
+            camera: its intrinsics.
+            max_range: as at the start [m].
+            cull_back_faces: as at the start; None: as this one.
 
         Raises:
             ValueError: `max_range` is not positive.
         """
         other = copy.copy(self)
         other._camera, other._max_depth = camera, _depth_limit(max_range)
+        other._cull = self._cull if cull_back_faces is None else cull_back_faces
         other._pixels = other._pixel_directions()
         return other
 

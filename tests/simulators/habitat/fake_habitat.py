@@ -1,7 +1,8 @@
 """A fake of Habitat-Sim 0.3.3 that knows no more of it than was measured on the real one.
 
 Attributes that are not listed raise AttributeError. What the real one ends the process for (a
-CUDA device on a machine without) and what it does by default (sensors 1.5 m above the agent,
+CUDA device on a machine without; closing or collecting a simulator that is not the newest, and then
+any use of the newer one) and what it does by default (sensors 1.5 m above the agent,
 a buffer that it uses again) is imitated; pictures come from a function of the sensor's state.
 """
 
@@ -70,6 +71,12 @@ class FakeHabitat:
         self.started: list[tuple[object, list[object]]] = []
         """Settings and sensors of every simulator that was started."""
 
+        self.alive: list[int] = []
+        """Numbers of the simulators whose graphics context exists, oldest first."""
+
+        self.has_context = True
+        """False once an older simulator was closed while a newer one was alive."""
+
         self.states: list[tuple[np.ndarray, np.ndarray]] = []
         """Position and rotation (w, x, y, z) of the agent at every picture."""
 
@@ -108,16 +115,27 @@ class FakeHabitat:
         assert agent.action_space == {}
         os.write(2, self.writes)
         self.started.append((settings, agent.sensor_specifications))
-        return _Simulator(agent.sensor_specifications, self._answer, self.states)
+        return _Simulator(self, agent.sensor_specifications, self._answer, self.states)
 
 
 class _Simulator:
-    def __init__(self, sensors, answer: Answer, states) -> None:
+    def __init__(self, library: FakeHabitat, sensors, answer: Answer, states) -> None:
         for sensor in sensors:
             assert sensor.sensor_subtype == "pinhole"
             assert isinstance(sensor.hfov, Degrees)
         self._sensors, self._answer, self._states = sensors, answer, states
         self._buffers: dict[str, np.ndarray] = {}
+        # By number: a simulator in its library's list would never be collected.
+        self._library, self._number = library, len(library.started)
+        library.alive.append(self._number)
+
+    def close(self, destroy: bool = True) -> None:
+        if self._number in self._library.alive:
+            self._library.has_context &= self._library.alive[-1] == self._number
+            self._library.alive.remove(self._number)
+
+    def __del__(self) -> None:
+        self.close()
 
     def get_agent(self, index: int) -> SimpleNamespace:
         assert index == 0
@@ -129,6 +147,8 @@ class _Simulator:
         self._axes = state.rotation.matrix
 
     def get_sensor_observations(self) -> dict[str, np.ndarray]:
+        if self._number not in self._library.alive or not self._library.has_context:
+            raise SystemExit("the real one aborts: GL::Context::current(): no current context")
         for sensor in self._sensors:
             place = self._states[-1][0] + self._axes @ np.asarray(sensor.position, float)
             rgb, depth = self._answer(place, self._axes)

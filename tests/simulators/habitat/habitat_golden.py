@@ -7,6 +7,8 @@ import numpy as np
 
 from r3jax.geometry.cameras import Camera
 
+HOUSE = Path(__file__).parents[3] / "experiments/scenes/aws_small_house/aws_small_house.glb"
+
 
 class Golden(NamedTuple):
     """A scene as Habitat saw it."""
@@ -43,7 +45,7 @@ class Golden(NamedTuple):
 def load_house(shared) -> Golden:
     return Golden(
         dict(np.load(shared("golden", "habitat_small_house.npz"))),
-        shared("scenes", "aws_small_house", "aws_small_house.glb"),
+        HOUSE,
         None,
         np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
     )

@@ -19,7 +19,8 @@ from r3jax.geometry.cameras import Camera
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.habitat import habitat
-from r3jax.simulators.meshes import load_world
+from r3jax.simulators.habitat.habitat_poses import BARE_GLB
+from r3jax.simulators.meshes import load_world, world_from_file
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from tests.conftest import shared_path
 from tests.mutants import Modules, Mutant, assert_caught, each
@@ -143,7 +144,10 @@ MUTANTS = [
     ),
     Mutant("habitat", "/ np.float32(255.0)", "/ np.float32(256.0)", law_golden),
     Mutant(
-        "habitat", "[camera.height, camera.width]", "[camera.width, camera.height]", law_request
+        "habitat",
+        "self._camera.height, self._camera.width",
+        "self._camera.width, self._camera.height",
+        law_request,
     ),
     Mutant("habitat", "gpu_device_id = default_gpu_device()", "gpu_device_id = 0", law_request),
     Mutant("habitat", "magnum.Deg(fov)", "magnum.Deg(0.5 * fov)", law_request),
@@ -214,6 +218,68 @@ def test_another_world_is_noticed(room, monkeypatch):
         _ = simulator.start_pose
 
 
+def box_room(path, *, is_inward: bool):
+    """A GLB of 6 x 5 x 3 m whose faces have their front inside or outside."""
+    box = trimesh.creation.box((6, 3, 5))
+    if is_inward:
+        box.invert()
+    box.export(path)
+    return SimpleNamespace(mesh=path, up="y", habitat_from_world=BARE_GLB @ world_from_file(path).T)
+
+
+@pytest.mark.parametrize("is_inward", [True, False])
+def test_faces_that_look_outward_are_refused(is_inward, tmp_path, monkeypatch):
+    room = box_room(tmp_path / "a.glb", is_inward=is_inward)
+    installed(FakeHabitat(ray_cast(room, CAMERA, np.eye(3))), monkeypatch)
+    simulator = habitat.HabitatSimulator(room.mesh, CAMERA)
+    if is_inward:
+        assert simulator.start_pose.shape == (4, 4)
+        return
+    with pytest.raises(ValueError, match=r"mesh:<file>"):
+        _ = simulator.start_pose
+
+
+def test_the_same_scene_shares_one_simulator(room, monkeypatch):
+    fake = installed(FakeHabitat(recorded(room)), monkeypatch)
+    cameras = [habitat.HabitatSimulator(room.mesh, room.camera, up=room.up) for _ in range(2)]
+    for simulator in [*cameras, *cameras]:
+        simulator.render(room.poses[0])
+    assert len(fake.started) == 1
+    first = cameras.pop(0)
+    first.close()
+    del first, simulator
+    cameras[0].render(room.poses[0])
+    assert len(fake.started) == 2
+    assert len(fake.alive) == 1
+
+
+def test_another_camera_takes_the_place_of_the_first(room, monkeypatch):
+    fake = installed(FakeHabitat(ray_cast(room, CAMERA, np.eye(3))), monkeypatch)
+    wide = Camera.from_fov(32, 24, 90.0)
+    first, second = (habitat.HabitatSimulator(room.mesh, c, up=room.up) for c in (CAMERA, wide))
+    for simulator in (first, second, first):
+        simulator.render(room.poses[0])
+        assert len(fake.alive) == 1
+    assert len(fake.started) == 5
+    del first, simulator
+    second.render(room.poses[0])
+    assert len(fake.alive) == 1
+
+
+def test_the_stand_in_ends_as_the_real_one_does_with_two_simulators(room, monkeypatch):
+    fake = installed(FakeHabitat(recorded(room)), monkeypatch)
+    simulators = []
+    for fov in (60.0, 90.0):
+        monkeypatch.setattr(habitat._Habitat, "_current", None)  # as if it knew of no other
+        one = habitat._shared_habitat(
+            (*fake.modules.values(),), room.mesh, (room.camera.height, room.camera.width), fov, -1
+        )
+        simulators.append(one)
+    simulators[0].close()
+    with pytest.raises(SystemExit, match="no current context"):
+        simulators[1].observe(np.zeros(3), np.eye(3))
+
+
 def test_a_start_in_a_wall_is_refused(room, monkeypatch):
     installed(FakeHabitat(recorded(room)), monkeypatch)
     pose = np.eye(4)
@@ -242,7 +308,7 @@ def test_without_habitat_it_says_how_to_get_it(room, monkeypatch):
 
 def test_noise_is_kept_from_the_terminal_and_trouble_is_not(room, monkeypatch, capfd):
     fake = installed(FakeHabitat(recorded(room)), monkeypatch)
-    habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up)
+    habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up).close()
     assert capfd.readouterr().err == ""
     fake.writes = b"unable to create a context\n" + NOISE + b"no texture"
     habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up)
@@ -304,7 +370,7 @@ def test_a_device_that_is_asked_for_is_used(room, monkeypatch):
 def test_the_real_habitat_gives_the_recorded_frames(golden):
     pytest.importorskip(
         "habitat_sim",
-        reason="Habitat-Sim is not installed (conda, see r3jax/simulators/habitat/habitat.py)",
+        reason="Habitat-Sim is not installed (see docs/howto/habitat.md)",
     )
     simulator = habitat.HabitatSimulator(
         golden.mesh, golden.camera, up=golden.up, max_range=None, start_pose=golden.poses[0]
