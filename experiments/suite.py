@@ -18,7 +18,7 @@ from r3jax.simulators.scenes.registry import scene_names
 
 T = TypeVar("T")
 
-HOUSE = "mesh:../shared/scenes/aws_small_house/aws_small_house.glb"
+HOUSE = "mesh:experiments/scenes/aws_small_house/aws_small_house.glb"
 
 Records = Sequence[Mapping[str, Any]]
 

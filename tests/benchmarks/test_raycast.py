@@ -5,12 +5,13 @@ import pytest
 
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
+from tests.simulators.habitat.habitat_golden import HOUSE
 
 pytestmark = pytest.mark.full
 
 
-def test_frame_of_the_house(benchmark, shared):
-    world = load_world(shared("scenes", "aws_small_house", "aws_small_house.glb"))
+def test_frame_of_the_house(benchmark):
+    world = load_world(HOUSE)
     simulator = RaycastSimulator(world)
     pose = simulator.start_pose
     simulator.render(pose)  # compiles

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,16 +10,18 @@ from PIL import Image
 
 from experiments import degeneracy, quality_over_budget, replica_dense
 from experiments.pages.artifacts import Origin
-from experiments.suite import Options, request_of, take_over
+from experiments.suite import HOUSE, Options, request_of, take_over
 from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
 from r3jax.apps.benchmark.conditions import Conditions
-from r3jax.apps.benchmark.record import read_records, write_record, write_records
+from r3jax.apps.benchmark.record import read_lines, read_records, write_record, write_records
 from r3jax.planning.registry import policy_names
+from r3jax.simulators.scenes.registry import open_world
 from r3jax.trace.writer import RunWriter
 from tests.evaluation.records import record
 from tests.trace.runs import make_header, make_view
 
 SOURCE = Origin("python -m experiments.some", "a machine", "abc")
+ROOT = Path(__file__).parents[2]
 POLICIES = ("random", "active-gs", "ours", "ours-pano")
 
 
@@ -160,3 +163,12 @@ def test_positions_come_from_the_runs_up_to_the_snapshot(tmp_path):
     assert (tmp_path / "out" / "flat.png").exists()
     page = (tmp_path / "out" / "degeneracy.md").read_text()
     assert "| random |" in page.replace("| random  ", "| random ")
+
+
+@pytest.mark.full
+def test_the_house_of_the_tables_comes_with_the_repository(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    files = list((ROOT / "experiments/results").rglob("*_records.jsonl"))
+    rows = [row for path in files for row in read_lines(path)]
+    hashes = {row["scene_hash"] for row in rows if row["scene"] == "aws_small_house"}
+    assert hashes == {open_world(HOUSE).content_hash}
