@@ -8,7 +8,7 @@ from typing import Literal
 from r3jax.formats.colmap.reader import find_model, read_colmap
 from r3jax.formats.errors import FormatError, check_capture
 from r3jax.formats.guesses import nearest_guess
-from r3jax.formats.nerfstudio import read_transforms
+from r3jax.formats.nerfstudio import find_transforms, read_transforms
 from r3jax.formats.phones.arkit_scenes import is_arkit_scenes, read_arkit_scenes
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
 from r3jax.formats.phones.record3d import is_record3d, read_record3d
@@ -32,7 +32,7 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_replica_slam, read_replica_slam),
     (is_tum, read_tum),
     (is_seven_scenes, read_seven_scenes),
-    (lambda path: (path / "transforms.json").exists(), read_transforms),
+    (lambda path: find_transforms(path) is not None, read_transforms),
     (lambda path: find_model(path) is not None, read_colmap),
     (is_polycam, read_polycam),
     (is_record3d, read_record3d),
@@ -47,12 +47,13 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
 """Folders and archives of posed images: what each looks like, and its reader."""
 
 _KNOWN = (
-    "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json, a COLMAP "
+    "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json or NeRF's "
+    "transforms_train.json, a COLMAP "
     "model (cameras.bin or cameras.txt, here or in sparse/0), raw data of Polycam (keyframes/), a "
-    "recording of Record3D (.r3d) or Stray Scanner (rgb.mp4, odometry.csv), a scene of ARKitScenes "
-    "(lowres_wide.traj), ScanNet (.sens, or color/, depth/, pose/, intrinsic/), Replica-SLAM "
-    "(traj.txt, results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or 7-Scenes "
-    "(frame-*.color.png), a ROS bag (.bag, .mcap, .db3, or metadata.yaml), "
+    "recording of Record3D (.r3d, or EXR_RGBD/) or Stray Scanner (rgb.mp4, odometry.csv), a "
+    "scene of ARKitScenes (lowres_wide.traj), ScanNet (.sens, or color/, depth/, pose/, "
+    "intrinsic/), Replica-SLAM (traj.txt, results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or "
+    "7-Scenes (frame-*.color.png), a ROS bag (.bag, .mcap, .db3, or metadata.yaml), "
     "RTAB-Map (.db, or *_camera_poses.txt)"
 )
 
@@ -112,14 +113,14 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y", topics: Topics | None 
             raise FormatError(path, "topics were named, but this is no ROS bag")
         return Capture(path, read_bag(path, topics))
     if path.is_file() and path.suffix == ".json":
-        return Capture(path, read_transforms(path))
+        return Capture(path, read_transforms(path).fitted())
     if (path / "run.json").exists():
         return Capture(path, read_run(path))
     if is_recording(path):
         return Capture(path, read_recording(path, up))
     for fits, read in _FORMATS:
         if fits(path):
-            return Capture(path, read(path))
+            return Capture(path, read(path).fitted())
     check_capture(path)
     guess = _below(path) or nearest_guess(path)
     raise FormatError(path, guess or f"this is neither {_KNOWN}")

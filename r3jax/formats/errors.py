@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import check_regular
 
 
 class FormatError(ValueError):
@@ -70,7 +71,11 @@ def check_capture(path: Path) -> None:
         FormatError: says what a capture is.
     """
     if not path.exists():
-        raise FormatError(path, "there is no such folder")
+        kind = "file" if path.suffix.lower() in (*CAPTURE_FILES, *_ADVICE) else "folder"
+        raise FormatError(path, f"there is no such {kind}")
+    if path.is_file():
+        with naming(path):
+            check_regular(path)
     if path.is_file() and path.suffix.lower() not in CAPTURE_FILES:
         default = (
             "this is a file; a capture is a folder, nerfstudio's transforms.json, or an app's file "

@@ -13,6 +13,9 @@ _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff")
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi")
 _MODELS = (".ply", ".glb", ".obj", ".usdz", ".las", ".laz", ".e57")
 
+_NO_COLORS = ("depth", "mask", "confidence", "conf", "normal", "semantic")
+"""How folders of images begin that no structure from motion could use."""
+
 _MARKS = ("keyframes/", "rgbd/", "odometry.csv", "lowres_wide.traj")
 """Beginnings of names by which phones' captures are known."""
 
@@ -72,6 +75,8 @@ def _of_database(path: Path) -> str:
         check_database(path)
     except ForeignFileError as error:
         return f"{error}: copy it again"
+    if not path.stat().st_size:
+        return "the database is empty: copy it again"
     return (
         "this is no database of RTAB-Map: of COLMAP give the folder of a model (colmap mapper "
         f"--database_path {path} --image_path IMAGES --output_path OUT)"
@@ -89,9 +94,23 @@ def _exr(path: Path, names: list[str]) -> str | None:
     if not any(name.endswith(".exr") or name.startswith("EXR_RGBD/") for name in names):
         return None
     return (
-        "this looks like Record3D's export EXR + RGB, whose depth is not read: share the same "
-        "recording as .r3d"
+        "this looks like Record3D's export EXR + JPG without metadata.json beside rgb/ and depth/: "
+        "copy the whole folder EXR_RGBD off the phone again, or share the recording as .r3d"
     )
+
+
+def _tum(path: Path, names: list[str]) -> str | None:
+    lists = {"rgb.txt", "depth.txt", "groundtruth.txt"}
+    missing = sorted(lists - set(names))
+    if len(missing) > 1 or not {"rgb.txt", "depth.txt"} & set(names):
+        return None
+    told = f"this looks like a sequence of TUM RGB-D without {' and '.join(missing)}: "
+    if missing == ["groundtruth.txt"]:
+        return told + (
+            "save the trajectory of your SLAM under this name (lines of timestamp tx ty tz qx qy "
+            "qz qw, camera to world), or download the sequence again"
+        )
+    return told + "download the sequence again"
 
 
 def _stray(path: Path, names: list[str]) -> str | None:
@@ -144,8 +163,9 @@ def _video(path: Path, names: list[str]) -> str | None:
 def _images(path: Path, names: list[str]) -> str | None:
     if not _count(names, _IMAGES):
         return None
-    first = next(name for name in names if name.lower().endswith(_IMAGES))
-    folder = (path / first).parent
+    found = [name for name in names if name.lower().endswith(_IMAGES)]
+    colors = [name for name in found if not name.lower().startswith(_NO_COLORS)]
+    folder = (path / (colors or found)[0]).parent
     return (
         f"these look like images without poses: ns-process-data images --data {folder} "
         "--output-dir OUT finds them by COLMAP, then audit OUT"
@@ -166,6 +186,6 @@ def _count(names: list[str], suffixes: tuple[str, ...]) -> int:
 
 
 _GUESSES: tuple[Callable[[Path, list[str]], str | None], ...] = (
-    *(_bags, _exr, _stray, _frames, _colmap, _metashape, _video, _images, _model),
+    *(_bags, _exr, _tum, _stray, _frames, _colmap, _metashape, _video, _images, _model),
 )
 """From the particular to the general."""

@@ -126,6 +126,15 @@ class Lens:
         """True if straight lines stay straight: `camera` is then all there is to know."""
         return self.model in _PINHOLE_WITHOUT_DISTORTION and not any(self.distortion.values())
 
+    def resized(self, width: int, height: int) -> "Lens":
+        """The lens of the same images with another number of pixels [px]."""
+        across, down = width / self.width, height / self.height
+        scales = (across, across, down) if MODELS[self.model][1][0] == "f" else (
+            across, down, across, down,
+        )  # fmt: skip
+        pixels = [value * scale for value, scale in zip(self.params, scales, strict=False)]
+        return Lens(self.model, width, height, (*pixels, *self.params[len(scales) :]))
+
     @property
     def camera(self) -> Camera:
         """The pinhole camera of the same focal lengths, whatever the distortion."""

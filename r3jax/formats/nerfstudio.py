@@ -50,6 +50,13 @@ _DEPTH = {
 _MAX_BYTES = 256 << 20
 """A frame takes a kilobyte."""
 
+NAMES = ("transforms.json", "transforms_train.json")
+"""nerfstudio's file, and that of NeRF's data sets, which are split."""
+
+_DEPTH_PATHS = ("depth_file_path", "depth_path")
+_DEPTH_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
+"""Keys of nerfstudio, and of instant-ngp."""
+
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 """What may be missing from a name."""
 
@@ -71,7 +78,8 @@ def read_transforms(path: Path | str) -> PosedImages:
     image that exists.
 
     Args:
-        path: the file, or the folder that holds one of that name.
+        path: the file, or the folder that holds one; of the data sets of NeRF, which are split,
+            transforms_train.json is read.
 
     Raises:
         FormatError: the file is missing or damaged; a field is missing or of another type; a pose
@@ -79,8 +87,9 @@ def read_transforms(path: Path | str) -> PosedImages:
             missing are noticed when they are read.
     """
     path = Path(path)
+    path = find_transforms(path) or path
     if path.is_dir():
-        path = path / "transforms.json"
+        path = path / NAMES[0]
     with naming(path):
         content = parse_json(read_bytes(path, _MAX_BYTES))
         if isinstance(content, list):
@@ -104,7 +113,10 @@ def read_transforms(path: Path | str) -> PosedImages:
         for i, (frame, image) in enumerate(zip(frames, images, strict=True))
     ]
     poses = np.stack([_pose(path, f"frames[{i}]", frame) for i, frame in enumerate(frames)])
+    others = sorted(p.name for p in path.parent.glob("transforms_*.json") if p != path)
     remark = None
+    if path.name in NAMES[1:] and others:
+        remark = f"The views of {', '.join(others[:4])} are not among the images."
     if scale != 1.0:
         if any(depths):
             poses[:, :3, 3] /= scale
@@ -132,6 +144,12 @@ def read_transforms(path: Path | str) -> PosedImages:
     )
 
 
+def find_transforms(path: Path) -> Path | None:
+    """The file in a folder: transforms.json, else the training views of a split data set."""
+    found = (path / name for name in NAMES if path.is_dir())
+    return next((file for file in found if file.exists()), None)
+
+
 def _image(folder: Path, index: int, frame: _Fields) -> Path:
     check_fields(f"frames[{index}]", frame, {"file_path": str})
     path = below(folder, frame["file_path"])
@@ -142,19 +160,32 @@ def _image(folder: Path, index: int, frame: _Fields) -> Path:
 
 
 def _depth(folder: Path, index: int, frame: _Fields) -> Path | None:
-    name = frame.get("depth_file_path")
-    check_type(f"frames[{index}].depth_file_path", name, str | None)
+    key = next((key for key in _DEPTH_PATHS if key in frame), _DEPTH_PATHS[0])
+    name = frame.get(key)
+    check_type(f"frames[{index}].{key}", name, str | None)
     return None if name is None else below(folder, name)
 
 
 def _depth_unit(content: _Fields) -> DepthUnit:
-    scale = content.get("depth_unit_scale_factor", DepthUnit.metres_per_step)
+    """The unit by nerfstudio's key or instant-ngp's; without one millimeters, and meters of floats.
+
+    nerfstudio itself takes floats without a key for millimeters, but users store meters.
+    """
     beyond = content.get("depth_beyond_range_value")
-    check_type("depth_unit_scale_factor", scale, float)
     check_type("depth_beyond_range_value", beyond, int | None)
-    if not 1e-12 < scale < 1e6:
-        raise ForeignFileError(f"the depth_unit_scale_factor {scale:g} makes no sense")
-    return DepthUnit(float(scale), beyond)
+    given = {key: content[key] for key in _DEPTH_SCALES if content.get(key) is not None}
+    for key, scale in given.items():
+        check_type(key, scale, float)
+        if not 1e-12 < scale < 1e6:
+            raise ForeignFileError(f"the {key} {scale:g} makes no sense")
+    if not given:
+        return DepthUnit(beyond_range=beyond)
+    scales = [float(scale) for scale in given.values()]
+    if max(scales) > 1.001 * min(scales):
+        both = " and ".join(f"{key} {scale:g}" for key, scale in given.items())
+        raise ForeignFileError(f"it names two units of depth, {both}: take the wrong one out")
+    floats = scales[0] if _DEPTH_SCALES[0] in given else DepthUnit.metres_per_unit
+    return DepthUnit(scales[0], beyond, metres_per_unit=floats)
 
 
 def _applied(content: _Fields) -> np.ndarray | None:

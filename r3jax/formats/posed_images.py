@@ -7,6 +7,7 @@ Shape symbols: n images; m points; t observations.
 """
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,17 +15,20 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.formats.depth_files import stored_depth
 from r3jax.formats.depth_images import resample_depth
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
+from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import read_bytes
 from r3jax.formats.validation.images import image_pixels, image_size
 from r3jax.frame import Frame
 
-IMAGE_FORMATS = ("PNG", "JPEG")
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 """What Pillow may try."""
 
-DEPTH_MODES = ("I;16", "I;16B", "I")
-"""Pillow's modes of a depth image."""
+_MAX_DEPTH = 256 << 20
+"""Floats of the largest image, and a header [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +58,10 @@ class SparsePoints:
 
 @dataclass(frozen=True)
 class DepthUnit:
-    """What the whole numbers in a depth image mean; 0 is no measurement."""
+    """What the numbers in a depth image mean; 0 is no measurement."""
 
     metres_per_step: float = 0.001
-    """Units of the capture per step."""
+    """Units of the capture per step of whole numbers."""
 
     beyond_range: int | None = None
     """Stored where nothing lies within the sensor's range; None: there is no such number."""
@@ -65,8 +69,13 @@ class DepthUnit:
     invalid: int | None = None
     """Stored, beside 0, where there is no measurement; None: there is no such number."""
 
+    metres_per_unit: float = 1.0
+    """Units of the capture per 1.0 where the numbers are floats."""
+
     def depth(self, steps: np.ndarray) -> np.ndarray:
-        """z-depth [h, w] float32 of whole numbers; 0 no measurement, inf beyond the range."""
+        """z-depth [h, w] float32 of stored numbers; 0 no measurement, inf beyond the range."""
+        if steps.dtype.kind == "f":
+            return (steps * self.metres_per_unit).astype(np.float32)
         depth = (steps.astype(np.float64) * self.metres_per_step).astype(np.float32)
         if self.invalid is not None:
             depth = np.where(steps == self.invalid, np.float32(0.0), depth)
@@ -144,6 +153,37 @@ class PosedImages:
         found = tuple(path if path.is_file() else None for path in candidates)
         return dataclasses.replace(self, depth_paths=found, depth_unit=unit)
 
+    def fitted(self) -> "PosedImages":
+        """The same images with lenses of the size that their files have, where only that differs.
+
+        Images are often reduced after their cameras were found. Of each lens the first image that
+        is there counts.
+        """
+        if self.pixels is not None:
+            return self
+        lenses = {lens: _fitted(lens, self.image_paths[i]) for lens, i in self._first_images()}
+        changed = [(lens, now) for lens, now in lenses.items() if now != lens]
+        if not changed:
+            return self
+        (lens, now), *_ = changed
+        said = (
+            f"The images have {now.width} x {now.height} pixels, their cameras were said to have "
+            f"{lens.width} x {lens.height}: focal lengths and principal points are scaled."
+        )
+        return dataclasses.replace(
+            self,
+            lenses=tuple(lenses.get(lens, lens) for lens in self.lenses),
+            remark=f"{self.remark} {said}" if self.remark else said,
+        )
+
+    def _first_images(self) -> Iterator[tuple[Lens, int]]:
+        """Each lens with its first image that is there."""
+        known: set[Lens] = set()
+        for index, (lens, path) in enumerate(zip(self.lenses, self.image_paths, strict=True)):
+            if lens not in known and os.path.isfile(path):  # no matter how long the name is
+                known.add(lens)
+                yield lens, index
+
     def frame(self, index: int) -> Frame:
         """One image with its depth. A depth image of another size is sampled at its nearest pixels.
 
@@ -191,7 +231,7 @@ class PosedImages:
         0 is no measurement, inf nothing within range.
 
         Raises:
-            FormatError: the file is missing, broken, or no 16-bit image.
+            FormatError: the file is missing, broken, or no depth image.
         """
         path = self.depth_paths[index]
         if path is None:
@@ -205,9 +245,18 @@ class PosedImages:
         return (self.frame(index) for index in range(len(self)))
 
 
+def _fitted(lens: Lens, image: Path) -> Lens:
+    """The lens in the size of an image, or as it is where the sides have another ratio."""
+    try:
+        width, height = image_size(image, IMAGE_FORMATS)
+        off = abs(width * lens.height - height * lens.width)
+        is_same_ratio = off <= max(lens.width, lens.height)  # a pixel by rounding
+        return lens.resized(width, height) if is_same_ratio else lens
+    except (ForeignFileError, OSError):
+        return lens  # reading its pixels says what is wrong
+
+
 def _read_depth(path: Path, unit: DepthUnit) -> np.ndarray:
     """z-depth [h, w] float32; 0 no measurement, inf beyond the range."""
     with naming(path):
-        stored = image_size(path, IMAGE_FORMATS)
-        wanted = "depth must be a 16-bit PNG"
-        return unit.depth(image_pixels(path, IMAGE_FORMATS, stored, DEPTH_MODES, wanted))
+        return unit.depth(stored_depth(read_bytes(path, _MAX_DEPTH)))

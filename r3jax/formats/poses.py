@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.files import plain_text, read_bytes
 from r3jax.geometry.cameras import rigid_error
 
 MAX_DRIFT = 0.02
@@ -60,7 +60,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
         FormatError: missing, not a regular file, or far too large.
     """
     with naming(path):
-        data = read_bytes(path, _MAX_TEXT)
+        data = plain_text(read_bytes(path, _MAX_TEXT))
     for number, raw in enumerate(io.BytesIO(data), start=1):
         words = raw.decode("utf-8", errors="replace").partition("#")[0].split()
         if words:

@@ -3,7 +3,9 @@
 import io
 import json
 import struct
+import tempfile
 import zlib
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -136,6 +138,31 @@ def record3d(size: bool = True, first: np.ndarray | None = None) -> dict[str, by
     return {"metadata": json.dumps(metadata).encode(), **files, "sound.m4a": b"", "icon": b""}
 
 
+def record3d_export(top: str = "EXR_RGBD/", suffix: str = "jpg") -> dict[str, bytes]:
+    """The app's export EXR + JPG of the same recording, which has no confidence."""
+    r3d = record3d()
+    files = {"metadata.json": r3d["metadata"], "sound.m4a": b""}
+    for i, room_pose in enumerate(room_poses()):
+        lens = lens_of(i)
+        depth = view(room_pose, smaller(lens))[1].astype(np.float32)
+        depth[0, 0] = np.nan
+        files[f"rgb/{i}.{suffix}"] = encoded(view(room_pose, lens)[0], "jpeg")
+        files[f"depth/{i}.exr"] = exr({"R": depth})
+    return {top + name: data for name, data in files.items()}
+
+
+def exr(channels: dict[str, np.ndarray]) -> bytes:
+    """An EXR image with these channels."""
+    import OpenEXR
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/image.exr"
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, channels) as file:
+            file.write(path)
+        return Path(path).read_bytes()
+
+
 VIDEO = Lens("PINHOLE", 192, 144, (132.0, 132.0, 102.0, 66.0))
 """Of a video: larger, as encoders want it."""
 
@@ -157,18 +184,22 @@ def video(images: list[np.ndarray]) -> bytes:
     return file.getvalue()
 
 
-def stray_scanner(intrinsics: bool = True) -> dict[str, bytes]:
-    """A recording; with intrinsics of every frame as newer versions write it."""
+def stray_scanner(intrinsics: bool = True, center: bool = False) -> dict[str, bytes]:
+    """A recording; with intrinsics of every frame as newer versions write it, and with empty
+    columns for the center of distortion as those of 2026 do."""
     fx, fy, cx, cy = VIDEO.params
     names = ["timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw"]
-    rows = [", ".join(names + (["fx", "fy", "cx", "cy"] if intrinsics else []))]
+    names += ["fx", "fy", "cx", "cy"] * intrinsics
+    names += ["distortion_center_x", "distortion_center_y"] * center
+    rows = [", ".join(names)]
     images, files = [], {}
     for i, room_pose in enumerate(room_poses()):
         lens = Lens("PINHOLE", 192, 144, (fx + 4 * i * intrinsics, fy + 4 * i * intrinsics, cx, cy))
         arkit = Y_UP_FROM_Z_UP @ room_pose  # the app has turned the camera's axes
         w, x, y, z = quaternion_of(arkit[:3, :3])
         numbers = [100 + i / 60, f"{i:06d}", *arkit[:3, 3], x, y, z, w]
-        rows.append(", ".join(str(v) for v in numbers + list(lens.params) * intrinsics))
+        numbers += [*lens.params] * intrinsics + ["", ""] * center
+        rows.append(", ".join(str(v) for v in numbers))
         images.append(view(room_pose, lens)[0])
         files[f"depth/{i:06d}.png"] = encoded(depth_steps(room_pose, smaller(lens)))
         files[f"confidence/{i:06d}.png"] = encoded(levels(2, smaller(lens)))

@@ -29,8 +29,16 @@ FOLDERS = {
         {"cameras.xml": b"", "images/1.jpg": b""},
         r"Metashape: ns-process-data metashape --data \S+scan --xml \S+scan/cameras\.xml",
     ),
-    "exr": ({"rgb/0.jpg": b"", "depth/0.exr": b""}, r"Record3D's export .* as \.r3d"),
-    "exr below": ({"EXR_RGBD/depth/0.exr": b""}, r"Record3D's export .* as \.r3d"),
+    "exr": ({"rgb/0.jpg": b"", "depth/0.exr": b""}, r"Record3D's export .*without metadata\.json"),
+    "exr below": ({"EXR_RGBD/depth/0.exr": b""}, r"Record3D's export .*metadata\.json .*EXR_RGBD"),
+    "tum": (
+        {name: data for name, data in sequences.tum().items() if name != "groundtruth.txt"},
+        r"TUM RGB-D without groundtruth\.txt: .*trajectory",
+    ),
+    "colors beside depth": (
+        {"depth/1.png": b"", "mask/1.png": b"", "photos/1.png": b""},
+        r"ns-process-data images --data \S+scan/photos ",
+    ),
     "a model": ({"scan.glb": b""}, "a finished model without the images it was made of"),
     "stray": ({"rgb.mp4": b"", "depth/000000.png": b""}, "Stray Scanner without odometry"),
     "scannet": ({"color/0.jpg": b"", "depth/0.png": b""}, "export of ScanNet without pose/"),

@@ -165,11 +165,11 @@ PIXELS = {
     ),
     "other size": (
         damaged("corrected_cameras", with_fields(width=50)),
-        r"1600000\.jpg: the size is \(48, 36\), others are \(50, 36\)",
+        r"1600000\.jpg: the image has 48 x 36 pixels, but .* 50 x 36",
     ),
     "colored depth": (
         damaged("keyframes/depth", lambda data: phones.encoded(np.zeros((12, 16, 3), np.uint8))),
-        r"depth/1600000\.png: depth must be a 16-bit PNG",
+        r"depth/1600000\.png: depth must be a PNG or TIFF of 16 bits",
     ),
     "confidence": (
         damaged("keyframes/confidence", lambda data: phones.encoded(np.zeros((3, 4), np.uint8))),
@@ -331,6 +331,40 @@ def test_record3d_without_lzfse_names_the_extra(tmp_path, monkeypatch):
         open_capture(path)
 
 
+@pytest.mark.parametrize("kind", ["folder", "folder EXR_RGBD", "archive", "png"])
+def test_the_exr_export_of_record3d_shows_the_room(tmp_path, kind):
+    files = phones.record3d_export("" if kind == "folder" else "EXR_RGBD/",
+                                   "png" if kind == "png" else "jpg")  # fmt: skip
+    path = tmp_path / "scan.zip"
+    if kind != "archive":
+        path = tmp_path / "scan"
+        lay_out(path, files)
+    else:
+        write_zip(path, files)
+    images = open_capture(path).source
+    assert isinstance(images, PosedImages)
+    assert len(images) == NUM
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+    np.testing.assert_array_equal(images.up, [0, 1, 0])
+    assert images.depth(0)[0, 0] == 0.0  # NaN: no measurement
+
+
+def test_an_exr_export_without_openexr_names_the_extra(tmp_path, monkeypatch):
+    lay_out(tmp_path, phones.record3d_export(""))
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    with pytest.raises(FormatError, match=r"OpenEXR.*not installed.*'r3jax\[phones\]'"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("cut", [8, 200, -40])
+def test_a_damaged_exr_is_named(tmp_path, cut):
+    files = phones.record3d_export("")
+    lay_out(tmp_path, files | {"depth/1.exr": files["depth/1.exr"][:cut]})
+    images = read_record3d(tmp_path)
+    with pytest.raises(FormatError, match=r"depth/1\.exr: the EXR image cannot be read"):
+        images.depth(1)
+
+
 @pytest.fixture(params=["folder", "archive"])
 def stray(request, tmp_path):
     if request.param == "archive":
@@ -346,6 +380,26 @@ def test_stray_scanner_shows_the_room(stray):
     np.testing.assert_array_equal(images.up, [0, 1, 0])
     assert [lens.params[0] for lens in images.lenses] == [132.0, 136.0, 140.0, 144.0]
     assert images.image_paths[1].name == "000001"
+
+
+def test_columns_of_stray_scanner_that_are_empty_are_not_known(tmp_path):
+    files = phones.stray_scanner(center=True)
+    lay_out(tmp_path / "today", files)
+    images = open_capture(tmp_path / "today").source
+    assert isinstance(images, PosedImages)
+    assert_shows_the_room(images, Y_UP_FROM_Z_UP)
+    assert [lens.params[0] for lens in images.lenses] == [132.0, 136.0, 140.0, 144.0]
+    rows = files["odometry.csv"].decode().splitlines()
+    without_pose = rows[2].split(",")
+    without_pose[2:9] = [""] * 7
+    without_focal_length = rows[3].split(",")
+    without_focal_length[9] = " "
+    rows[2:4] = [",".join(without_pose), ",".join(without_focal_length)]
+    lay_out(tmp_path / "gaps", files | {"odometry.csv": "\r\n".join(rows).encode("utf-8-sig")})
+    images = read_stray_scanner(tmp_path / "gaps")
+    assert [lens.params[0] for lens in images.lenses] == [132.0, 132.0, 144.0]
+    assert images.remark == "1 of 4 frames lack an image, depth or a pose and are left out."
+    assert_shows_the_room(read_stray_scanner(tmp_path / "today"), Y_UP_FROM_Z_UP)
 
 
 def test_stray_scanner_of_earlier_versions_has_one_camera(tmp_path):
@@ -377,8 +431,8 @@ STRAY = {
         damaged("odometry", lambda data: data.replace(b"qw", b"q")), r"odometry\.csv: .*columns qw",
     ),
     "no rows": (damaged("odometry", lines(lambda rows: rows[:1])), "it lists no frames"),
-    "row": (damaged("odometry", lines(lambda rows: [*rows, "1, 2"])), "not every row is a row of"),
-    "word": (damaged("odometry", lambda d: d.replace(b"000001", b"x")), "not every row is a row"),
+    "row": (damaged("odometry", lines(lambda rows: [*rows, "1, 2"])), "row 5 has 2 fields"),
+    "word": (damaged("odometry", lambda d: d.replace(b"000001", b"x")), "row 2: `frame`"),
     "frame": (damaged("odometry", lambda d: d.replace(b"000003", b"-3")), "-3 is no number"),
     "video": (damaged("rgb.mp4", lambda data: data[:100]), r"rgb\.mp4: the video cannot be read"),
 }  # fmt: skip

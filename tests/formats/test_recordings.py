@@ -137,7 +137,7 @@ def test_an_image_of_another_size_is_named_when_it_is_read(folder):
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(folder / "images" / "002.png")
     recording = read_recording(folder)
     recording.frame(0)
-    with pytest.raises(FormatError, match=r"002\.png: the size is \(4, 4\)"):
+    with pytest.raises(FormatError, match=r"002\.png: the image has 4 x 4 pixels"):
         recording.frame(2)
 
 

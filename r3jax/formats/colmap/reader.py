@@ -13,7 +13,7 @@ from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import PosedImages, SparsePoints
 from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.names import below
+from r3jax.formats.validation.names import below, check_relative
 
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
 """Where COLMAP, its users and nerfstudio put the model of a capture."""
@@ -133,7 +133,7 @@ def _check_images(model: ColmapModel) -> None:
     ids: set[int] = set()
     names: set[str] = set()
     for image in model.images:
-        below(Path(), image.name)
+        check_relative(image.name)
         if image.id in ids or image.name in names:
             raise ForeignFileError(f"the image {image.id} ({image.name[:80]!r}) occurs twice")
         ids.add(image.id)

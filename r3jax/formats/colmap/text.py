@@ -13,7 +13,7 @@ from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.files import plain_text, read_bytes
 
 T = TypeVar("T")
 
@@ -70,7 +70,7 @@ _Line = tuple[int, str]
 
 def _lines(path: Path) -> Iterator[_Line]:
     """Every line, without blanks at its ends."""
-    for number, raw in enumerate(io.BytesIO(read_bytes(path, _MAX_BYTES)), start=1):
+    for number, raw in enumerate(io.BytesIO(plain_text(read_bytes(path, _MAX_BYTES))), start=1):
         yield number, os.fsdecode(raw).strip()
 
 

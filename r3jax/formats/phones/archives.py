@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.formats.depth_files import DEPTH_MODES, stored_depth
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.posed_images import DEPTH_MODES, IMAGE_FORMATS
+from r3jax.formats.posed_images import IMAGE_FORMATS
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.files import check_regular, read_bytes
 from r3jax.formats.validation.images import image_pixels, image_size
@@ -119,12 +120,14 @@ class Archive:
             return image_size(data, IMAGE_FORMATS)
 
     def depth_steps(self, name: str) -> np.ndarray:
-        """Reads a depth image as it is stored, [h, w] of whole numbers.
+        """Reads a depth image as it is stored, [h, w]; see `stored_depth`.
 
         Raises:
-            FormatError: missing, damaged, or not of 16 bits.
+            FormatError: missing, damaged, or no depth image.
         """
-        return self._gray(name, DEPTH_MODES, "depth must be a 16-bit PNG")
+        data = self.read(name, _MAX_IMAGE)
+        with naming(self.where(name)):
+            return stored_depth(data)
 
     def confidence(self, name: str) -> np.ndarray:
         """Reads an image of levels of confidence, [h, w] of whole numbers.
@@ -132,13 +135,10 @@ class Archive:
         Raises:
             FormatError: missing, damaged, or colored.
         """
-        return self._gray(name, _CONFIDENCE_MODES, "confidence must be a gray image")
-
-    def _gray(self, name: str, modes: tuple[str, ...], wanted: str) -> np.ndarray:
-        data = self.read(name, _MAX_IMAGE)
+        data, wanted = self.read(name, _MAX_IMAGE), "confidence must be a gray image"
         with naming(self.where(name)):
             size = image_size(data, IMAGE_FORMATS)
-            return image_pixels(data, IMAGE_FORMATS, size, modes, wanted)
+            return image_pixels(data, IMAGE_FORMATS, size, _CONFIDENCE_MODES, wanted)
 
 
 def _unpack(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:

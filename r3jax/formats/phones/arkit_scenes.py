@@ -24,6 +24,7 @@ from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import mend_pose
 from r3jax.formats.sequences.tum import nearest
 from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import plain_text
 
 _BEST = 2
 _TRAJECTORY, _CAMERAS = "lowres_wide.traj", "lowres_wide_intrinsics"
@@ -107,7 +108,7 @@ def _rotation(axis_angle: np.ndarray) -> np.ndarray:
 
 def _numbers(data: bytes, columns: int) -> np.ndarray:
     """A table of numbers, [n, columns], n >= 1."""
-    rows = [line.split() for line in data.splitlines() if line.strip()]
+    rows = [line.split() for line in plain_text(data).splitlines() if line.strip()]
     if not rows or {len(row) for row in rows} != {columns}:
         raise ForeignFileError(f"every line must have {columns} numbers")
     try:

@@ -11,6 +11,7 @@ from typing import Any
 
 from r3jax.formats.errors import FormatError
 from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.packages import why_not_imported
 
 
 def load_decoder(path: Path) -> Any:
@@ -26,12 +27,13 @@ def load_decoder(path: Path) -> Any:
         import lzfse
 
         decoder = ctypes.CDLL(lzfse.__file__).lzfse_decode_buffer
-    except (ImportError, AttributeError, OSError):
-        raise FormatError(
-            path,
-            "the depth of Record3D is unpacked by lzfse, which is not installed: pip install "
-            "'r3jax[phones]'",
-        ) from None
+    except ImportError as error:
+        what_for = "the depth of Record3D is unpacked by"
+        reason = why_not_imported(error, "lzfse", what_for, "phones")
+        raise FormatError(path, reason) from None
+    except (AttributeError, OSError) as error:
+        reason = f"the package lzfse does not hold its decoder ({error!s:.200}): another version?"
+        raise FormatError(path, reason) from None
     size, pointer = ctypes.c_size_t, ctypes.c_char_p
     decoder.argtypes = [pointer, size, pointer, size, ctypes.c_void_p]
     decoder.restype = size

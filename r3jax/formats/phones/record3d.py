@@ -1,10 +1,14 @@
-"""Reads recordings of Record3D: the .r3d archive that the app shares, or what it unpacks to.
+"""Reads recordings of Record3D: the .r3d archive, or what it unpacks to, and the export EXR + JPG.
 
     metadata         JSON: w, h, dw, dh; K, 9 numbers column by column; poses [qx, qy, qz, qw, x, y,
                      z], camera to world, OpenGL axes [m]; perFrameIntrinsicCoeffs [fx, fy, cx, cy]
     rgbd/<n>.jpg     8-bit RGB
     rgbd/<n>.depth   LZFSE of float32 [dh, dw] [m], NaN where there is no measurement
     rgbd/<n>.conf    LZFSE of uint8 [dh, dw], 2 is the best; the front camera has none
+
+    metadata.json    the same JSON, in a folder EXR_RGBD
+    rgb/<n>.jpg      or .png: 8-bit RGB
+    depth/<n>.exr    one channel of float32 [m]; confidence is not exported
 
 Where the first pose is no rotation, the app has made the first camera the world: which way is up
 is not known then. Else the world is ARKit's, y up.
@@ -16,13 +20,14 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.formats.depth_files import check_exr, stored_depth
 from r3jax.formats.depth_images import keep_confident
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.formats.phones.archives import Archive, find_archive, is_there
 from r3jax.formats.phones.lzfse_streams import load_decoder, unpack_lzfse
-from r3jax.formats.phones.shots import UP_Y, Shot, complete_shots, posed_images
+from r3jax.formats.phones.shots import MILLIMETERS, UP_Y, Shot, complete_shots, posed_images
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.quaternion_poses import quaternion_pose
 from r3jax.formats.validation.errors import ForeignFileError
@@ -36,31 +41,45 @@ say it."""
 _MAX_BYTES = 16 << 20
 """A packed depth image takes a megabyte at most."""
 
+_MAX_EXR = 64 << 20
+"""A depth image that is not packed takes 1.2 MB; some enlarge it to the size of the image."""
+
+_R3D, _EXPORT = ("metadata", "rgbd"), ("metadata.json", "rgb", "depth")
+"""Names in an archive of each layout."""
+
 _FIELDS = {"w": int, "h": int, "K": list[float], "poses": list[list[float]]}
 
 
 def is_record3d(path: Path) -> bool:
     """True if the folder or archive looks like a recording of Record3D."""
-    return is_there(path, "metadata", "rgbd")
+    return is_there(path, *_R3D) or (is_there(path, *_EXPORT) and _export(path) is not None)
+
+
+def _export(path: Path) -> Archive | None:
+    """The export EXR + JPG in a folder or archive."""
+    archive = find_archive(path, *_EXPORT)
+    return archive if archive is not None and archive.names("depth", ".exr") else None
 
 
 def read_record3d(path: Path | str) -> PosedImages:
     """Opens a recording and checks everything but the pixels.
 
     Args:
-        path: the .r3d file, or the folder that it was unpacked to.
+        path: the .r3d file, the folder that it was unpacked to, or an export EXR + JPG.
 
     Raises:
-        FormatError: lzfse is not installed; metadata that are missing or damaged; numbers of
-            poses and intrinsics that differ; no depth images.
+        FormatError: lzfse or OpenEXR is not installed; metadata that are missing or damaged;
+            numbers of poses and intrinsics that differ; no depth images.
     """
     path = Path(path)
-    archive = find_archive(path, "metadata", "rgbd")
+    r3d = find_archive(path, *_R3D)
+    archive = r3d or _export(path)
     if archive is None:
         raise FormatError(path, "there are no metadata and no folder rgbd in it")
-    decoder = load_decoder(path)
-    metadata = archive.json("metadata")
-    source = archive.where("metadata")
+    with naming(path):
+        decoder = load_decoder(path) if r3d else check_exr()
+    name = (_R3D if r3d else _EXPORT)[0]
+    metadata, source = archive.json(name), archive.where(name)
     with naming(source):
         check_fields("metadata", metadata, _FIELDS)
         lenses = _lenses(metadata)
@@ -72,25 +91,41 @@ def read_record3d(path: Path | str) -> PosedImages:
             f"the {len(rows)} poses must have 7 numbers each and be as many as there are "
             f"intrinsics, {len(lenses)}",
         )
+    depth = partial(_depth, archive, decoder, size) if r3d else partial(_exported_depth, archive)
     shots = [
         Shot(
-            image=f"rgbd/{i}.jpg",
-            depth=f"rgbd/{i}.depth",
-            confidence=f"rgbd/{i}.conf",
+            *(_files(i) if r3d else _exported_files(archive, i)),
             lens=lens,
             pose=quaternion_pose(source, f"pose {i}", row[4:], row[:4]) @ OPENGL_FROM_OPENCV,
         )
         for i, (row, lens) in enumerate(zip(np.asarray(rows, np.float64), lenses, strict=True))
     ]
     advice = (
-        "this looks like a recording of Record3D without depth (rgbd/<n>.depth): share it as .r3d"
+        "this looks like a recording of Record3D without depth (rgbd/<n>.depth or depth/<n>.exr): "
+        "share it as .r3d"
     )
     kept, remark = complete_shots(archive, shots, len(rows), advice)
     is_relative = abs(abs(rows[0][3]) - 1.0) < 1e-6
     up = None if is_relative else UP_Y
-    return posed_images(
-        archive, kept, depth=partial(_depth, archive, decoder, size), up=up, remark=remark
-    )
+    return posed_images(archive, kept, depth=depth, up=up, remark=remark)
+
+
+def _files(index: int) -> tuple[str, str, str]:
+    """Image, depth and confidence of a frame in an .r3d archive."""
+    return f"rgbd/{index}.jpg", f"rgbd/{index}.depth", f"rgbd/{index}.conf"
+
+
+def _exported_files(archive: Archive, index: int) -> tuple[str, str, str]:
+    """The same in an export, which has no confidence."""
+    image = f"rgb/{index}.jpg"
+    return image if archive.has(image) else f"rgb/{index}.png", f"depth/{index}.exr", ""
+
+
+def _exported_depth(archive: Archive, shot: Shot) -> np.ndarray:
+    """z-depth [h, w] float32 [m]."""
+    data = archive.read(shot.depth, _MAX_EXR)
+    with naming(archive.where(shot.depth)):
+        return MILLIMETERS.depth(stored_depth(data))
 
 
 def _lenses(metadata: dict[str, Any]) -> list[Lens]:

@@ -4,12 +4,15 @@
     depth/000000.png         uint16, millimeters
     confidence/000000.png    2 is the best
     odometry.csv             "timestamp, frame, x, y, z, qx, qy, qz, qw", camera to world, OpenCV
-                             axes, world y up [m]; newer versions: and fx, fy, cx, cy
+                             axes, world y up [m]; newer versions: and fx, fy, cx, cy, and
+                             distortion_center_x, distortion_center_y, which may be empty
     camera_matrix.csv        3x3 intrinsics of the video, of the last frame
 
+Columns are found by their names, and an empty field is not known.
 (https://github.com/StrayRobots/scanner)
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +25,7 @@ from r3jax.formats.phones.videos import Video
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.quaternion_poses import quaternion_pose
 from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import check_regular
+from r3jax.formats.validation.files import check_regular, plain_text
 
 _BEST = 2
 _POSE = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -54,12 +57,14 @@ def read_stray_scanner(path: Path | str) -> PosedImages:
     video = _video(archive)
     with naming(archive.where("odometry.csv")):
         poses, intrinsics = _table(archive)
-        if intrinsics is None:
-            intrinsics = np.tile(_camera_matrix(archive), (len(poses), 1))
+        unknown = np.isnan(intrinsics).any(axis=1)
+        if unknown.any():
+            intrinsics[unknown] = _camera_matrix(archive)
         shots = [
             _shot(archive, video, *row)
             for row in zip(poses, intrinsics, strict=True)
-            if row[0][0] < len(video)  # some videos end before the poses do
+            # Some videos end before the poses do; where tracking was lost there is no pose.
+            if row[0][0] < len(video) and not np.isnan(row[0]).any()
         ]
     advice = (
         "this looks like a recording of Stray Scanner without depth/: the phone has no LiDAR "
@@ -102,13 +107,13 @@ def _video(archive: Archive) -> Video:
     return Video(name, name)
 
 
-def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray | None]:
-    """The columns of odometry.csv: frame and pose [n, 8], and intrinsics [n, 4] if it has them.
+def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
+    """The columns of odometry.csv: frame and pose [n, 8], and intrinsics [n, 4]; NaN: not known.
 
     Raises:
-        ForeignFileError: no such columns, no rows, or a row that is not all numbers.
+        ForeignFileError: no such columns, no rows, or a field that is no number.
     """
-    lines = archive.read("odometry.csv").decode("utf-8", errors="replace").splitlines()
+    lines = plain_text(archive.read("odometry.csv")).decode(errors="replace").splitlines()
     rows = [[word.strip() for word in line.split(",")] for line in lines if line.strip()]
     names = rows[0] if rows else []
     missing = [name for name in _POSE if name not in names]
@@ -116,22 +121,31 @@ def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray | None]:
         raise ForeignFileError(f"there are no columns {', '.join(missing)}")
     if not rows[1:]:
         raise ForeignFileError("it lists no frames")
+    at = [names.index(name) if name in names else -1 for name in (*_POSE, *_INTRINSICS)]
+    table = np.full((len(rows) - 1, len(at)), np.nan)
+    for number, row in enumerate(rows[1:]):
+        if len(row) != len(names):
+            raise ForeignFileError(f"row {number + 1} has {len(row)} fields, not {len(names)}")
+        table[number] = [_number(row[i], f"row {number + 1}: `{names[i]}`") if i >= 0 else np.nan
+                         for i in at]  # fmt: skip
+    return table[:, : len(_POSE)], table[:, len(_POSE) :]
+
+
+def _number(word: str, which: str) -> float:
+    """A field; NaN where it is empty."""
     try:
-        values = np.array([[float(word) for word in row] for row in rows[1:]])
-    except ValueError as error:  # a word that is no number, or rows of different lengths
-        raise ForeignFileError(f"not every row is a row of numbers ({error!s:.200})") from None
-    if values.shape[1] != len(names) or not np.all(np.isfinite(values)):
-        raise ForeignFileError(f"every row must hold {len(names)} finite numbers")
-    columns = {name: values[:, at] for at, name in enumerate(names)}
-    pose = np.stack([columns[name] for name in _POSE], axis=1)
-    has_intrinsics = all(name in columns for name in _INTRINSICS)
-    return pose, np.stack([columns[n] for n in _INTRINSICS], axis=1) if has_intrinsics else None
+        value = float(word) if word else 0.0
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ForeignFileError(f"{which} must be a number, got {word[:40]!r}")
+    return value if word else math.nan
 
 
 def _camera_matrix(archive: Archive) -> np.ndarray:
     """fx, fy, cx, cy of all frames, [4]."""
     source = archive.where("camera_matrix.csv")
-    text = archive.read("camera_matrix.csv").decode("utf-8", errors="replace")
+    text = plain_text(archive.read("camera_matrix.csv")).decode(errors="replace")
     with naming(source):
         try:
             K = np.array([[float(word) for word in line.split(",")] for line in text.split()])

@@ -10,6 +10,7 @@ import numpy as np
 
 from r3jax.formats.errors import FormatError
 from r3jax.formats.validation.images import MAX_PIXELS
+from r3jax.formats.validation.packages import why_not_imported
 
 _AHEAD = 90
 """Frames so close before the next one asked for are decoded rather than jumped over."""
@@ -84,9 +85,7 @@ class Video:
 def _load_av(path: Path) -> ModuleType:
     try:
         import av
-    except ImportError:
-        raise FormatError(
-            path,
-            "videos are decoded by PyAV, which is not installed: pip install 'r3jax[phones]'",
-        ) from None
+    except ImportError as error:
+        reason = why_not_imported(error, "av", "videos are decoded by PyAV,", "phones")
+        raise FormatError(path, reason) from None
     return av

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.ros.unpack import unpack_chunk
 from r3jax.formats.validation.files import check_database, check_regular
+from r3jax.formats.validation.packages import why_not_imported
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Files of ROS 1, and of ROS 2's two storages."""
@@ -228,10 +229,9 @@ def is_bag(path: Path) -> bool:
 def _load_rosbags(path: Path) -> tuple[ModuleType, ModuleType]:
     try:
         from rosbags import highlevel, typesys
-    except ImportError:
-        raise FormatError(
-            path, "ROS bags are read by rosbags, which is not installed: pip install 'r3jax[ros]'"
-        ) from None
+    except ImportError as error:
+        reason = why_not_imported(error, "rosbags", "ROS bags are read by", "ros")
+        raise FormatError(path, reason) from None
     _limit_chunks()
     return highlevel, typesys
 

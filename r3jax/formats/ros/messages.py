@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.formats.depth_files import DEPTH_MODES
 from r3jax.formats.lenses import Lens
-from r3jax.formats.posed_images import DEPTH_MODES, IMAGE_FORMATS
+from r3jax.formats.posed_images import IMAGE_FORMATS
 from r3jax.formats.ros.rvl import unpack_rvl
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size

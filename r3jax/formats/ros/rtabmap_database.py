@@ -24,11 +24,12 @@ from urllib.parse import quote
 
 import numpy as np
 
+from r3jax.formats.depth_files import DEPTH_MODES
 from r3jax.formats.depth_images import keep_confident
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.phones.shots import UP_Z
-from r3jax.formats.posed_images import DEPTH_MODES, IMAGE_FORMATS, Pixels, PosedImages
+from r3jax.formats.posed_images import IMAGE_FORMATS, Pixels, PosedImages
 from r3jax.formats.poses import mend_pose
 from r3jax.formats.ros.messages import clean_depth, rectified_lens
 from r3jax.formats.ros.rtabmap_export import COMMAND

@@ -24,6 +24,7 @@ from r3jax.formats.poses import read_numbers
 from r3jax.formats.quaternion_poses import quaternion_pose
 from r3jax.formats.ros.messages import rectified_lens
 from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import plain_text
 
 COMMAND = "rtabmap-export --images_id --poses_camera --poses_format 11 {}"
 """What a user runs on a database."""
@@ -76,7 +77,7 @@ def _shot(archive: Archive, source: Path, name: str, row: np.ndarray) -> Shot | 
     if not archive.has(image) or not archive.has(calibration):
         return None
     with naming(archive.where(calibration)):
-        text = archive.read(calibration).decode("utf-8", errors="replace")
+        text = plain_text(archive.read(calibration)).decode(errors="replace")
         lens = _lens(text, archive.size(image))
     return Shot(
         image=image,

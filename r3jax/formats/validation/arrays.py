@@ -1,9 +1,11 @@
-"""Arrays from an NPZ file: no pickles, and no member that unpacks to more than it may."""
+"""Arrays from NPZ and NPY files: no pickles, and none that unpacks to more than it may."""
 
+import io
 import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,25 +56,44 @@ def read_npz(path: str | Path, types: Mapping[str, str]) -> dict[str, np.ndarray
     return arrays
 
 
+def read_npy(data: bytes) -> np.ndarray:
+    """The array of an NPY file.
+
+    Raises:
+        ForeignFileError: not an NPY, cut off, or no plain numbers or texts.
+    """
+    try:
+        return _array(io.BytesIO(data), "the array", len(data))
+    except ForeignFileError:
+        raise
+    except Exception as error:  # a header that is no Python literal, ...
+        raise ForeignFileError(f"this is no NPY file ({error!s:.200})") from None
+
+
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One member; its header may not promise more than there is."""
+    """One member."""
     with archive.open(info) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in ((1, 0), (2, 0)):
-            raise ForeignFileError(f"{info.filename} has the unknown version {version}")
-        head = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
-        shape, is_fortran, dtype = head(file)
-        count = math.prod(shape)
-        if dtype.hasobject or min(shape, default=0) < 0:
-            raise ForeignFileError(f"{info.filename} holds no plain numbers or texts")
-        if count * dtype.itemsize != info.file_size - file.tell():
-            raise ForeignFileError(f"{info.filename} promises {count} numbers, others are there")
-        data = file.read(count * dtype.itemsize)
+        return _array(file, info.filename, info.file_size)
+
+
+def _array(file: Any, name: str, size: int) -> np.ndarray:
+    """An array of so many bytes with its header, which may not promise more than there is."""
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ForeignFileError(f"{name} has the unknown version {version}")
+    head = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, is_fortran, dtype = head(file)
+    count = math.prod(shape)
+    if dtype.hasobject or min(shape, default=0) < 0:
+        raise ForeignFileError(f"{name} holds no plain numbers or texts")
+    if count * dtype.itemsize != size - file.tell():
+        raise ForeignFileError(f"{name} promises {count} numbers, others are there")
+    data = file.read(count * dtype.itemsize)
     if len(data) != count * dtype.itemsize:
-        raise ForeignFileError(f"{info.filename} is cut off")
+        raise ForeignFileError(f"{name} is cut off")
     array = np.frombuffer(data, dtype).reshape(shape[::-1] if is_fortran else shape)
     return array.T if is_fortran else array

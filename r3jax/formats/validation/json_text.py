@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.formats.validation.files import plain_text
 
 _SEAL = "seal"
 
@@ -25,7 +26,7 @@ def parse_json(data: bytes | str) -> Any:
             bits, a key that occurs twice, nested too deeply.
     """
     try:
-        text = data if isinstance(data, str) else data.decode("utf-8")
+        text = data if isinstance(data, str) else plain_text(data).decode("utf-8")
         value = json.loads(
             text,
             object_pairs_hook=_without_doubles,

@@ -11,6 +11,7 @@ from r3jax.formats.validation.files import (
     check_database,
     check_regular,
     check_tree,
+    plain_text,
     read_bytes,
 )
 
@@ -24,6 +25,20 @@ def test_a_file_and_a_link_to_it(tmp_path):
         read_bytes(tmp_path / "a", 4)
     with pytest.raises(FileNotFoundError):
         check_regular(tmp_path / "c")
+
+
+def test_a_pointer_of_git_lfs_says_how_to_fetch_the_file(tmp_path):
+    text = "version https://git-lfs.github.com/spec/v1\noid sha256:" + "0" * 64 + "\nsize 12\n"
+    (tmp_path / "a").write_text(text)
+    with pytest.raises(ForeignFileError, match="git lfs pull"):
+        read_bytes(tmp_path / "a", 1000)
+    (tmp_path / "b").write_text(f"notes on {text}")
+    assert read_bytes(tmp_path / "b", 1000)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_marks_of_byte_order_are_no_text(encoding):
+    assert plain_text('{"ü": 1}'.encode(encoding)) == '{"ü": 1}'.encode()
 
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device", "zero"])
