@@ -136,7 +136,7 @@ def _no_process_that_compiles_ahead():
     """Two test processes use the cores; what one compiles the other finds on the disk."""
     with pytest.MonkeyPatch.context() as patch:
         for caller in (
-            "r3jax.cli.main", "r3jax.planning.planner", "r3jax.simulators.scenes.registry",
+            "r3jax.cli.command_line", "r3jax.planning.planner", "r3jax.simulators.scenes.registry",
         ):  # fmt: skip
             patch.setattr(importlib.import_module(caller), "compile_ahead", lambda: None)
         yield

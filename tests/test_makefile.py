@@ -16,7 +16,7 @@ def test_all_targets_compile_for_the_commands(tmp_path):
     words = ["make", "-s", "-f", "Makefile", "-f", "-", "-o", ".venv/.installed", *TARGETS]
     done = subprocess.run(words, input=SHOW, capture_output=True, text=True, cwd=ROOT, env=env)
     program = (
-        "import os; from r3jax.cli.main import _keep_compilations as keep; keep(); "
+        "import os; from r3jax.cli.command_line import _keep_compilations as keep; keep(); "
         "print(os.environ['JAX_COMPILATION_CACHE_DIR'])"
     )
     command = subprocess.run(

@@ -22,6 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from r3jax.cli.errors import printable
+from r3jax.interrupts import check_interrupt
 
 __all__ = [
     "BarColumn",
@@ -66,7 +67,8 @@ class _Status(Status):
     """A spinner; rich would read its line as markup."""
 
     def update(self, status: rich.console.RenderableType | None = None, **settings: Any) -> None:
-        """Replaces the line."""
+        """Replaces the line; a Ctrl-C that got lost is obeyed."""
+        check_interrupt()
         super().update(None if status is None else _as_it_is(status), **settings)
 
 

@@ -1,54 +1,12 @@
-"""Reads the command line and turns errors into messages and exit codes."""
+"""The entry of the command line: Ctrl-C first, then what a command needs."""
 
-import importlib
 import os
 import sys
 from collections.abc import Sequence
 
-import tyro
-
-import r3jax
 from r3jax.cli.errors import UserError, one_line, printable
-from r3jax.cli.options import (
-    AuditOptions,
-    BenchmarkOptions,
-    DemoOptions,
-    EvaluateOptions,
-    ExploreOptions,
-    ExportOptions,
-    ForecastOptions,
-    InfoOptions,
-    MergeOptions,
-    PoliciesOptions,
-    ReplayOptions,
-    TeamOptions,
-    TrainOptions,
-    ViewOptions,
-)
-from r3jax.cli.options.parsing import number_rules, options_of, parser_class
-from r3jax.native.ahead import cache_folder, compile_ahead
+from r3jax.interrupts import INTERRUPTED, caught_interrupts, is_interrupted, settle_interrupt
 
-_COMMANDS = {
-    "demo": DemoOptions,
-    "explore": ExploreOptions,
-    "team": TeamOptions,
-    "train": TrainOptions,
-    "evaluate": EvaluateOptions,
-    "benchmark": BenchmarkOptions,
-    "replay": ReplayOptions,
-    "merge": MergeOptions,
-    "export": ExportOptions,
-    "forecast": ForecastOptions,
-    "audit": AuditOptions,
-    "view": ViewOptions,
-    "policies": PoliciesOptions,
-    "info": InfoOptions,
-}
-
-_DECIDES = ("demo", "explore", "team", "benchmark")
-"""Commands that decide, and may train afterwards: they need the kernels."""
-
-INTERRUPTED = 130
 USER_ERROR = 2
 """Exit code where the user can mend it: an unknown name, a folder that exists, a broken file."""
 
@@ -60,65 +18,37 @@ def main(args: Sequence[str] | None = None) -> int:
     """Runs one command.
 
     Args:
-        args: the words after `r3jax`; None: those of this process.
+        args: the words after `r3jax`; None: those of this process, which ends with the command.
 
     Returns:
         The exit code: 0 done, 1 stopped by the disk, a cell failed or a replay differed, 2 wrong
         input, 130 interrupted, 141 nobody reads the output any more.
     """
-    try:
-        return _main(args)
-    except BrokenPipeError:
-        # Python would fail once more when it flushes at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return NO_READER
+    with caught_interrupts(stays=args is None):
+        try:
+            # Imported here: the imports of a command take a second, in which Ctrl-C works, too.
+            from r3jax.cli.command_line import run_command
+
+            code = run_command(sys.argv[1:] if args is None else args)
+            return INTERRUPTED if code == 0 and is_interrupted() else code
+        except BrokenPipeError:
+            # Python would fail once more when it flushes at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return NO_READER
+        except (KeyboardInterrupt, Exception) as error:
+            # A library may make another error of a KeyboardInterrupt that passes through it.
+            if isinstance(error, KeyboardInterrupt) or is_interrupted():
+                return _interrupted(error)
+            if not isinstance(error, UserError):
+                raise
+            print(f"r3jax: {printable(one_line(error))}", file=sys.stderr)
+            return USER_ERROR
 
 
-def _main(args: Sequence[str] | None) -> int:
-    words = list(sys.argv[1:] if args is None else args)
-    if words == ["--version"]:
-        print(f"r3jax {r3jax.__version__}")
-        return 0
-    # The list of commands says each in a sentence; a command's own --help begins with examples.
-    one = len(words) > 0 and words[0] in _COMMANDS
-    parsers = {name: parser_class(k, with_examples=one) for name, k in _COMMANDS.items()}
-    parsed = tyro.extras.subcommand_cli_from_dict(
-        parsers,
-        prog="r3jax",
-        description="Where to look next for 3D Gaussian splatting: explores a scene with an RGB-D "
-        "camera, chooses every view by closed-form renderability, and leaves a data set. "
-        "--version prints the version.",
-        args=words,
-        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-        registry=number_rules(),
-    )
-    (name,) = (name for name, parser in parsers.items() if isinstance(parsed, parser))
-    _keep_compilations()
-    try:
-        return _run(name, options_of(_COMMANDS[name], parsed))
-    except UserError as error:
-        print(f"r3jax: {printable(one_line(error))}", file=sys.stderr)
-        return USER_ERROR
-    except KeyboardInterrupt as error:  # what a command has not caught itself
-        how = printable(str(error)) or "what was recorded before is complete"
-        print(f"r3jax: interrupted; {how}", file=sys.stderr)
-        return INTERRUPTED
-
-
-def _run(name: str, options: object) -> int:
-    """Checks the options, and calls `run_NAME` of `r3jax.cli.commands.NAME` for the command NAME.
-
-    Imports what the command needs and nothing else, so that --help does not wait for JAX.
-    """
-    from r3jax.cli.checks import check_options  # not for --help, which needs no NumPy
-
-    check_options(options)
-    if name in _DECIDES:
-        compile_ahead()
-    return getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}")(options)
-
-
-def _keep_compilations() -> None:
-    """Lets the second start find what the first one compiled, unless JAX is told otherwise."""
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+def _interrupted(error: BaseException) -> int:
+    """Says how to go on, if the command knows it."""
+    settle_interrupt()
+    how = str(error) if isinstance(error, KeyboardInterrupt) else ""
+    how = printable(how) or "what was recorded before is complete"
+    print(f"r3jax: interrupted; {how}", file=sys.stderr)
+    return INTERRUPTED

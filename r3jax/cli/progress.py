@@ -1,4 +1,7 @@
-"""Tells the user what happens: a bar on a terminal, a few lines in a log."""
+"""Tells the user what happens: a bar on a terminal, a few lines in a log.
+
+All long loops come by here between their steps, which is where a Ctrl-C that got lost is obeyed.
+"""
 
 from collections.abc import Iterable, Iterator
 from types import TracebackType
@@ -14,6 +17,7 @@ from r3jax.cli.console import (
     progress_bar,
 )
 from r3jax.exploration.budget import Budget
+from r3jax.interrupts import check_interrupt
 from r3jax.trace.rows import StepRow
 
 if TYPE_CHECKING:  # training imports what an exploration does not need
@@ -67,6 +71,7 @@ class RunProgress:
 
     def on_stage(self, stage: str) -> None:
         """A stage begins."""
+        check_interrupt()
         what = _STAGES.get(stage, stage)
         if self._views < 2 and stage in ("plan", "map", "measure"):
             what += " (compiling on first use)"
@@ -124,6 +129,7 @@ class Stages:
 
     def on_progress(self, stage: str, steps: int) -> None:
         """A stage of so many steps begins (0: nobody knows), or some are done (no name)."""
+        check_interrupt()
         if not stage:
             task = self._bar.tasks[0]
             self.at(self._stage, int(task.completed) + steps, int(task.total or 0))
@@ -135,6 +141,7 @@ class Stages:
 
     def at(self, stage: str, done: int, total: int) -> None:
         """So many steps of a stage are done; it begins if it has not."""
+        check_interrupt()
         if stage != self._stage:
             self.on_progress(stage, total)
         count = f"{done}/{total}" if total else ""

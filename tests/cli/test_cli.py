@@ -10,7 +10,8 @@ import pytest
 import trimesh
 import tyro
 
-from r3jax.cli.main import _COMMANDS, main
+from r3jax.cli.command_line import COMMANDS
+from r3jax.cli.main import main
 from r3jax.cli.options.parsing import number_rules, options_of, parser_class
 from r3jax.exploration.budget import parse_budget
 from r3jax.simulators.raycast.raycast import RaycastSimulator
@@ -35,7 +36,7 @@ def run_folder(room, tmp_path_factory):
     return out / "box"
 
 
-@pytest.mark.parametrize("name", _COMMANDS)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_what_runs_it(name):
     assert callable(getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}"))
 
@@ -189,7 +190,7 @@ def test_the_demo_overwrites_its_own_folder_only(tmp_path):
     assert read_run(tmp_path / "other").header == make_header()
 
 
-@pytest.mark.parametrize("name", quick_and_full(_COMMANDS, ["explore", "audit"]))
+@pytest.mark.parametrize("name", quick_and_full(COMMANDS, ["explore", "audit"]))
 def test_help_begins_with_examples_that_parse_and_shows_no_default_of_none(name, capsys):
     with pytest.raises(SystemExit):
         main([name, "--help"])
@@ -197,12 +198,12 @@ def test_help_begins_with_examples_that_parse_and_shows_no_default_of_none(name,
     assert "None" not in said
     examples = [line.split() for line in said.splitlines() if line.startswith("    r3jax ")]
     assert examples
-    parser = parser_class(_COMMANDS[name], with_examples=True)
+    parser = parser_class(COMMANDS[name], with_examples=True)
     for program, command, *words in examples:
         assert (program, command) == ("r3jax", name)
         config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
         parsed = tyro.cli(parser, args=words, config=config, registry=number_rules())
-        assert isinstance(options_of(_COMMANDS[name], parsed), _COMMANDS[name])
+        assert isinstance(options_of(COMMANDS[name], parsed), COMMANDS[name])
 
 
 @pytest.mark.parametrize("words", [["--help"], ["explore", "--help"], ["info", "--help"]])

@@ -10,7 +10,6 @@ import time
 
 import pytest
 
-from r3jax.cli.commands.view import noted_interrupt
 from r3jax.cli.main import main
 from r3jax.trace.reader import read_run
 from tests.box_room import write_room
@@ -123,27 +122,13 @@ def test_a_page_is_shown_until_it_is_interrupted(path, capsys, monkeypatch):
     from r3jax.cli.commands import view
 
     monkeypatch.setattr(view.time, "sleep", lambda _: os.kill(os.getpid(), signal.SIGINT))
-    monkeypatch.setattr(view, "end_at_once", lambda: None)
-    assert main(["view", str(path), "--port", "0"]) == 0
+    codes = []
+    monkeypatch.setattr(view, "end_process", codes.append)
+    main(["view", str(path), "--port", "0"])
+    assert codes == [0]
     shown = capsys.readouterr()
     assert "view      http://127.0.0.1:" in shown.err
     assert shown.out == ""
-
-
-def test_ctrl_c_is_not_lost_in_a_finalizer():
-    """Python drops what is raised there, a KeyboardInterrupt, too."""
-
-    class Dying:
-        def __del__(self):
-            os.kill(os.getpid(), signal.SIGINT)
-            assert signal.getsignal(signal.SIGINT)  # handlers run before the next call returns
-
-    before = signal.getsignal(signal.SIGINT)
-    with noted_interrupt() as was_interrupted:
-        assert not was_interrupted()
-        Dying()
-        assert was_interrupted()
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.full

@@ -21,9 +21,9 @@ import pytest
 
 from r3jax.apps.models import judge
 from r3jax.apps.report import revisits
-from r3jax.cli import kernels
+from r3jax.cli import command_line, kernels
 from r3jax.cli.commands import audit, benchmark, explore, replay, train
-from r3jax.cli.main import _COMMANDS, main
+from r3jax.cli.main import main
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.backends.numba import bridge as mapping
@@ -76,7 +76,10 @@ COMMANDS = (
 )
 
 OPTIONS = {
-    name: [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(_COMMANDS[name])]
+    name: [
+        f"--{field.name.replace('_', '-')}"
+        for field in dataclasses.fields(command_line.COMMANDS[name])
+    ]
     for name in sorted({words[0] for words in COMMANDS})
 }
 """The options of each command."""

@@ -19,6 +19,7 @@ from r3jax.cli.options import AuditOptions
 from r3jax.cli.progress import Stages
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
+from r3jax.interrupts import settle_interrupt
 from r3jax.network import who_sees
 
 _SHOWN = 5
@@ -62,6 +63,7 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         progress.say("Ctrl-C ends the scan, and audits it")
         topics = parse_topics(options.topics)
         source = follow(options.capture, page, scratch, up=options.up, topics=topics)
+        settle_interrupt()  # it has ended the scan
         if source is None:
             raise UserError(f"{options.capture}: no frame came in")
         page.say("The scan has ended.", "its audit is being written")

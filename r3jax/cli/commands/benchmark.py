@@ -40,6 +40,7 @@ from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import BenchmarkOptions
 from r3jax.formats.submissions import Submission, read_submission
+from r3jax.interrupts import check_interrupt, settle_interrupt
 
 _SHOWN = 20
 """Problems of a submission that are printed."""
@@ -270,6 +271,7 @@ def _run(
         else:
             run_in_processes(cells, options.out, report, jobs=options.jobs)
     except KeyboardInterrupt:
+        settle_interrupt()
         return True
     return False
 
@@ -329,6 +331,7 @@ class BenchmarkProgress:
 
     def on_event(self, event: Event) -> None:
         """Something happened to a cell."""
+        check_interrupt()
         name = event.cell.name
         if event.kind == "started":
             self._tasks[name] = self._bar.add_task(name, total=None, facts=event.text)

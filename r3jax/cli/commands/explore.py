@@ -18,6 +18,7 @@ from r3jax.cli.options import ExploreOptions
 from r3jax.cli.progress import RunProgress, Stages
 from r3jax.exploration.loop import Result, explore
 from r3jax.exploration.state import StopReason, TakenView, in_words
+from r3jax.interrupts import settle_interrupt
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import PolicyError
 from r3jax.planning.robot.motion import motion_of
@@ -156,6 +157,7 @@ def warn_of_versions(console: Console, run: Run) -> None:
 
 def _conclude(console: Console, path: Path, result: Result) -> None:
     """Data set, report, and a few words; a full disk must not hide how the run ended."""
+    settle_interrupt()  # it has ended the run; what was recorded is written out
     console.say(f"{result.reason.value}: {result.message}")
     if result.reason in EXIT_CODES:
         console.say(f"go on     {resume_command('explore', path)}")

@@ -9,6 +9,7 @@ from r3jax.cli.options import InfoOptions
 from r3jax.files import write_atomic
 from r3jax.formats.errors import FormatError
 from r3jax.formats.recordings import is_recording, read_recording
+from r3jax.interrupts import check_interrupt
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import read_run
 
@@ -95,6 +96,7 @@ def _show_recording(console: Console, options: InfoOptions, path: Path) -> None:
     console.print("frame  renderability  new voxels  voxels  path [m]", style="bold")
     reports: list[FrameReport] = []
     for report, _ in follow_recording(recording, voxel_size=options.voxel_size):
+        check_interrupt()
         reports.append(report)
         bar = "█" * round(20 * report.renderability)
         console.print(

@@ -14,6 +14,7 @@ from r3jax.cli.errors import UserError, one_line, resumable, resume_command
 from r3jax.cli.from_options import run_settings, scene_settings
 from r3jax.cli.options import TeamOptions
 from r3jax.cli.progress import RunProgress, Stages
+from r3jax.interrupts import settle_interrupt
 from r3jax.planning.policy import PolicyError
 from r3jax.trace.errors import RunError
 
@@ -85,6 +86,7 @@ def _crew(options: TeamOptions, console: Console, stack: contextlib.ExitStack) -
 
 def _conclude(console: Console, folder: Path, result: TeamResult) -> None:
     """Data sets, reports, and a few words; a full disk must not hide how the team ended."""
+    settle_interrupt()  # it has ended the runs; what was recorded is written out
     for number, member in enumerate(result.members):
         console.say(f"{number}: {member.reason.value}: {member.message}")
     if any(member.reason in EXIT_CODES for member in result.members):

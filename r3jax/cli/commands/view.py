@@ -1,12 +1,7 @@
 """`r3jax view`: a run in the browser, or as images and a film without one."""
 
 import contextlib
-import os
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Generator
 from pathlib import Path
 
 from r3jax.apps.viewer.film import export_film, load_av
@@ -15,6 +10,7 @@ from r3jax.cli.errors import UserError, check_viser, one_line
 from r3jax.cli.options import ViewOptions
 from r3jax.cli.progress import Stages
 from r3jax.exploration.replay import config_of
+from r3jax.interrupts import deferred_interrupt, end_process
 from r3jax.network import who_sees
 from r3jax.trace.reader import Run, read_run
 
@@ -63,39 +59,13 @@ def _show(options: ViewOptions, run: Run, console: Console) -> None:
         )
         with console.status("opening the run ..."):
             shown = stack.enter_context(page)
-        with noted_interrupt() as was_interrupted:
+        with deferred_interrupt() as was_interrupted:
             console.say(f"view      {shown.url}")
             console.say("Ctrl-C ends it")  # from here on, and not only once this waits
             while not was_interrupted():
                 time.sleep(0.1)
-        end_at_once()
-
-
-@contextlib.contextmanager
-def noted_interrupt() -> Generator[Callable[[], bool]]:
-    """Notes Ctrl-C instead of raising it.
-
-    An exception would be lost where it happens to reach a finalizer or a callback of the garbage
-    collector, and a thread that waits without a time limit may miss the signal altogether: the
-    page would stay for ever.
-    """
-    asked = threading.Event()
-    before = signal.signal(signal.SIGINT, lambda *_: asked.set())
-    try:
-        yield asked.is_set
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def end_at_once() -> None:
-    """Ends the process: the page writes nothing, and what it works on may take half a minute yet.
-
-    An answer that is being worked out or compiled cannot be stopped, and Python would wait for it,
-    as viser does for its browsers.
-    """
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(0)
+        # The page writes nothing, and what it works on may take half a minute yet.
+        end_process(0)
 
 
 def _export(run: Run, out: Path, video: bool, console: Console) -> int:

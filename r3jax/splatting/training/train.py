@@ -1,11 +1,9 @@
 """Fits a scene of Gaussians to views: the loop on the host round the jitted step."""
 
 import dataclasses
-import signal
-import threading
 import time
-from collections.abc import Callable, Generator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r3jax.geometry.arguments import checked, one, or_none
+from r3jax.interrupts import deferred_interrupt
 from r3jax.splatting.config import fitting_budget
 from r3jax.splatting.errors import TrainingDiverged
 from r3jax.splatting.scene import GaussianScene, a_scene, empty_scene
@@ -248,7 +247,9 @@ class _Loop:
     def result(self) -> FitResult:
         """Trains to the end, or until Ctrl-C."""
         iterations = self.run.config.iterations
-        with _deferred_interrupt() as interrupted:
+        # A step donates its state's buffers: an exception between the call and the assignment
+        # would leave none.
+        with deferred_interrupt() as interrupted:
             while self.step < iterations and not interrupted():
                 self._advance(self._next_stop())
             self._save()
@@ -353,28 +354,3 @@ class _Loop:
             return np.array([getattr(info, name) for info in self.infos])
 
         return History(self.first_step, column("loss"), column("psnr"), column("num_gaussians"))
-
-
-@contextmanager
-def _deferred_interrupt() -> Generator[Callable[[], bool]]:
-    """Lets Ctrl-C wait until the loop looks, so that no step is torn; a second one does not wait.
-
-    A step gives its state's buffers away: an exception between the call and the assignment would
-    leave none. Handlers that others have installed stay.
-    """
-    asked = threading.Event()
-
-    def ask(signum: int, frame: object) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        asked.set()
-
-    is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield asked.is_set
-        return
-    signal.signal(signal.SIGINT, ask)
-    try:
-        yield asked.is_set
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,0 +1,94 @@
+"""Reads the command line, and runs the command that it names."""
+
+import importlib
+import os
+from collections.abc import Sequence
+
+import tyro
+
+import r3jax
+from r3jax.cli.options import (
+    AuditOptions,
+    BenchmarkOptions,
+    DemoOptions,
+    EvaluateOptions,
+    ExploreOptions,
+    ExportOptions,
+    ForecastOptions,
+    InfoOptions,
+    MergeOptions,
+    PoliciesOptions,
+    ReplayOptions,
+    TeamOptions,
+    TrainOptions,
+    ViewOptions,
+)
+from r3jax.cli.options.parsing import number_rules, options_of, parser_class
+from r3jax.native.ahead import cache_folder, compile_ahead
+
+COMMANDS = {
+    "demo": DemoOptions,
+    "explore": ExploreOptions,
+    "team": TeamOptions,
+    "train": TrainOptions,
+    "evaluate": EvaluateOptions,
+    "benchmark": BenchmarkOptions,
+    "replay": ReplayOptions,
+    "merge": MergeOptions,
+    "export": ExportOptions,
+    "forecast": ForecastOptions,
+    "audit": AuditOptions,
+    "view": ViewOptions,
+    "policies": PoliciesOptions,
+    "info": InfoOptions,
+}
+
+_DECIDES = ("demo", "explore", "team", "benchmark")
+"""Commands that decide, and may train afterwards: they need the kernels."""
+
+
+def run_command(args: Sequence[str]) -> int:
+    """Runs the command that the words after `r3jax` name, and returns its exit code.
+
+    Raises:
+        UserError: something that the user can mend.
+    """
+    words = list(args)
+    if words == ["--version"]:
+        print(f"r3jax {r3jax.__version__}")
+        return 0
+    # The list of commands says each in a sentence; a command's own --help begins with examples.
+    one = len(words) > 0 and words[0] in COMMANDS
+    parsers = {name: parser_class(k, with_examples=one) for name, k in COMMANDS.items()}
+    parsed = tyro.extras.subcommand_cli_from_dict(
+        parsers,
+        prog="r3jax",
+        description="Where to look next for 3D Gaussian splatting: explores a scene with an RGB-D "
+        "camera, chooses every view by closed-form renderability, and leaves a data set. "
+        "--version prints the version.",
+        args=words,
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+        registry=number_rules(),
+    )
+    (name,) = (name for name, parser in parsers.items() if isinstance(parsed, parser))
+    _keep_compilations()
+    return _run(name, options_of(COMMANDS[name], parsed))
+
+
+def _run(name: str, options: object) -> int:
+    """Checks the options, and calls `run_NAME` of `r3jax.cli.commands.NAME` for the command NAME.
+
+    Imports what the command needs and nothing else, so that --help does not wait for JAX.
+    """
+    from r3jax.cli.checks import check_options  # not for --help, which needs no NumPy
+
+    check_options(options)
+    if name in _DECIDES:
+        compile_ahead()
+    return getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}")(options)
+
+
+def _keep_compilations() -> None:
+    """Lets the second start find what the first one compiled, unless JAX is told otherwise."""
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
