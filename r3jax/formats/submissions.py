@@ -51,6 +51,13 @@ PROTOCOL = 1
 _MAX_BYTES = 64 << 20
 """A frame takes some hundred bytes."""
 
+MAX_FRAMES = 20_000
+"""Of a submission; the protocol's budgets end at 300 views, and at ten frames a second on the way
+this is half an hour."""
+
+MAX_WAYPOINTS = 100_000
+"""Of all paths of a submission."""
+
 _LENS = ("fx", "fy", "cx", "cy")
 
 _LARGEST = {"capacity": 1 << 22, "num_bins": 1024, "num_probes": 1024}
@@ -287,11 +294,14 @@ def parse_submission(data: bytes) -> Submission:
     Raises:
         ForeignFileError: as `read_submission` says.
     """
-    lines = data.removeprefix(codecs.BOM_UTF8).split(b"\n")
-    while lines and not lines[-1].strip():
-        lines.pop()
-    if not lines:
+    text = data.removeprefix(codecs.BOM_UTF8).rstrip()
+    if not text:
         raise ForeignFileError("the file is empty: its first line should say what it is")
+    if (num := text.count(b"\n")) > MAX_FRAMES:
+        raise ForeignFileError(
+            f"it has {num:,} frames, a submission may have {MAX_FRAMES:,}: submit a shorter run"
+        )
+    lines, waypoints = text.split(b"\n"), 0
     frames: list[SubmittedFrame] = []
     header: dict[str, Any] = {}
     for number, line in enumerate(lines, start=1):
@@ -301,6 +311,13 @@ def parse_submission(data: bytes) -> Submission:
                 header = _header_of(plain)
             else:
                 frames.append(_frame_of(plain, len(frames)))
+                path = frames[-1].path
+                waypoints += 0 if path is None else len(path)
+                if waypoints > MAX_WAYPOINTS:
+                    raise ForeignFileError(
+                        f"with it the paths have {waypoints:,} waypoints, {MAX_WAYPOINTS:,} are "
+                        "allowed: leave out those on straight lines"
+                    )
         except ForeignFileError as error:
             raise ForeignFileError(f"line {number}: {error}") from None
     if not frames:

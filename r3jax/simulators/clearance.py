@@ -9,6 +9,12 @@ from scipy.spatial import KDTree
 _NEIGHBORS = 12
 """Pieces looked at first; the rest only if they could be nearer."""
 
+_CHUNK = 2000
+"""Points that are measured at once."""
+
+_FEW = 32
+"""Points at once for each of which many pieces are measured."""
+
 
 class SurfaceDistance:
     """Answers how far points are from the nearest surface.
@@ -26,9 +32,22 @@ class SurfaceDistance:
         self._radius = float(np.linalg.norm(self._pieces - centers[:, None], axis=2).max())
         self._tree = KDTree(centers)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Distances [n] of `points` [n, 3] to the mesh [m]."""
+    def __call__(self, points: np.ndarray, limit: float = np.inf) -> np.ndarray:
+        """Distances [n] of `points` [n, 3] to the mesh [m]; `inf` where beyond the limit."""
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        found = np.full(len(points), np.inf)
+        near = np.arange(len(points))
+        if np.isfinite(limit):
+            # No piece reaches farther from its center than the radius.
+            near = np.flatnonzero(self._tree.query(points)[0] - self._radius <= limit)
+        for begin in range(0, len(near), _CHUNK):
+            chunk = near[begin : begin + _CHUNK]
+            found[chunk] = self._measure(points[chunk])
+        found[found > limit] = np.inf
+        return found
+
+    def _measure(self, points: np.ndarray) -> np.ndarray:
+        """Distances [n] of `points` [n, 3] [m]."""
         k = min(_NEIGHBORS, len(self._pieces))
         reach, nearest = self._tree.query(points, k=k)
         reach, nearest = reach.reshape(len(points), k), nearest.reshape(len(points), k)
@@ -38,11 +57,12 @@ class SurfaceDistance:
         # A piece that was not looked at is at least this far away.
         is_open = reach[:, -1] - self._radius < found
         if k < len(self._pieces):
-            for i in np.flatnonzero(is_open):
-                rest = self._tree.query_ball_point(points[i], found[i] + self._radius)
-                if rest:
-                    point = np.broadcast_to(points[i], (len(rest), 3))
-                    found[i] = min(found[i], point_triangle(point, self._pieces[rest]).min())
+            rest = np.flatnonzero(is_open)
+            for few in (rest[begin : begin + _FEW] for begin in range(0, len(rest), _FEW)):
+                near = self._tree.query_ball_point(points[few], found[few] + self._radius)
+                which = np.repeat(few, [len(pieces) for pieces in near])
+                pieces = self._pieces[np.concatenate([[], *near]).astype(int)]
+                np.minimum.at(found, which, point_triangle(points[which], pieces))
         return found
 
 

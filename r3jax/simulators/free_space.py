@@ -9,7 +9,6 @@ Shape symbols: I J K nodes along the axes; n points; V views.
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -131,25 +130,43 @@ class GroundTruth:
         simulator = self._simulator.with_camera(camera, max_range=None)
         return (simulator.render(pose) for pose in poses)
 
-    def room_along(self, waypoints: np.ndarray) -> tuple[float, np.ndarray]:
-        """Least distance to a surface along a path over waypoints [K, 3] [m], and its place [3].
+    def room_along(
+        self, paths: Sequence[np.ndarray], limit: float = math.inf
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Least distances to a surface along paths, and where it is that.
 
-        Sampled every 2 cm; 0 where a surface lies across the path. Glass that no depth sensor sees
-        (`Material.is_hole`) does not count: nobody who explores can know of it.
+        Sampled every 2 cm. Glass that no depth sensor sees (`Material.is_hole`) does not count:
+        nobody who explores can know of it.
+
+        Args:
+            paths: waypoints [K, 3] [m] of each, one at least.
+            limit: a larger distance is not measured, which saves most of the time [m].
+
+        Returns:
+            Distances [n] [m], 0 where a surface lies across the path and `inf` beyond the limit;
+            and the places [n, 3].
         """
         distance, rays = self._seen_surfaces
-        points = [waypoints[:1]]
-        for a, b in itertools.pairwise(waypoints):
-            length = float(np.linalg.norm(b - a))
-            ends = a[None].astype(np.float32), (b - a)[None].astype(np.float32)
-            if length > 0.0 and rays.cast(*ends).distance[0] <= 1.0:
-                return 0.0, 0.5 * (a + b)
-            num = max(1, math.ceil(length / _ALONG))
-            points.append(a + (b - a) * (np.arange(1, num + 1) / num)[:, None])
-        places = np.concatenate(points)
-        room = distance(places)
-        nearest = int(np.argmin(room))
-        return float(room[nearest]), places[nearest]
+        # Each waypoint with the one before; the first one twice, as it may be the only one.
+        begin = np.concatenate([np.concatenate([path[:1], path[:-1]]) for path in paths])
+        along = np.concatenate(paths) - begin
+        owner = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+        length = np.linalg.norm(along, axis=1)
+        pieces = np.maximum(1, np.ceil(length / _ALONG)).astype(int)
+        number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 1
+        places = np.repeat(begin, pieces, axis=0)
+        places += (number / np.repeat(pieces, pieces))[:, None] * np.repeat(along, pieces, axis=0)
+        room = distance(places, limit)
+        # The first of the nearest places of each path, or where a surface is crossed.
+        order = np.lexsort((room, np.repeat(owner, pieces)))
+        first = order[np.searchsorted(np.repeat(owner, pieces), np.arange(len(paths)))]
+        least, where = room[first], places[first]
+        moves = np.flatnonzero(length > 0.0)
+        ends = begin[moves].astype(np.float32), along[moves].astype(np.float32)
+        crossed = moves[rays.cast(*ends).distance <= 1.0][::-1]  # the first of a path comes last
+        least[owner[crossed]] = 0.0
+        where[owner[crossed]] = begin[crossed] + 0.5 * along[crossed]
+        return least, where
 
     @functools.cached_property
     def _seen_surfaces(self) -> tuple[SurfaceDistance, TriangleScene]:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from r3jax.apps.audit.source import source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
+from r3jax.formats.phones import archives
 from r3jax.formats.phones.arkit_scenes import read_arkit_scenes
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
 from r3jax.formats.phones.record3d import read_record3d
@@ -203,6 +205,18 @@ def test_an_archive_that_was_cut_off_says_so(tmp_path):
     path = tmp_path / "scan.zip"
     path.write_bytes(zipped(phones.polycam())[:-100])
     with pytest.raises(FormatError, match=r"scan\.zip: this is no whole zip archive .*again"):
+        open_capture(path)
+
+
+def test_an_archive_of_many_folders_is_refused_at_once(tmp_path, monkeypatch):
+    """Each was compared with each: 8,000 took 45 s."""
+    path = write_zip(tmp_path / "many.zip", {f"d{i}/a.txt": b"" for i in range(8000)})
+    begun = time.process_time()
+    with pytest.raises(FormatError, match=r"many\.zip"):
+        open_capture(path)
+    assert time.process_time() - begun < 5.0
+    monkeypatch.setattr(archives, "_MAX_MEMBERS", 7999)
+    with pytest.raises(FormatError, match="8,000 files"):
         open_capture(path)
 
 

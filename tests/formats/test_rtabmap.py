@@ -95,6 +95,10 @@ STATEMENTS = {
     "no depth": ("UPDATE Data SET depth = NULL", (), "of 4 images in it none has depth"),
     "graph": ("UPDATE Admin SET opt_ids = opt_poses", (), "the optimized poses are damaged"),
     "zlib": ("UPDATE Admin SET opt_ids = ?", (b"1234",), "the optimized poses are damaged"),
+    "view": ("ALTER TABLE Node RENAME TO Old; CREATE VIEW Node AS SELECT * FROM Old", (),
+             "its `Node` is a view"),
+    "computed": ("ALTER TABLE Data RENAME TO Old; CREATE TABLE Data (id, image, depth, "
+                 "calibration AS (zeroblob(900000000)))", (), "`calibration` of its `Data`"),
     "old": ("ALTER TABLE Data DROP COLUMN depth", (), "no such column.* rtabmap-export"),
 }  # fmt: skip
 
@@ -105,7 +109,8 @@ def test_a_database_that_lacks_something_says_so(tmp_path, damage):
     path = tmp_path / "map.db"
     path.write_bytes(rtabmap.database())
     connection = sqlite3.connect(path)
-    connection.execute(sql, values)
+    for statement in sql.split("; "):
+        connection.execute(statement, values)
     connection.commit()
     connection.close()
     with pytest.raises(FormatError, match=message) as found:

@@ -303,21 +303,39 @@ def office():
     ],
 )
 def test_a_path_through_a_surface_has_no_room(office, waypoints):
-    assert GroundTruth(office).room_along(np.array(waypoints))[0] == 0.0
+    assert GroundTruth(office).room_along([np.array(waypoints)])[0] == 0.0
 
 
 def test_a_path_through_glass_has_room(office):
     """A pane between two rooms of the office, from 1.45 m up: a depth sensor sees nothing there."""
     path = np.array([[1.45, 3.95, 2.25], [1.45, 3.45, 2.25]])
     assert not office.segment_is_clear(*path)
-    assert GroundTruth(office).room_along(path)[0] > 0.15
+    assert GroundTruth(office).room_along([path])[0] > 0.15
 
 
 def test_the_room_along_a_path_is_the_least_clearance(office):
     path = np.array([[0.65, 4.25, 2.45], [1.2, 4.25, 2.3], [1.2, 4.6, 2.3]])
-    room, place = GroundTruth(office).room_along(path)
+    truth = GroundTruth(office)
+    (room,), (place,) = truth.room_along([path])
     share = np.linspace(0.0, 1.0, 400)[:, None]
     points = np.concatenate([a + share * (b - a) for a, b in itertools.pairwise(path)])
     assert room == pytest.approx(office.clearance(points).min(), abs=0.01)
     assert office.clearance(place[None])[0] == pytest.approx(room, abs=1e-6)
-    assert GroundTruth(office).room_along(path[:1])[0] == office.clearance(path[:1])[0]
+    assert truth.room_along([path[:1]])[0] == office.clearance(path[:1])[0]
+
+
+def test_many_paths_are_measured_as_each_one(office):
+    """With waypoints that stand still, none at all, and a surface across some of them."""
+    rng = np.random.default_rng(0)
+    low, high = office.bounds
+    paths = [rng.uniform(low, high, (rng.integers(1, 5), 3)) for _ in range(40)]
+    paths.append(np.repeat(paths[0][:1], 3, axis=0))
+    truth = GroundTruth(office)
+    rooms, places = truth.room_along(paths)
+    assert 0 < (rooms == 0.0).sum() < len(paths)
+    for path, room, place in zip(paths, rooms, places, strict=True):
+        one, where = truth.room_along([path])
+        assert room == one[0]
+        np.testing.assert_array_equal(place, where[0])
+    limited, _ = truth.room_along(paths, 0.3)
+    np.testing.assert_array_equal(limited, np.where(rooms <= 0.3, rooms, np.inf))

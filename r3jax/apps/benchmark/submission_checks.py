@@ -29,6 +29,9 @@ CLEARANCE = 0.15
 between them and what is not known to be free; a surface may reach 0.05 m into a cell before a hit
 marks it. Glass that the depth sensor does not see is left out, as no policy can know of it."""
 
+_MAX_LENGTH = 20_000.0
+"""Of all paths together [m]; eleven hours of flight at the speed of the protocol."""
+
 _SAME_PLACE = 2e-3
 """Places this close are one [m]."""
 
@@ -136,14 +139,23 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
     heights = motion.heights_from(float(start[2, 3]))
     budget, camera = parse_budget(submission.budget), submission.intrinsics
     terms = _Terms(budget, submission.config, motion, heights, camera)
+    legs = list(_legs(submission))
+    steps = [step for leg in legs for step in leg]
+    length = sum(step.length for step in steps)
+    if not length <= _MAX_LENGTH:
+        told = f"its paths are {length:.3g} m long, more than {_MAX_LENGTH:g} m are not checked"
+        return [Problem(None, f"{told}: are the positions in meters? Submit a shorter run")]
+    # All paths at once: one by one, ten thousand frames would take a minute.
+    rooms = truth.room_along([step.path for step in steps], CLEARANCE)
+    room_of = {step.frame.frame: found for step, *found in zip(steps, *rooms, strict=True)}
     problems: list[Problem] = []
-    for leg in _legs(submission):
+    for leg in legs:
         of_leg = [*_on_the_way(leg, terms), *_looks_ahead(leg, terms)]
         for step in leg:
             texts = [
                 *_in_budget(step, terms),
                 *_within_limits(step, terms),
-                *_in_free_space(step, truth),
+                *_in_free_space(*room_of[step.frame.frame]),
                 *_is_mapped(step, terms),
                 *(_at_start(step, start, submission.seed) if step.frame.frame == 0 else ()),
                 *(_in_time(step, terms) if step.frame.frame > 0 else ()),
@@ -291,9 +303,8 @@ def _within_limits(step: _Step, terms: _Terms) -> Iterator[str]:
         )
 
 
-def _in_free_space(step: _Step, truth: GroundTruth) -> Iterator[str]:
+def _in_free_space(room: float, place: np.ndarray) -> Iterator[str]:
     """Nothing is nearer to the path than the clearance."""
-    room, place = truth.room_along(step.path)
     if room < CLEARANCE:
         what = "runs through a surface" if room == 0.0 else f"comes as near as {room:.3f} m to one"
         yield (

@@ -27,6 +27,9 @@ _MAX_IMAGE = 64 << 20
 _MAX_TEXT = 64 << 20
 """A pose takes some hundred bytes."""
 
+_MAX_MEMBERS = 200_000
+"""Files of an archive; ten times those of the longest recordings."""
+
 _CONFIDENCE_MODES = ("L", *DEPTH_MODES)
 
 _NOT_THE_USERS = "__MACOSX"
@@ -55,13 +58,6 @@ class Archive:
         if self.zipped is None:
             return self.where(name).is_file()
         return self.top + name in self.zipped.NameToInfo
-
-    def holds(self, name: str) -> bool:
-        """True if there is a file or a folder of this name."""
-        if self.zipped is None:
-            return self.where(name).exists()
-        start = f"{self.top}{name}/"
-        return self.has(name) or any(one.startswith(start) for one in self.zipped.NameToInfo)
 
     def names(self, folder: str, suffix: str) -> list[str]:
         """Names of the files in a folder that end like this, sorted, without their suffix."""
@@ -171,21 +167,29 @@ def find_archive(path: Path, *marks: str) -> Archive | None:
         FormatError: an archive that is damaged.
     """
     if path.is_dir():
+        zipped = None
         below = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-        tops = [f"{name}/" for name in below if (path / name / marks[0]).exists()]
-        candidates = [Archive(path, top) for top in ("", *tops)]
+        tops = {"", *(f"{name}/" for name in below)}
+        for mark in marks:
+            tops = {top for top in tops if (path / f"{top}{mark}").exists()}
     elif path.is_file() and path.suffix.lower() in SUFFIXES:
         zipped = open_zip(path)
-        names = [name for name in zipped.NameToInfo if "/" in name]
-        tops = sorted({f"{name.partition('/')[0]}/" for name in names})
-        candidates = [
-            Archive(path, top, zipped) for top in ("", *tops) if not top.startswith(_NOT_THE_USERS)
-        ]
+        tops = set[str].intersection(*(_tops(zipped, mark) for mark in marks))
     else:
         return None
-    found = [one for one in candidates if all(one.holds(mark) for mark in marks)]
-    is_one = len(found) == 1 or any(not one.top for one in found)
-    return found[0] if is_one else None  # of several, the user has to choose
+    if "" not in tops and len(tops) != 1:
+        return None  # of several, the user has to choose
+    return Archive(path, "" if "" in tops else tops.pop(), zipped)
+
+
+def _tops(zipped: zipfile.ZipFile, mark: str) -> set[str]:
+    """Where in an archive a file or a folder of this name is: at its top, or in a folder there."""
+    found: set[str] = set()
+    for name in zipped.NameToInfo:
+        first, slash, rest = name.partition("/")
+        below = {"": name, first + slash: rest} if slash else {"": name}
+        found |= {top for top, it in below.items() if it == mark or it.startswith(f"{mark}/")}
+    return {top for top in found if not top.startswith(_NOT_THE_USERS)}
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
@@ -197,11 +201,17 @@ def open_zip(path: Path) -> zipfile.ZipFile:
     with naming(path):
         check_regular(path)
         try:
-            return zipfile.ZipFile(path)
+            zipped = zipfile.ZipFile(path)
         except Exception as error:  # cut off, no archive, seeks before the beginning, ...
             raise ForeignFileError(
                 f"this is no whole zip archive ({error!s:.200}): copy or export it again"
             ) from None
+        if len(zipped.NameToInfo) > _MAX_MEMBERS:
+            raise ForeignFileError(
+                f"the archive holds {len(zipped.NameToInfo):,} files, more than {_MAX_MEMBERS:,}: "
+                "unpack it and give its folder"
+            )
+        return zipped
 
 
 def is_there(path: Path, *marks: str) -> bool:

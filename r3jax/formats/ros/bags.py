@@ -15,13 +15,17 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.ros.unpack import unpack_chunk
-from r3jax.formats.validation.files import check_database, check_regular
+from r3jax.formats.validation.database import check_database
+from r3jax.formats.validation.files import check_regular
 from r3jax.formats.validation.packages import why_not_imported
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Files of ROS 1, and of ROS 2's two storages."""
 
 _METADATA = "metadata.yaml"
+
+_TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
+"""Of a .db3."""
 
 
 class Stamped(NamedTuple):
@@ -92,7 +96,7 @@ class Bag:
         with self._reading("opened"):
             for file in files:
                 if file.suffix.lower() == ".db3":
-                    check_database(file)
+                    check_database(file, _TABLES)
             # Bags of ROS 2 before Iron do not say what their messages look like.
             default = typesys.get_typestore(typesys.Stores.LATEST)
             self._reader: Any = highlevel.AnyReader([_BagPath(path)], default_typestore=default)

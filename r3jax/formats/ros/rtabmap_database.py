@@ -16,11 +16,10 @@
 import sqlite3
 import struct
 import zlib
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import numpy as np
 
@@ -34,8 +33,8 @@ from r3jax.formats.poses import mend_pose
 from r3jax.formats.ros.messages import clean_depth, rectified_lens
 from r3jax.formats.ros.rtabmap_export import COMMAND
 from r3jax.formats.ros.rvl import unpack_rvl
+from r3jax.formats.validation.database import check_database, query_database
 from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import check_database
 from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size
 
 _HEADER = 11
@@ -79,8 +78,8 @@ def read_rtabmap_database(path: Path | str) -> PosedImages:
             no node with an image, depth, a camera and a pose.
     """
     path = Path(path)
-    with naming(path):
-        check_database(path)
+    with _reading(path):
+        check_database(path, ("Node", "Data", "Admin"))
     rows = _query(path, _NODES)
     columns = {row[1] for row in _query(path, "PRAGMA table_info(Data)")}
     has_confidence = "depth_confidence" in columns
@@ -121,22 +120,27 @@ class _Node(NamedTuple):
     """`T_map_camera`, [4, 4]."""
 
 
-def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
-    """All rows of a query; the database is only read, whoever else has it open.
+@contextmanager
+def _reading(path: Path) -> Generator[None]:
+    """Names the database in what goes wrong in SQLite.
 
     Raises:
         FormatError: missing, no database, damaged, or without such tables.
     """
     with naming(path):
         try:
-            name = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
-            with closing(sqlite3.connect(name, uri=True)) as connection:
-                return connection.execute(sql, values).fetchall()
+            yield
         except (sqlite3.Error, UnicodeError, OverflowError) as error:
             raise ForeignFileError(
                 f"this database cannot be read ({error!s:.200}): was RTAB-Map closed when it was "
                 f"copied? Or export it: {COMMAND.format(path)}"
             ) from None
+
+
+def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
+    """All rows of a query; raises FormatError as `_reading`."""
+    with _reading(path):
+        return query_database(path, sql, values)
 
 
 def _optimized(path: Path) -> dict[int, np.ndarray] | None:

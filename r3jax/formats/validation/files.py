@@ -3,7 +3,6 @@
 import codecs
 import os
 import stat
-import struct
 from pathlib import Path
 
 from r3jax.formats.validation.errors import ForeignFileError
@@ -72,29 +71,6 @@ def plain_text(data: bytes) -> bytes:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace").encode()
     return data.removeprefix(codecs.BOM_UTF8)
-
-
-def check_database(path: str | Path) -> None:
-    """Refuses an SQLite database that is shorter than it says.
-
-    SQLite itself may read what is missing as zeros, or not notice (its file format, 1.3: pages in
-    the header, to be trusted where the version that wrote them is that of the last change).
-
-    Raises:
-        ForeignFileError: not a regular file, or cut off.
-        OSError: missing, or not permitted.
-    """
-    size = check_regular(path)
-    with open(path, "rb") as file:
-        header = file.read(100)
-    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
-        return  # SQLite says what is wrong
-    (page,) = struct.unpack_from(">H", header, 16)
-    changes, pages = struct.unpack_from(">II", header, 24)
-    (valid_for,) = struct.unpack_from(">I", header, 92)
-    whole = pages * (1 << 16 if page == 1 else page)  # 65,536 does not fit into two bytes
-    if valid_for == changes and size < whole:
-        raise ForeignFileError(f"the database is cut off: {size:,} of {whole:,} bytes are there")
 
 
 def check_tree(folder: Path) -> None:

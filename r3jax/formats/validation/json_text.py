@@ -14,6 +14,9 @@ from r3jax.formats.validation.files import plain_text
 
 _SEAL = "seal"
 
+_MAX_PARTS = 4_000_000
+"""Values of one text: a list takes 60 bytes of memory, and three of the file."""
+
 _LARGEST_WHOLE = 1 << 63
 """Whole numbers beyond this fit in no array and no float."""
 
@@ -23,10 +26,14 @@ def parse_json(data: bytes | str) -> Any:
 
     Raises:
         ForeignFileError: not UTF-8, not JSON, numbers that are not finite or have more than 63
-            bits, a key that occurs twice, nested too deeply.
+            bits, a key that occurs twice, nested too deeply, more values than fit into memory.
     """
     try:
         text = data if isinstance(data, str) else plain_text(data).decode("utf-8")
+        if sum(text.count(sign) for sign in "[{,") > _MAX_PARTS:
+            raise ForeignFileError(
+                f"the JSON holds more than {_MAX_PARTS:,} values: it is something else"
+            )
         value = json.loads(
             text,
             object_pairs_hook=_without_doubles,

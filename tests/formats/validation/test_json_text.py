@@ -49,3 +49,10 @@ def test_what_is_refused(data, reason):
 
 def test_both_halves_of_a_character_are_one():
     assert parse_json(b'"\\ud83d\\ude00"') == "\N{GRINNING FACE}"
+
+
+@pytest.mark.parametrize("part", ["[]", "{}", "1.5"])
+def test_more_values_than_fit_into_memory_are_refused_unread(part):
+    text = "[" + ",".join([part] * 4_100_000) + "]"
+    with pytest.raises(ForeignFileError, match="more than 4,000,000 values"):
+        parse_json(text)
