@@ -204,7 +204,7 @@ def stray_scanner(intrinsics: bool = True, center: bool = False) -> dict[str, by
         files[f"depth/{i:06d}.png"] = encoded(depth_steps(room_pose, smaller(lens)))
         files[f"confidence/{i:06d}.png"] = encoded(levels(2, smaller(lens)))
     files["odometry.csv"] = ("\n".join(rows) + "\n").encode()
-    files["camera_matrix.csv"] = f"{fx},0.0,{cx}\n0.0,{fy},{cy}\n0.0,0.0,1.0\n".encode()
+    files["camera_matrix.csv"] = f"{fx}, 0.0, {cx}\n0.0, {fy}, {cy}\n0.0, 0.0, 1.0".encode()
     return files | {"rgb.mp4": video(images), "imu.csv": b"timestamp, a_x\n"}
 
 

@@ -148,7 +148,8 @@ def _camera_matrix(archive: Archive) -> np.ndarray:
     text = plain_text(archive.read("camera_matrix.csv")).decode(errors="replace")
     with naming(source):
         try:
-            K = np.array([[float(word) for word in line.split(",")] for line in text.split()])
+            lines = filter(str.strip, text.splitlines())  # the app writes blanks after commas
+            K = np.array([[float(word) for word in line.split(",")] for line in lines])
         except ValueError as error:
             raise ForeignFileError(f"this is no matrix ({error!s:.200})") from None
         if K.shape != (3, 3):
