@@ -56,6 +56,8 @@ def mend_pose(path: Path, which: str, pose: np.ndarray) -> np.ndarray:
 def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The words of every line that has any, and its number from 1; comments start with #.
 
+    A heading that lost its # ("timestamp filename") is no line either.
+
     Raises:
         FormatError: missing, not a regular file, or far too large.
     """
@@ -63,7 +65,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
         data = plain_text(read_bytes(path, _MAX_TEXT))
     for number, raw in enumerate(io.BytesIO(data), start=1):
         words = raw.decode("utf-8", errors="replace").partition("#")[0].split()
-        if words:
+        if words and words[0].lower() != "timestamp":
             yield number, words
 
 

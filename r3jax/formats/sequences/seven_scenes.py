@@ -3,6 +3,7 @@
     frame-000000.color.png    8-bit RGB, 640x480; or .jpg, .JPEG, ..., as some hand it on
     frame-000000.depth.png    uint16, millimeters; 0 and 65535 are no measurement
     frame-000000.pose.txt     a 4x4 camera-to-world matrix, OpenCV axes
+    camera-intrinsics.txt     3x3 intrinsics, here or one folder above, as 3DMatch adds them
 
 The data set names one camera for both images: focal length 585 px, principal point (320, 240).
 Its depth images are not registered to the color images, which are off by some pixels.
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.formats.errors import FormatError
+from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import DepthUnit, PosedImages
 from r3jax.formats.poses import mend_pose, read_numbers
@@ -54,11 +55,26 @@ def read_seven_scenes(path: Path | str) -> PosedImages:
     return PosedImages(
         path=path,
         image_paths=tuple(found[base] for base in bases),
-        lenses=(_LENS,) * len(bases),
+        lenses=(_lens(path),) * len(bases),
         poses=np.stack([_pose(path / f"{base}.pose.txt") for base in bases]),
         depth_paths=tuple(path / f"{base}.depth.png" for base in bases),
         depth_unit=_UNIT,
     )
+
+
+def _lens(path: Path) -> Lens:
+    """The data set's own camera, unless a file of intrinsics names another one."""
+    folders = (path, path.resolve().parent)
+    found = (folder / "camera-intrinsics.txt" for folder in folders)
+    source = next((file for file in found if file.exists()), None)
+    if source is None:
+        return _LENS
+    K = read_numbers(source, columns=3)
+    if K.shape != (3, 3):
+        raise FormatError(source, f"expected a 3x3 matrix, got {len(K)} lines")
+    with naming(source):
+        params = tuple(float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        return Lens("PINHOLE", _LENS.width, _LENS.height, params)
 
 
 def _pose(source: Path) -> np.ndarray:
