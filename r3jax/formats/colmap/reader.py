@@ -85,11 +85,24 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
 
 
 def _parts(path: Path, folder: Path) -> list[Path]:
-    """COLMAP numbers its models, one for every part of a capture that it could not join."""
+    """COLMAP numbers its models, one for every part of a capture that it could not join.
+
+    A part without its images is left out where another one is whole: some keep only a piece of it.
+    """
     if not folder.name.isdecimal() or folder.resolve() == path.resolve():
         return [folder]
+    parts = _numbered(folder)
+    return [part for part in parts if _has_images(part)] or parts
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """The model and those of other numbers beside it."""
     found = [part for part in folder.parent.iterdir() if part.name.isdecimal()]
     return sorted((p for p in found if find_model(p) == p), key=lambda p: int(p.name))
+
+
+def _has_images(folder: Path) -> bool:
+    return any((folder / f"images{suffix}").exists() for suffix in (".bin", ".txt"))
 
 
 def _left_out(
@@ -109,6 +122,10 @@ def _left_out(
             f"{folder.name} is used, with {number} pictures; the other "
             f"{'has' if len(others) == 1 else 'ones have'} {', '.join(others)}"
         )
+    broken = [part.name for part in _numbered(folder) if not _has_images(part)]
+    if broken:
+        names = ", ".join(f"{folder.parent.name}/{name}" for name in broken)
+        said.append(f"{names} without images.bin is left out")
     return "; ".join(said) + "." if said else None
 
 
