@@ -209,12 +209,12 @@ def _applied_scale(content: _Fields) -> float:
     return float(scale)
 
 
-def _matrix(name: str, rows: Any) -> np.ndarray:
-    """A 4x4 matrix; its last row may be left out."""
+def _matrix(name: str, rows: Any, size: int = 4) -> np.ndarray:
+    """A square matrix; its last row may be left out."""
     check_type(name, rows, list[list[float]])
-    if [len(row) for row in rows] not in ([4] * 3, [4] * 4):
-        raise ForeignFileError(f"`{name}` must be a 3x4 or a 4x4 matrix")
-    matrix = np.eye(4)
+    if [len(row) for row in rows] not in ([size] * (size - 1), [size] * size):
+        raise ForeignFileError(f"`{name}` must be a {size - 1}x{size} or a {size}x{size} matrix")
+    matrix = np.eye(size)
     matrix[: len(rows)] = rows
     return matrix
 
@@ -264,6 +264,9 @@ def _value(fields: _Fields, name: str, otherwise: float | None = None) -> float:
 
 
 def _lens_of(fields: _Fields, width: int, height: int) -> Lens:
+    if "K" in fields and "fl_x" not in fields:
+        K = _matrix("K", fields["K"], size=3)
+        fields = {**fields, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     fx, fy = _focal_lengths(fields, width, height)
     values = (fx, fy, _value(fields, "cx", 0.5 * width), _value(fields, "cy", 0.5 * height))
     name = fields.get("camera_model", "OPENCV")
