@@ -1,6 +1,7 @@
 """Guesses what a folder is that no reader understands, and the command that would convert it."""
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,10 @@ _MODELS = (".ply", ".glb", ".obj", ".usdz", ".las", ".laz", ".e57")
 
 _NO_COLORS = ("depth", "mask", "confidence", "conf", "normal", "semantic")
 """How folders of images begin that no structure from motion could use."""
+
+_EXR_DEPTH = re.compile(r"depth/\d+\.exr$")
+_POSES = re.compile(r"(pose|traj|extrinsic)[^/]*\.(txt|csv|json|npy)$", re.IGNORECASE)
+"""Files by their names."""
 
 _MARKS = ("keyframes/", "rgbd/", "odometry.csv", "lowres_wide.traj")
 """Beginnings of names by which phones' captures are known."""
@@ -91,7 +96,7 @@ def _bags(path: Path, names: list[str]) -> str | None:
 
 
 def _exr(path: Path, names: list[str]) -> str | None:
-    if not any(name.endswith(".exr") or name.startswith("EXR_RGBD/") for name in names):
+    if not any(name.startswith("EXR_RGBD/") or _EXR_DEPTH.match(name) for name in names):
         return None
     return (
         "this looks like Record3D's export EXR + JPG without metadata.json beside rgb/ and depth/: "
@@ -123,7 +128,7 @@ def _stray(path: Path, names: list[str]) -> str | None:
 
 
 def _frames(path: Path, names: list[str]) -> str | None:
-    if not {"color", "depth"} <= set(names):
+    if not {"color", "depth"} <= set(names) or any(map(_POSES.match, names)):
         return None
     return (
         "this looks like an export of ScanNet without pose/ and intrinsic/: export them too "
@@ -163,6 +168,13 @@ def _video(path: Path, names: list[str]) -> str | None:
 def _images(path: Path, names: list[str]) -> str | None:
     if not _count(names, _IMAGES):
         return None
+    poses = next((name for name in names if _POSES.search(name)), None)
+    if poses is not None:
+        return (
+            f"these look like images with poses ({poses}) in a layout that is not known: write "
+            "them into a transforms.json, or lay them out as a recording (images/, depth/, "
+            "poses.txt, K.txt)"
+        )
     found = [name for name in names if name.lower().endswith(_IMAGES)]
     colors = [name for name in found if not name.lower().startswith(_NO_COLORS)]
     folder = (path / (colors or found)[0]).parent

@@ -84,6 +84,13 @@ def read_rtabmap_database(path: Path | str) -> PosedImages:
     columns = {row[1] for row in _query(path, "PRAGMA table_info(Data)")}
     has_confidence = "depth_confidence" in columns
     (total,) = _query(path, "SELECT count(*) FROM Data WHERE length(image) > 0")[0]
+    if not total:
+        (nodes,) = _query(path, "SELECT count(*) FROM Node")[0]
+        raise FormatError(
+            path,
+            f"the map has {nodes} nodes and no image: RTAB-Map keeps images only with "
+            "Mem/BinDataKept true, so map again with it, or audit the bag that it was made from",
+        )
     with naming(path):
         optimized = _optimized(path)
         nodes = [node for row in rows if (node := _node(path, row, optimized)) is not None]
