@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import tyro
 
 import r3jax
+from r3jax.cli.errors import UserError
 from r3jax.cli.options import (
     AuditOptions,
     BenchmarkOptions,
@@ -24,6 +25,7 @@ from r3jax.cli.options import (
     ViewOptions,
 )
 from r3jax.cli.options.parsing import number_rules, options_of, parser_class
+from r3jax.formats.validation.choices import did_you_mean
 from r3jax.native.ahead import cache_folder, compile_ahead
 
 COMMANDS = {
@@ -57,6 +59,9 @@ def run_command(args: Sequence[str]) -> int:
     if words == ["--version"]:
         print(f"r3jax {r3jax.__version__}")
         return 0
+    if words and not words[0].startswith("-") and words[0] not in COMMANDS:
+        hint = did_you_mean(words[0], COMMANDS)
+        raise UserError(f"there is no command {words[0]!r}{hint}; `r3jax --help` lists them")
     # The list of commands says each in a sentence; a command's own --help begins with examples.
     one = len(words) > 0 and words[0] in COMMANDS
     parsers = {name: parser_class(k, with_examples=one) for name, k in COMMANDS.items()}

@@ -24,6 +24,9 @@ _MAX_JSON = 256 << 20
 
 _EXTENSION = "KHR_texture_transform"
 
+_PACKED = {"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_mesh_quantization"}
+"""Extensions without which the numbers of a mesh cannot be read; trimesh passes over the last."""
+
 _NUMBER_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 """Bytes of a number by glTF's `componentType`."""
 
@@ -148,6 +151,17 @@ def _whole(tree: dict[str, Any], name: str, default: int | None = None) -> int:
     if value < 0:
         raise ForeignFileError(f"`{name}` is {value}")
     return value
+
+
+def _check_extensions(tree: dict[str, Any]) -> None:
+    """Refuses meshes that are packed, or whose numbers mean something else, by an extension."""
+    required = _part(tree, "extensionsRequired", list[str], [])
+    found = sorted(_PACKED & set(required))
+    if found:
+        raise ForeignFileError(
+            f"its meshes are stored by {', '.join(found)}, which is not read: export it without "
+            "compression and quantization (gltfpack: without -c, with -noq)"
+        )
 
 
 def num_lines(tree: dict[str, Any]) -> int:
@@ -292,6 +306,7 @@ class MeshFile:
 
         if path.suffix.lower() in GLTF_SUFFIXES:
             tree = read_tree(path)
+            _check_extensions(tree)
             check_claims(path, tree)
             self.texture_moves = texture_transforms(tree)
             self.num_lines = num_lines(tree)

@@ -22,6 +22,9 @@ _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _PLAIN = Material(color=(0.7, 0.7, 0.7))
 """What a surface without any color looks like."""
 
+_HEADER_BYTES = 1 << 14
+"""A PLY's header has some hundred bytes."""
+
 _MAX_EXTENT = 1e5
 """Worlds larger than this are not in meters [m]."""
 
@@ -63,6 +66,7 @@ def load_world(path: str | Path, up: str | None = None, scale: float | int = 1.0
     turn = scaled_turn(path, up, scale)
     if not path.is_file():
         raise ValueError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
+    _refuse_splat(path)
     try:
         file = MeshFile(path)
         nodes = [_part_of(file, T, name) for T, name in file.placed]
@@ -79,6 +83,29 @@ def load_world(path: str | Path, up: str | None = None, scale: float | int = 1.0
     if file.num_lines:
         world.notes["lines"] = str(file.num_lines)
     return world
+
+
+def assumptions(world: World) -> list[str]:
+    """Says what a mesh file does not: which unit it was read in, and that it has no colors.
+
+    Args:
+        world: of `load_world`, or any other.
+
+    Returns:
+        A sentence each; none of a world that is no mesh file.
+    """
+    if not world.name.startswith("mesh:"):
+        return []
+    size = " x ".join(f"{side:.3g}" for side in world.bounds[1] - world.bounds[0])
+    found = [f"the mesh is taken as {size} m large, z up: if it is not, give --scale or --up"]
+    is_even = world.face_color is None or not np.ptp(world.face_color, axis=(0, 1)).any()
+    looks = {material.color for material in world.materials if material.texture is None}
+    if is_even and len(looks) == 1 and all(m.texture is None for m in world.materials):
+        found.append(
+            "the mesh has no colors but a single one, so that pictures show neither texture nor "
+            "edges: export it with vertex colors or textures"
+        )
+    return found
 
 
 def world_from_file(path: Path, up: str | None = None) -> np.ndarray:
@@ -106,6 +133,19 @@ def scaled_turn(path: Path, up: str | None, scale: Any) -> np.ndarray:
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0.0 < scale < math.inf:
         raise ValueError(f"scale must be a number > 0, the meters in a unit, got {scale!r}")
     return scale * world_from_file(path, up)
+
+
+def _refuse_splat(path: Path) -> None:
+    """Refuses a PLY of Gaussians, which trimesh takes for a cloud of points."""
+    if path.suffix.lower() != ".ply":
+        return
+    with open(path, "rb") as file:
+        header = file.read(_HEADER_BYTES).partition(b"end_header")[0]
+    if b" f_dc_0" in header or b" packed_position" in header:
+        raise ValueError(
+            f"{path} is a Gaussian splat and no mesh: it has no surfaces to look at; give the mesh "
+            "of the place, or export one (2D Gaussian splatting and SuGaR write meshes)"
+        )
 
 
 def _refuse_empty(path: Path, scene: Any) -> None:

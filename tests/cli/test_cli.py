@@ -78,6 +78,20 @@ def test_info_tells_what_a_run_did(run_folder, capsys):
     assert "report.html" in text.replace("\n", "")
 
 
+@pytest.mark.parametrize("words", [["audti", "x"], ["audti", "--help"], ["audti"]])
+def test_a_command_that_does_not_exist_gets_the_one_that_was_meant(words, capsys):
+    assert main(words) == 2
+    told = capsys.readouterr()
+    assert "'audti' (did you mean audit?)" in told.err
+    assert not told.out
+
+
+@pytest.mark.parametrize(("name", "kind"), [("my_scan.zip", "file"), ("my_scan", "folder")])
+def test_a_capture_that_is_not_there_is_called_what_it_would_be(tmp_path, name, kind, capsys):
+    assert main(["audit", str(tmp_path / name)]) == 2
+    assert f"{name}: there is no such {kind}" in capsys.readouterr().err
+
+
 def test_info_lists_what_there_is(capsys):
     assert main(["info"]) == 0
     text = capsys.readouterr().out

@@ -16,6 +16,9 @@ from tests.formats.sequences import encoded
 COLOR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
 OPTICAL, DEPTH_OPTICAL = "camera_color_optical_frame", "camera_depth_optical_frame"
 
+SERVICE = "/add_two_ints/_service_event"
+_SERVICE_TYPE = "int64 a\nint64 b\n---\nint64 sum\n"
+
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 
@@ -52,6 +55,9 @@ class Robot:
     """False: depth has a camera and a frame of its own."""
 
     info: bool = True
+    service: bool = False
+    """True: and a topic of a recorded service, whose type no parser of messages reads."""
+
     depth_delay: float = 0.008
     leave_out: tuple[str, ...] = ()
     """Topics."""
@@ -185,7 +191,9 @@ def messages(robot: Robot) -> Iterator[Sent]:
             fields = packed(encoded(rgb, "jpeg"), "rgb8; jpeg compressed bgr8", OPTICAL, time)
             yield Sent(f"{COLOR}/compressed", "sensor_msgs/msg/CompressedImage", time + 5, fields)
         else:
-            stored = rgb[..., ::-1] if robot.color == "bgr8" else rgb
+            stored = rgb[..., ::-1] if robot.color in ("bgr8", "8UC3") else rgb
+            stored = rgb[..., 1] if robot.color == "mono8" else stored
+            stored = rgb.astype(np.uint16) * 257 if robot.color == "rgb16" else stored
             fields = image(stored, robot.color, OPTICAL, time)
             yield Sent(COLOR, "sensor_msgs/msg/Image", time + 5, fields)
         seen_from = room_poses()[i] @ (np.eye(4) if robot.registered else T_COLOR_DEPTH)
@@ -267,6 +275,15 @@ def write_bag(path: Path, robot: Robot = Robot(), kind: str = "mcap") -> Path:
     serialize = store.serialize_ros1 if is_1 else store.serialize_cdr
     connections: dict[str, Any] = {}
     with writer:
+        if robot.service:
+            digest = {"md5sum": "0" * 32} if is_1 else {"rihs01": "RIHS01_" + "0" * 64}
+            event = writer.add_connection(
+                SERVICE,
+                "interfaces/msg/Event" if is_1 else "interfaces/srv/AddTwoInts_Event",
+                msgdef=_SERVICE_TYPE,
+                **digest,
+            )
+            writer.write(event, START, b"\0\1\0\0" + bytes(40))
         for sent in messages(robot):
             if sent.topic in robot.leave_out:
                 continue

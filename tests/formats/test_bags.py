@@ -23,6 +23,7 @@ from tests.formats.bags import (
     DEPTH,
     DEPTH_OPTICAL,
     OPTICAL,
+    SERVICE,
     T_COLOR_DEPTH,
     Robot,
     camera_info,
@@ -71,6 +72,8 @@ def test_a_bag_shows_the_room(tmp_path, kind):
         Robot(depth="compressedDepth rvl 16UC1"),
         Robot(pose="odometry"),
         Robot(pose="pose"),
+        Robot(color="8UC3"),
+        Robot(color="rgb16"),
     ],
     ids=lambda robot: f"{robot.color} {robot.depth} {robot.pose}",
 )
@@ -79,6 +82,60 @@ def test_other_messages_show_the_same(tmp_path, robot):
     assert len(images) == NUM
     assert_shows_the_room(images, Z_UP_FROM_ROOM, JPEG if robot.color == "jpeg" else LOSSLESS)
     assert (images.depth(0)[:FACTOR, :FACTOR] == 0).all()
+
+
+@pytest.mark.parametrize("kind", ["mcap", "db3", "bag"])
+def test_topics_whose_type_cannot_be_parsed_are_left_out_and_named(tmp_path, kind):
+    path = write_bag(path_of(tmp_path, kind), Robot(service=True), kind)
+    images = read_bag(path)
+    assert len(images) == NUM
+    assert_shows_the_room(images, Z_UP_FROM_ROOM, LOSSLESS)
+    assert f"cannot be parsed: {SERVICE}." in images.remark
+
+
+def test_channels_of_other_languages_in_an_mcap_are_left_out(tmp_path):
+    path = next(write_bag(tmp_path / "drive", Robot(service=True)).glob("*.mcap"))
+    data = path.read_bytes()
+    name = b"AddTwoInts_Event" + (7).to_bytes(4, "little") + b"ros2msg"
+    assert name in data
+    path.write_bytes(data.replace(name, name.replace(b"ros2msg", b"jsonsch")))
+    images = read_bag(path)
+    assert len(images) == NUM
+    assert SERVICE in images.remark
+
+
+def test_gray_is_color_where_nothing_else_is(tmp_path):
+    images = read_bag(write_bag(tmp_path / "drive", Robot(color="mono8")))
+    rgb, gray = images.rgb(0), view(room_poses()[0], LENS)[0][..., 1]
+    np.testing.assert_array_equal(rgb, np.repeat(gray[..., None], 3, axis=-1))
+
+
+@pytest.mark.parametrize("is_bigendian", [0, 1])
+def test_a_mosaic_of_16_bits_shows_what_one_of_8_does(is_bigendian):
+    raw = np.random.default_rng(0).integers(0, 256, (6, 8)).astype(np.uint8)
+    wide = (raw.astype(np.uint16) << 8).astype(">u2" if is_bigendian else "<u2")
+    sent = lambda pixels, encoding: SimpleNamespace(
+        encoding=encoding, height=6, width=8, step=pixels.strides[0], is_bigendian=is_bigendian,
+        data=pixels.tobytes(),
+    )  # fmt: skip
+    expected = rgb_of(sent(raw, "bayer_rggb8"))
+    np.testing.assert_array_equal(rgb_of(sent(wide, "bayer_rggb16")), expected)
+
+
+def test_a_camera_info_that_was_never_filled_in_says_so():
+    info = SimpleNamespace(k=np.zeros(9), d=np.zeros(5), width=8, height=6, distortion_model="")
+    with pytest.raises(ForeignFileError, match=r"never filled in.*--topics info="):
+        lens_of(info)
+
+
+def test_a_package_that_fails_by_itself_is_not_called_missing(tmp_path, monkeypatch):
+    path = write_bag(tmp_path / "drive")
+    for name in [name for name in sys.modules if name.startswith("rosbags")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "lz4", None)
+    monkeypatch.setitem(sys.modules, "lz4.frame", None)
+    with pytest.raises(FormatError, match=r"rosbags.*installed but cannot be imported.*lz4"):
+        open_capture(path)
 
 
 def test_poses_of_a_topic_are_of_the_frame_that_is_named(tmp_path):
@@ -135,18 +192,18 @@ def without(*topics, **fields):
 
 DAMAGED = {
     "no depth": (without(DEPTH), "there are no depth images .*only /camera.*record them, too"),
-    "no color": (without(COLOR), "there are no color images .rgb8, bgr8 or JPEG."),
+    "no color": (without(COLOR), "there are no color images .rgb8, bgr8, mono8 or JPEG."),
     "no info": (Robot(info=False), f"no camera_info that belongs to {COLOR}: record it"),
     "no tf": (
         without("/tf"),
-        "nothing says where camera_color_optical_frame.* was: record /tf and",
+        "camera_color_optical_frame.* was, tf only has .*camera_link in base_link: record /tf",
     ),
     "no static": (
         without("/tf_static", pose="odometry"),
         f"/odom says where base_link is, .*--topics pose=/odom,frame={OPTICAL}",
     ),
     "clocks": (Robot(depth_delay=0.1), r"of 4 images .* within 0\.02 s \(0 have one\) and a pose"),
-    "encoding": (Robot(color="mono8"), "there are no color images"),
+    "encoding": (Robot(color="nv21"), "there are no color images"),
 }
 
 

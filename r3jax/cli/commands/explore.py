@@ -22,6 +22,7 @@ from r3jax.interrupts import settle_interrupt
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import PolicyError
 from r3jax.planning.robot.motion import motion_of
+from r3jax.simulators.meshes import assumptions
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run, read_run
 
@@ -142,7 +143,12 @@ def _expedition(options: ExploreOptions, console: Console) -> Expedition:
     name = options.name or default_name(options, options.scene, settings.policy.name)
     with console.status(f"opening {options.scene} ..."):
         path = options.out / name
-        return begin_run(settings, scene_settings(options), path, overwrite=options.overwrite)
+        begun = begin_run(settings, scene_settings(options), path, overwrite=options.overwrite)
+    # Behind a sensor's noise is the simulator that has a world.
+    world = getattr(getattr(begun.simulator, "simulator", begun.simulator), "world", None)
+    for sentence in [] if world is None else assumptions(world):
+        console.say(sentence)
+    return begun
 
 
 def warn_of_versions(console: Console, run: Run) -> None:

@@ -87,10 +87,16 @@ def find_chain(
     if not tree.is_timed(chain):
         raise FormatError(
             bag.path,
-            f"nothing says where {camera}, the frame of the images, was: record /tf and "
-            "/tf_static, or odometry (--topics pose=TOPIC)",
+            f"nothing says where {camera}, the frame of the images, was{_known(tree)}: record /tf "
+            "and /tf_static, or odometry (--topics pose=TOPIC)",
         )
     return chain
+
+
+def _known(tree: TransformTree) -> str:
+    """A part of a sentence on the transforms that there are."""
+    known = [f"{child} in {edge.parent}" for child, edge in sorted(tree.edges.items())]
+    return f", tf only has {', '.join(known[:4])[:200]}" if known else ""
 
 
 def _pose_of(message: Any) -> tuple[Any, Any]:

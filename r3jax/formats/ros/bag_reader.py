@@ -30,6 +30,7 @@ from r3jax.formats.ros.topics import (
     check_topics,
     find_images,
     find_info,
+    not_parsed,
 )
 from r3jax.formats.ros.transforms import TransformTree
 from r3jax.formats.sequences.tum import nearest
@@ -176,7 +177,8 @@ class BagReading:
             depth_lenses=None if camera.own is None else (camera.own,) * len(color),
             up=UP_Z if chain[-1] in _WORLDS else None,
             remark=f"Color is {color.topic}, depth {depth.topic}, poses are those of {chain[0]} in "
-            f"{chain[-1]} by {source}.{camera.remark}{lost}",
+            f"{chain[-1]} by {source}{not_parsed(bag)}."
+            f"{camera.remark}{lost}",
         )
 
     def _choose_pose(self, frame: str) -> None:

@@ -27,6 +27,12 @@ _METADATA = "metadata.yaml"
 _TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
 """Of a .db3."""
 
+_LANGUAGES = {"MSG": "ros2msg", "IDL": "ros2idl", "NONE": ""}
+"""Of rosbags' formats of definitions."""
+
+_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")
+"""Encodings of schemas in an MCAP that rosbags reads."""
+
 
 class Stamped(NamedTuple):
     """A message as it lies in a bag."""
@@ -45,6 +51,9 @@ class AnyBag(Protocol):
     path: Path
     types: dict[str, str]
     """Type of the messages of every topic that has some, such as sensor_msgs/msg/Image."""
+
+    left_out: list[str]
+    """Topics whose type cannot be parsed."""
 
     def topics(self, *types: str) -> list[str]:
         """Names of the topics of these types, sorted."""
@@ -87,25 +96,34 @@ class Bag:
         Raises:
             FormatError: rosbags is not installed; no bag, one that is damaged, or not finished.
         """
-        highlevel, typesys = _load_rosbags(path)
+        rosbag1, rosbag2, _ = _load_rosbags(path)
         self.path = path
         files = [path] if path.is_file() else list(path.iterdir())
         for file in files:
             with naming(file):
                 check_regular(file)
+        is_ros1 = path.suffix.lower() == ".bag"
         with self._reading("opened"):
             for file in files:
                 if file.suffix.lower() == ".db3":
                     check_database(file, _TABLES)
-            # Bags of ROS 2 before Iron do not say what their messages look like.
-            default = typesys.get_typestore(typesys.Stores.LATEST)
-            self._reader: Any = highlevel.AnyReader([_BagPath(path)], default_typestore=default)
+            self._reader: Any = (rosbag1 if is_ros1 else rosbag2).Reader(_BagPath(path))
             self._reader.open()
             weakref.finalize(self, self._reader.close)
-        self.types: dict[str, str] = {
-            one.topic: one.msgtype for one in self._reader.connections if one.msgcount
-        }
+        self._messages = MessageTypes(path, is_ros1=is_ros1)
+        self.types: dict[str, str] = {}
         """Type of the messages of every topic that has some, such as sensor_msgs/msg/Image."""
+
+        self.left_out: list[str] = []
+        """Topics whose type cannot be parsed, such as those of a recorded service, sorted."""
+
+        for one in sorted(self._reader.connections, key=lambda one: one.topic):
+            if one.msgcount and self._messages.register(
+                one.msgtype, one.msgdef.data, _LANGUAGES[one.msgdef.format.name]
+            ):
+                self.types[one.topic] = one.msgtype
+            elif one.msgcount and one.topic not in self.left_out:
+                self.left_out.append(one.topic)
 
     def topics(self, *types: str) -> list[str]:
         """Names of the topics of these types, sorted."""
@@ -124,13 +142,13 @@ class Bag:
         Raises:
             FormatError: the bag is damaged there.
         """
-        wanted = [one for one in self._reader.connections if one.topic in topics]
+        wanted = [one for one in self._reader.connections if one.topic in topics and one.msgcount]
         if not wanted:
             return
         with self._reading("read"):
             found = self._reader.messages(wanted, start, stop)
             for connection, time, data in found:
-                message = self._reader.deserialize(data, connection.msgtype)
+                message = self._messages.read(data, connection.msgtype)
                 yield Stamped(connection.topic, time, message)
 
     def first(self, topic: str) -> Any:
@@ -177,27 +195,33 @@ class MessageTypes:
             path: for what is wrong.
             is_ros1: messages are stored as ROS 1 does it.
         """
-        _, self._typesys = _load_rosbags(path)
+        *_, self._typesys = _load_rosbags(path)
         self._store: Any = self._typesys.get_typestore(self._typesys.Stores.EMPTY)
         self._known: set[str] = set()
         self._is_ros1 = is_ros1
 
-    def read(self, data: bytes, kind: str, definition: str, language: str) -> Any:
-        """Makes a message of its data; raises what rosbags does.
+    def register(self, kind: str, definition: str, language: str) -> bool:
+        """Takes note of a type, once; False where it cannot be parsed.
 
         Args:
-            data: as it is stored.
-            kind: its type, such as sensor_msgs/msg/Image.
-            definition: what messages of this type look like; empty: as in the latest ROS 2.
+            kind: the type, such as sensor_msgs/msg/Image.
+            definition: what its messages look like; empty: as in the latest ROS 2.
             language: ros2msg, or one of the kinds of IDL.
         """
         if kind not in self._known:
-            self._register(kind, definition, language)
+            try:
+                self._register(kind, definition, language)
+            except Exception:  # of a definition, its grammar, or the code that is made of it
+                return False
+        return kind in self._store.fielddefs
+
+    def read(self, data: bytes, kind: str) -> Any:
+        """Makes a message of its data, of a type that is registered; raises what rosbags does."""
         read = self._store.deserialize_ros1 if self._is_ros1 else self._store.deserialize_cdr
         return read(data, kind)
 
     def _register(self, kind: str, definition: str, language: str) -> None:
-        if not definition:
+        if not definition:  # bags of ROS 2 before Iron have none
             latest = self._typesys.get_typestore(self._typesys.Stores.LATEST)
             new = dict(latest.fielddefs)
         elif language == "ros2msg":
@@ -230,14 +254,27 @@ def is_bag(path: Path) -> bool:
     return find_bag(path) is not None
 
 
-def _load_rosbags(path: Path) -> tuple[ModuleType, ModuleType]:
+def _load_rosbags(path: Path) -> tuple[ModuleType, ModuleType, ModuleType]:
     try:
-        from rosbags import highlevel, typesys
+        from rosbags import rosbag1, rosbag2, typesys
     except ImportError as error:
         reason = why_not_imported(error, "rosbags", "ROS bags are read by", "ros")
         raise FormatError(path, reason) from None
     _limit_chunks()
-    return highlevel, typesys
+    _pass_over_schemas()
+    return rosbag1, rosbag2, typesys
+
+
+def _pass_over_schemas() -> None:
+    """Makes rosbags open an MCAP that holds channels of another language beside those of ROS."""
+    from rosbags.rosbag2 import storage_mcap
+
+    with suppress(AttributeError):  # another version: it keeps its own
+        read = storage_mcap.get_msgdef
+        if read.__module__ == storage_mcap.__name__:
+            storage_mcap.get_msgdef = lambda schema: read(
+                schema if schema is None or schema.encoding in _SCHEMAS else None
+            )
 
 
 def _limit_chunks() -> None:

@@ -25,17 +25,24 @@ _CHANNELS = {
     "rgb8": (3, (0, 1, 2)),
     "bgr8": (3, (2, 1, 0)),
     "8UC3": (3, (2, 1, 0)),  # OpenCV's order
+    "8UC4": (4, (2, 1, 0)),
     "rgba8": (4, (0, 1, 2)),
     "bgra8": (4, (2, 1, 0)),
+    "rgb16": (3, (0, 1, 2)),
+    "bgr16": (3, (2, 1, 0)),
+    "rgba16": (4, (0, 1, 2)),
+    "bgra16": (4, (2, 1, 0)),
+    "16UC3": (3, (2, 1, 0)),
 }
 """Channels of a color image, and where red, green and blue are among them."""
 
-_BAYER = {
+_BAYER_8 = {
     "bayer_rggb8": (0, 1, 1, 2),
     "bayer_bggr8": (2, 1, 1, 0),
     "bayer_gbrg8": (1, 2, 0, 1),
     "bayer_grbg8": (1, 0, 2, 1),
 }
+_BAYER = _BAYER_8 | {name[:-1] + "16": order for name, order in _BAYER_8.items()}
 """Channels of a block of 2 x 2 pixels, row by row."""
 
 _YUV = {"uyvy": 1, "yuv422": 1, "yuyv": 0, "yuv422_yuy2": 0}
@@ -94,6 +101,11 @@ def is_color(message: Any) -> bool:
     return not stored.startswith(("mono", *_GRAY))
 
 
+def is_gray(message: Any) -> bool:
+    """True if an image holds 8 bits of gray."""
+    return not is_depth(message) and encoding_of(message).startswith(_GRAY)
+
+
 def rgb_of(message: Any) -> np.ndarray:
     """Colors of an image, [H, W, 3] uint8.
 
@@ -113,15 +125,23 @@ def rgb_of(message: Any) -> np.ndarray:
     if encoding in _GRAY:
         return np.repeat(_rows(message, np.dtype("u1"), 1)[..., None], 3, axis=-1)
     if encoding in _BAYER:
-        return _from_bayer(_rows(message, np.dtype("u1"), 1), _BAYER[encoding])
+        return _from_bayer(_levels(message, encoding, 1), _BAYER[encoding])
     if encoding in _YUV:
         return _from_yuv(_rows(message, np.dtype("u1"), 2), _YUV[encoding])
     if encoding not in _CHANNELS:
         known = ", ".join((*_CHANNELS, *_BAYER, *_YUV, *_GRAY))
         raise ForeignFileError(f"images of the encoding {encoding[:40]!r} are not read: {known}")
     channels, order = _CHANNELS[encoding]
-    pixels = _rows(message, np.dtype("u1"), channels)
+    pixels = _levels(message, encoding, channels)
     return pixels.reshape(message.height, message.width, channels)[..., order]
+
+
+def _levels(message: Any, encoding: str, channels: int) -> np.ndarray:
+    """Rows of 8 bits a value, [height, width * channels] uint8; of 16 bits the upper half."""
+    if "16" not in encoding:
+        return _rows(message, np.dtype("u1"), channels)
+    order = ">" if message.is_bigendian else "<"
+    return (_rows(message, np.dtype(f"{order}u2"), channels) >> 8).astype(np.uint8)
 
 
 def _from_bayer(raw: np.ndarray, channels: tuple[int, ...]) -> np.ndarray:
@@ -256,6 +276,11 @@ def rectified_lens(matrix: np.ndarray, size: tuple[int, int]) -> Lens:
         size: width and height [px].
     """
     K = matrix.reshape(3, -1)
+    if not K[:2].any():
+        raise ForeignFileError(
+            "the camera_info was never filled in, its matrix is zero: calibrate the camera "
+            "(camera_calibration), or name another topic by --topics info=TOPIC"
+        )
     values = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
     return Lens("PINHOLE", *size, tuple(float(value) for value in values))
 

@@ -15,6 +15,7 @@ from r3jax.formats.ros.messages import (
     frame_of,
     is_color,
     is_depth,
+    is_gray,
 )
 from r3jax.formats.ros.names import Topics
 
@@ -65,6 +66,8 @@ def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
         if name is not None and name not in by_name:
             raise FormatError(bag.path, f"{name} holds no images but {bag.types[name]}")
     colors = [one for one in images if is_color(one.first)]
+    if not colors:  # a gray camera, or infrared
+        colors = [one for one in images if is_gray(one.first) and "depth" not in one.name]
     depths = [one for one in images if is_depth(one.first)]
     if topics.color is not None:
         colors = [by_name[topics.color]]
@@ -72,7 +75,11 @@ def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
         depths = [by_name[topics.depth]]
     for kind, found in (("color", colors), ("depth", depths)):
         if not found:
-            what = "rgb8, bgr8 or JPEG" if kind == "color" else "16UC1, 32FC1 or compressedDepth"
+            what = (
+                "rgb8, bgr8, mono8 or JPEG"
+                if kind == "color"
+                else "16UC1, 32FC1 or compressedDepth"
+            )
             raise FormatError(
                 bag.path,
                 f"there are no {kind} images ({what}) in it, only {_listed(bag)}: record them, too",
@@ -128,4 +135,12 @@ def _listed(bag: AnyBag) -> str:
     """Some topics and their types."""
     shown = [f"{name} ({kind.rpartition('/')[2]})" for name, kind in sorted(bag.types.items())]
     more = f" and {len(shown) - 12} more" if shown[12:] else ""
-    return (", ".join(shown[:12])[:1000] or "nothing") + more
+    return (", ".join(shown[:12])[:1000] or "nothing") + more + not_parsed(bag)
+
+
+def not_parsed(bag: AnyBag) -> str:
+    """A part of a sentence on the topics that are left out."""
+    if not bag.left_out:
+        return ""
+    more = f" and {len(bag.left_out) - 4} more" if bag.left_out[4:] else ""
+    return f"; left out, as their type cannot be parsed: {', '.join(bag.left_out[:4])}{more}"

@@ -25,6 +25,7 @@ from r3jax.formats.ros.growing.rosbag1 import Rosbag1Follower
 from r3jax.formats.ros.messages import CAMERA_INFO, COMPRESSED, IMAGE
 from r3jax.formats.ros.names import Topics
 from r3jax.formats.ros.topics import POSES, TF
+from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import angle_between
 
 _ACTIVE = ".bag.active"
@@ -56,6 +57,7 @@ class GrowingBag:
         """
         self.path = path
         self.types: dict[str, str] = {}
+        self.left_out: list[str] = []
         self._files: dict[Path, Follower] = {}
         self._notes: list[tuple[Path, Note]] = []
         self._by_topic: dict[str, list[int]] = {}
@@ -125,7 +127,10 @@ class GrowingBag:
                     "without --compression-mode message",
                 )
             channel = note.channel
-            message = self._messages.read(data, channel.kind, channel.definition, channel.language)
+            kind = channel.kind
+            if not self._messages.register(kind, channel.definition, channel.language):
+                raise ForeignFileError(f"the type {kind} of {channel.topic} cannot be parsed")
+            message = self._messages.read(data, kind)
             return Stamped(channel.topic, note.time, message)
 
 
