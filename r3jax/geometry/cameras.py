@@ -235,13 +235,20 @@ def rigid_error(T: np.ndarray) -> str | None:
     R = T[:3, :3].astype(np.float64)
     deviation = float(np.abs(R @ R.T - np.eye(3)).max())
     if deviation > RIGID_TOLERANCE:
+        scale = float(np.sqrt(np.trace(R @ R.T) / 3.0))
+        is_scaled = np.abs(R @ R.T - scale**2 * np.eye(3)).max() <= RIGID_TOLERANCE * scale**2
+        why = f"it is scaled by {scale:.4g}: divide the rotation, not the position, by that"
         return (
             f"the pose is not rigid: its rotation deviates from orthonormal by {deviation:.3g} "
-            "(is a scale mixed in, or is it transposed?)"
+            f"({why if is_scaled and scale > 0.0 else 'is a shear mixed in, or is it transposed?'})"
         )
     # Checked after orthonormality: only then is a negative determinant a mirror.
     if np.linalg.det(R) < 0:
-        return "the pose mirrors (its rotation has determinant -1): check the axes convention"
+        return (
+            "the pose mirrors (its rotation has determinant -1): reverse one axis, or exchange two; "
+            "a camera's axes are x right, y down, z ahead (OpenCV) or x right, y up, z back "
+            "(OpenGL), and worlds are right-handed (Unity's is not)"
+        )
     if np.abs(T[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > _LAST_ROW_TOLERANCE:
         return f"the pose's last row must be 0 0 0 1, got {T[3].tolist()}"
     return None

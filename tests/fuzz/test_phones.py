@@ -60,6 +60,7 @@ POLYCAM = of_folder(phones.polycam, read_polycam)
 POLYCAM_ZIP = of_archive(phones.polycam, read_polycam, "scan.zip")
 RECORD3D = of_folder(phones.record3d, read_record3d)
 RECORD3D_ARCHIVE = of_archive(phones.record3d, read_record3d, "scan.r3d")
+RECORD3D_EXPORT = of_folder(phones.record3d_export, read_record3d)
 STRAY_SCANNER = of_folder(phones.stray_scanner, read_stray_scanner)
 ARKIT_SCENES = of_folder(phones.arkit_scenes, read_arkit_scenes)
 SCANNET = of_folder(phones.scannet, read_scannet)
@@ -69,6 +70,7 @@ NAMES = (
     "POLYCAM_ZIP",
     "RECORD3D",
     "RECORD3D_ARCHIVE",
+    "RECORD3D_EXPORT",
     "STRAY_SCANNER",
     "ARKIT_SCENES",
     "SCANNET",

@@ -25,6 +25,7 @@ from r3jax.apps.viewer.overlays import frustum_segments, path_segments
 from r3jax.apps.viewer.stills import Sheet, Squares, compose, draw, lines, overview
 from r3jax.apps.viewer.story import Timeline
 from r3jax.formats.errors import FormatError
+from r3jax.formats.validation.packages import why_not_imported
 from r3jax.trace.reader import Run
 
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "mpeg4")
@@ -78,9 +79,9 @@ def load_av() -> ModuleType:
     """
     try:
         import av
-    except ImportError:
+    except ImportError as error:
         raise ImportError(
-            "films are written by PyAV, which is not installed: pip install 'r3jax[viewer]'"
+            why_not_imported(error, "av", "films are written by PyAV,", "viewer")
         ) from None
     return av
 
