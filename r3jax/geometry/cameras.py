@@ -245,8 +245,8 @@ def rigid_error(T: np.ndarray) -> str | None:
     # Checked after orthonormality: only then is a negative determinant a mirror.
     if np.linalg.det(R) < 0:
         return (
-            "the pose mirrors (its rotation has determinant -1): reverse one axis, or exchange two; "
-            "a camera's axes are x right, y down, z ahead (OpenCV) or x right, y up, z back "
+            "the pose mirrors (its rotation has determinant -1): reverse one axis, or exchange "
+            "two; a camera's axes are x right, y down, z ahead (OpenCV) or x right, y up, z back "
             "(OpenGL), and worlds are right-handed (Unity's is not)"
         )
     if np.abs(T[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > _LAST_ROW_TOLERANCE:
