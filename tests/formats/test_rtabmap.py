@@ -93,7 +93,7 @@ STATEMENTS = {
         "UPDATE Data SET calibration = ?", (rtabmap.calibration()[:80],), "node 5 is cut off",
     ),
     "no depth": ("UPDATE Data SET depth = NULL", (), "of 4 images in it none has depth"),
-    "empty": ("DELETE FROM Data", (), "holds no images: .*Mem/BinDataKept"),
+    "empty": ("DELETE FROM Data", (), "4 nodes and no image: .*Mem/BinDataKept"),
     "graph": ("UPDATE Admin SET opt_ids = opt_poses", (), "the optimized poses are damaged"),
     "zlib": ("UPDATE Admin SET opt_ids = ?", (b"1234",), "the optimized poses are damaged"),
     "view": ("ALTER TABLE Node RENAME TO Old; CREATE VIEW Node AS SELECT * FROM Old", (),

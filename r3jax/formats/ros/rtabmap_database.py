@@ -95,9 +95,6 @@ def read_rtabmap_database(path: Path | str) -> PosedImages:
         optimized = _optimized(path)
         nodes = [node for row in rows if (node := _node(path, row, optimized)) is not None]
     if not nodes:
-        if not total:
-            told = "the database holds no images: its recording was empty, or kept no raw data"
-            raise FormatError(path, f"{told} (in RTAB-Map: Mem/BinDataKept true)")
         raise FormatError(
             path,
             f"of {total} images in it none has depth, a camera and a pose: export what there is by "
