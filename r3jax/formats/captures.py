@@ -1,5 +1,6 @@
 """What can be trained on, judged or audited: runs, recordings, posed images, opened in one way."""
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,6 +58,9 @@ _KNOWN = (
     "RTAB-Map (.db, or *_camera_poses.txt)"
 )
 
+_COMMON_NAME = re.compile(r"\d+|sparse|dense|colmap|undistorted|raw|seq-?\d+", re.IGNORECASE)
+"""Names of folders that say nothing of the capture in them."""
+
 _MOST_BELOW = 100
 """Folders that are looked into, where the one given is no capture."""
 
@@ -75,11 +79,18 @@ class Capture:
 
     @property
     def name(self) -> str:
-        """The folder's name, or that of an archive without its suffix."""
+        """The folder's name, or that of an archive without its suffix.
+
+        Of a folder with a common name it starts with those above: `scan-sparse-0`.
+        """
         path = self.path.resolve()
-        if not path.is_file():
-            return path.name
-        return path.parent.name if path.suffix == ".json" else path.stem
+        if path.is_file():
+            path = path.parent if path.suffix == ".json" else path.with_suffix("")
+        names = [path.name]
+        while _COMMON_NAME.fullmatch(path.name) and path.parent.name:
+            path = path.parent
+            names.insert(0, path.name)
+        return "-".join(names)
 
     def __len__(self) -> int:
         return len(self.source.rows if isinstance(self.source, Run) else self.source)

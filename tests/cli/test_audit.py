@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -227,3 +228,31 @@ def test_what_came_in_while_scanning_is_audited_in_the_end(captures, tmp_path, c
     told = refused(capsys, "/no/such/topic", "--live", "--port", 0)
     assert "-r color:=/no/such/topic" in told
     assert "no frame came in" in refused(capsys, captures / "recording", "--live", "--port", 0)
+
+
+def test_captures_whose_folders_have_common_names_are_told_apart(captures):
+    poses = round_poses(3)
+    for path, name in (
+        (write_colmap(captures / "kitchen", poses) / "sparse" / "0", "kitchen-sparse-0"),
+        (write_nerfstudio(captures / "chess" / "seq-01", poses, depth=True), "chess-seq-01"),
+    ):
+        assert open_capture(path).name == name
+
+
+def test_the_audit_of_another_capture_is_not_replaced(captures, audited, tmp_path, capsys):
+    said = refused(capsys, captures / "nerfstudio", "--out", audited)
+    assert str(captures / "recording") in said
+    assert "--out" in said
+    assert audit(captures / "recording", audited, "--voxel-size", "0.15") == 0
+
+
+def test_the_command_that_comes_next_keeps_the_options(captures, tmp_path, capsys):
+    out = tmp_path / "my audit"
+    words = ("--up=-z", "--max-frames", "12", "--trust-depth", "--voxel-size", "0.2")
+    assert audit(captures / "recording", out, *words) == 0
+    line = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("next"))
+    again = shlex.split(line.removeprefix("next"))
+    expected = {"--up=-z", "--max-frames", "12", "--trust-depth", "--voxel-size", "0.2"}
+    assert again[:3] == ["r3jax", "audit", str(captures / "recording")]
+    assert {*expected, "--views", "--folds", "--out", str(out)} <= set(again)
+    assert "--port" not in again

@@ -191,3 +191,18 @@ def test_a_damaged_sequence_is_named(tmp_path, kind, damage):
     break_it(tmp_path / kind)
     with pytest.raises(FormatError, match=message):
         READERS[kind][1](tmp_path / kind)
+
+
+@pytest.mark.parametrize("kind", ["replica_slam", "tum"])
+def test_up_is_z_unless_the_world_is_the_first_cameras(tmp_path, kind):
+    files, read = getattr(sequences, kind)(), READERS[kind][1]
+    lay_out(tmp_path / "theirs", files)
+    np.testing.assert_array_equal(read(tmp_path / "theirs").up, [0, 0, 1])
+    name, still = {
+        "replica_slam": ("traj.txt", lambda line: " ".join(map(str, np.eye(4).ravel()))),
+        "tum": ("groundtruth.txt", lambda line: f"{line.split()[0]} 0 0 0 0 0 0 1"),
+    }[kind]
+    lines = files[name].decode().splitlines()
+    files[name] = "\n".join(still(line) for line in lines if line[0] != "#").encode()
+    lay_out(tmp_path / "ours", files)
+    assert read(tmp_path / "ours").up is None

@@ -14,12 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_SNAP = 8.0
-"""An estimated vertical this near to an axis is that axis [deg]."""
-
-_WEAK = 1e-3
-"""Weight of the cameras' own up where their rows do not say (all of them parallel)."""
-
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 """Names of the axes; `-y` is the opposite of `y`."""
 
@@ -65,41 +59,25 @@ class Alignment:
 
 
 def up_of(name: str) -> np.ndarray:
-    """The unit vector [3] of an axis' name, such as `y` or `-z`.
+    """The unit vector [3] of an axis' name, such as `y` or `-z`, or of three numbers.
 
     Raises:
-        ValueError: no such axis.
+        ValueError: neither of them.
     """
     axis = name.removeprefix("-")
-    if axis not in AXES:
-        raise ValueError(f"up must be one of x, y, z, -x, -y, -z, got {name!r}")
-    return (-1.0 if name.startswith("-") else 1.0) * np.asarray(AXES[axis])
-
-
-def estimated_up(poses: np.ndarray) -> np.ndarray:
-    """The vertical of a capture that was held upright, [3], unit length.
-
-    Whoever holds a camera tilts it up and down and turns round, but keeps its rows level: the
-    vertical is what all rows x_i are perpendicular to. With m the mean of the cameras' own up,
-
-        up ~ (mean x_i x_i^T + w I)^-1 m
-
-    which is m itself where the rows say nothing. A result within 8 degrees of an axis is the axis.
-
-    Args:
-        poses: `T_world_camera`, [n, 4, 4], n >= 1.
-    """
-    rows, mean = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
-    level = rows.T @ rows / len(rows) + _WEAK * np.eye(3)
-    up = np.linalg.solve(level, mean)
-    length = np.linalg.norm(up)
-    if not length > 1e-9:  # as many cameras upside down as upright
-        return np.asarray(AXES["z"])
-    up /= length
-    axis = int(np.argmax(np.abs(up)))
-    if np.degrees(np.arccos(min(abs(up[axis]), 1.0))) <= _SNAP:
-        return np.sign(up[axis]) * np.eye(3)[axis]
-    return up
+    if axis in AXES:
+        return (-1.0 if name.startswith("-") else 1.0) * np.asarray(AXES[axis])
+    try:
+        up = np.array([float(word) for word in name.split(",")])
+    except ValueError:
+        up = np.zeros(0)
+    length = float(np.linalg.norm(up))
+    if up.shape != (3,) or not 0.0 < length < np.inf:
+        raise ValueError(
+            f"--up must be one of {', '.join([*AXES, *(f'-{axis}' for axis in AXES)])}, or a "
+            f"direction such as 0.1,-0.9,0.4, got {name!r}"
+        )
+    return up / length
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 Shape symbols: n frames of the path that is evaluated.
 """
 
+import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from r3jax.apps.audit.diagnosis import (
     places_in_hull,
     view_score,
 )
-from r3jax.apps.audit.faults.faults import Faults, find_faults
+from r3jax.apps.audit.faults.faults import Faults, find_faults, stray_finding
 from r3jax.apps.audit.source import Source, thinned
 from r3jax.apps.audit.suggest import SuggestedViews, Task, suggest
 from r3jax.apps.audit.survey import RANGE, AuditSettings, Survey, survey_of
@@ -153,6 +154,9 @@ def audit(
     survey = survey_of(source, settings)
     on_progress("comparing pictures", len(survey.chosen))
     faults = find_faults(source, survey.chosen, step)
+    if survey.strays:
+        stray = stray_finding(source, survey.strays, survey.chosen)
+        faults = dataclasses.replace(faults, findings=(stray, *faults.findings))
     on_progress("mapping", 2 * len(survey.chosen))
     seen = see(source, survey, settings.folds, step)
     unit = _WORTH_OF_UNSEEN * (survey.cell_size / survey.voxel_size) ** 2

@@ -22,17 +22,23 @@ from r3jax.apps.audit.pages.audit_colors import cause_colors, score_colors
 from r3jax.files import write_atomic
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.formats.points import write_points
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json
 
 FORMAT = 1
 """Version of audit.json."""
 
+_MAX_BYTES = 1 << 26
+"""An audit of 400 pictures takes some hundred kilobytes."""
 
-def write_outputs(audit: Audit, folder: Path) -> dict[str, Path]:
+
+def write_outputs(audit: Audit, folder: Path, capture: Path) -> dict[str, Path]:
     """Writes everything but the report.
 
     Args:
         audit: what was found.
         folder: a folder that exists.
+        capture: what was audited.
 
     Returns:
         The files by what they hold.
@@ -52,9 +58,19 @@ def write_outputs(audit: Audit, folder: Path) -> dict[str, Path]:
         written["transforms"] = folder / "suggested_transforms.json"
         write_camera_path(written["camera path"], poses, audit.lens.camera)
         write_path_transforms(written["transforms"], poses, audit.lens.camera)
-    text = json.dumps(record_of(audit), indent=1, allow_nan=False)
+    record = {**record_of(audit), "capture_path": str(capture.resolve())}
+    text = json.dumps(record, indent=1, allow_nan=False)
     write_atomic(written["numbers"], (text + "\n").encode())
     return written
+
+
+def audited_capture(folder: Path) -> Path | None:
+    """The capture whose audit a folder holds; None: not known."""
+    try:
+        record = parse_json(read_bytes(folder / "audit.json", _MAX_BYTES))
+        return Path(record["capture_path"])
+    except (OSError, ValueError, KeyError, TypeError):  # none, an older one, or no audit
+        return None
 
 
 def suggested_poses(audit: Audit) -> np.ndarray:
@@ -106,11 +122,13 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "depth_from": audit.source.kind,
         "pictures": len(audit.source),
         "pictures_used": survey.chosen.tolist(),
+        "pictures_diverged": list(survey.strays),
         "voxel_size": survey.length(survey.voxel_size),
         "max_range": survey.length(float(audit.config.max_range)),
         "median_depth": survey.median_depth,
         "far_depth": survey.far_depth,
-        "up": survey.alignment.directions_back(np.array([[0.0, 0.0, 1.0]]))[0].tolist(),
+        "up": survey.up.direction.tolist(),
+        "up_is_within_degrees": survey.up.within,
         "folds": len(audit.seen.folds),
         "fine_from": FINE,
         "rare_below": FEW,

@@ -20,8 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.apps.audit.alignment import Alignment, estimated_up, rotation_to_z, up_of
+from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
 from r3jax.apps.audit.source import Source
+from r3jax.apps.audit.strays import strays
+from r3jax.apps.audit.vertical import Vertical, block_normals, estimated_up
 from r3jax.formats.errors import FormatError
 from r3jax.frame import FAR
 from r3jax.geometry.cameras import Camera
@@ -189,8 +191,8 @@ _PIXELS = 3.0
 _SURVEYED = 32
 """Images that are looked at."""
 
-_VALUES = 4000
-"""Depths taken of each."""
+_VALUES, _FEW_VALUES = 4000, 1000
+"""Depths taken of each; and of each where poses may have diverged."""
 
 _FAR_AWAY = 100.0
 """Cameras farther from the origin than this lose digits of float32 [audit units]."""
@@ -219,7 +221,8 @@ class AuditSettings:
     """What is farther does not count as visible [capture units]; None: from the depths."""
 
     up: str | None = None
-    """Vertical axis of the capture, such as `y` or `-y`; None: as the format or the cameras say."""
+    """Vertical of the capture: an axis such as `y` or `-y`, or three numbers with commas; None: as
+    the format says, or as cameras and surfaces suggest."""
 
     max_frames: int = 400
     """Images that are used at most, evenly spread."""
@@ -250,8 +253,14 @@ class Survey:
     alignment: Alignment
     """From the capture's coordinates to the audit's."""
 
+    up: Vertical
+    """The vertical, in the capture's coordinates."""
+
     chosen: np.ndarray
     """Indices of the images that are used, ascending."""
+
+    strays: tuple[int, ...]
+    """Images that are left out, as their poses have diverged."""
 
     bounds: np.ndarray
     """Box round what the images show and where they were taken, [2, 3] [audit units]."""
@@ -292,6 +301,10 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
     chosen = np.unique(np.linspace(0, len(source) - 1, count).round().astype(np.int64))
     images = _depth_images(source, chosen)
     depths, points = _measured(source, images)
+    if len(left_out := _strays(source, chosen, float(np.median(depths)))):
+        chosen = np.setdiff1d(chosen, left_out)
+        images = _depth_images(source, chosen)
+        depths, points = _measured(source, images)
     median, far = (float(v) for v in np.percentile(depths, [50.0, 95.0]))
     doubt = None
     if source.is_dense:
@@ -302,12 +315,13 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
                 raise
             doubt = str(error).partition(" --trust-depth")[0]
     scale = RANGE / _range(far, source.is_metric, settings.max_range)
-    cameras = source.poses[:, :3, 3]
+    cameras = source.poses[chosen, :3, 3]
     is_near = float(np.abs(cameras).max()) * scale < _FAR_AWAY
-    origin = np.zeros(3) if is_near else np.median(cameras[chosen], axis=0)
-    alignment = Alignment(rotation_to_z(_up(source, settings)), scale, origin)
+    origin = np.zeros(3) if is_near else np.median(cameras, axis=0)
+    up = _up(source, settings, chosen, images)
+    alignment = Alignment(rotation_to_z(up.direction), scale, origin)
     low, high = np.percentile(alignment.points(points), [0.5, 99.5], axis=0)
-    stood = alignment.points(cameras[chosen])
+    stood = alignment.points(cameras)
     low, high = np.minimum(low, stood.min(axis=0)), np.maximum(high, stood.max(axis=0))
     bounds = np.stack([low - 2 * MARGIN, high + 2 * MARGIN])
     voxel = _voxel_size(source, settings, scale, median)
@@ -315,7 +329,9 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
     least = float(np.cbrt(np.prod(bounds[1] - bounds[0]) / _MOST_CELLS))
     return Survey(
         alignment=alignment,
+        up=up,
         chosen=chosen,
+        strays=tuple(left_out.tolist()),
         bounds=bounds,
         voxel_size=voxel,
         cell_size=max(_CELL, 2.0 * voxel, least),
@@ -388,10 +404,29 @@ def _range(far: float, is_metric: bool, wanted: float | None) -> float:
     return max(far, _ROOM[1])
 
 
-def _up(source: Source, settings: AuditSettings) -> np.ndarray:
+def _strays(source: Source, chosen: np.ndarray, depth: float) -> np.ndarray:
+    """Which of the chosen images have poses that diverged."""
+    rng = np.random.default_rng(0)
+
+    def points_of(number: int) -> np.ndarray:
+        index = int(chosen[number])
+        look = DepthImage(source.read(index)[1], source.camera(index), source.poses[index])
+        return look.points(_FEW_VALUES, rng) @ look.pose[:3, :3].T + look.pose[:3, 3]
+
+    return chosen[strays(source.poses[chosen, :3, 3], depth, points_of)]
+
+
+def _up(
+    source: Source, settings: AuditSettings, chosen: np.ndarray, images: Sequence[DepthImage]
+) -> Vertical:
+    """The vertical as it was given, as the format says, or as cameras and surfaces suggest."""
     if settings.up is not None:
-        return up_of(settings.up)
-    return source.up if source.up is not None else estimated_up(source.poses)
+        return Vertical(up_of(settings.up))
+    if source.up is not None:
+        return Vertical(source.up)
+    dense = images if source.is_dense else []
+    seen = [block_normals(look.depth, look.camera, look.pose[:3, :3]) for look in dense]
+    return estimated_up(source.poses[chosen], seen)
 
 
 def _check_voxel(voxel: float, bounds: np.ndarray, scale: float) -> None:

@@ -1,5 +1,6 @@
 """`r3jax audit`: what a capture lacks, how its frames would render, which views would help."""
 
+import dataclasses
 import tempfile
 from pathlib import Path
 
@@ -7,7 +8,7 @@ from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.camera_paths import CameraPath, path_of
 from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.page import open_guide
-from r3jax.apps.audit.outputs import suggested_poses, write_outputs
+from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_outputs
 from r3jax.apps.audit.pages import sentences
 from r3jax.apps.audit.pages.audit_page import write_report
 from r3jax.apps.audit.pages.ground_plan import letter
@@ -16,6 +17,8 @@ from r3jax.apps.audit.survey import AuditSettings
 from r3jax.cli.console import Console, Table
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import AuditOptions
+from r3jax.cli.options.audit import GuideOptions
+from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
@@ -24,6 +27,11 @@ from r3jax.network import who_sees
 
 _SHOWN = 5
 """Regions that the console lists."""
+
+_REPEATED = {field.name for field in dataclasses.fields(AuditOptions)} - {
+    field.name for field in dataclasses.fields(GuideOptions)
+}
+"""Options that hold for an audit of the same capture with further views."""
 
 
 def run_audit(options: AuditOptions) -> int:
@@ -86,17 +94,17 @@ def _audit(
         ValueError, OSError: as `audit` and `write_outputs`.
     """
     folder = options.out or Path("runs") / "audit" / source.name
-    _check_folder(folder)
+    _check_folder(folder, options.capture)
     with Stages(progress) as stages:
         found = audit(source, _settings_of(options), path, stages.on_progress)
         folder.mkdir(parents=True, exist_ok=True)
         stages.on_progress("writing the report", 0)
-        written = write_outputs(found, folder)
+        written = write_outputs(found, folder, options.capture)
         page = write_report(found, folder, written.values())
     _show(Console(), found, {"report": page, **written})
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")
-    progress.next("audit", options.capture, *options.topic_words)
+    progress.next("audit", options.capture, *given_words(options, _REPEATED))
 
 
 def _settings_of(options: AuditOptions) -> AuditSettings:
@@ -112,10 +120,13 @@ def _settings_of(options: AuditOptions) -> AuditSettings:
     )
 
 
-def _check_folder(folder: Path) -> None:
-    """Only an earlier audit is replaced."""
+def _check_folder(folder: Path, capture: Path) -> None:
+    """Only an earlier audit of the same capture is replaced."""
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "audit.json").exists():
         raise UserError(f"{folder} holds something that is no audit: give another --out")
+    audited = audited_capture(folder)
+    if audited is not None and audited != capture.resolve():
+        raise UserError(f"{folder} holds the audit of {audited}: give another --out")
 
 
 def _show(console: Console, found: Audit, written: dict[str, Path]) -> None:

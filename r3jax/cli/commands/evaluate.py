@@ -18,6 +18,7 @@ from r3jax.apps.report.report import write_report
 from r3jax.cli.console import Console, Table, Text
 from r3jax.cli.errors import UserError, check_resolution, one_line
 from r3jax.cli.options import EvaluateOptions
+from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages
 from r3jax.evaluation.scores import Summary
 from r3jax.formats.captures import open_capture
@@ -54,7 +55,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
         which = () if options.name == EvaluateOptions.name else ("--name", options.name)
         progress.next("view", options.path, *which)
     else:
-        progress.next("audit", options.path)
+        progress.next("audit", options.path, *given_words(options, ("up", "topics")))
     return 0
 
 

@@ -6,6 +6,7 @@ from r3jax.apps.models.folder import check_free, only_writer, write_model
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
 from r3jax.cli.options import TrainOptions
+from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages, TrainProgress
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
@@ -88,4 +89,4 @@ def _conclude(
     which = () if options.name == TrainOptions.name else ("--name", options.name)
     where = which if options.out is None else ("--model", folder)
     how = () if options.hold_out else ("--views", "all")
-    console.next("evaluate", options.path, *where, *how, *options.topic_words)
+    console.next("evaluate", options.path, *where, *how, *given_words(options, ("up", "topics")))

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import tyro
 
@@ -22,8 +22,9 @@ class AuditTermOptions(BagOptions):
     """Surfaces farther from a camera count as invisible, in the capture's units; by default 5 m,
     or from the depths."""
 
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Axis of the capture that points up (`--up=-y` where it points down); by default as its
+    up: Annotated[str | None, tyro.conf.arg(metavar="DIRECTION")] = None
+    """Direction of the capture that points up: x, y, z, -x, -y or -z (`--up=-y`), or three numbers
+    (`--up=0.1,-0.9,0.4`). By default as the format says, or a guess from floors, walls and how the
     cameras were held."""
 
     max_frames: int = 400

@@ -13,8 +13,3 @@ class BagOptions:
     topics: Annotated[str | None, tyro.conf.arg(metavar="NAMES")] = None
     """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
     depth_info, frame, world. By default they are found."""
-
-    @property
-    def topic_words(self) -> tuple[str, ...]:
-        """The option as it was given, for a command that comes next."""
-        return () if self.topics is None else ("--topics", self.topics)

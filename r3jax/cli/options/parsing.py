@@ -4,7 +4,7 @@ import ast
 import dataclasses
 import inspect
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from types import NoneType, UnionType
@@ -60,6 +60,29 @@ def options_of(kind: type, parsed: Any) -> Any:
     for name, value in vars(parsed).items():
         values |= vars(value) if name.startswith(_GROUP) else {name: value}
     return kind(**values)
+
+
+def given_words(options: Any, names: Collection[str]) -> list[str]:
+    """Writes options that differ from their defaults as words of a command line.
+
+    Args:
+        options: an instance of a command's options.
+        names: fields to write; those that have no default are arguments, and left out.
+    """
+    words: list[str] = []
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        has_default = field.default is not dataclasses.MISSING
+        if field.name not in names or not has_default or value == field.default:
+            continue
+        option = f"--{field.name.replace('_', '-')}"
+        if value is True:
+            words.append(option)
+        elif str(value).startswith("-"):
+            words.append(f"{option}={value}")
+        else:
+            words += [option, str(value)]
+    return words
 
 
 def _made(like: type, fields: list[Any]) -> type:

@@ -5,7 +5,8 @@
     traj.txt                   a camera-to-world matrix per line, 16 numbers row by row, OpenCV axes
     cam_params.json            {"camera": {w, h, fx, fy, cx, cy, scale}}; here or one folder above
 
-The world is Replica's own: meters, z up.
+The world is Replica's own: meters, z up; unless the first pose is the identity, as in sequences
+that others write in this layout.
 """
 
 from pathlib import Path
@@ -17,6 +18,7 @@ from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import DepthUnit, PosedImages
 from r3jax.formats.poses import mend_pose, read_numbers
+from r3jax.formats.sequences.scannet import UP
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.fields import check_fields
 from r3jax.formats.validation.files import read_bytes
@@ -58,15 +60,17 @@ def read_replica_slam(path: Path | str) -> PosedImages:
         if image.stem.removeprefix("frame") != depth.stem.removeprefix("depth"):
             raise FormatError(depth, f"the depth image of {image.name} should be here")
     lens, unit = _camera(path)
+    poses = np.stack(
+        [mend_pose(source, f"pose {i} (line {i + 1})", pose) for i, pose in enumerate(poses)]
+    )
     return PosedImages(
         path=path,
         image_paths=images,
         lenses=(lens,) * len(images),
-        poses=np.stack(
-            [mend_pose(source, f"pose {i} (line {i + 1})", pose) for i, pose in enumerate(poses)]
-        ),
+        poses=poses,
         depth_paths=depths,
         depth_unit=unit,
+        up=None if np.allclose(poses[0], np.eye(4), atol=1e-6) else UP,
     )
 
 

@@ -7,7 +7,9 @@
 Depth images are uint16 in steps of 0.2 mm, registered to the color images; 0 is no measurement.
 The three lists have clocks of their own: every color image takes the depth image and the pose
 that are nearest in time, and is left out where one of them is more than 0.02 s away. The
-benchmark recommends its default intrinsics, without undistortion.
+benchmark recommends its default intrinsics, without undistortion. Its world has z up, by motion
+capture; a trajectory that begins at the identity is another program's, whose world is the first
+camera's.
 (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats)
 """
 
@@ -20,6 +22,7 @@ from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
 from r3jax.formats.poses import read_lines, read_numbers, to_floats
 from r3jax.formats.quaternion_poses import quaternion_pose
+from r3jax.formats.sequences.scannet import UP
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.images import image_size
 from r3jax.formats.validation.names import below
@@ -71,6 +74,7 @@ def read_tum(path: Path | str) -> PosedImages:
         poses=np.stack(poses),
         depth_paths=tuple(depths[depth_at[i]] for i in chosen),
         depth_unit=_UNIT,
+        up=None if np.allclose(poses[0], np.eye(4), atol=1e-6) else UP,
     )
 
 

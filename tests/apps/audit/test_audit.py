@@ -251,7 +251,7 @@ def test_a_model_without_images_is_audited_by_its_points(folder):
 
 
 def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
-    written = write_outputs(cloud, tmp_path)
+    written = write_outputs(cloud, tmp_path, tmp_path / "capture")
     poses = suggested_poses(cloud)
     images = read_transforms(written["transforms"])
     np.testing.assert_array_equal(images.poses, poses)

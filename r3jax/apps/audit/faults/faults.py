@@ -57,7 +57,10 @@ _OFF_TYPICAL = 6.0
 SCALE = 0.03
 """Depths that fit the poses better by another factor than 1 +- this have a wrong scale."""
 
-Kind = Literal["blur", "focus", "brightness", "tint", "pose", "scale", "repeat"]
+_NAMED = 5
+"""Pictures that a sentence names."""
+
+Kind = Literal["blur", "focus", "brightness", "tint", "pose", "scale", "repeat", "stray"]
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,32 @@ def find_faults(
         images.append(block_image(*source.read(index), source.camera(index), source.poses[index]))
         on_frame()
     return faults_of(images, chosen, source.labels, source.is_metric, source.has_images)
+
+
+def stray_finding(source: Source, strays: Sequence[int], chosen: np.ndarray) -> Finding:
+    """The finding on images that are left out, as their poses have diverged.
+
+    Args:
+        source: the capture.
+        strays: these images, one or more.
+        chosen: the others.
+    """
+    middle = np.median(source.poses[chosen, :3, 3], axis=0)
+    distances = np.linalg.norm(source.poses[list(strays), :3, 3] - middle, axis=1)
+    order = np.argsort(-distances)
+    frames = tuple(int(strays[i]) for i in order)
+    unit = "m" if source.is_metric else "u"
+    captions = tuple(f"{distances[i]:.3g} {unit} from the others" for i in order)
+    named = [source.labels[index] for index in frames[:_NAMED]]
+    named += [f"{len(frames) - _NAMED} more"] if frames[_NAMED:] else []
+    count = len(frames)
+    what = (
+        f"{_pictures(frames)} left out, as the {'pose has' if count == 1 else 'poses have'} "
+        f"diverged: {', '.join(named)}, up to {distances.max():.3g} {unit} from the others, "
+        "with nothing in common."
+    )
+    todo = "Align these pictures again, or delete them from the capture."
+    return Finding("stray", what, todo, frames, captions, float(distances.max()))
 
 
 def faults_of(

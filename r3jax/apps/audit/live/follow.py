@@ -15,12 +15,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from r3jax.apps.audit.alignment import Alignment, estimated_up, rotation_to_z, up_of
+from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
 from r3jax.apps.audit.faults.blocks import BlockImage, block_image
 from r3jax.apps.audit.faults.faults import Kind, faults_of
 from r3jax.apps.audit.live.growing import Arrival, GrowingCapture
 from r3jax.apps.audit.live.page import GuidePage
 from r3jax.apps.audit.source import Source
+from r3jax.apps.audit.vertical import Normals, block_normals, estimated_up
 from r3jax.formats.ros.names import Topics
 from r3jax.frame import Frame
 from r3jax.mapping.config import MappingConfig
@@ -81,6 +82,8 @@ class Guide:
         self._growth = GrowthAhead()
         self._alignment = Alignment(np.eye(3), 1.0, np.zeros(3))
         self._bounds = np.zeros((2, 3))
+        self._normals: dict[int, Normals] = {}  # in the cameras' axes: poses may be corrected
+        self._guess: tuple[int, np.ndarray] | None = None
         self._recent: deque[tuple[str, BlockImage]] = deque(maxlen=_COMPARED)
         self._target: np.ndarray | None = None
         self._since = 0
@@ -106,6 +109,8 @@ class Guide:
 
     def add(self, source: Source, arrival: Arrival, *, is_latest: bool) -> None:
         """Maps a frame; shows what is known with it, unless others have come since."""
+        depth, camera = arrival.picture[1], source.camera(arrival.index)
+        self._normals[arrival.index] = block_normals(depth, camera, np.eye(3))
         if self._planner is None:
             self._begin(source, arrival)
         assert self._planner is not None
@@ -123,9 +128,20 @@ class Guide:
             self._questions.put((self._planner, frame))
 
     def _up(self, source: Source) -> np.ndarray:
+        """The vertical; a guess is made again whenever there are twice as many frames."""
         if self._up_name is not None:
             return up_of(self._up_name)
-        return source.up if source.up is not None else estimated_up(source.poses)
+        if source.up is not None:
+            return source.up
+        size = len(source).bit_length()
+        if self._guess is None or self._guess[0] != size:
+            seen = [
+                normals._replace(direction=normals.direction @ source.poses[index, :3, :3].T)
+                for index, normals in self._normals.items()
+                if index < len(source)
+            ]
+            self._guess = size, estimated_up(source.poses, seen).direction
+        return self._guess[1]
 
     def _begin(self, source: Source, arrival: Arrival) -> None:
         self._alignment = Alignment(rotation_to_z(self._up(source)), 1.0, np.zeros(3))

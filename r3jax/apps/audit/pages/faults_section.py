@@ -21,6 +21,7 @@ TITLES = {
     "pose": "Poses contradict the depth",
     "scale": "The scale of the depth is wrong",
     "repeat": "Pictures repeat each other",
+    "stray": "Poses have diverged",
 }
 """Heading of each kind of finding."""
 

@@ -40,6 +40,9 @@ _SHORT = {
 _MOST_SAID = 4
 """Findings on single pictures that the summary repeats."""
 
+_DOUBTFUL = 5.0
+"""A guess of the vertical that may be off by more is told first [deg]."""
+
 _ORDINARY = ("angle", "rare", "distance", "noise")
 
 
@@ -78,6 +81,8 @@ def verdict(audit: Audit) -> list[str]:
         sentences.append(
             "Without depth images only surfaces with points are scored; plain walls may have none."
         )
+    if (audit.survey.up.within or 0.0) > _DOUBTFUL:
+        sentences.insert(0, vertical(audit))
     if audit.source.remark is not None:
         sentences.insert(0, audit.source.remark)
     if audit.survey.doubt is not None:
@@ -112,6 +117,20 @@ def verdict(audit: Audit) -> list[str]:
             f"{plan.random_mean[-1]:.2f}."
         )
     return sentences
+
+
+def vertical(audit: Audit) -> str:
+    """Which way is up, and how sure that is."""
+    up = audit.survey.up
+    if up.within is None:
+        return f"Up is {_up_name(up.direction)} of the capture."
+    from_what = "floors, walls and " if audit.source.is_dense else ""
+    numbers = ",".join(f"{value:.2f}" for value in up.direction)
+    return (
+        f"Up is a guess, within {up.within:.0f} degrees: {_up_name(up.direction)} of the capture, "
+        f"from {from_what}how the cameras were held. Where another direction is up, give it "
+        f"(--up=z, or three numbers such as --up={numbers})."
+    )
 
 
 def saturation() -> str:
@@ -166,7 +185,6 @@ def method(audit: Audit) -> list[str]:
         "tracks": "the points whose tracks name the picture",
         "cloud": "the cloud's points that no nearer one hides",
     }[source.kind]
-    up = survey.alignment.directions_back(np.array([[0.0, 0.0, 1.0]]))[0]
     sentences = [
         f"{len(survey.chosen)} of {len(source)} pictures, every {_ordinal(source.stride)} pixel "
         f"along rows and columns; depth from {depth}.",
@@ -175,7 +193,7 @@ def method(audit: Audit) -> list[str]:
         f"the median {survey.median_depth:.3g} {survey.unit} and the 95th percentile "
         f"{survey.far_depth:.3g} {survey.unit}, and the sizes follow from them where they are not "
         "given.",
-        f"Up is {_up_name(up)} of the capture.",
+        vertical(audit),
         "Renderability R (arXiv 2601.07484) of a surface for a place to look from is bias × noise "
         "× resolution: the angle to the nearest direction it was seen from, the consistency of "
         "its color, and the best distance it was seen from.",
