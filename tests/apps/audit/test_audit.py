@@ -16,6 +16,7 @@ from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
 from r3jax.apps.audit.pages.sentences import directions, method, verdict
 from r3jax.apps.audit.source import Source, source_of
 from r3jax.apps.audit.survey import MARGIN, AuditSettings, survey_of
+from r3jax.apps.audit.vertical import Vertical
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import read_transforms
@@ -269,6 +270,19 @@ def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
     for text in (*verdict(cloud), *method(cloud)):
         assert text[0].isupper() or text[0].isdigit()
         assert text.endswith(".")
+
+
+def test_a_guess_of_up_says_how_far_off_it_may_be_and_how_to_give_it(cloud):
+    def said(sentences, within: float | None) -> str:
+        up = Vertical(np.array([0.6, 0.0, 0.8]), within)
+        survey = dataclasses.replace(cloud.survey, up=up)
+        return " ".join(sentences(dataclasses.replace(cloud, survey=survey)))
+
+    for sentences in (verdict, method):
+        assert "within 12 degrees" in said(sentences, 12.4)
+        assert "--up=0.60,0.00,0.80" in said(sentences, 12.4)
+        assert "guess" not in said(sentences, None)
+    assert "guess" not in said(verdict, 3.0)  # told in the method alone
 
 
 def test_one_view_is_spoken_of_as_one(cloud):

@@ -69,14 +69,15 @@ def test_up_is_a_direction_for_any_cameras():
 
 
 def test_normals_are_those_of_the_planes_and_only_of_planes():
-    place = held.Place(walls=held.room(5, 4, 2.5))
+    place = held.Place(held.room(5, 4, 2.5), noise=2e-4)
     pose = held_pose([2.5, 1.0, 1.4], 20.0, -20.0, 5.0)
     found = block_normals(place.depth(pose, CAMERA, 0), CAMERA, pose[:3, :3])
-    assert len(found.weight) > 200
-    assert np.abs(np.sort(np.abs(found.direction), axis=1)[:, 2] - 1.0).max() < 0.01
+    assert len(found.weight) > 100
+    nearest = np.abs(found.direction).max(axis=1)  # to an axis; some blocks show a corner
+    assert (nearest > np.cos(np.radians(5))).mean() > 0.9
     floor = found.direction[:, 2] > 0.99
     assert floor.any()  # towards the camera
     noise = np.random.default_rng(0).uniform(1.0, 3.0, (120, 160)).astype(np.float32)
     assert not len(block_normals(noise, CAMERA, np.eye(3)).weight)
-    for empty in (np.zeros((120, 160)), np.full((120, 160), np.inf), np.ones((2, 3))):
+    for empty in (np.zeros((120, 160)), np.full((120, 160), np.inf), np.ones((1, 3))):
         assert not len(block_normals(empty.astype(np.float32), CAMERA, np.eye(3)).weight)
