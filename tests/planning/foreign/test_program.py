@@ -182,6 +182,29 @@ def test_memory_has_a_limit():
     )
 
 
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import mmap; m = mmap.mmap(-1, 400 << 20)\nfor i in range(0, len(m), 4096): m[i] = 1",
+        "for _ in range(4):\n    if os.fork() == 0: x = b'x' * (100 << 20); time.sleep(60)\n"
+        "time.sleep(1)",
+    ],
+)
+def test_memory_is_that_of_all_processes_and_what_they_share(code):
+    if sys.platform != "linux":
+        pytest.skip("elsewhere nothing tells what processes share")
+    with pytest.raises(PolicyError, match=r"takes .* GiB .* its memory is 0\.25 GiB"):
+        asked(f"receive()\n{code}\nsend(kind='fine')", memory=0.25)
+
+
+def test_what_processes_share_counts_once():
+    code = (
+        "x = b'x' * (120 << 20)\nfor _ in range(4):\n    if os.fork() == 0: time.sleep(60)\n"
+        "receive(); time.sleep(0.5); send(kind='fine')"
+    )
+    assert asked(code, memory=0.3).kind == "fine"
+
+
 def test_there_is_no_network():
     if network() == "shared":
         pytest.skip("this system does not let a program leave the network")

@@ -59,7 +59,7 @@ class ForeignConfig(PlannerConfig):
     """Time limit of an answer [s]."""
 
     memory: float = 8.0
-    """What each process of the program may take [GiB]; 0: no limit."""
+    """What the program and all that it has started may take [GiB]; 0: no limit."""
 
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""

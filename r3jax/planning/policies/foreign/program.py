@@ -1,4 +1,7 @@
-"""A program that answers messages: started under limits, runs only while asked, always ended."""
+"""A program that answers messages: started under limits, runs only while asked, always ended.
+
+No sandbox: it has the rights of the user who starts it (`docs/howto/policy.md`).
+"""
 
 import contextlib
 import functools
@@ -10,6 +13,8 @@ import sys
 import time
 import weakref
 from pathlib import Path
+
+import psutil
 
 from r3jax.planning.policies.foreign.commands import words_of
 from r3jax.planning.policies.foreign.messages import (
@@ -30,6 +35,9 @@ _TAIL = 2000
 
 _GRACE = 1.0
 """A program whose input has ended may take so long to end [s]."""
+
+_MEASURE_EVERY = 0.25
+"""Pause between two measurements of its memory while it computes [s]."""
 
 
 @functools.cache
@@ -57,15 +65,15 @@ class Program:
 
         Args:
             command: program and arguments, as for a shell.
-            memory: that each of its processes may take [GiB]; 0: no limit.
+            memory: that it and all that it has started may take [GiB]; 0: no limit.
 
         Raises:
             ValueError: there is no such program.
             PolicyError: it cannot be started.
         """
         self.command = command
-        size = str(int(memory * (1 << 30)))
-        limits = [sys.executable, "-I", "-S", str(_LAUNCH), size, network()]
+        self._memory = int(memory * (1 << 30))
+        limits = [sys.executable, "-I", "-S", str(_LAUNCH), str(self._memory), network()]
         try:
             self._process = subprocess.Popen(
                 [*limits, *words_of(command)],
@@ -82,15 +90,15 @@ class Program:
             assert pipe is not None
             os.set_blocking(pipe.fileno(), False)
         self._said = b""
-        self._paused: dict[int, int] = {}
+        self._paused: list[psutil.Process] = []
         self.close = weakref.finalize(self, _end, self._process)
 
     def ask(self, message: Message, seconds: float) -> Message:
         """Sends a message and waits for the answer.
 
         Raises:
-            PolicyError: no answer in time, none at all, or something else than a message; the
-                program has ended then.
+            PolicyError: no answer in time, none at all, or something else than a message; more
+                memory than allowed. The program has ended then.
         """
         if not self.close.alive:
             raise PolicyError(f"the program {self.command!r} has ended")
@@ -98,9 +106,12 @@ class Program:
         try:
             answer = decode(self._exchange(encode(message), time.monotonic() + seconds))
             self._paused = _pause(self._process)
+            self._check_memory()
             return answer
         except TimeoutError:
             reason = f"gave no answer to `{message.kind}` within {seconds:g} s"
+        except MemoryError as error:
+            reason = str(error)
         except EOFError as error:
             reason = self._death(str(error))
         except MessageError as error:
@@ -116,11 +127,13 @@ class Program:
         Raises:
             TimeoutError: it is past `end` on the monotonic clock.
             EOFError: the program has closed its `input` or its `output`, as the text says.
+            MemoryError: the program takes more than it may.
             MessageError: what comes is no message, or comes before the question is sent.
         """
         streams = self._process.stdin, self._process.stdout, self._process.stderr
         into, out, errors = (pipe.fileno() for pipe in streams if pipe is not None)
         left, inbox = memoryview(data), bytearray()
+        measured = time.monotonic()
         with selectors.DefaultSelector() as selector:
             selector.register(into, selectors.EVENT_WRITE)
             selector.register(out, selectors.EVENT_READ)
@@ -128,7 +141,10 @@ class Program:
             while True:
                 if (patience := end - time.monotonic()) <= 0.0:
                     raise TimeoutError
-                ready = {key.fd for key, _ in selector.select(patience)}
+                ready = {key.fd for key, _ in selector.select(min(patience, _MEASURE_EVERY))}
+                if time.monotonic() - measured > _MEASURE_EVERY:
+                    self._check_memory()
+                    measured = time.monotonic()
                 if errors in ready and not self._listen(errors):
                     selector.unregister(errors)
                 if out in ready:
@@ -143,6 +159,25 @@ class Program:
                     left = left[_write(into, left) :]
                     if not left:  # there is nothing to read: ready once nobody is at the other end
                         selector.modify(into, selectors.EVENT_READ)
+
+    def _check_memory(self) -> None:
+        """Measures what a limit on each process cannot see: many of them, and what they share.
+
+        Raises:
+            MemoryError: the program and all that it has started take more than it may.
+        """
+        if not self._memory:
+            return
+        family = _family(self._process.pid)
+        # What processes share is in the size of each: only if that is too much, it is divided.
+        taken = sum(_size(one) for one in family)
+        if taken > self._memory:
+            taken = sum(_size(one, shared=True) for one in family)
+        if taken > self._memory:
+            raise MemoryError(
+                f"takes {taken / (1 << 30):.2f} GiB with all that it has started, its memory is "
+                f"{self._memory / (1 << 30):g} GiB"
+            )
 
     def _listen(self, errors: int) -> bool:
         """Keeps the end of what the program says; False once it says nothing more."""
@@ -214,62 +249,54 @@ def _wait(process: "subprocess.Popen[bytes]") -> int | None:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Ends a program and its group, and, on Linux, what it has started outside of the group."""
+    """Ends a program, its group, and what it has started outside of the group."""
     started = _pause(process)  # so that nothing is started meanwhile
     _signal_all(process, started, signal.SIGCONT)
     for pipe in (process.stdin, process.stdout):
         assert pipe is not None
         pipe.close()
     _wait(process)  # the end of its input is its sign to go
-    started |= _descendants(process.pid)
-    _signal_all(process, started, signal.SIGKILL)
+    _signal_all(process, [*started, *_family(process.pid)], signal.SIGKILL)
     process.wait()
     assert process.stderr is not None
     process.stderr.close()
 
 
-def _pause(process: "subprocess.Popen[bytes]") -> dict[int, int]:
-    """Stops a program and all that it has started; returns the latter as `_descendants` does."""
-    _signal_all(process, {}, signal.SIGSTOP)
-    started = _descendants(process.pid)
-    _signal_all(process, started, signal.SIGSTOP)
-    return started
+def _pause(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
+    """Stops a program and all that it has started; returns them."""
+    _signal_all(process, [], signal.SIGSTOP)
+    family = _family(process.pid)
+    _signal_all(process, family, signal.SIGSTOP)
+    return family
 
 
-def _signal_all(process: "subprocess.Popen[bytes]", started: dict[int, int], signum: int) -> None:
-    """Signals a program, its group, and what it has started, as `_descendants` has it."""
+def _signal_all(
+    process: "subprocess.Popen[bytes]", family: list[psutil.Process], signum: int
+) -> None:
+    """Signals a program, its group, and what it has started."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signum)
-    for pid, birth in started.items():
-        if (now := _stat(pid)) is not None and now[1] == birth:  # the number is not another's yet
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.kill(pid, signum)
+    for one in family:
+        with contextlib.suppress(psutil.Error):
+            one.send_signal(signum)
 
 
-def _descendants(ancestor: int) -> dict[int, int]:
-    """When each process began that descends from another; none on systems that are not Linux.
+def _family(pid: int) -> list[psutil.Process]:
+    """A process and all that descends from it.
 
-    What loses its parent becomes the program's own child, as `launch.py` has it, for as long as
-    the program is there.
+    What loses its parent becomes the program's own child on Linux, as `launch.py` has it, for as
+    long as the program is there.
     """
-    numbers = [int(path.name) for path in Path("/proc").glob("[0-9]*")]
-    table = {pid: stat for pid in numbers if (stat := _stat(pid)) is not None}
-    children: dict[int, list[int]] = {}
-    for pid, (parent, _) in table.items():
-        children.setdefault(parent, []).append(pid)
-    found, left = dict[int, int](), [ancestor]
-    while left:
-        for pid in children.get(left.pop(), []):
-            found[pid] = table[pid][1]
-            left.append(pid)
-    return found
+    with contextlib.suppress(psutil.Error):
+        program = psutil.Process(pid)
+        return [program, *program.children(recursive=True)]
+    return []
 
 
-def _stat(pid: int) -> tuple[int, int] | None:
-    """A process's parent, and when it began [ticks since the system did]; None: it has ended."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_bytes()
-    except OSError:
-        return None
-    fields = text.rpartition(b")")[2].split()  # its name, in brackets, may hold anything
-    return int(fields[1]), int(fields[19])
+def _size(process: psutil.Process, *, shared: bool = False) -> int:
+    """Memory of a process [bytes]; `shared`: of what it shares its part, where that is known."""
+    with contextlib.suppress(psutil.Error):
+        if shared and sys.platform == "linux":
+            return int(process.memory_full_info().pss)
+        return int(process.memory_info().rss)
+    return 0
