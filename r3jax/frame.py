@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from r3jax.arrays import color_image, depth_image, own_matrix, pinhole_camera
 from r3jax.geometry.arguments import one
 from r3jax.geometry.cameras import Camera, is_rigid, is_traced, rigid_error
+from r3jax.geometry.voxels import check_near_origin
 
 FAR = 50.0
 """A median depth beyond this is taken for one in another unit [m]."""
@@ -64,8 +65,8 @@ class Frame(eqx.Module):
     Raises:
         ValueError: shapes that do not fit the camera, integer images (divide by 255 first),
             colors outside [0, 1] or not finite, depth that is NaN or negative, a pose that is
-            not finite or not rigid, a median depth of more than 50 m (without `far`). Values are
-            checked where they are known (outside jit).
+            not finite, not rigid, or more than 32 km from the origin, a median depth of more
+            than 50 m (without `far`). Values are checked where they are known (outside jit).
     """
 
     rgb: Float[Array, "H W 3"]
@@ -189,6 +190,7 @@ class Frame(eqx.Module):
         problem = rigid_error(np.asarray(self.T_world_camera))
         if problem is not None:
             raise ValueError(f"T_world_camera: {problem}")
+        check_near_origin("T_world_camera", np.asarray(self.T_world_camera)[:3, 3])
 
     @property
     def position(self) -> Float[Array, " 3"]:

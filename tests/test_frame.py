@@ -71,6 +71,7 @@ BAD = {
         {"T_world_camera": np.diag([1.0, -1.0, 1.0, 1.0])},
         "T_world_camera.*mirrors",
     ),
+    "pose of UTM": (with_value("T_world_camera", (1, 3), -4.6e6), "coordinate 4,600,000 m.*origin"),
     "pose transposed": (with_value("T_world_camera", (3, 0), 1.0), "T_world_camera.*last row"),
 }
 

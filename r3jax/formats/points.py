@@ -185,7 +185,7 @@ def write_points(
 
     Args:
         path: the file.
-        points: [n, 3] [m].
+        points: [n, 3] [m]; float64 is stored as such.
         colors: [n, 3] uint8.
         properties: further numbers of every point by their names, [n] each; stored as float32.
 
@@ -196,7 +196,8 @@ def write_points(
     if points.shape != colors.shape or points.shape[1:] != (3,):
         raise ValueError(f"points {points.shape} and colors {colors.shape} must both be [n, 3]")
     properties = {} if properties is None else properties
-    fields = [(name, "<f4") for name in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")]
+    kind = "<f8" if points.dtype == np.float64 else "<f4"
+    fields = [(name, kind) for name in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")]
     fields += [(name, "<f4") for name in properties]
     table = np.empty(len(points), dtype=fields)
     for name, values in properties.items():
@@ -207,7 +208,7 @@ def write_points(
         table[name] = points[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         table[name] = colors[:, channel]
-    kinds = {"<f4": "float", "u1": "uchar"}
+    kinds = {"<f4": "float", "<f8": "double", "u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     header += [f"property {kinds[kind]} {name}" for name, kind in fields] + ["end_header", ""]
     write_atomic(path, "\n".join(header).encode() + table.tobytes())

@@ -1,19 +1,37 @@
 """Points, integer voxels and packed keys.
 
 A voxel index is three signed integers of 21 bits each, packed into two 32-bit words; at 5 cm
-that is a world of 100 km.
+that is a world of 100 km. float32 ends sooner: coordinates of UTM would be rounded to half a meter.
 """
 
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 INDEX_LIMIT = 1 << 20
 """Voxel indices lie in [-INDEX_LIMIT, INDEX_LIMIT)."""
 
+MAX_COORDINATE = float(1 << 15)
+"""Beyond it float32 no longer tells 2 mm apart [m]."""
+
 EMPTY_WORD = 0xFFFFFFFF
 """Both words of an empty row. No voxel packs to it: the top bit of a packed key is 0."""
+
+
+def check_near_origin(name: str, points: np.ndarray, limit: float = MAX_COORDINATE) -> None:
+    """Refuses points [..., 3] too far from the origin for float32, or for a voxel's index.
+
+    Raises:
+        ValueError: names the largest coordinate, and what to do.
+    """
+    largest = float(np.abs(points).max(initial=0.0))
+    if largest > limit:
+        raise ValueError(
+            f"{name} has the coordinate {largest:,.0f} m, {limit:,.0f} m is the most: subtract an "
+            "origin near the cameras from all coordinates, in float64"
+        )
 
 
 def voxel_index(

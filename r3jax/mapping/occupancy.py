@@ -32,6 +32,7 @@ from jaxtyping import Array, Bool, Float, Int
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked, one
 from r3jax.geometry.cameras import Camera, invert_pose, pixel_rays, sound
+from r3jax.geometry.voxels import check_near_origin
 
 FREE_LOG_ODDS = -1.3862944
 """A cell is free below this: p = 0.2."""
@@ -121,8 +122,8 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
         faces lie inside.
 
     Raises:
-        ValueError: bounds that are not finite or not ordered, a cell size that is not positive,
-            or more cells than a grid can sensibly have.
+        ValueError: bounds that are not finite, not ordered or far from the origin, a cell size
+            that is not positive, or more cells than a grid can sensibly have.
     """
     box = np.asarray(bounds, dtype=np.float64)
     if box.shape != (2, 3) or not np.all(np.isfinite(box)) or not np.all(box[1] > box[0]):
@@ -130,6 +131,7 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
             "bounds are a lower and an upper corner, [2, 3] in meters, finite, each upper value "
             f"above the lower one; got {box.tolist()}"
         )
+    check_near_origin("bounds", box)
     if not (math.isfinite(cell_size) and cell_size > 0.0):
         raise ValueError(f"cell_size must be positive [m], got {cell_size}")
     # The small tolerance keeps a side of exactly 12 cells from becoming 13 by rounding.

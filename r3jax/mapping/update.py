@@ -17,7 +17,7 @@ from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import is_traced, sound
 from r3jax.geometry.compaction import positions_of_set
-from r3jax.geometry.voxels import unpack, voxel_center
+from r3jax.geometry.voxels import INDEX_LIMIT, check_near_origin, unpack, voxel_center
 from r3jax.mapping.associate import (
     Groups,
     edge_pixels,
@@ -29,6 +29,9 @@ from r3jax.mapping.join import CHUNK, Statistics, grow, join
 from r3jax.mapping.seen import evidence_of_view, mark_seen, rows_in_view
 from r3jax.mapping.state import MapState, a_map
 from r3jax.native.platform import by_platform
+
+_NEAR = 1000.0
+"""Up to here voxels of a millimeter have an index [m]."""
 
 _MAX_LOAD = 0.7
 """The table grows before more than this share of its rows is in use."""
@@ -193,15 +196,27 @@ def integrate(
 
     Raises:
         TypeError: no map, or no frame.
-        ValueError: a range that is not positive (where it is known, that is outside jit); several
-            maps or frames at once, without `jax.vmap`.
+        ValueError: a range that is not positive, a camera so far from the origin that voxels have
+            no index (where they are known, that is outside jit); several maps or frames at once,
+            without `jax.vmap`.
     """
     # Only where values are known can they be refused.
     if not is_traced(max_range) and not float(max_range) > 0.0:
         raise ValueError(f"max_range must be positive [m], got {float(max_range)}")
+    if not is_traced(frame.T_world_camera, state.voxel_size):
+        _check_in_reach(state, frame)
     max_range = jnp.asarray(max_range, dtype=jnp.float32)
     update = _integrate_donating if donate else _integrate_jitted
     return update(state, frame, max_range, jnp.asarray(drop_edges))
+
+
+def _check_in_reach(state: MapState, frame: Frame) -> None:
+    """Refuses a camera in whose surroundings voxels have no index."""
+    position = np.asarray(frame.T_world_camera)[:3, 3]
+    # Near the origin small voxels have one, too, and the map's size need not be waited for.
+    if np.abs(position).max(initial=0.0) > _NEAR:
+        limit = 0.99 * INDEX_LIMIT * float(state.voxel_size)
+        check_near_origin("T_world_camera", position, limit)
 
 
 def integrate_growing(

@@ -22,6 +22,7 @@ from jaxtyping import Array
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import a_camera, a_pose, checked, one
 from r3jax.geometry.cameras import Camera
+from r3jax.geometry.voxels import check_near_origin
 from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import MapState, empty_map
@@ -126,9 +127,13 @@ def decide(
     Returns:
         The decision, or None if there is no view to take; the planner, which remembers it; and what
         happened, with the reason in `outcome`.
+
+    Raises:
+        ValueError: a camera more than 32 km from the origin.
     """
     # float64: the path begins at this very position.
     pose = np.asarray(T_world_camera, dtype=np.float64)
+    check_near_origin("T_world_camera", pose[:3, 3])
     decision, policy_state, info = planner.policy.decide(
         planner.policy_state, planner.map_state, planner.grid, pose, key=key
     )

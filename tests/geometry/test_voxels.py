@@ -9,6 +9,7 @@ from hypothesis import example, given
 from r3jax.geometry.voxels import (
     EMPTY_WORD,
     INDEX_LIMIT,
+    check_near_origin,
     pack,
     unpack,
     voxel_center,
@@ -67,3 +68,12 @@ def test_index_stops_at_the_limits_of_the_world():
     far = jnp.array([-1e30, -1e7, 1e7, 1e30])
     found = np.asarray(voxel_index(far, jnp.float32(0.05)))
     np.testing.assert_array_equal(found, [-INDEX_LIMIT] * 2 + [INDEX_LIMIT - 1] * 2)
+
+
+@pytest.mark.parametrize("value", [-32769.0, 5e5, 1e30, np.inf])
+def test_what_float32_cannot_hold_to_a_millimeter_is_refused(value):
+    points = np.zeros((4, 3))
+    check_near_origin("bounds", points + 32768.0)
+    points[2, 1] = value
+    with pytest.raises(ValueError, match=r"bounds has the coordinate .*subtract an origin"):
+        check_near_origin("bounds", points)

@@ -4,6 +4,8 @@ The camera and its poses are such that float32 holds all points exactly: no roun
 which voxel a point is in, and the reference can be exact about it.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -252,3 +254,14 @@ def test_laws_hold_without_a_fault():
 @each(MUTANTS)
 def test_mutant_is_caught(mutant):
     assert_caught(CHAIN, mutant)
+
+
+def test_a_camera_whose_surroundings_have_no_voxel_index_is_refused():
+    state = new_map(CAPACITY)
+    small = dataclasses.replace(state, voxel_size=jnp.float32(0.01))
+    frame = frame_of(scene_depth())
+    far = frame.T_world_camera.at[0, 3].set(12_000.0)
+    moved = dataclasses.replace(frame, T_world_camera=far)
+    integrate(state, moved)
+    with pytest.raises(ValueError, match=r"12,000 m.* 10,381 m is the most.* origin"):
+        integrate(small, moved)

@@ -84,7 +84,9 @@ def _write_clouds(audit: Audit, values: Path, causes: Path) -> None:
     state, found = audit.seen.state, audit.diagnosis
     present = np.asarray(state.occupied)
     centers = np.asarray(state.center, np.float64).T[present]
-    points = audit.survey.alignment.points_back(centers).astype(np.float32)
+    points = audit.survey.alignment.points_back(centers)
+    if not np.any(audit.survey.alignment.origin):  # near it float32 is exact enough, and usual
+        points = points.astype(np.float32)
     evaluated = found.is_seen[present]
     shown = score_colors(found.value)[present]
     write_points(

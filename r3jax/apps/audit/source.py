@@ -280,6 +280,8 @@ def source_of(capture: Run | Recording | PosedImages, name: str) -> Source:
     else:
         poses, labels, up = capture.poses, tuple(p.name for p in capture.image_paths), None
         camera = capture.camera
+        # Only its pixels are read: in coordinates of UTM a frame would lose those of its pose.
+        capture = dataclasses.replace(capture, poses=np.tile(np.eye(4), (len(poses), 1, 1)))
     lens = pinhole_lens(camera)
     stride = _stride([lens])
     table = sampling_table(lens, stride)

@@ -101,6 +101,8 @@ def _audit(
         stages.on_progress("writing the report", 0)
         written = write_outputs(found, folder, options.capture)
         page = write_report(found, folder, written.values())
+    if (moved := sentences.origin(found)) is not None:
+        progress.say(moved)
     _show(Console(), found, {"report": page, **written})
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")

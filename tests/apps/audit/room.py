@@ -78,6 +78,15 @@ def write_recording(folder: Path, poses: np.ndarray) -> Path:
     return folder
 
 
+def write_far_recording(folder: Path, poses: np.ndarray, far: np.ndarray) -> Path:
+    """The same capture in a world whose origin is far away."""
+    write_recording(folder, poses)
+    moved = poses.copy()
+    moved[:, :3, 3] += far
+    np.savetxt(folder / "poses.txt", moved.reshape(-1, 16), fmt="%.17g")
+    return folder
+
+
 def wall_points(num: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Points strewn over the walls [num, 3], and their colors [num, 3] uint8."""
     rng = np.random.default_rng(seed)

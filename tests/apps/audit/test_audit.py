@@ -28,6 +28,7 @@ from tests.apps.audit.room import (
     pose_at,
     round_poses,
     write_colmap,
+    write_far_recording,
     write_nerfstudio,
     write_recording,
 )
@@ -69,6 +70,21 @@ def corner(folder) -> Audit:
 def cloud(folder) -> Audit:
     images = read_transforms(write_nerfstudio(folder / "cloud", round_poses(), depth=False))
     return audit(source_of(images, "cloud"), FEW_VIEWS)
+
+
+def test_an_audit_in_coordinates_of_utm_says_so_and_comes_back_in_them(folder, tmp_path):
+    far = np.array([500_000.0, 4_600_000.0, 100.0])
+    recording = read_recording(write_far_recording(folder / "far", corner_poses(), far), "z")
+    found = audit(source_of(recording, "far"), dataclasses.replace(SETTINGS, num_views=1))
+    assert "was subtracted" in " ".join(method(found))
+    written = write_outputs(found, tmp_path)
+    points, _ = read_points(written["causes"])
+    local = np.asarray(points, np.float64) - far
+    to_wall = np.minimum(np.abs(local), np.abs(local - SIZE)).min(axis=1)
+    assert len(local) > 500
+    assert np.percentile(to_wall, 99) < VOXEL
+    (eye,) = suggested_poses(found)[:, :3, 3] - far
+    assert ((eye > 0.0) & (eye < SIZE)).all()
 
 
 def centers(found: Audit) -> np.ndarray:

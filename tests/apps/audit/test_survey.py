@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from r3jax.apps.audit.survey import DepthImage, check_agreement
-from tests.apps.audit.room import LENS, picture, pose_at, round_poses
+from r3jax.apps.audit.source import source_of
+from r3jax.apps.audit.survey import AuditSettings, DepthImage, check_agreement, survey_of
+from r3jax.formats.recordings import read_recording
+from tests.apps.audit.room import (
+    LENS,
+    picture,
+    pose_at,
+    round_poses,
+    write_far_recording,
+    write_recording,
+)
 from tests.conftest import shared_path
 
 SHOWN = [(picture(pose)[1], pose) for pose in round_poses(16)]
@@ -60,3 +69,28 @@ def test_a_real_recording_fits_and_five_times_its_depth_does_not():
     check_agreement(real)
     with pytest.raises(ValueError, match=r"multiplied by 0\.2"):
         check_agreement([DepthImage(5.0 * look.depth, look.camera, look.pose) for look in real])
+
+
+def test_coordinates_of_utm_lose_an_origin_and_no_digits(tmp_path):
+    """float32 would round them to half a meter."""
+    far = np.array([500_000.0, 4_600_000.0, 100.0])
+    near, source = (
+        source_of(read_recording(path, "z"), path.name)
+        for path in (
+            write_recording(tmp_path / "near", round_poses()),
+            write_far_recording(tmp_path / "far", round_poses(), far),
+        )
+    )
+    settings = AuditSettings(voxel_size=0.2)
+    one, other = survey_of(near, settings), survey_of(source, settings)
+    assert not one.alignment.origin.any()
+    assert np.abs(other.alignment.origin - far).max() < 10.0
+    shift = (far - other.alignment.origin) * other.alignment.scale
+    for index in (0, 5):
+        first, second = near.frame(index, one.alignment), source.frame(index, other.alignment)
+        np.testing.assert_allclose(
+            np.asarray(second.position), np.asarray(first.position) + shift, atol=1e-5
+        )
+        np.testing.assert_array_equal(second.depth, first.depth)
+    back = other.alignment.poses_back(other.alignment.poses(source.poses))
+    np.testing.assert_allclose(back[:, :3, 3] - far, near.poses[:, :3, 3], atol=1e-7)

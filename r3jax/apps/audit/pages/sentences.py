@@ -67,6 +67,17 @@ def point(position: np.ndarray) -> str:
     return ", ".join(f"{value:.2f}" for value in position)
 
 
+def origin(audit: Audit) -> str | None:
+    """The point that was subtracted from a capture far from its origin; None: none."""
+    subtracted = audit.survey.alignment.origin
+    if not np.any(subtracted):
+        return None
+    return (
+        f"The capture is far from its origin: ({point(subtracted)}) was subtracted from all "
+        "coordinates before they were computed with, and added to all that are written."
+    )
+
+
 def verdict(audit: Audit) -> list[str]:
     """What the audit comes to, a sentence each."""
     found, plan = audit.diagnosis, audit.plan
@@ -229,6 +240,8 @@ def method(audit: Audit) -> list[str]:
         "taken before the next one is chosen. What cannot be foreseen: surfaces that nobody has "
         "seen, and colors."
     )
+    if (moved := origin(audit)) is not None:
+        sentences.append(moved)
     if not source.is_metric:
         sentences.append("Nobody knows what a unit of this capture is: u stands for one.")
     if not source.has_images:
