@@ -10,10 +10,11 @@ from hypothesis import given
 from scipy.spatial.transform import Rotation
 
 from r3jax.formats.colmap.binary import read_binary, write_binary
-from r3jax.formats.colmap.model import colmap_pose, pose_of, quaternion_of, rotation_of
+from r3jax.formats.colmap.model import ColmapModel, colmap_pose, pose_of, quaternion_of, rotation_of
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.colmap.text import read_text, write_text
 from r3jax.formats.errors import FormatError
+from r3jax.formats.lenses import Lens
 from tests.formats.colmap_models import assert_equal, random_model, random_pose, seeds
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 
@@ -116,6 +117,11 @@ def test_the_model_is_found_where_tools_put_it(tmp_path, place):
 def split(tmp_path):
     """A capture that COLMAP could not join: three models, and pictures without a pose."""
     models = {"0": random_model(3), "1": random_model(1), "10": random_model(2)}
+    lens = Lens("PINHOLE", 40, 30, (33.0, 33.0, 20.0, 15.0))  # random ones are no real lenses
+    models = {
+        name: ColmapModel(dict.fromkeys(model.cameras, lens), model.images, model.points)
+        for name, model in models.items()
+    }
     for name, model in models.items():
         (tmp_path / "sparse" / name).mkdir(parents=True)
         write_binary(tmp_path / "sparse" / name, model)

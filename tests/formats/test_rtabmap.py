@@ -134,9 +134,7 @@ def test_a_database_that_was_copied_in_part_says_so(tmp_path):
 def test_what_is_no_database_says_so(tmp_path, content):
     path = tmp_path / "map.db"
     path.write_bytes(content)
-    with pytest.raises(
-        FormatError, match=r"map\.db: (this is no|the) database"
-    ):
+    with pytest.raises(FormatError, match=r"map\.db: (this is no|the) database"):
         open_capture(path)
     with pytest.raises(FormatError, match=r"map\.db: this database cannot be read"):
         read_rtabmap_database(path)

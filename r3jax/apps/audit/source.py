@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.apps.audit.alignment import Alignment
+from r3jax.formats.colmap.reader import find_model
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens
 from r3jax.formats.points import read_points
@@ -352,10 +353,13 @@ def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
     elif images.points_path is not None:
         xyz, rgb = read_points(images.points_path)
     else:
+        is_file = images.path.suffix == ".json"
+        model = find_model(images.path.parent) if is_file else None
+        beside = "" if model is None else f"; the COLMAP model beside it has points: audit {model}"
         raise FormatError(
             images.path,
             "there are neither depth images nor points: an audit needs one of them (COLMAP's "
-            "points3D, nerfstudio's ply_file_path or depth_file_path)",
+            f"points3D, nerfstudio's ply_file_path or depth_file_path){beside}",
         )
     if len(xyz) == 0:
         raise FormatError(images.points_path or images.path, "there are no points in it")

@@ -15,8 +15,18 @@ from r3jax.formats.posed_images import PosedImages, SparsePoints
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.names import below, check_relative
 
-_MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
-"""Where COLMAP, its users and nerfstudio put the model of a capture."""
+_MODEL_FOLDERS = (
+    *(".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap"),
+    *("colmap_sparse/0", "colmap_text"),
+)
+"""Where COLMAP, its users, nerfstudio and instant-ngp put the model of a capture."""
+
+_MAX_EXTRA = 1.0
+_FOCAL_RATIOS = (0.1, 10.0)
+_SERIES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
+"""COLMAP's mapper calls a lens bogus whose distortion, or whose focal length by its longer side,
+lies beyond; a model can still end with one when the last adjustment moves it. Terms of fisheyes
+and of fractions (FULL_OPENCV) may be larger."""
 
 
 def find_model(path: Path) -> Path | None:
@@ -125,8 +135,35 @@ def _left_out(
     broken = [part.name for part in _numbered(folder) if not _has_images(part)]
     if broken:
         names = ", ".join(f"{folder.parent.name}/{name}" for name in broken)
-        said.append(f"{names} without images.bin is left out")
-    return "; ".join(said) + "." if said else None
+        said.append(f"the model in {names} has no images.bin and is left out")
+    said += _odd_lenses(models[folder])
+    text = "; ".join(said)
+    return f"{text[0].upper()}{text[1:]}." if text else None
+
+
+def _odd_lenses(model: ColmapModel) -> list[str]:
+    """Says which lens cannot be true: then the poses and points, fitted with it, are not either."""
+    odd = [
+        f"camera {number} (focal length {max(lens.intrinsics[:2]):.0f} px, distortion "
+        f"{max(map(abs, lens.distortion.values()), default=0.0):.3g})"
+        for number, lens in sorted(model.cameras.items())
+        if not _is_plausible(lens)
+    ]
+    if not odd:
+        return []
+    return [
+        f"{odd[0]} is no real lens, so poses and points are likely wrong: reconstruct again with "
+        "known intrinsics (--ImageReader.camera_params) or more overlap"
+    ]
+
+
+def _is_plausible(lens: Lens) -> bool:
+    low, high = _FOCAL_RATIOS
+    focals, side = lens.intrinsics[:2], max(lens.width, lens.height)
+    is_bent = any(abs(value) > _MAX_EXTRA for value in lens.distortion.values())
+    if is_bent and lens.model in _SERIES:
+        return False
+    return all(low < focal / side < high for focal in focals)
 
 
 def _files(folder: Path) -> list[Path]:

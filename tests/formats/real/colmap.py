@@ -102,6 +102,17 @@ def _torn() -> Files:
     return whole | torn | photos("images")
 
 
+def _failed() -> Files:
+    """A calibration that ran away, as of photos without overlap."""
+    lens = struct.pack("<QIiQQ4d", 1, 1, 2, 64, 48, 70.0, 32.0, 24.0, -15.46)
+    return _workspace() | {"sparse/0/cameras.bin": lens}
+
+
+def _instant_ngp() -> Files:
+    """colmap2nerf.py's folders, without its transforms.json."""
+    return within("colmap_text", text_model(_JPEGS)) | photos("images", _JPEGS)
+
+
 _JPEGS = ("1.jpeg", "2.jpeg", "3.jpeg")
 
 _COMMON = {
@@ -118,4 +129,6 @@ LAYOUTS = (
         "colmap, text", lambda: text_model(_JPEGS) | photos("images", _JPEGS), poses_off=1e-9,
         **_COMMON,
     ),
+    Layout("colmap, a lens that ran away", _failed, remark=("Camera 1 ", "no real"), **_COMMON),
+    Layout("colmap_text of instant-ngp", _instant_ngp, **_COMMON),
 )  # fmt: skip

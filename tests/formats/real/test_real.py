@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from r3jax.apps.audit.source import source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
 from r3jax.formats.posed_images import PosedImages
@@ -66,6 +67,15 @@ def assert_picture(images: PosedImages, index: int, shown: int, layout: Layout) 
             assert depth == pytest.approx(meters(shown, width, height)[row, column], abs=2e-3)
     if not layout.has_depth:
         assert images.depth_paths[index] is None
+
+
+def test_a_transforms_json_without_points_names_the_model_beside_it(tmp_path):
+    layouts = {layout.name: layout for layout in LAYOUTS}
+    model = layouts["colmap_text of instant-ngp"].files()
+    lay_out(tmp_path, layouts["instant-ngp's colmap2nerf"].files() | model)
+    capture = open_capture(tmp_path)
+    with pytest.raises(FormatError, match=r"model beside it .*colmap_text"):
+        source_of(capture.source, capture.name)
 
 
 @pytest.mark.parametrize("name", sequences.lost_in_the_wild())
