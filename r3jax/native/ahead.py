@@ -13,6 +13,7 @@ import platform
 import subprocess
 import sys
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 COMPILER = "r3jax.cli.kernels"
@@ -33,6 +34,8 @@ def compile_ahead(cache: Path | None = None) -> None:
     Args:
         cache: folder for the note that it did; None: in the package's own.
     """
+    if find_spec("numba") is None:
+        return
     note = _note_in(cache_folder() / "kernels" if cache is None else cache)
     # Where a program embeds Python, it is the executable, and would start once more.
     is_python = Path(sys.executable or "").name.startswith("python")

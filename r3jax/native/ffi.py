@@ -32,6 +32,7 @@ from r3jax.native.compiled import called_from_python, inlined, intrinsic
 from r3jax.native.one_piece import in_one_piece
 from r3jax.native.platform import num_cores
 from r3jax.native.structs import OFFSETS, VALUES
+from r3jax.native.threads import use_own_threads
 
 # Bytes in structs; the names say whose, where it is not the call frame.
 _EXTENSION, _API = OFFSETS["CallFrame.extension_start"], OFFSETS["CallFrame.api"]
@@ -186,21 +187,29 @@ def _wake_up(x):
         x[i] = i
 
 
-@functools.cache
-def require_threads() -> None:
-    """Starts Numba's threads, the first time that it is called.
+_starting = threading.Lock()
+
+
+def require_threads() -> str:
+    """Starts the threads that share loops, the first time that it is called.
+
+    Returns:
+        Numba's threading layer; with `workqueue` the threads are ours.
 
     Raises:
-        RuntimeError: its threading layer cannot serve two callers at once.
+        ValueError: a threading layer was asked for that is not there.
     """
+    with _starting:
+        return _start_threads()
+
+
+@functools.cache
+def _start_threads() -> str:
     _wake_up(np.zeros(8))
     layer = threading_layer()
     if layer == "workqueue":
-        raise RuntimeError(
-            "machine code for CPUs needs Numba's threading layer `omp` or `tbb`, but only "
-            "`workqueue` is there, which aborts the process when two calls run at once. "
-            "Install OpenMP (libgomp) or `pip install tbb`, or render with backend='xla'."
-        )
+        use_own_threads(get_num_threads() - 1)
+    return layer
 
 
 def num_workers() -> int:
@@ -229,9 +238,6 @@ def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> None:
 
     Args:
         handlers: by their names.
-
-    Raises:
-        RuntimeError: Numba has no threading layer that serves two callers at once.
     """
     with _lock:
         missing = {name: handlers[name] for name in handlers if name not in _compiled}

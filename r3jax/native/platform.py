@@ -33,25 +33,69 @@ def is_cpu_only() -> bool:
     return set(backend.backends()) == {"cpu"}
 
 
-def can_call_kernels(instead: str = "mapping and scoring in plain JAX") -> bool:
-    """Whether XLA can call the kernels; warns once if its structs are not those that they read.
-
-    Args:
-        instead: what the caller does then.
-    """
-    if problem := misread():
-        _warn(problem, instead)
+def can_call_kernels() -> bool:
+    """Whether kernels run here; warns once if they do not, or only one after the other."""
+    problem = missing_for_kernels()
+    if problem and jax.default_backend() == "cpu":
+        _warn(
+            f"no machine code for CPUs, since {problem}; mapping, scoring, training and rendering "
+            "(backend='xla') run in plain JAX, which is slower"
+        )
+    if not problem and _start()[0] == "workqueue":
+        _warn(
+            "Numba finds neither OpenMP nor TBB: kernels run one after the other, which is slower "
+            "where several are due at once (planning while moving). To run them side by side, "
+            "install OpenMP (Debian: `apt install libgomp1`, macOS: `brew install libomp`) or "
+            "`pip install tbb`"
+        )
     return not problem
 
 
+def missing_for_kernels() -> str:
+    """Says why XLA can call no kernel here; empty: it can."""
+    if problem := misread():
+        has = "jaxlib 0.10 to 0.12 have them where they are read"
+        return f"the structs of jaxlib {version('jaxlib')} cannot be read: {problem} ({has})"
+    return missing_for_machine_code()
+
+
+def missing_for_machine_code() -> str:
+    """Says why Numba compiles nothing here; empty: it does."""
+    return _start()[1]
+
+
+def describe_kernels() -> str:
+    """Says how this machine maps, scores and trains on its CPU."""
+    if problem := missing_for_kernels():
+        return f"plain JAX, since {problem}"
+    return f"machine code on {num_cores()} cores, Numba's threading layer {_start()[0]}"
+
+
 @functools.cache
-def _warn(problem: str, instead: str) -> None:
-    warnings.warn(
-        f"the kernels for CPUs cannot read the structs of jaxlib {version('jaxlib')}: {problem}; "
-        f"{instead}, which is slower. jaxlib 0.10 to 0.12 have them where they are read",
-        RuntimeWarning,
-        stacklevel=3,
-    )
+def _start() -> tuple[str, str]:
+    """Starts the threads of kernels: Numba's layer, and what failed."""
+    try:
+        from r3jax.native.ffi import require_threads
+
+        return require_threads(), ""
+    # Of any kind: a Numba that does not fit its NumPy, or this processor, fails in many ways.
+    except Exception as error:
+        first = next(iter(str(error).splitlines()), "")
+        return "", f"Numba fails with {type(error).__name__}: {first.rstrip('.')}"
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    warnings.warn(text, RuntimeWarning, stacklevel=1)
+
+
+def compiled_or_plain(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compiles a function that Python calls; it stays Python, slow, where Numba cannot be used."""
+    if missing_for_machine_code():
+        return function
+    from r3jax.native.compiled import called_from_python
+
+    return called_from_python()(function)
 
 
 def num_cores() -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.mapping.state import MapState
-from r3jax.native.platform import by_platform
+from r3jax.native.platform import by_platform, can_call_kernels
 from r3jax.scoring.backends import dense, reference
 from r3jax.scoring.backends.views import layout_of, over_views, row_of
 from r3jax.scoring.cells import Cells
@@ -37,7 +37,7 @@ def _by_platform(answer_by: Callable[[Any], Callable[..., Any]], edge: int = 1) 
         answer_by: from a backend's module to the function that asks it.
         edge: of the depth buffer [px].
     """
-    if edge > LARGEST_BUFFER:
+    if edge > LARGEST_BUFFER or not can_call_kernels():
         return answer_by(dense)
     from r3jax.scoring.backends import numba
 

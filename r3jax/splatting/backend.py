@@ -51,7 +51,7 @@ class Rasterize(Protocol):
 def find_backend(name: str) -> Rasterize:
     """Finds the backend of a name; `auto` takes the fastest that runs on this machine.
 
-    `numba` becomes `xla`, with a warning, where it cannot read XLA's structs.
+    `numba` becomes `xla`, with a warning, where no kernel runs.
 
     Raises:
         ValueError: there is no such backend.
@@ -59,7 +59,7 @@ def find_backend(name: str) -> Rasterize:
     """
     if name == "auto":
         name = _fastest()
-    if name == "numba" and not can_call_kernels("rendering with backend='xla'"):
+    if name == "numba" and not can_call_kernels():
         name = "xla"
     if name == "numba":
         from r3jax.splatting.backends.numba import rasterize

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera
-from r3jax.native.structs import misread
+from r3jax.native.platform import can_call_kernels
 from r3jax.splatting.backends.reference import composite_pixel
 from r3jax.splatting.config import RasterConfig, fitting_budget
 from r3jax.splatting.projection import project_gaussians
@@ -119,7 +119,7 @@ def on_cpu(tree: Any) -> Any:
 
 def _is_compiled(source: Source) -> bool:
     if source == "auto":
-        return not misread()  # as for rendering: the kernels must know XLA's structs
+        return can_call_kernels()
     return source == "numba"
 
 

@@ -39,6 +39,7 @@ def run_info(options: InfoOptions) -> int:
 
 
 def _show_inventory(console: Console) -> None:
+    from r3jax.native.platform import describe_kernels
     from r3jax.planning.registry import describe, policy_names
     from r3jax.simulators.scenes import registry
     from r3jax.trace.header import package_versions
@@ -49,7 +50,7 @@ def _show_inventory(console: Console) -> None:
     for title, entries in (
         ("Scenes", scenes),
         ("Policies", policies),
-        ("Software", package_versions()),
+        ("Software", {**package_versions(), "kernels": describe_kernels()}),
     ):
         console.print(_two_columns(title, entries))
     Console(stderr=True).next("demo")

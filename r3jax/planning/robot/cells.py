@@ -10,13 +10,13 @@ import math
 
 import numpy as np
 
-from r3jax.native.compiled import called_from_python
+from r3jax.native.platform import compiled_or_plain
 
 BORDER = 1e-3
 """A segment that passes a corner closer than this counts as touching it [cells]."""
 
 
-@called_from_python()
+@compiled_or_plain
 def segment_cells(a, b):
     """Lists the cells that a segment between two points [cells] touches, [n, 3], repeated."""
     num = 2
@@ -41,7 +41,7 @@ def segment_cells(a, b):
     return cells
 
 
-@called_from_python()
+@compiled_or_plain
 def segments_are_inside(mask, a, b):
     """Finds which segments from one point to others run through cells of a mask only.
 
@@ -67,7 +67,7 @@ def segments_are_inside(mask, a, b):
     return inside
 
 
-@called_from_python()
+@compiled_or_plain
 def flood(mask, seeds):
     """Finds the regions of a mask, connected over faces, that hold at least one seed.
 
@@ -106,7 +106,7 @@ def flood(mask, seeds):
     return is_wet
 
 
-@called_from_python()
+@compiled_or_plain
 def nearest_in_ring(mask, middle, reach, cell_size, closest, farthest, most):
     """Finds the cells of a mask nearest to a cell, and of these those in a range of distances.
 

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from r3jax.native.platform import compiled_or_plain
+
 _LONGEST = 6
 """Cells between the two ends of a diagonal step through space."""
 
@@ -76,10 +78,7 @@ def _steps(
 @functools.cache
 def _compiled() -> _Kernel:
     """The kernel; compiled on the first call, and the disk keeps it for the next process."""
-    # Imported only here: whoever plans no way does not wait for Numba.
-    from r3jax.native.compiled import called_from_python
-
-    return called_from_python()(_settle)
+    return compiled_or_plain(_settle)  # only here: whoever plans no path does not wait for Numba
 
 
 def _settle(

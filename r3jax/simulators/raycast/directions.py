@@ -13,8 +13,12 @@ import numpy as np
 from numba import prange
 
 from r3jax.native.arithmetic import fused
-from r3jax.native.compiled import called_from_python
+from r3jax.native.compiled import called_from_python, inlined
 from r3jax.native.ffi import num_workers, require_threads
+
+_EDGE_CONTRAST = np.float32(12.0 / 255.0)
+"""Neighbors that differ by less in every channel get no more rays: with a third of this, half as
+many rays again gain 0.2 dB at 40 dB."""
 
 
 def turned(directions: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -85,3 +89,27 @@ def _average_all(image, pixels, colors, workers):
                     total += colors[k * each + s, channel]
                 whole = image[pixels[k], channel] + total
                 image[pixels[k], channel] = whole / np.float32(each + 1)
+
+
+@inlined
+def _differ(image, face, row, column, next_row, next_column):
+    """True if two pixels show different faces in different colors."""
+    if face[row, column] == face[next_row, next_column]:
+        return False
+    contrast = np.float32(0.0)
+    for channel in range(3):
+        step = abs(image[row, column, channel] - image[next_row, next_column, channel])
+        contrast = max(contrast, step)
+    return contrast > _EDGE_CONTRAST
+
+
+@called_from_python()
+def find_edges(image, face, is_edge):
+    """Marks pixels that show another face in another color than a pixel beside them, [H, W]."""
+    height, width = face.shape
+    for i in range(height):
+        for j in range(width):
+            if j + 1 < width and _differ(image, face, i, j, i, j + 1):
+                is_edge[i, j] = is_edge[i, j + 1] = True
+            if i + 1 < height and _differ(image, face, i, j, i + 1, j):
+                is_edge[i, j] = is_edge[i + 1, j] = True

@@ -24,9 +24,7 @@ from numba import prange, types
 
 from r3jax.native.compiled import called_from_python, inlined, intrinsic
 from r3jax.native.ffi import num_workers, require_threads
-
-MAX_LAYERS = 64
-"""Back faces that a ray may pass before it counts as a miss."""
+from r3jax.simulators.raycast.rays import MAX_LAYERS
 
 _LANES = 16
 _PACKET_BYTES = 2048

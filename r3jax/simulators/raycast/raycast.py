@@ -7,9 +7,6 @@ texture filter already does. A mirror's share of the color comes from one reflec
 Shape symbols: H W image size; n rays; F faces.
 """
 
-# Kernels have the types that Numba infers where they are called; annotations it would not read.
-# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
-
 import copy
 import functools
 import hashlib
@@ -20,21 +17,14 @@ import numpy as np
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, rigid_error
-from r3jax.native.compiled import called_from_python, inlined
 from r3jax.simulators import start
 from r3jax.simulators.clearance import SurfaceDistance
-from r3jax.simulators.raycast.directions import average, inside, turned
 from r3jax.simulators.raycast.rays import Hits, TriangleScene
-from r3jax.simulators.raycast.shading import shade
 from r3jax.simulators.raycast.shading_tables import build_shading_tables
 from r3jax.simulators.world import World
 
 # A rotated grid: nearly level and nearly upright edges, the ones that show, get four steps.
 _SUBPIXELS = np.array([[0.125, 0.375], [-0.375, 0.125], [-0.125, -0.375], [0.375, -0.125]])
-
-_EDGE_CONTRAST = np.float32(12.0 / 255.0)
-"""Neighbors that differ by less in every channel get no more rays: with a third of this, half as
-many rays again gain 0.2 dB at 40 dB."""
 
 
 class RaycastSimulator:
@@ -167,6 +157,8 @@ class RaycastSimulator:
         problem = rigid_error(T)
         if problem is not None:
             raise ValueError(f"cannot render: {problem}")
+        from r3jax.simulators.raycast.directions import turned  # not before: it needs Numba
+
         height, width = self._camera.height, self._camera.width
         directions = turned(self._pixels, T[:3, :3].astype(np.float32))
         colors, hits = self._look(T, directions)
@@ -229,6 +221,8 @@ class RaycastSimulator:
 
     def _look(self, T: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, Hits]:
         """Colors [n, 3] and hits of rays `directions` [n, 3] from the camera."""
+        from r3jax.simulators.raycast.shading import shade
+
         steps = self._pixel_steps(T)
         origin = T[None, :3, 3].astype(np.float32)
         hits = self._scene.cast(origin, directions, cull_back_faces=self._cull, neighbors=True)
@@ -249,6 +243,8 @@ class RaycastSimulator:
         steps: np.ndarray,
     ) -> np.ndarray:
         """What the mirrors hit by `rays` (indices) show, one bounce deep, [n, 3]."""
+        from r3jax.simulators.raycast.shading import shade
+
         normal = self._face_normals[hits.face[rays]]
         incoming, path = directions[rays], hits.distance[rays]
         along = np.einsum("ij,ij->i", normal, incoming)
@@ -278,8 +274,10 @@ class RaycastSimulator:
             directions: their rays, row by row [H * W, 3].
             T: `T_world_camera`.
         """
+        from r3jax.simulators.raycast.directions import average, find_edges, inside
+
         is_edge = np.zeros(face.shape, dtype=bool)
-        _find_edges(image, face, is_edge)
+        find_edges(image, face, is_edge)
         pixels = np.flatnonzero(is_edge)
         if len(pixels) == 0:
             return
@@ -294,27 +292,3 @@ def _depth_limit(max_range: float | int | None) -> np.float32:
     if max_range is not None and not max_range > 0.0:
         raise ValueError(f"max_range must be positive or None, got {max_range}")
     return np.float32(np.inf if max_range is None else max_range)
-
-
-@inlined
-def _differ(image, face, row, column, next_row, next_column):
-    """True if two pixels show different faces in different colors."""
-    if face[row, column] == face[next_row, next_column]:
-        return False
-    contrast = np.float32(0.0)
-    for channel in range(3):
-        step = abs(image[row, column, channel] - image[next_row, next_column, channel])
-        contrast = max(contrast, step)
-    return contrast > _EDGE_CONTRAST
-
-
-@called_from_python()
-def _find_edges(image, face, is_edge):
-    """Marks pixels that show another face in another color than a pixel beside them, [H, W]."""
-    height, width = face.shape
-    for i in range(height):
-        for j in range(width):
-            if j + 1 < width and _differ(image, face, i, j, i, j + 1):
-                is_edge[i, j] = is_edge[i, j + 1] = True
-            if i + 1 < height and _differ(image, face, i, j, i + 1, j):
-                is_edge[i, j] = is_edge[i + 1, j] = True

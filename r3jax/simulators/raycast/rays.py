@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.simulators.raycast.embree import MAX_LAYERS, PacketScene, library
+from r3jax.native.platform import missing_for_machine_code
+
+MAX_LAYERS = 64
+"""Back faces that a ray may pass before it counts as a miss."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +38,17 @@ class TriangleScene:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         """Builds the search tree over `vertices` [V, 3] [m] and `faces` [F, 3]."""
-        embree = library()
-        self._packets = None if embree is None else PacketScene(embree, vertices, faces)
+        self._packets = None
+        if not missing_for_machine_code():
+            from r3jax.simulators.raycast.embree import PacketScene, library
+
+            embree = library()
+            self._packets = None if embree is None else PacketScene(embree, vertices, faces)
         if self._packets is None:
             self._build_single(vertices, faces)
 
     def _build_single(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        """The same through embreex, where its package does not hold embree as a library."""
+        """The same through embreex, one ray at a time."""
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from r3jax.geometry.cameras import Camera
 from r3jax.native.ahead import compile_ahead
-from r3jax.native.platform import is_cpu_only
+from r3jax.native.platform import is_cpu_only, missing_for_machine_code
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.habitat.habitat import HabitatSimulator
@@ -97,7 +97,7 @@ def open_scene(
 
     Raises:
         ValueError: see `open_world`, `RaycastSimulator` and `HabitatSimulator`.
-        ImportError: a Habitat scene, and Habitat-Sim is not installed; says how to get it.
+        ImportError: Numba cannot be used; or a Habitat scene, and Habitat-Sim is not installed.
     """
     kind, rest = split_name(spec)
     if is_cpu_only():
@@ -114,6 +114,8 @@ def open_scene(
             seed=seed,
         )
     else:
+        if problem := missing_for_machine_code():
+            raise ImportError(f"{spec}: scenes are drawn by machine code, but {problem}")
         simulator = RaycastSimulator(
             open_world(spec, up, scale),
             camera,
