@@ -2,6 +2,7 @@
 #
 #   make test       formulas, laws, one run end to end: minutes
 #   make test-all   also browsers, notebooks, fuzzing, whole runs of every policy
+#   make test-workqueue  `make test` where Numba has its own threads only (slim containers, Macs): nightly
 #   make test-newest  `make test` with the newest version of every library
 #   make mutants    plants every listed fault and asks whether a law notices
 #   make stress     kill loops, thousands of damaged files, long runs: hours
@@ -17,7 +18,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/r3jax
 # Python keeps what it compiled, too: a test process saves six seconds each time.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-all test-newest test-added mutants stress lint docs notebooks benchmark gpu-check clean
+.PHONY: setup demo test test-all test-newest test-workqueue test-added mutants stress lint docs notebooks benchmark gpu-check clean
 
 setup: $(STAMP)
 
@@ -42,6 +43,10 @@ test-newest:
 	$(PYTHON) -m venv .venv-newest
 	.venv-newest/bin/pip install --quiet --upgrade --editable '.[dev]'
 	$(PYTEST:$(BIN)%=.venv-newest/bin%)
+
+# Where Numba finds neither OpenMP nor TBB: slim containers, Macs without Homebrew. For a nightly job.
+test-workqueue: setup
+	NUMBA_THREADING_LAYER=workqueue $(PYTEST)
 
 # What `test-all` adds to `test`.
 test-added: setup

@@ -2,7 +2,9 @@
 
 import importlib
 import os
+import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 import tyro
 
@@ -77,6 +79,7 @@ def run_command(args: Sequence[str]) -> int:
     )
     (name,) = (name for name, parser in parsers.items() if isinstance(parsed, parser))
     _keep_compilations()
+    warnings.formatwarning = _format_warning
     return _run(name, options_of(COMMANDS[name], parsed))
 
 
@@ -91,6 +94,22 @@ def _run(name: str, options: object) -> int:
     if name in _DECIDES:
         compile_ahead()
     return getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}")(options)
+
+
+def _format_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    """Prints our own warnings as a sentence; those of libraries with their line, as usual."""
+    if Path(filename).is_relative_to(Path(r3jax.__file__).parent):
+        return f"r3jax: {message}\n"
+    return _usual_format(message, category, filename, lineno, line)
+
+
+_usual_format = warnings.formatwarning
 
 
 def _keep_compilations() -> None:

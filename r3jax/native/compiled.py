@@ -77,16 +77,30 @@ def kernel(function: _Function) -> _Function:
     return _compiled_by(njit(error_model="numpy", **_BARE, pipeline_class=Borrowing), function)
 
 
+def kept_on_disk(compiled: Callable[[bool], Any]) -> Any:
+    """Compiles with Numba's cache, or without it where no folder for it can be written.
+
+    Args:
+        compiled: told whether to cache.
+    """
+    try:
+        return compiled(True)
+    except RuntimeError as error:
+        if "cannot cache" not in str(error):
+            raise
+        return compiled(False)
+
+
 def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Function]:
     """Compiles a kernel that Python calls, and other kernels may; the disk keeps it.
 
     Args:
         parallel: its `prange` loops share the cores that the process may use.
     """
-    compiler = njit(cache=True, error_model="numpy", parallel=parallel)
 
     def decorate(function: _Function) -> _Function:
-        dispatcher: Any = _compiled_by(compiler, function)
+        compiler = lambda cache: njit(cache=cache, error_model="numpy", parallel=parallel)
+        dispatcher = kept_on_disk(lambda cache: _compiled_by(compiler(cache), function))
         dispatcher.compile = in_one_piece()(dispatcher.compile)
         return dispatcher
 

@@ -28,7 +28,7 @@ from numba import cfunc, get_num_threads, prange, types
 from numba.np.numpy_support import carray
 from numba.np.ufunc.parallel import threading_layer
 
-from r3jax.native.compiled import called_from_python, inlined, intrinsic
+from r3jax.native.compiled import called_from_python, inlined, intrinsic, kept_on_disk
 from r3jax.native.one_piece import in_one_piece
 from r3jax.native.platform import num_cores
 from r3jax.native.structs import OFFSETS, VALUES
@@ -247,9 +247,11 @@ def register_handlers(handlers: dict[str, Callable[[Any], int]]) -> None:
 
 def _register(handlers: dict[str, Callable[[Any], int]]) -> None:
     require_threads()
-    compiler = cfunc(types.int64(types.int64), cache=True)
+    compiler = lambda handler: kept_on_disk(
+        lambda cache: cfunc(types.int64(types.int64), cache=cache)(inspect.unwrap(handler))
+    )
     with _one_process_at_a_time("-".join(handlers)), in_one_piece():
-        compiled = tuple(compiler(inspect.unwrap(handler)) for handler in handlers.values())
+        compiled = tuple(map(compiler, handlers.values()))
     for name, handler in zip(handlers, compiled, strict=True):
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler.address), platform="cpu")
         _compiled[name] = handler

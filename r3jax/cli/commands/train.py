@@ -82,7 +82,10 @@ def _conclude(
             f"training views {latest:.2f} dB",
         )
     if result.dropped:
-        console.say(f"{result.dropped} Gaussians found no room: raise --capacity for finer detail")
+        console.say(
+            f"Capacity reached, {result.dropped} Gaussians dropped; "
+            "increase --capacity for more detail"
+        )
     console.say(f"model     {folder / 'scene.ply'}")
     if result.interrupted:
         return

@@ -133,13 +133,6 @@ def test_training_on_one_core_does_not_hang(when):
     assert last < first
 
 
-def test_a_threading_layer_for_one_rendering_only_is_refused(monkeypatch):
-    monkeypatch.setattr(ffi, "threading_layer", lambda: "workqueue")
-    ffi.require_threads.cache_clear()  # this process has been found to be fine
-    with pytest.raises(RuntimeError, match="omp"):
-        ffi.require_threads()
-
-
 def test_workers_follow_the_cores_of_the_process(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3}, raising=False)
     assert ffi.num_workers() == 1
