@@ -48,6 +48,7 @@ def _train(options: DemoOptions, path: Path) -> int:
             iterations=options.iterations,
             resolution=options.train_resolution,
             gaussians=20_000,
+            capacity=64_000,  # what densification wants in a thousand steps finds room
             overwrite=True,
         )
     )
