@@ -5,7 +5,13 @@ import sys
 from collections.abc import Sequence
 
 from r3jax.cli.errors import UserError, one_line, printable
-from r3jax.interrupts import INTERRUPTED, caught_interrupts, is_interrupted, settle_interrupt
+from r3jax.interrupts import (
+    INTERRUPTED,
+    caught_interrupts,
+    end_process,
+    is_interrupted,
+    settle_interrupt,
+)
 
 USER_ERROR = 2
 """Exit code where the user can mend it: an unknown name, a folder that exists, a broken file."""
@@ -25,24 +31,33 @@ def main(args: Sequence[str] | None = None) -> int:
         input, 130 interrupted, 141 nobody reads the output any more.
     """
     with caught_interrupts(stays=args is None):
-        try:
-            # Imported here: the imports of a command take a second, in which Ctrl-C works, too.
-            from r3jax.cli.command_line import run_command
+        code = _main(args)
+        if code == INTERRUPTED and args is None:
+            # Python would wait for threads that compile, and for what an interrupted import left.
+            end_process(code)
+        return code
 
-            code = run_command(sys.argv[1:] if args is None else args)
-            return INTERRUPTED if code == 0 and is_interrupted() else code
-        except BrokenPipeError:
-            # Python would fail once more when it flushes at its end.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return NO_READER
-        except (KeyboardInterrupt, Exception) as error:
-            # A library may make another error of a KeyboardInterrupt that passes through it.
-            if isinstance(error, KeyboardInterrupt) or is_interrupted():
-                return _interrupted(error)
-            if not isinstance(error, UserError):
-                raise
-            print(f"r3jax: {printable(one_line(error))}", file=sys.stderr)
-            return USER_ERROR
+
+def _main(args: Sequence[str] | None) -> int:
+    """Runs one command, and turns errors into messages and exit codes."""
+    try:
+        # Imported here: the imports of a command take a second, in which Ctrl-C works, too.
+        from r3jax.cli.command_line import run_command
+
+        code = run_command(sys.argv[1:] if args is None else args)
+        return INTERRUPTED if code == 0 and is_interrupted() else code
+    except BrokenPipeError:
+        # Python would fail once more when it flushes at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NO_READER
+    except (KeyboardInterrupt, Exception) as error:
+        # A library may make another error of a KeyboardInterrupt that passes through it.
+        if isinstance(error, KeyboardInterrupt) or is_interrupted():
+            return _interrupted(error)
+        if not isinstance(error, UserError):
+            raise
+        print(f"r3jax: {printable(one_line(error))}", file=sys.stderr)
+        return USER_ERROR
 
 
 def _interrupted(error: BaseException) -> int:
