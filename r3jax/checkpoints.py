@@ -4,17 +4,16 @@ Orbax writes the arrays. Of what it wrote the SHA-256 of every file is kept in `
 it in place the checkpoint gets its name, a number. A checkpoint without that file is of an
 earlier version of this package, and read unchecked.
 
-Nothing is ever deleted here but what bears a name that only this package gives, and nothing at
-all through a link.
+Of a checkpoint only the files are deleted that it lists; one of an earlier version holds what Orbax
+writes.
 """
 
 import errno
+import glob
 import hashlib
 import json
 import logging
 import os
-import re
-import shutil
 import sys
 import time
 from collections.abc import Callable, Generator, Mapping
@@ -24,11 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.files import sync_folder, write_atomic
+from r3jax import files
+from r3jax.files import is_link, remove, remove_own, sync_folder, whole_folder, write_atomic
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.fields import check_type
 from r3jax.formats.validation.files import check_tree, read_bytes
 from r3jax.formats.validation.json_text import parse_json
+from r3jax.formats.validation.names import check_relative
 
 Tables = Mapping[str, Mapping[str, np.ndarray]]
 """Named arrays, by table."""
@@ -42,64 +43,68 @@ _STRAGGLING = 0.5
 """After an error Orbax's other threads write and report no longer than this [s]."""
 
 _DIGITS = 6
-_WRITING, _DISCARDED = ".writing-", ".discarded-"
-_LEFTOVER = re.compile(
-    rf"{re.escape(_WRITING)}\d+(\.orbax-checkpoint-tmp.*)?"
-    rf"|{re.escape(_DISCARDED)}\d+"
-    r"|\d+\.orbax-checkpoint-tmp.*"  # of earlier versions of this package
+_OF_ORBAX = (
+    "_*",
+    "manifest.ocdbt",
+    "commit_success.txt",
+    "d/*",
+    "array_metadatas/*",
+    "ocdbt.process_*/**/*",
 )
+"""Files of a checkpoint without hashes."""
 
 
 def make_folder(folder: Path) -> None:
-    """Makes the folder of checkpoints and clears away what a killed process left behind.
+    """Makes the folder of checkpoints, and ends deletions that were cut off.
 
     Raises:
         OSError: it is a link, or cannot be made.
     """
-    if folder.is_symlink():
-        # What is deleted at its other end was perhaps never ours.
-        reason = "a folder of checkpoints must not be a link"
-        raise NotADirectoryError(errno.ENOTDIR, reason, str(folder))
-    folder.mkdir(parents=True, exist_ok=True)
-    _clear_leftovers(folder)
-
-
-def _clear_leftovers(folder: Path) -> None:
-    for entry in folder.iterdir():
-        if _LEFTOVER.fullmatch(entry.name) and entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry, ignore_errors=True)
+    if is_link(folder):
+        raise files.NotOursError(folder, "a folder of checkpoints must not be a link")
+    files.make_folder(folder)
+    for path in folder.glob("[0-9]*"):
+        if _has_number(path) and (path / _HASHES).is_file() and not (path / _ORBAX).exists():
+            discard(path)
 
 
 def numbered(folder: Path) -> list[Path]:
     """The checkpoints in a folder, oldest first."""
-    if folder.is_symlink():
+    if is_link(folder):
         return []
     found = [path for path in folder.glob("[0-9]*") if _is_checkpoint(path)]
     return sorted(found, key=lambda path: int(path.name))
 
 
 def _is_checkpoint(path: Path) -> bool:
+    return _has_number(path) and (path / _ORBAX).is_file()
+
+
+def _has_number(path: Path) -> bool:
     is_number = path.name.isdecimal() and path.name.isascii() and len(path.name) >= _DIGITS
-    return is_number and not path.is_symlink() and (path / _ORBAX).is_file()
+    return is_number and not is_link(path)
 
 
 def discard(path: Path) -> None:
-    """Deletes a checkpoint that `numbered` has named.
+    """Deletes a checkpoint that `numbered` has named; what else lies in it stays.
 
     Raises:
-        OSError: it cannot be renamed.
+        OSError: not permitted.
     """
-    # Out of sight first: a checkpoint that is half deleted must not look like one.
-    hidden = path.with_name(f"{_DISCARDED}{path.name}")
-    path.rename(hidden)
-    shutil.rmtree(hidden, ignore_errors=True)
+    try:
+        names = [glob.escape(name) for name in _read_hashes(path)] + [_HASHES]
+    except (OSError, ForeignFileError):  # none are there, or they are damaged
+        names = [*_OF_ORBAX, _HASHES]
+    # First what tells a checkpoint: one that is half deleted must not look like one.
+    remove(path / _ORBAX)
+    remove_own(path.parent, [f"{path.name}/{name}" for name in names])
 
 
 def write_checkpoint(path: Path, tables: Tables) -> None:
     """Writes one: it is there as a whole, or not at all.
 
     Args:
-        path: a number in a folder that `make_folder` has made, in which nobody else writes.
+        path: a number in a folder that is there, in which nobody else writes.
         tables: the arrays.
 
     Raises:
@@ -108,23 +113,18 @@ def write_checkpoint(path: Path, tables: Tables) -> None:
     """
     import orbax.checkpoint as ocp
 
-    writing = path.with_name(f"{_WRITING}{path.name}")
     try:
-        with _quiet(), ocp.PyTreeCheckpointer() as checkpointer:
-            checkpointer.save(writing.resolve(), dict(tables), force=True)
-        _write_hashes(writing)
-        if _is_checkpoint(path):
-            discard(path)
-        writing.rename(path)
+        with whole_folder(path) as writing:
+            with _quiet(), ocp.PyTreeCheckpointer() as checkpointer:
+                checkpointer.save(writing.resolve(), dict(tables), force=True)
+            _write_hashes(writing)
+            if _is_checkpoint(path):
+                discard(path)
         sync_folder(path.parent)
     except (ValueError, RuntimeError) as error:  # how Orbax's storage reports a full disk
-        _clear_leftovers(path.parent)
         is_full = "RESOURCE_EXHAUSTED" in str(error) or "No space left" in str(error)
         reason = os.strerror(errno.ENOSPC) if is_full else " ".join(str(error).split())[:300]
         raise OSError(errno.ENOSPC if is_full else errno.EIO, reason, str(path)) from error
-    except OSError:
-        _clear_leftovers(path.parent)
-        raise
 
 
 def _write_hashes(folder: Path) -> None:
@@ -170,16 +170,23 @@ def read_arrays(path: Path) -> dict[str, Any]:
 
 def _check_hashes(folder: Path) -> None:
     try:
-        stored = parse_json(read_bytes(folder / _HASHES, _MAX_BYTES))
+        stored = _read_hashes(folder)
     except FileNotFoundError:
         return
-    check_type(_HASHES, stored, dict[str, str])
     found = _files(folder)
     for name, sha256 in stored.items():
         if name not in found:
             raise ForeignFileError(f"{name[:80]} is missing")
         if _sha256(found[name]) != sha256:
             raise ForeignFileError(f"{name[:80]} is damaged: its SHA-256 is not the one kept")
+
+
+def _read_hashes(folder: Path) -> dict[str, str]:
+    stored = parse_json(read_bytes(folder / _HASHES, _MAX_BYTES))
+    check_type(_HASHES, stored, dict[str, str])
+    for name in stored:
+        check_relative(name)
+    return stored
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import contextlib
 import datetime
+import glob
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -11,10 +12,18 @@ from types import TracebackType
 
 from r3jax.checkpoints import Tables, discard, numbered
 from r3jax.files import (
+    NotOursError,
     append_line,
+    check_own,
+    clear_partial,
+    disown_folder,
+    is_link,
+    is_own,
     lock_folder,
+    make_folder,
+    own_folder,
+    remove,
     remove_own,
-    remove_partial,
     sync_folder,
     write_atomic,
 )
@@ -36,9 +45,6 @@ _ROOM = ".room"
 _ROOM_BYTES = 64 << 10
 """Kept free while a run is written, so that a full disk has room for the row that says so."""
 
-_BEGUN = ("lock", "trace.jsonl", "frames", "report", _ROOM)
-"""What there may be before run.json is."""
-
 # By name, never a whole tree: what users put into a run survives `overwrite`.
 _OWN = (
     "trace.jsonl",
@@ -57,12 +63,15 @@ _OWN = (
     *(f"report/{name}" for name in ("report.html", "evaluation.json", "evaluation.csv")),
     "report/evaluation.parquet",
     "exports/points.ply",
-    *(f"models/*/{name}" for name in ("scene.ply", "points.ply", "history.csv", "train.json")),
-    *(f"models/*/{name}" for name in ("lock", "checkpoints/lock", "checkpoints/training.json")),
-    *("models/*/checkpoints", "models/*"),
     *("frames", "checkpoints", "report", "models", "exports"),
 )
-"""Everything in a run that this package makes, but run.json, the lock and the checkpoints."""
+"""Everything in a run that this package makes, but run.json, the lock, checkpoints and models."""
+
+_OF_MODEL = (
+    *("scene.ply", "points.ply", "history.csv", "train.json", "lock", "checkpoints"),
+    *("checkpoints/training.json", "checkpoints/lock"),
+)
+"""The same of a model, but its checkpoints."""
 
 
 class RunWriter:
@@ -84,17 +93,19 @@ class RunWriter:
         self.path = Path(path)
         try:
             _check_free(self.path, overwrite=overwrite)  # nothing is written where no run may be
-            self.path.mkdir(parents=True, exist_ok=True)
+            own_folder(self.path, "run")
             with self._locked():
                 _check_free(self.path, overwrite=overwrite)  # another process may have been faster
                 _clear(self.path)
                 for name in ("frames", "report"):
-                    (self.path / name).mkdir(exist_ok=True)
-                (self.path / "trace.jsonl").touch()
+                    make_folder(self.path / name)
+                write_atomic(self.path / "trace.jsonl", b"")
                 # The last: a folder with a run.json can be gone on with.
                 write_atomic(self.path / "run.json", header_to_json(header).encode())
                 self._checkpoints = CheckpointWriter(self.path / "checkpoints")
                 self._begin(header, views=0)
+        except NotOursError as error:
+            raise RunError(error.path, error.reason) from error
         except OSError as error:
             raise RunError(self.path, f"cannot make the run folder ({error.strerror})") from error
 
@@ -123,11 +134,16 @@ class RunWriter:
             with writer._locked():
                 # Read under the lock: until now another process may have added views.
                 run = read_run(writer.path)
+                own_folder(writer.path, "run")
+                for name in ("frames", "report", "exports"):  # refused now, not after an hour
+                    make_folder(writer.path / name)
                 writer._checkpoints = CheckpointWriter(writer.path / "checkpoints")
                 _mend(writer.path)  # after the read, which refuses a trace that cannot be mended
                 if header is not None:
                     write_atomic(writer.path / "run.json", header_to_json(header).encode())
                 writer._begin(header or run.header, views=len(run.rows))
+        except NotOursError as error:
+            raise RunError(error.path, error.reason) from error
         except OSError as error:
             raise RunError(
                 writer.path, f"cannot go on with the run ({error.strerror or error})"
@@ -240,7 +256,7 @@ class RunWriter:
             # Also if the row fails: a checkpoint that is under way is told of, and not dropped.
             afterwards.callback(self._checkpoints.wait)
             # Freed first: on a full disk this room is all there is for the row.
-            (self.path / _ROOM).unlink(missing_ok=True)
+            remove(self.path / _ROOM)
             append_line(self.path / "trace.jsonl", to_json(EndRow(outcome, message, self.views)))
 
     @contextlib.contextmanager
@@ -261,7 +277,7 @@ class RunWriter:
             self._checkpoints.close()
             # A disk that has become read-only refuses this; the run is whole all the same.
             with contextlib.suppress(OSError):
-                (self.path / _ROOM).unlink(missing_ok=True)
+                remove(self.path / _ROOM)
         finally:
             self._lock.close()
 
@@ -297,8 +313,7 @@ def _mend(path: Path) -> None:
     timings = path / "timings.jsonl"
     if timings.exists() and not timings.read_bytes().endswith(b"\n"):
         write_atomic(timings, "".join(f"{line}\n" for line in complete_lines(timings)).encode())
-    for folder in (path, path / "frames"):
-        remove_partial(folder)
+    clear_partial(path)
 
 
 def _check_free(path: Path, *, overwrite: bool) -> None:
@@ -307,38 +322,24 @@ def _check_free(path: Path, *, overwrite: bool) -> None:
     Raises:
         RunError: a file, something that is not a run, or a run that may not be overwritten.
     """
-    if not path.exists():
-        return
-    if not path.is_dir():
+    if path.exists() and not path.is_dir():
         raise RunError(path, "is a file; a run needs a folder")
-    if (path / "run.json").exists():
-        if not overwrite:
-            raise RunError(path, "the run exists already: choose another name or give --overwrite")
-    # Without run.json it is ours only if a process that began a run may have left all of it.
-    elif not all(_is_begun(entry) for entry in path.iterdir()):
-        raise RunError(path, "the folder holds something that is not a run: choose another name")
-
-
-def _is_begun(entry: Path) -> bool:
-    """Whether a process that was killed while it began a run may have left this."""
-    if entry.name.startswith(".run.json.") or entry.name.startswith(f".{_ROOM}."):
-        return True
-    if entry.name not in _BEGUN or entry.is_symlink():
-        return False
-    return (
-        not any(entry.iterdir())
-        if entry.is_dir()
-        else entry.name != "trace.jsonl" or (entry.stat().st_size == 0)
-    )
+    check_own(path, "run", "choose another name")
+    if (path / "run.json").exists() and not overwrite:
+        raise RunError(path, "the run exists already: choose another name or give --overwrite")
 
 
 def _clear(path: Path) -> None:
     """Deletes the run that is there, but for run.json, which the new one replaces."""
-    for folder in (path / "checkpoints", *path.glob("models/*/checkpoints")):
-        # A link on the way leads to what was perhaps never ours.
-        if folder.resolve() == path.resolve() / folder.relative_to(path):
-            for old in numbered(folder):
+    for old in numbered(path / "checkpoints"):
+        discard(old)
+    models = path / "models"
+    for model in [] if is_link(models) else models.glob("*"):
+        if not is_link(model) and is_own(model, "model"):
+            for old in numbered(model / "checkpoints"):
                 discard(old)
-    for folder in (path, path / "frames"):
-        remove_partial(folder)
+            disown_folder(model / "checkpoints")
+            disown_folder(model)
+            remove_own(models, [f"{glob.escape(model.name)}/{name}" for name in _OF_MODEL])
+    clear_partial(path)
     remove_own(path, _OWN)

@@ -62,13 +62,43 @@ def test_a_slow_disk_leaves_checkpoints_out_but_not_the_last(tmp_path, monkeypat
     assert checkpoint_steps(tmp_path / "c") == [0, 2]
 
 
-def test_what_a_killed_process_left_is_cleared_away(tmp_path):
+def test_a_deletion_that_was_cut_off_is_ended(tmp_path):
+    writer = CheckpointWriter(tmp_path / "c")
+    for step in (0, 1):
+        writer.save(step, TABLES, wait=True)
+    writer.close()
+    (tmp_path / "c" / "000000" / "_CHECKPOINT_METADATA").unlink()
+    CheckpointWriter(tmp_path / "c").close()
+    assert [p.name for p in (tmp_path / "c").iterdir()] == ["000001"]
+
+
+def test_what_the_user_keeps_in_a_checkpoint_survives_it(tmp_path):
     folder = tmp_path / "c"
-    for name in ("000004", "000005.orbax-checkpoint-tmp-3", ".discarded-000001"):
-        (folder / name).mkdir(parents=True)
-        (folder / name / "part").write_bytes(b"x")
-    CheckpointWriter(folder).close()
-    assert [p.name for p in folder.iterdir()] == ["000004"]
+    writer = CheckpointWriter(folder)
+    writer.save(0, TABLES, wait=True)
+    (folder / "000000" / "mine").write_bytes(b"x")
+    (folder / "000000" / "d" / "mine").write_bytes(b"x")
+    for step in range(1, KEPT + 1):
+        writer.save(step, TABLES, wait=True)
+    writer.close()
+    assert checkpoint_steps(folder) == [1, 2, 3]
+    left = {p.relative_to(folder / "000000").as_posix() for p in (folder / "000000").rglob("*")}
+    assert left == {"mine", "d", "d/mine"}
+
+
+def test_a_link_under_a_temporary_name_is_not_written_through(tmp_path):
+    """What led to the loss of a folder: names that can be foreseen."""
+    (tmp_path / "victim").mkdir()
+    (tmp_path / "victim" / "mine").write_bytes(b"x")
+    folder = tmp_path / "c"
+    folder.mkdir()
+    (folder / ".writing-000000").symlink_to(tmp_path / "victim")
+    (folder / "000000.orbax-checkpoint-tmp").symlink_to(tmp_path / "victim")
+    writer = CheckpointWriter(folder)
+    writer.save(0, TABLES, wait=True)
+    writer.close()
+    assert checkpoint_steps(folder) == [0]
+    assert [p.name for p in (tmp_path / "victim").iterdir()] == ["mine"]
 
 
 def test_nothing_of_the_user_is_deleted(tmp_path):
@@ -95,7 +125,7 @@ def test_what_is_no_checkpoint_is_not_written_over(tmp_path):
     (folder / "000000").mkdir(parents=True)
     (folder / "000000" / "mine").write_bytes(b"x")
     writer = CheckpointWriter(folder)
-    with pytest.raises(OSError, match="not empty"):
+    with pytest.raises(OSError, match="000000.*is there already"):
         writer.save(0, TABLES, wait=True)
     writer.close()
     assert (folder / "000000" / "mine").exists()

@@ -302,10 +302,10 @@ def test_a_full_disk_stops_the_recording_and_spares_what_is_there(
         real_fsync, real_replace = os.fsync, os.replace
 
         def fail_at(real):
-            def call(*args):
+            def call(*args, **handles):
                 if next(calls) == failing_call:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                return real(*args)
+                return real(*args, **handles)
 
             return call
 

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Generator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.checkpoints import discard, make_folder, numbered, read_arrays, write_checkpoint
-from r3jax.files import lock_folder, write_atomic
+from r3jax.files import (
+    clear_partial,
+    disown_folder,
+    is_link,
+    lock_folder,
+    own_folder,
+    remove_own,
+    write_atomic,
+)
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.files import read_bytes
 from r3jax.formats.validation.json_text import parse_json
@@ -68,17 +76,19 @@ def only_training(folder: Path, *, is_new: bool) -> Generator[None]:
 
     Raises:
         CheckpointError: another process does.
-        OSError: the folder cannot be written.
+        OSError: the folder cannot be written, is a link, or holds something else.
     """
     if is_new:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     elif not numbered(folder):  # nothing is written into a folder that holds no training
         raise CheckpointError(folder, "there is no checkpoint to resume from")
+    own_folder(folder, "training")
     try:
         lock = lock_folder(folder)
     except BlockingIOError:
         raise CheckpointError(folder, "another process is training here") from None
     with lock:
+        clear_partial(folder)
         make_folder(folder)
         yield
 
@@ -120,14 +130,12 @@ def remove_checkpoints(folder: Path) -> None:
     Raises:
         OSError: a checkpoint cannot be deleted.
     """
-    if folder.is_symlink():
+    if is_link(folder):
         return
     for old in numbered(folder):
         discard(old)
-    for name in (_SETTINGS, "lock"):
-        (folder / name).unlink(missing_ok=True)
-    with suppress(OSError):  # something of the user's is there
-        folder.rmdir()
+    disown_folder(folder)
+    remove_own(folder.parent, [f"{folder.name}/{name}" for name in (_SETTINGS, "lock")])
 
 
 def _named(state: Any) -> dict[str, Any]:
