@@ -29,6 +29,7 @@ from r3jax.cli.options import (
 )
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig
+from r3jax.files import check_own
 from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.names import parse_topics
 from r3jax.planning.policies import check_policy
@@ -459,8 +460,10 @@ def _check_free(folder: Path, overwrite: bool) -> None:
 
 def _check_replaceable(folder: Path) -> None:
     """Refuses to write an audit over anything but an earlier one."""
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "audit.json").exists():
-        raise UserError(f"{folder} holds something that is no audit: give another --out")
+    try:
+        check_own(folder, "audit", "give another --out")
+    except OSError as error:
+        raise UserError(one_line(error)) from error
 
 
 def _check_folder(path: Path) -> None:

@@ -4,6 +4,8 @@ import os
 import sys
 from pathlib import Path
 
+from r3jax.files import make_folder, write_atomic
+
 
 def main(note: Path) -> None:
     """Compiles all kernels, and leaves a note."""
@@ -26,10 +28,11 @@ def main(note: Path) -> None:
     for name in (training.LOSS, training.ADAM):
         training.register(name)
     scoring.register(scoring.ROWS)
-    note.parent.mkdir(parents=True, exist_ok=True)
-    note.touch()
+    make_folder(note.parent)
+    write_atomic(note, b"")
 
 
 if __name__ == "__main__":
-    os.nice(5)  # the command itself goes first
+    if hasattr(os, "nice"):  # Windows has no such thing
+        os.nice(5)  # the command itself goes first
     main(Path(sys.argv[1]))

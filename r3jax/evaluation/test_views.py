@@ -20,7 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from r3jax.files import write_atomic
+from r3jax.files import make_folder, write_atomic
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.fields import check_fields
 from r3jax.formats.validation.files import read_bytes
@@ -286,7 +286,7 @@ def _check_scene(view_set: ViewSet, truth: Truth, what: str) -> None:
 
 def _write(path: Path, view_set: ViewSet) -> None:
     """Stores a set; a reader sees all of it or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     lines = [
         json.dumps({"position": [round(x, 4) for x in position.tolist()], "look": look})
         for position, look in zip(view_set.positions, view_set.looks, strict=True)

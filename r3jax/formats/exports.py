@@ -9,16 +9,13 @@ copies: uint16 in steps of 0.2 mm. COLMAP has no place for depth; it lies beside
 """
 
 import json
-import os
-import secrets
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from r3jax.files import write_atomic
+from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic
 from r3jax.formats.colmap.binary import write_binary
 from r3jax.formats.colmap.model import (
     ColmapImage,
@@ -54,27 +51,18 @@ def export_run(
         The number of points: centers of the map's voxels; 0 where the run has no stored map.
 
     Raises:
-        FormatError: the run has no views, `out` holds something, or is no name of a folder.
+        FormatError: the run has no views, or `out` is no name of a folder.
         RunError: the stored map or an image cannot be read, or is not what was recorded.
-        OSError: the disk is full, not writable, ...
+        OSError: `out` holds something; the disk is full, not writable, ...
     """
     if not run.rows:
         raise FormatError(run.path, "the run has no views yet: there is nothing to export")
     if "\0" in str(out):
         raise FormatError(Path(repr(out.name)), "this cannot be the name of a folder")
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise FormatError(out, "something is there already: give another folder")
+    check_vacant(out)
     xyz, rgb = _map_points(run)
-    out = out.absolute()  # "." has no name
-    partial = out.with_name(f".{out.name}.{secrets.token_hex(4)}.partial")
-    if not out.parent.is_dir():
-        out.parent.mkdir(parents=True, exist_ok=True)
-    partial.mkdir()
-    try:
+    with whole_folder(out) as partial:
         _fill(partial, run, kind, (xyz, rgb), on_view)
-        os.replace(partial, out)  # takes the place of an empty folder
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return len(xyz)
 
 
@@ -93,12 +81,12 @@ def _fill(
 ) -> None:
     xyz, rgb = points
     for name in ("images", "depth"):
-        (out / name).mkdir()
+        make_folder(out / name)
     for row in run.rows:
         run.images(row.step)  # says what is wrong with them
         image = run.image_path(row.step)
-        shutil.copyfile(image, out / "images" / image.name)
-        shutil.copyfile(run.depth_path(row.step), out / "depth" / image.name)
+        write_atomic(out / "images" / image.name, image.read_bytes())
+        write_atomic(out / "depth" / image.name, run.depth_path(row.step).read_bytes())
         on_view()
     if len(xyz):
         write_points(out / _POINTS, xyz, rgb)
@@ -107,7 +95,7 @@ def _fill(
         return
     model = model_of(run, xyz, rgb)
     folder = out / "sparse" / "0"
-    folder.mkdir(parents=True)
+    make_folder(folder)
     (write_binary if kind == "colmap" else write_text)(folder, model)
 
 

@@ -11,6 +11,7 @@ from llvmlite import ir
 from numba import extending, njit, types
 from numba.core import cgutils
 
+from r3jax.files import remove
 from r3jax.native.borrowing import Borrowing
 from r3jax.native.one_piece import in_one_piece
 
@@ -41,7 +42,7 @@ def forget_outdated_code(folder: Path = _HERE, *others: Path) -> None:
         is_ours = index.name.partition(".")[0] in sources  # of a kernel in one of these files
         with contextlib.suppress(OSError):
             if is_ours and index.stat().st_mtime < newest:
-                index.unlink()
+                remove(index)
 
 
 forget_outdated_code()

@@ -11,7 +11,6 @@ and nothing can wait for a thread of XLA's pool while it occupies the only one.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
 import contextlib
-import fcntl
 import functools
 import inspect
 import os
@@ -28,6 +27,7 @@ from numba import cfunc, get_num_threads, prange, types
 from numba.np.numpy_support import carray
 from numba.np.ufunc.parallel import threading_layer
 
+from r3jax.files import lock_file
 from r3jax.native.compiled import called_from_python, inlined, intrinsic, kept_on_disk
 from r3jax.native.one_piece import in_one_piece
 from r3jax.native.platform import num_cores
@@ -220,11 +220,12 @@ def num_workers() -> int:
 @contextlib.contextmanager
 def _one_process_at_a_time(name: str) -> Generator[None]:
     """Waits for other processes that compile the same: what they leave on the disk is found."""
-    path = Path(tempfile.gettempdir()) / f"r3jax-{os.getuid()}-{name}.lock"
+    user = os.getuid() if hasattr(os, "getuid") else ""  # on Windows the folder is the user's own
+    path = Path(tempfile.gettempdir()) / f"r3jax-{user}-{name}.lock"
     with contextlib.ExitStack() as held:
-        # A folder that cannot be written: both compile. Let go by the end of a process, too.
+        # A file that cannot be written, or is a link: both compile.
         with contextlib.suppress(OSError):
-            fcntl.flock(held.enter_context(open(path, "w")), fcntl.LOCK_EX)
+            held.enter_context(lock_file(path, wait=True))
         yield
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from r3jax.apps.benchmark.cells import Cell
 from r3jax.apps.benchmark.conditions import Conditions
-from r3jax.files import write_atomic
+from r3jax.files import make_folder, write_atomic
 from r3jax.formats.validation.arrays import read_npz
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import Camera, rigid_error
@@ -77,7 +77,7 @@ def save_reference_images(path: Path, reference: ReferenceImages) -> None:
         T_world_camera=np.asarray(views.T_world_camera),
         cameras=np.stack(cameras),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     write_atomic(path, data.getvalue())
 
 

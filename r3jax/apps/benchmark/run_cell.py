@@ -36,7 +36,14 @@ from r3jax.evaluation.maps import map_of
 from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.loop import explore
 from r3jax.exploration.state import COMPLETE, StopReason
-from r3jax.files import lock_folder, write_atomic
+from r3jax.files import (
+    clear_partial,
+    lock_folder,
+    make_folder,
+    own_folder,
+    remove,
+    write_atomic,
+)
 from r3jax.formats.submissions import Submission, content_hash
 from r3jax.scoring.renderability import renderability
 from r3jax.simulators.base import Simulator
@@ -77,14 +84,15 @@ def run_cell(cell: Cell, root: Path, on_stage: OnStage = lambda stage: None) -> 
         KeyboardInterrupt: Ctrl-C; the next call goes on from here.
     """
     paths = paths_of(root, cell)
-    paths.folder.mkdir(parents=True, exist_ok=True)
+    own_folder(paths.folder, "cell", "move it away")
     with _lock(paths.folder):
+        clear_partial(paths.folder)
         try:
             _run_locked(cell, root, paths, on_stage)
         except Exception:
             write_atomic(paths.error, traceback.format_exc().encode())
             raise
-        paths.error.unlink(missing_ok=True)
+        remove(paths.error)
 
 
 def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> None:
@@ -348,6 +356,6 @@ def _train(
         result = fit(overwrite=True)
     if result.interrupted:
         raise KeyboardInterrupt
-    paths.model(snapshot).parent.mkdir(parents=True, exist_ok=True)
+    make_folder(paths.model(snapshot).parent)
     write_scene(paths.model(snapshot), result.scene)
     return result.scene

@@ -25,7 +25,7 @@ from r3jax.evaluation.comparison import (
 )
 from r3jax.evaluation.scores import METRICS, Metric
 from r3jax.evaluation.statistics import Scores, mean_over_scenes, paired_difference
-from r3jax.files import write_atomic
+from r3jax.files import check_own, make_folder, own_folder, write_atomic
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.render import render
 from r3jax.trace.images import encode_png
@@ -35,8 +35,6 @@ PAPER_LEAD = ("ours-pano", "active-gs", "views:300", 2.9, "arXiv 2601.07484")
 docs/results/views.md has it beside ours."""
 
 _GENERATOR = '<meta name="generator" content="r3jax benchmark">'
-_MARKS = (_GENERATOR, "</style></head><body>\n<h1>r3jax benchmark</h1>\n")
-"""What tells a page of ours: the second, those that were written before there was the first."""
 
 _PAGE = Template(
     """<!doctype html>
@@ -80,38 +78,21 @@ def write_site(
         OSError: the disk is full, not writable, ...
     """
     page = Path(folder) / "index.html"
-    _check_own(page)
+    check_own(page.parent, "site")
     records = read_records(root)
     if not records:
         raise ValueError(
             f"{root} holds no records of explorations: run the benchmark first (those of --photos "
             "are no part of the page)"
         )
-    (page.parent / "pictures").mkdir(parents=True, exist_ok=True)
+    own_folder(page.parent, "site")
+    make_folder(page.parent / "pictures")
     parts = [_speed(on_stage)]
     for heading, group in headed_groups(records):
         parts += [f"<h2>{_text(heading)}</h2>", *_tables(group), *_papers(group)]
         parts += _worst_views(root, group, page.parent, on_stage)
     write_atomic(page, _PAGE.substitute(generator=_GENERATOR, body="\n".join(parts)).encode())
     return page
-
-
-def _check_own(page: Path) -> None:
-    """Refuses a folder that holds anything but an earlier page.
-
-    Raises:
-        ValueError: it does.
-        OSError: it cannot be read.
-    """
-    if not page.parent.is_dir() or not any(page.parent.iterdir()):
-        return
-    # A pipe of that name would wait for a writer.
-    text = page.read_text(errors="replace") if page.is_file() else ""
-    if not any(mark in text for mark in _MARKS):
-        raise ValueError(
-            f"{page.parent} holds something that is no page of a benchmark, which stays as it is: "
-            "give another folder"
-        )
 
 
 def _text(value: object) -> str:

@@ -11,6 +11,7 @@ from r3jax.apps.benchmark.conditions import OWN_OF_LOOP, Conditions
 from r3jax.apps.benchmark.plan import Request, prepare_scene
 from r3jax.apps.benchmark.submission_checks import Problem, check_submission
 from r3jax.exploration.step import check_world
+from r3jax.files import make_folder
 from r3jax.formats.submissions import (
     Submission,
     content_hash,
@@ -155,7 +156,7 @@ def plan_submission(
     )
     view_set = prepare_scene(request, scene["name"], root, on_stage)
     digest = content_hash(submission)
-    stored_submission(root, digest).parent.mkdir(parents=True, exist_ok=True)
+    make_folder(stored_submission(root, digest).parent)
     write_submission(stored_submission(root, digest), submission)
     return Cell(
         scene=scene["name"],

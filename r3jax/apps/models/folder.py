@@ -20,7 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.files import lock_folder, write_atomic
+from r3jax.files import (
+    MARKER,
+    check_own,
+    clear_partial,
+    lock_folder,
+    own_folder,
+    write_atomic,
+)
 from r3jax.formats.captures import Capture
 from r3jax.formats.errors import FormatError
 from r3jax.formats.points import write_points
@@ -140,17 +147,17 @@ def check_free(folder: Path, *, replace: bool) -> None:
     """Refuses a folder that holds a model, unless it may change, or something that is no model.
 
     Raises:
-        FormatError: says which of them.
+        FormatError: a model.
+        NotOursError: something else.
     """
-    present = {path.name for path in folder.iterdir()} - {"lock"} if folder.is_dir() else set[str]()
-    if present and not replace:
+    check_own(folder, "model", "give another --name")
+    present = {path.name for path in folder.iterdir()} if folder.is_dir() else set[str]()
+    if present - {"lock", MARKER} and not replace:
         raise FormatError(
             folder,
             "this holds a model: --resume goes on with it, --overwrite replaces it, "
             "--name NAME makes another",
         )
-    if present and not present & {"scene.ply", "train.json", "checkpoints"}:
-        raise FormatError(folder, "this holds something that is not a model: give another --name")
 
 
 @contextlib.contextmanager
@@ -159,14 +166,16 @@ def only_writer(folder: Path, *, replace: bool) -> Generator[None]:
 
     Raises:
         FormatError: another process is training here, or see `check_free`.
+        OSError: the folder cannot be made, or a link is in the way.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    own_folder(folder, "model", "give another --name")
     try:
         lock = lock_folder(folder)
     except BlockingIOError:
         raise FormatError(folder, "another process is training here") from None
     with lock:
         check_free(folder, replace=replace)  # another process may have been faster
+        clear_partial(folder)
         yield
 
 

@@ -19,7 +19,7 @@ from r3jax.evaluation.evaluate import Evaluation, evaluate
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
 from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
-from r3jax.files import write_atomic
+from r3jax.files import check_replaceable, holds, make_folder, write_atomic
 from r3jax.formats.captures import Capture
 from r3jax.formats.validation.json_text import sealed
 from r3jax.mapping.state import MapState
@@ -133,6 +133,27 @@ def _map(capture: Capture, numbers: list[int]) -> MapState:
     )
 
 
+_MARKS = {
+    "json": b'"bootstrap_seed"',
+    "csv": b"view,psnr,",
+    "parquet": b"renderability",
+    "png": style.PNG_MARK,
+}
+"""What the files of a judgment hold, by their suffix."""
+
+
+def check_judgment_folder(folder: Path) -> None:
+    """Refuses a folder with files of a judgment's names that are of no judgment.
+
+    Raises:
+        NotOursError: names the file.
+    """
+    if holds(folder / "evaluation.json", _MARKS["json"]):  # earlier versions marked no picture
+        return
+    for suffix, mark in _MARKS.items():
+        check_replaceable(folder / f"evaluation.{suffix}", mark)
+
+
 def write_judgment(
     judgment: Judgment, folder: Path, spec: str, rows: Literal["csv", "parquet"], worst: int
 ) -> dict[str, Path]:
@@ -152,7 +173,7 @@ def write_judgment(
         OSError: the disk is full, not writable, ...
         ImportError: no package writes parquet.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     written = {"rows": folder / f"evaluation.{rows}", "summary": folder / "evaluation.json"}
     write_rows(written["rows"], judgment.evaluation.rows)
     record = _record(judgment, spec)

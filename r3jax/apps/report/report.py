@@ -22,7 +22,7 @@ from r3jax.apps.report.pictures import panorama_picture
 from r3jax.apps.report.reasons import reasons_figure, utility_by_cause
 from r3jax.apps.report.summary import StageTime, count_of_views, stage_times, summary
 from r3jax.exploration.replay import states_of
-from r3jax.files import write_atomic
+from r3jax.files import make_folder, own_folder, write_atomic
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
@@ -117,7 +117,8 @@ def write_report(
     }
     on_progress("drawing the report", len(drawn))
     folder = run.path / "report"
-    folder.mkdir(exist_ok=True)
+    own_folder(run.path, "run")
+    make_folder(folder)
     sections: list[str] = []
     for name, figure in drawn.items():
         on_progress("", 1)

@@ -18,6 +18,7 @@ from r3jax.apps.runs.settings import (
 from r3jax.exploration.loop import Result
 from r3jax.exploration.replay import is_decided_apart
 from r3jax.exploration.step import check_world
+from r3jax.files import make_folder
 from r3jax.formats.nerfstudio import write_transforms
 from r3jax.formats.points import voxel_points, write_points
 from r3jax.planning.robot.limits import begin_at
@@ -184,6 +185,6 @@ def write_data_set(run: Run, result: Result) -> None:
         OSError: the disk is full, not writable, ...
     """
     points = run.path / "exports" / "points.ply"
-    points.parent.mkdir(exist_ok=True)
+    make_folder(points.parent)
     write_points(points, *voxel_points(result.state.map_state))
     write_transforms(run, points.relative_to(run.path).as_posix())

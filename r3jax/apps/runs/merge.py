@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from r3jax.exploration.replay import check_alike, parts_of, rebuild
+from r3jax.files import make_folder
 from r3jax.formats.nerfstudio import write_transforms
 from r3jax.formats.points import voxel_points, write_points
 from r3jax.mapping.state import MapState
@@ -62,7 +63,7 @@ def merge_runs(
         writer.finish("merged", f"the views of {' and '.join(str(run.path) for run in runs)}")
     merged = read_run(out)
     points = out / "exports" / "points.ply"
-    points.parent.mkdir(exist_ok=True)
+    make_folder(points.parent)
     write_points(points, *voxel_points(map_state))
     write_transforms(merged, points.relative_to(out).as_posix())
     return map_state

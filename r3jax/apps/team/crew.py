@@ -17,7 +17,14 @@ from r3jax.apps.runs.settings import (
 )
 from r3jax.apps.team.team import Member, TeamResult
 from r3jax.exploration.step import check_world
-from r3jax.files import lock_folder, write_atomic
+from r3jax.files import (
+    check_own,
+    clear_partial,
+    lock_folder,
+    make_folder,
+    own_folder,
+    write_atomic,
+)
 from r3jax.formats.nerfstudio import write_team_transforms, write_transforms
 from r3jax.formats.points import voxel_points, write_points
 from r3jax.planning.robot.limits import begin_at
@@ -85,7 +92,6 @@ def begin_team(
             zip(settings, placed, simulators, strict=True)
         )
     ]
-    folder.mkdir(parents=True, exist_ok=True)
     _only_writer(folder, stack)
     _check_leftovers(folder, len(scenes))  # another process may have been faster
     recorders = [
@@ -130,10 +136,12 @@ def resume_team(folder: Path, stack: contextlib.ExitStack, budget: str | None = 
 
 def _only_writer(folder: Path, stack: contextlib.ExitStack) -> None:
     """Until the stack ends no other process writes this team."""
+    own_folder(folder, "team", "give another --name")
     try:
         stack.enter_context(lock_folder(folder))
     except BlockingIOError:
         raise ValueError(f"{folder}: another process is writing this team") from None
+    clear_partial(folder)
 
 
 def _with_starts(
@@ -172,9 +180,7 @@ def _opened(scene: SceneSettings, cell_size: float) -> Simulator:
 
 def _check_leftovers(folder: Path, cameras: int) -> None:
     """A smaller team must not be written over a larger one: whose run would the last one be?"""
-    present = {path.name for path in folder.iterdir()} if folder.is_dir() else set[str]()
-    if present - {"lock"} and "0" not in present:
-        raise ValueError(f"{folder} holds something that is not a team: give another --name")
+    check_own(folder, "team", "give another --name")
     if (folder / str(cameras)).exists():
         raise ValueError(f"{folder} holds a team of more than {cameras}: give another --name")
 
@@ -201,7 +207,7 @@ def write_team_data(
     runs = [read_run(folder / str(number)) for number in range(len(result.members))]
     points = voxel_points(result.map_state)
     for place in (folder, *(run.path for run in runs)):
-        (place / "exports").mkdir(exist_ok=True)
+        make_folder(place / "exports")
         write_points(place / "exports" / "points.ply", *points)
     for run in runs:
         write_transforms(run, "exports/points.ply")

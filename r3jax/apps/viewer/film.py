@@ -3,9 +3,7 @@
 Shape symbols: n blocks; H W picture size.
 """
 
-import os
-import secrets
-import shutil
+import io
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -24,6 +22,7 @@ from r3jax.apps.viewer.blocks import (
 from r3jax.apps.viewer.overlays import frustum_segments, path_segments
 from r3jax.apps.viewer.stills import Sheet, Squares, compose, draw, lines, overview
 from r3jax.apps.viewer.story import Timeline
+from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic
 from r3jax.formats.errors import FormatError
 from r3jax.formats.validation.packages import why_not_imported
 from r3jax.trace.reader import Run
@@ -202,25 +201,18 @@ def export_film(
         What was written: the stills, the folder of the pictures, the film.
 
     Raises:
-        FormatError: `out` holds something, or is no name of a folder.
+        FormatError: `out` is no name of a folder.
         RunError: the run has no view, or a frame is missing or broken.
         ImportError: a film is asked for, and PyAV is not installed.
-        OSError: the disk is full, not writable, ...
+        OSError: `out` holds something; the disk is full, not writable, ...
     """
     if "\0" in str(out):
         raise FormatError(Path(repr(out.name)), "this cannot be the name of a folder")
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise FormatError(out, "something is there already: give another folder")
     out = out.absolute()
+    check_vacant(out)
     film = Film(run, Timeline(run))
-    partial = out.with_name(f".{out.name}.{secrets.token_hex(4)}.partial")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial.mkdir()
-    try:
+    with whole_folder(out) as partial:
         written = _fill(partial, film, video, on_picture)
-        os.replace(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return [out / path.relative_to(partial) for path in written]
 
 
@@ -231,7 +223,7 @@ def _fill(
     num_views = len(film.run.rows)
     total = num_views + len(stills)
     pictures = folder / "views"
-    pictures.mkdir()
+    make_folder(pictures)
     for step in range(num_views):
         _save(pictures / f"{step:06d}.png", film.picture(step))
         on_picture(step + 1, total)
@@ -250,7 +242,9 @@ def _fill(
 
 
 def _save(path: Path, picture: np.ndarray) -> None:
-    Image.fromarray(picture).save(path, compress_level=6)
+    data = io.BytesIO()
+    Image.fromarray(picture).save(data, "png", compress_level=6)
+    write_atomic(path, data.getvalue())
 
 
 def _read_back(folder: Path, num_views: int, last_for: int) -> Iterator[np.ndarray]:

@@ -20,6 +20,7 @@ from r3jax.cli.options import AuditOptions
 from r3jax.cli.options.audit import GuideOptions
 from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages
+from r3jax.files import check_own, own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
 from r3jax.interrupts import settle_interrupt
@@ -97,7 +98,7 @@ def _audit(
     _check_folder(folder, options.capture)
     with Stages(progress) as stages:
         found = audit(source, _settings_of(options), path, stages.on_progress)
-        folder.mkdir(parents=True, exist_ok=True)
+        own_folder(folder, "audit", "give another --out")
         stages.on_progress("writing the report", 0)
         written = write_outputs(found, folder, options.capture)
         page = write_report(found, folder, written.values())
@@ -124,8 +125,7 @@ def _settings_of(options: AuditOptions) -> AuditSettings:
 
 def _check_folder(folder: Path, capture: Path) -> None:
     """Only an earlier audit of the same capture is replaced."""
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "audit.json").exists():
-        raise UserError(f"{folder} holds something that is no audit: give another --out")
+    check_own(folder, "audit", "give another --out")
     audited = audited_capture(folder)
     if audited is not None and audited != capture.resolve():
         raise UserError(f"{folder} holds the audit of {audited}: give another --out")

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -39,6 +40,7 @@ from r3jax.cli.console import (
 from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import BenchmarkOptions
+from r3jax.files import lock_folder, own_folder
 from r3jax.formats.submissions import Submission, read_submission
 from r3jax.interrupts import check_interrupt, settle_interrupt
 
@@ -71,14 +73,15 @@ def run_benchmark(options: BenchmarkOptions) -> int:
         if options.jobs > 0 and visible_gpus():
             # The workers have the GPUs; planning must not hold on to their memory.
             jax.config.update("jax_platforms", "cpu")
-        options.out.mkdir(parents=True, exist_ok=True)
-        with console.status("planning ...") as status:
-            cells = _plan(options, lambda what: status.update(f"{what} ..."))
-        left = cells_left(options.out, cells)
-        _announce(console, options, cells, left)
-        with BenchmarkProgress(console, len(cells), len(left), options.out) as progress:
-            interrupted = _run(options, left, parameters, progress.on_event)
-        collected = collect(options.out)
+        own_folder(options.out, "benchmark", "give another --out")
+        with _only_one(options.out):
+            with console.status("planning ...") as status:
+                cells = _plan(options, lambda what: status.update(f"{what} ..."))
+            left = cells_left(options.out, cells)
+            _announce(console, options, cells, left)
+            with BenchmarkProgress(console, len(cells), len(left), options.out) as progress:
+                interrupted = _run(options, left, parameters, progress.on_event)
+            collected = collect(options.out)
         _show(console, options, cells)
     except (ValueError, OSError, ImportError) as error:
         raise UserError(one_line(error)) from error
@@ -87,6 +90,16 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     if code == 0:
         console.next("view", paths_of(options.out, cells[0]).run)
     return code
+
+
+def _only_one(folder: Path) -> ExitStack:
+    """Takes the folder's lock: two benchmarks would wait for each other's cells."""
+    try:
+        return lock_folder(folder)
+    except BlockingIOError:
+        raise UserError(
+            f"{folder}: another process runs this benchmark: wait for it, or give another --out"
+        ) from None
 
 
 def _show(console: Console, options: BenchmarkOptions, cells: Sequence[Cell]) -> None:

@@ -12,6 +12,7 @@ from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import BenchmarkOptions
 from r3jax.evaluation.image_metrics import load_lpips
+from r3jax.files import own_folder
 
 DEFAULT_POLICIES = ("ours", "cover", "gavis", "random")
 
@@ -30,6 +31,7 @@ def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
     policies = DEFAULT_POLICIES if is_default else words(options.policies)
     records: list[dict[str, Any]] = []
     try:
+        own_folder(options.out, "benchmark", "give another --out")
         for name in policies:
             check_chooser(name)
         terms = _terms(options)

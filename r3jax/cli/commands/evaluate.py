@@ -9,6 +9,7 @@ from r3jax.apps.models.judge import (
     NETWORKS,
     JudgeSettings,
     Judgment,
+    check_judgment_folder,
     judge,
     warnings_of,
     write_judgment,
@@ -21,6 +22,7 @@ from r3jax.cli.options import EvaluateOptions
 from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages
 from r3jax.evaluation.scores import Summary
+from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
 
@@ -39,11 +41,14 @@ def run_evaluate(options: EvaluateOptions) -> int:
         capture = open_capture(options.path, options.up, parse_topics(options.topics))
         model = find_model(capture, options.name, options.model)
         test = choose_views(options.views, capture, model, options.up)
+        default = model.path.parent if capture.run is None else capture.path / "report"
+        folder = options.out or default
+        check_judgment_folder(folder)
         with Stages(progress) as stages:
             judgment = judge(capture, model, test, _settings(options), stages.on_progress)
             stages.on_progress("writing the results", 0)
-            default = model.path.parent if capture.run is None else capture.path / "report"
-            folder = options.out or default
+            if capture.run is not None and folder == default:
+                own_folder(capture.path, "run")
             written = write_judgment(judgment, folder, options.views, options.rows, options.worst)
             if capture.run is not None and folder == default:
                 _, state, grid = capture.run.checkpoint()

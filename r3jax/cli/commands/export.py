@@ -7,6 +7,7 @@ from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import ExportOptions
 from r3jax.cli.progress import Stages
+from r3jax.files import make_folder
 from r3jax.formats.errors import FormatError
 from r3jax.formats.exports import export_run
 from r3jax.formats.submissions import submission_of_run, write_submission
@@ -47,7 +48,7 @@ def run_export(options: ExportOptions) -> int:
 def _write_submission(console: Console, run: Run, out: Path) -> int:
     """Writes the poses of a run, and says how they are judged."""
     submission = submission_of_run(run)
-    out.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(out.parent)
     write_submission(out, submission)
     console.say(f"{len(submission.frames)} frames, {out.stat().st_size / 1000:.0f} kB")
     console.say(f"exported  {out}")

@@ -6,7 +6,7 @@ from r3jax.apps.report.summary import stage_times, summary
 from r3jax.cli.console import Console, Table
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import InfoOptions
-from r3jax.files import write_atomic
+from r3jax.files import check_replaceable, write_atomic
 from r3jax.formats.errors import FormatError
 from r3jax.formats.recordings import is_recording, read_recording
 from r3jax.interrupts import check_interrupt
@@ -86,8 +86,10 @@ def _show_run(console: Console, path: Path) -> None:
 
 def _show_recording(console: Console, options: InfoOptions, path: Path) -> None:
     from r3jax.apps.report.revisits import FrameReport, follow_recording, revisit_figure
-    from r3jax.apps.report.style import to_png
+    from r3jax.apps.report.style import PNG_MARK, to_png
 
+    if options.plot is not None:
+        check_replaceable(options.plot, PNG_MARK)
     recording = read_recording(path, options.up)
     camera = recording.camera
     console.print(

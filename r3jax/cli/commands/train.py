@@ -8,6 +8,7 @@ from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one
 from r3jax.cli.options import TrainOptions
 from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages, TrainProgress
+from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
 from r3jax.splatting.config import RasterConfig
@@ -38,6 +39,8 @@ def run_train(options: TrainOptions) -> int:
         with Stages(console) as stages:
             frames = stages.each("reading the views", capture.frames(), len(capture))
             views = load_views(frames, options.resolution).take(split[0])
+        if capture.run is not None and options.out is None:
+            own_folder(capture.path, "run")
         with only_writer(folder, replace=replace):
             with TrainProgress(console, config.iterations) as progress:
                 result = train.fit(

@@ -15,7 +15,7 @@ from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.evaluation.evaluate import ImageMetric
 from r3jax.evaluation.scores import summarize
 from r3jax.evaluation.statistics import Estimate, mean_over_scenes, paired_difference
-from r3jax.files import write_atomic
+from r3jax.files import make_folder, write_atomic
 
 FORMAT = 1
 """Format version of a record."""
@@ -74,7 +74,7 @@ def kept_or_made(
     made = make_chooser(chooser, terms.nearest, terms.max_range)
     outcome = run_photos(pool, made, terms, seed, lpips=lpips, on_stage=on_stage)
     record = asked | _fields(outcome) | {"machine": machine(), "commit": source_commit()}
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     write_atomic(path, (json.dumps(record) + "\n").encode())
     return record
 

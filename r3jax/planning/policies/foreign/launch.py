@@ -6,7 +6,6 @@ much. Imports nothing but the standard library, and of that little.
 
 import ctypes
 import os
-import resource
 import signal
 import sys
 
@@ -26,6 +25,8 @@ def main(memory: int, network: str, command: list[str]) -> None:
         command: program and arguments.
     """
     try:
+        import resource  # not on Windows, where this is imported but never run
+
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         if memory:
             # Not the address space: that of GPUs and of sparse tables is reserved, never used.
@@ -39,7 +40,7 @@ def main(memory: int, network: str, command: list[str]) -> None:
             # What the program starts stays below it, so that it is found and paused.
             system.prctl(_ADOPT_ORPHANS, 1)
         os.execvp(command[0], command)
-    except (OSError, ValueError, AttributeError) as error:
+    except (ImportError, OSError, ValueError, AttributeError) as error:
         print(f"{command[0]}: {error}", file=sys.stderr)
         sys.exit(CANNOT)
 
