@@ -125,7 +125,7 @@ def test_what_is_no_checkpoint_is_not_written_over(tmp_path):
     (folder / "000000").mkdir(parents=True)
     (folder / "000000" / "mine").write_bytes(b"x")
     writer = CheckpointWriter(folder)
-    with pytest.raises(OSError, match="000000.*is there already"):
+    with pytest.raises(OSError, match=r"000000.*is there already"):
         writer.save(0, TABLES, wait=True)
     writer.close()
     assert (folder / "000000" / "mine").exists()

@@ -28,7 +28,7 @@ from r3jax.formats.poses import mend_pose
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.fields import check_fields, check_type
 from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json
+from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.reader import Run
 
@@ -72,6 +72,7 @@ def read_camera_path(path: Path) -> CameraPath:
     """
     with naming(path):
         content = parse_json(read_bytes(path, _MAX_BYTES))
+        content = unsealed(content) if isinstance(content, dict) else content
         kinds = {"render_width": float, "render_height": float}
         check_fields("camera path", content, {"camera_path": list[dict[str, Any]], **kinds})
         kind = content.get("camera_type", "perspective")
@@ -146,7 +147,7 @@ def write_camera_path(path: Path, poses: np.ndarray, camera: Camera, seconds: fl
             {"matrix": c["camera_to_world"], "fov": fov, "aspect": aspect} for c in cameras
         ],
     }
-    write_atomic(path, (json.dumps(content, indent=1) + "\n").encode())
+    write_atomic(path, (json.dumps(sealed(content), indent=1) + "\n").encode())
 
 
 def write_path_transforms(path: Path, poses: np.ndarray, camera: Camera) -> None:

@@ -228,7 +228,7 @@ def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
     Raises:
         OSError: the disk is full, not writable, ...
     """
-    lines = [json.dumps(record, separators=(",", ":")) + "\n" for record in records]
+    lines = [json.dumps(sealed(dict(record)), separators=(",", ":")) + "\n" for record in records]
     write_atomic(path, "".join(lines).encode())
 
 

@@ -114,10 +114,27 @@ def _first(content, **fields):
 def test_a_damaged_path_is_named(folder, damage):
     break_it, message = DAMAGES[damage]
     write_camera_path(folder / "bad.json", np.stack([np.eye(4)] * 2), CAMERA)
-    content = break_it(json.loads((folder / "bad.json").read_text()))
-    (folder / "bad.json").write_text(json.dumps(content))
+    written = json.loads((folder / "bad.json").read_text())
+    del written["seal"]  # changed by hand
+    (folder / "bad.json").write_text(json.dumps(break_it(written)))
     with pytest.raises(FormatError, match=rf"bad\.json.*({message})"):
         read_camera_path(folder / "bad.json")
+
+
+def test_no_flipped_bit_of_a_path_is_believed(folder):
+    path = folder / "flipped.json"
+    write_camera_path(path, np.stack([np.eye(4)] * 2), CAMERA)
+    data, whole = path.read_bytes(), read_camera_path(path)
+    for bit in range(5, 8 * len(data), 499):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            found = read_camera_path(path)
+        except FormatError:
+            continue
+        np.testing.assert_array_equal(found.poses, whole.poses)
+        assert found.lenses == whole.lenses
 
 
 def test_other_files_are_no_camera_paths(folder):

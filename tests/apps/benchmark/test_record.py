@@ -21,3 +21,19 @@ def test_a_line_that_is_no_record_is_named(tmp_path, harm):
     path.write_text(f"{first}\n{harm}\n{second}\n")
     with pytest.raises(ValueError, match=r"records\.jsonl, line 2, is no record of a benchmark"):
         read_lines(path)
+
+
+def test_no_flipped_bit_of_a_record_is_believed(tmp_path):
+    path = tmp_path / "records.jsonl"
+    records = [record(seed=0), record(seed=1)]
+    write_records(path, records)
+    data = path.read_bytes()
+    for bit in range(3, 8 * len(data), 997):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            found = read_lines(path)
+        except ValueError:
+            continue
+        assert found == records  # a blank

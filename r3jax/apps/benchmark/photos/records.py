@@ -16,9 +16,13 @@ from r3jax.evaluation.evaluate import ImageMetric
 from r3jax.evaluation.scores import summarize
 from r3jax.evaluation.statistics import Estimate, mean_over_scenes, paired_difference
 from r3jax.files import make_folder, write_atomic
+from r3jax.formats.validation.files import read_bytes
+from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
 
 FORMAT = 1
 """Format version of a record."""
+
+_MAX_BYTES = 64 << 20
 
 Record = dict[str, Any]
 
@@ -66,16 +70,17 @@ def kept_or_made(
     }
     if path.exists():
         try:
-            kept = json.loads(path.read_text())
+            kept = parse_json(read_bytes(path, _MAX_BYTES))
+            kept = unsealed(kept) if isinstance(kept, dict) else {}
         except ValueError:  # damaged: made again
             kept = {}
-        if isinstance(kept, dict) and all(kept.get(name) == asked[name] for name in asked):
+        if all(kept.get(name) == asked[name] for name in asked):
             return kept
     made = make_chooser(chooser, terms.nearest, terms.max_range)
     outcome = run_photos(pool, made, terms, seed, lpips=lpips, on_stage=on_stage)
     record = asked | _fields(outcome) | {"machine": machine(), "commit": source_commit()}
     make_folder(path.parent)
-    write_atomic(path, (json.dumps(record) + "\n").encode())
+    write_atomic(path, (json.dumps(sealed(record)) + "\n").encode())
     return record
 
 

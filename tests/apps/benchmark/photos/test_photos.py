@@ -192,9 +192,11 @@ def test_a_record_is_made_once_on_equal_terms(pool, tmp_path, monkeypatch):
     assert len(made) == 1
     longer = dataclasses.replace(TERMS, iterations=20)
     assert kept_or_made(tmp_path, pool, "random", longer, 0)["terms"]["iterations"] == 20
-    record_path(tmp_path, pool, "random", 0).write_text("{")
-    kept_or_made(tmp_path, pool, "random", TERMS, 0)
-    assert made == [TERMS, longer, TERMS]
+    path = record_path(tmp_path, pool, "random", 0)
+    for damage in (lambda text: "{", lambda text: text.replace('"psnr": [', '"psnr": [9', 1)):
+        path.write_text(damage(path.read_text()))
+        kept_or_made(tmp_path, pool, "random", TERMS, 0)
+    assert made == [TERMS, longer, TERMS, TERMS]
 
 
 def record(chooser: str, seed: int, psnr: list[float], lpips=None, capture: str = "a"):
