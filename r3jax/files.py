@@ -161,7 +161,8 @@ def check_own(folder: Path, kind: Kind, remedy: str = "give another folder") -> 
         raise NotOursError(folder, f"is a file, where a folder is needed: {remedy}")
     if is_own(folder, kind) or (kind_of(folder) is None and _is_void(folder)):
         return
-    raise NotOursError(folder, f"the folder holds something that is not a {kind}: {remedy}")
+    article = "an" if kind == "audit" else "a"
+    raise NotOursError(folder, f"holds something that is not {article} {kind}: {remedy}")
 
 
 def is_own(folder: Path, kind: Kind) -> bool:

@@ -174,7 +174,7 @@ def test_what_is_no_capture_is_named(captures, tmp_path, capsys):
 def test_nothing_but_an_audit_is_overwritten(captures, tmp_path, capsys):
     (tmp_path / "thesis.txt").write_text("precious")
     said = refused(capsys, captures / "recording", "--out", tmp_path)
-    assert "holds something that is no audit" in said
+    assert "holds something that is not an audit" in said
     said = refused(capsys, captures / "recording", "--out", tmp_path / "thesis.txt")
     assert "this is a file" in said
 

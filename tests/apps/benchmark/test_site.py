@@ -97,7 +97,7 @@ def test_a_page_is_not_written_over_something_else(tmp_path, capsys):
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     words = ["benchmark", "--site", str(tmp_path / "mine"), "--out", str(out)]
     assert main(words) == 2
-    assert "holds something that is no page of a benchmark" in capsys.readouterr().err
+    assert "holds something that is not a site" in capsys.readouterr().err
     assert main([*words, "--budget", "views:9"]) == 2
     assert "--site takes these from the records" in capsys.readouterr().err
     empty = ["benchmark", "--site", str(tmp_path / "site"), "--out", str(tmp_path / "none")]
