@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 
 from r3jax.apps.benchmark.record import read_records
+from r3jax.files import MARKER
 from r3jax.trace.reader import read_run
 from tests.box_room import write_room
 
@@ -145,7 +146,7 @@ def _finish(target: Target) -> object:
     assert "Traceback" not in output, output
     leftovers = [
         path
-        for pattern in (".writing-*", ".discarded-*", "*.partial", "*.orbax-checkpoint-tmp*")
+        for pattern in ("*.partial", "*.orbax-checkpoint-tmp*")
         for path in target.folder.rglob(pattern)
     ]
     assert not leftovers
@@ -175,11 +176,8 @@ def _is_alive(pid: int) -> bool:
 
 def _is_writing(target: Target, since: float) -> bool:
     """Whether a checkpoint is being written; one that an earlier kill left does not count."""
-    for parent in ("*/checkpoints", "*/*/checkpoints", "checkpoints", "cells/*/run/checkpoints"):
-        for path in target.folder.glob(f"{parent}/.writing-*"):
-            if _is_newer(path, since):
-                return True
-    return any(_is_newer(p, since) for p in target.folder.glob("cells/*/training/*/.writing-*"))
+    written = target.folder.rglob(f"{MARKER}/*.partial")
+    return any(path.is_dir() and _is_newer(path, since) for path in written)
 
 
 def _is_newer(path: Path, since: float) -> bool:

@@ -15,6 +15,7 @@ import pytest
 from r3jax.exploration import explore
 from r3jax.exploration.recording import state_of, state_tables
 from r3jax.exploration.state import StopReason
+from r3jax.files import MARKER
 from r3jax.trace.checkpoints import CheckpointWriter, load_checkpoint
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import camera_fields
@@ -150,9 +151,9 @@ def damage(path, how):
         with open(path / "trace.jsonl", "a") as file:
             file.write('{"kind":"step","step":3,"pose":[[0.1')
     elif how == "a half-written checkpoint":
-        shutil.copytree(newest, checkpoints / f"{CUT:06d}.orbax-checkpoint-tmp-7")
+        shutil.copytree(newest, path / MARKER / f".{CUT:06d}.ab12cd34.partial")
     elif how == "a half-written image":
-        (path / "frames" / ".000003.png.ab12cd34.partial").write_bytes(b"\x89PNG")
+        (path / MARKER / ".000003.png.ab12cd34.partial").write_bytes(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
