@@ -21,7 +21,7 @@ from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.images import image_pixels, image_size
+from r3jax.formats.validation.images import image_size, masked_pixels
 from r3jax.frame import Frame
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
@@ -201,7 +201,10 @@ class PosedImages:
         depth_path = self.depth_paths[index]
         if depth_path is None:
             raise FormatError(path, "there is no depth image that belongs to it")
-        rgb, depth = self.rgb(index), self.depth(index)
+        rgb, is_there = self.masked_rgb(index)
+        depth = self.depth(index)
+        if depth is not None and is_there is not None:
+            depth = np.where(is_there, depth, np.float32(0.0))
         try:
             return Frame(
                 rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
@@ -218,12 +221,23 @@ class PosedImages:
         Raises:
             FormatError: the file is missing, broken or of another size.
         """
+        return self.masked_rgb(index)[0]
+
+    def masked_rgb(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """The pixels of one image, and which of them its alpha channel does not cut out.
+
+        Returns:
+            [H, W, 3] uint8 as `rgb`, and [H, W] bool; None: all of them count.
+
+        Raises:
+            FormatError: the file is missing, broken or of another size.
+        """
         if self.pixels is not None:
-            return self.pixels.rgb(index)
+            return self.pixels.rgb(index), None
         path, lens = self.image_paths[index], self.lenses[index]
         with naming(path):
             image_size(path, IMAGE_FORMATS)  # refuses what would not fit into memory
-            return image_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
+            return masked_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
 
     def depth(self, index: int) -> np.ndarray | None:
         """The depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.

@@ -18,13 +18,14 @@ import numpy as np
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.poses import mend_pose, read_numbers
-from r3jax.formats.validation.images import image_pixels, image_size
+from r3jax.formats.validation.images import image_pixels, image_size, masked_pixels
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 
 Up = Literal["y", "z"]
 
 _FORMATS = ("PNG", "JPEG")
+_DEPTH_MODES = ("I;16", "I;16B", "I")
 
 _Z_UP_FROM_Y_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -54,8 +55,14 @@ class Recording:
         Raises:
             FormatError: an image that is missing, broken, or of another size or kind.
         """
-        rgb = _read_image(self.image_paths[index], self.camera, is_depth=False)
-        depth = _read_image(self.depth_paths[index], self.camera, is_depth=True)
+        size = (self.camera.width, self.camera.height)
+        path, depth_path = self.image_paths[index], self.depth_paths[index]
+        with naming(path):
+            rgb, is_there = masked_pixels(path, _FORMATS, size)
+        with naming(depth_path):
+            depth = image_pixels(depth_path, _FORMATS, size, _DEPTH_MODES, "depth must be 16-bit")
+        if is_there is not None:
+            depth = np.where(is_there, depth, 0)
         return Frame(
             rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
             depth=jnp.asarray(depth.astype(np.float32) / np.float32(1000.0)),
@@ -133,12 +140,3 @@ def _read_camera(path: Path, first_image: Path) -> Camera:
             "is K for another resolution?",
         )
     return Camera(width, height, float(fx), float(fy), float(cx) + 0.5, float(cy) + 0.5)
-
-
-def _read_image(path: Path, camera: Camera, *, is_depth: bool) -> np.ndarray:
-    """[H, W, 3] uint8 or [H, W] uint16."""
-    size = (camera.width, camera.height)
-    modes = ("I;16", "I;16B", "I") if is_depth else ()
-    with naming(path):
-        pixels = image_pixels(path, _FORMATS, size, modes, "depth must be 16-bit")
-    return pixels.astype(np.uint16) if is_depth else pixels

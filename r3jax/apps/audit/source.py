@@ -325,7 +325,8 @@ def _of_images(images: PosedImages, name: str) -> Source:
             camera, images.poses[index], xyz[part], rgb[part], hides=ends is None
         )
         if has_images:
-            colors = sampling_table(images.lenses[index], stride).take(images.rgb(index))
+            colors, is_there = _thinned_colors(images, index, stride)
+            depth[~is_there] = 0.0
         return colors, depth
 
     return Source(
@@ -343,7 +344,15 @@ def _read_dense(images: PosedImages, index: int, stride: int) -> Picture:
     depth = images.depth(index)
     if depth is None:
         depth = np.zeros((images.lenses[index].height, images.lenses[index].width), np.float32)
-    return table.take(images.rgb(index)), table.take(depth)
+    colors, is_there = _thinned_colors(images, index, stride)
+    return colors, np.where(is_there, table.take(depth), np.float32(0.0))
+
+
+def _thinned_colors(images: PosedImages, index: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colors [h, w, 3] uint8 of a thinned image, and which pixels it has, [h, w]."""
+    table = sampling_table(images.lenses[index], stride)
+    rgb, mask = images.masked_rgb(index)
+    return table.take(rgb), table.is_there if mask is None else table.take(mask)
 
 
 def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,15 @@ _ORIENTATION = 0x0112
 _QUARTER_TURNS = (5, 6, 7, 8)
 """Its values where width and height change places."""
 
+_WITH_ALPHA = ("LA", "PA", "RGBA", "La", "RGBa")
+"""Pillow's modes of images with an alpha channel."""
+
+_OPAQUE = 128
+"""Pixels with less alpha are cut out."""
+
+_WHITE = (1 << 16) - 1
+"""White of a gray image of 16 bits."""
+
 
 def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
     """Width and height of an image [px].
@@ -58,17 +67,16 @@ def image_pixels(
         wanted: what to say of an image that has another mode.
 
     Returns:
-        [H, W, 3] uint8 where no modes are given, else whatever the mode is.
+        [H, W, 3] uint8 where no modes are given (see `masked_pixels`), else whatever the mode is.
 
     Raises:
         ForeignFileError: not an image of these formats, broken, of another size or mode.
         OSError: missing, or not permitted.
     """
     with _opened(path, formats) as image:
-        if image.size != size:
-            raise ForeignFileError(_other_size(image, size))
+        _check_size(image, size)
         if not modes:
-            return np.asarray(image.convert("RGB"))
+            return _colors(image)[0]
         if image.mode not in modes:
             raise ForeignFileError(f"{wanted}, the image's mode is {image.mode}")
         return np.asarray(image)
@@ -109,6 +117,60 @@ def _no_image(source: Path | io.BytesIO, formats: Sequence[str]) -> str:
     if head.lstrip().lower().startswith((b"<!doctype", b"<html")):
         return "this is a web page and no image: download it again"
     return f"the image cannot be read (it does not begin like a {wanted})"
+
+
+def masked_pixels(
+    path: Path | bytes, formats: Sequence[str], size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Reads the colors of an image and the mask in its alpha channel.
+
+    Gray becomes three equal colors, 16 bits become 8, a palette and CMYK are converted. A pixel
+    whose alpha is below one half is cut out: its color, which no viewer shows, becomes black.
+
+    Args:
+        path: the file, or what it holds.
+        formats: those that Pillow may try, such as "PNG".
+        size: width and height that it must have [px].
+
+    Returns:
+        Colors [H, W, 3] uint8, and True for the pixels that are there, [H, W]; None: all are.
+
+    Raises:
+        ForeignFileError: not an image of these formats, broken, of another size, or of numbers
+            that do not say what white is.
+        OSError: missing, or not permitted.
+    """
+    with _opened(path, formats) as image:
+        _check_size(image, size)
+        return _colors(image)
+
+
+def _check_size(image: Any, size: tuple[int, int]) -> None:
+    if image.size != size:
+        raise ForeignFileError(_other_size(image, size))
+
+
+def _colors(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """As `masked_pixels`, of an open image."""
+    if image.mode == "F" or image.mode.startswith("I"):
+        return np.repeat(_eight_bits(np.asarray(image))[..., None], 3, axis=2), None
+    if image.mode not in _WITH_ALPHA and "transparency" not in image.info:
+        return np.asarray(image.convert("RGB")), None
+    pixels = np.asarray(image.convert("RGBA"))
+    is_there = pixels[..., 3] >= _OPAQUE
+    if is_there.all():
+        return np.ascontiguousarray(pixels[..., :3]), None
+    return np.where(is_there[..., None], pixels[..., :3], np.uint8(0)), is_there
+
+
+def _eight_bits(gray: np.ndarray) -> np.ndarray:
+    """Gray values of 16 bits [H, W] as 8; Pillow itself would clip them, so that all are white."""
+    if gray.dtype.kind == "f" or gray.min() < 0 or gray.max() > _WHITE:
+        raise ForeignFileError(
+            "the colors are numbers of 32 bits, which do not say what white is: save the image "
+            "with 8 or 16 bits"
+        )
+    return ((gray.astype(np.int64) * 255 + _WHITE // 2) // _WHITE).astype(np.uint8)
 
 
 @contextmanager

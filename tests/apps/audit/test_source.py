@@ -7,12 +7,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
-from r3jax.apps.audit.source import distorted, sampling_table, sparse_depth, thinned
+from r3jax.apps.audit.source import distorted, sampling_table, source_of, sparse_depth, thinned
 from r3jax.formats.lenses import MODELS, Lens
+from r3jax.formats.nerfstudio import read_transforms
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import Camera
-from tests.apps.audit.room import FOCAL, HEIGHT, WIDTH, picture, round_poses, wall_points
+from tests.apps.audit.room import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    picture,
+    round_poses,
+    wall_points,
+    write_nerfstudio,
+)
 
 SOME = {
     "SIMPLE_RADIAL": (400.0, 320.0, 240.0, -0.12),
@@ -120,3 +130,17 @@ def test_no_points_are_no_depth():
     assert depth.shape == (HEIGHT, WIDTH)
     assert not depth.any()
     assert not colors.any()
+
+
+def test_pixels_that_alpha_cuts_out_have_no_depth(tmp_path):
+    path = write_nerfstudio(tmp_path / "masked", POSES[:2], depth=True)
+    name = path / "images" / "000.png"
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    alpha[:, :20] = 0
+    Image.fromarray(np.dstack([np.asarray(Image.open(name)), alpha])).save(name)
+    images = read_transforms(path)
+    rgb, depth = source_of(images, "masked").read(0)
+    assert not depth[:, :20].any()
+    assert not rgb[:, :20].any()
+    assert (depth[:, 20:] > 0).all()
+    np.testing.assert_array_equal(depth, np.asarray(images.frame(0).depth))
