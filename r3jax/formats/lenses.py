@@ -126,6 +126,11 @@ class Lens:
         """True if straight lines stay straight: `camera` is then all there is to know."""
         return self.model in _PINHOLE_WITHOUT_DISTORTION and not any(self.distortion.values())
 
+    def has_shape(self, width: int, height: int) -> bool:
+        """True if images of this size may be its own, scaled: each side rounded to a pixel."""
+        off = abs(width * self.height - height * self.width)
+        return min(width, height) > 0 and off <= self.width + self.height
+
     def resized(self, width: int, height: int) -> "Lens":
         """The lens of the same images with another number of pixels [px]."""
         across, down = width / self.width, height / self.height

@@ -17,6 +17,7 @@ nothing lies within the sensor's range.
 
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,12 +27,13 @@ import numpy as np
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import Lens
+from r3jax.formats.moved_images import COPIES
 from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
 from r3jax.formats.poses import mend_pose
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.fields import check_fields, check_type
 from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.images import image_size
+from r3jax.formats.validation.images import first_size
 from r3jax.formats.validation.json_text import parse_json
 from r3jax.formats.validation.names import below
 from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
@@ -74,8 +76,8 @@ def read_transforms(path: Path | str) -> PosedImages:
     """Reads a transforms.json. The images come in the order of the file.
 
     Intrinsics of a frame go before those of the file. Without a principal point it is the
-    image's center, without a size the image is asked; names without a suffix get that of an
-    image that exists.
+    image's center, without a size that of the image, or of another one where it is missing; names
+    without a suffix get that of an image that exists.
 
     Args:
         path: the file, or the folder that holds one; of the data sets of NeRF, which are split,
@@ -102,6 +104,7 @@ def read_transforms(path: Path | str) -> PosedImages:
         if not frames:
             raise ForeignFileError("it lists no frames")
         images = [_image(path.parent, i, frame) for i, frame in enumerate(frames)]
+        images = _smaller_copies(path.parent, images)
         points = content.get("ply_file_path")
         check_type("ply_file_path", points, str | None)
         points_path = None if points is None else below(path.parent, points)
@@ -109,7 +112,7 @@ def read_transforms(path: Path | str) -> PosedImages:
         depths = [_depth(path.parent, i, frame) for i, frame in enumerate(frames)]
         scale = _applied_scale(content)
     lenses = [
-        _lens(path, f"frames[{i}]", {**content, **frame}, image)
+        _lens(path, f"frames[{i}]", {**content, **frame}, [image, *images])
         for i, (frame, image) in enumerate(zip(frames, images, strict=True))
     ]
     poses = np.stack([_pose(path, f"frames[{i}]", frame) for i, frame in enumerate(frames)])
@@ -142,6 +145,17 @@ def read_transforms(path: Path | str) -> PosedImages:
         T_capture_original=moved,
         remark=remark,
     )
+
+
+def _smaller_copies(folder: Path, images: list[Path]) -> list[Path]:
+    """Where all images are gone, their copies in images_2, images_4 or images_8, if any."""
+    if folder in {image.parent for image in images} or any(map(os.path.exists, images)):
+        return images
+    for copy in COPIES:
+        copies = [p.parent.with_name(p.parent.name + copy) / p.name for p in images]
+        if any(map(os.path.exists, copies)):
+            return copies
+    return images
 
 
 def find_transforms(path: Path) -> Path | None:
@@ -228,22 +242,22 @@ def _pose(path: Path, which: str, frame: _Fields) -> np.ndarray:
     return mend_pose(path, name, matrix @ OPENGL_FROM_OPENCV)
 
 
-def _lens(path: Path, which: str, fields: _Fields, image: Path) -> Lens:
-    """The camera of one frame."""
+def _lens(path: Path, which: str, fields: _Fields, images: Sequence[Path]) -> Lens:
+    """The camera of one frame; of the images the frame's own goes first."""
     with naming(path):
         try:
-            width, height = _size(fields, image)
+            width, height = _size(fields, images)
             return _lens_of(fields, width, height)
         except ForeignFileError as error:
             raise ForeignFileError(f"{which}: {error}") from None
 
 
-def _size(fields: _Fields, image: Path) -> tuple[int, int]:
+def _size(fields: _Fields, images: Sequence[Path]) -> tuple[int, int]:
     if "w" in fields and "h" in fields:
         return _whole(fields, "w"), _whole(fields, "h")
-    with naming(image):
+    with naming(images[0]):
         try:
-            return image_size(image, IMAGE_FORMATS)
+            return first_size(images, IMAGE_FORMATS)
         except FileNotFoundError:
             reason = "the file is missing, and its size is not in transforms.json (w, h)"
             raise ForeignFileError(reason) from None

@@ -7,8 +7,9 @@ Shape symbols: n images; m points; t observations.
 """
 
 import dataclasses
-import os
+from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,9 @@ from r3jax.frame import Frame
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 """What Pillow may try."""
+
+_MEASURED = 5
+"""Images of a lens whose size is compared with it: one may be another's namesake."""
 
 _MAX_DEPTH = 256 << 20
 """Floats of the largest image, and a header [bytes]."""
@@ -156,12 +160,15 @@ class PosedImages:
     def fitted(self) -> "PosedImages":
         """The same images with lenses of the size that their files have, where only that differs.
 
-        Images are often reduced after their cameras were found. Of each lens the first image that
-        is there counts.
+        Images are often reduced after their cameras were found. Of each lens the size of most of
+        the first images that are there counts.
         """
         if self.pixels is not None:
             return self
-        lenses = {lens: _fitted(lens, self.image_paths[i]) for lens, i in self._first_images()}
+        paths: dict[Lens, list[Path]] = {}
+        for lens, path in zip(self.lenses, self.image_paths, strict=True):
+            paths.setdefault(lens, []).append(path)
+        lenses = {lens: _fitted(lens, of_lens) for lens, of_lens in paths.items()}
         changed = [(lens, now) for lens, now in lenses.items() if now != lens]
         if not changed:
             return self
@@ -172,17 +179,9 @@ class PosedImages:
         )
         return dataclasses.replace(
             self,
-            lenses=tuple(lenses.get(lens, lens) for lens in self.lenses),
+            lenses=tuple(lenses[lens] for lens in self.lenses),
             remark=f"{self.remark} {said}" if self.remark else said,
         )
-
-    def _first_images(self) -> Iterator[tuple[Lens, int]]:
-        """Each lens with its first image that is there."""
-        known: set[Lens] = set()
-        for index, (lens, path) in enumerate(zip(self.lenses, self.image_paths, strict=True)):
-            if lens not in known and os.path.isfile(path):  # no matter how long the name is
-                known.add(lens)
-                yield lens, index
 
     def frame(self, index: int) -> Frame:
         """One image with its depth. A depth image of another size is sampled at its nearest pixels.
@@ -259,15 +258,17 @@ class PosedImages:
         return (self.frame(index) for index in range(len(self)))
 
 
-def _fitted(lens: Lens, image: Path) -> Lens:
-    """The lens in the size of an image, or as it is where the sides have another ratio."""
-    try:
-        width, height = image_size(image, IMAGE_FORMATS)
-        off = abs(width * lens.height - height * lens.width)
-        is_same_ratio = off <= max(lens.width, lens.height)  # a pixel by rounding
-        return lens.resized(width, height) if is_same_ratio else lens
-    except (ForeignFileError, OSError):
-        return lens  # reading its pixels says what is wrong
+def _fitted(lens: Lens, images: list[Path]) -> Lens:
+    """The lens in the size of its images, or as it is where their sides have another ratio."""
+    sizes: Counter[tuple[int, int]] = Counter()
+    for image in images:
+        # What is wrong with an image is said when its pixels are read.
+        with suppress(ForeignFileError, OSError):
+            sizes[image_size(image, IMAGE_FORMATS)] += 1
+        if sizes.total() == _MEASURED:
+            break
+    (size, _), *_ = sizes.most_common(1) or [((0, 0), 0)]
+    return lens.resized(*size) if lens.has_shape(*size) else lens
 
 
 def _read_depth(path: Path, unit: DepthUnit) -> np.ndarray:

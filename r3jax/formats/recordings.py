@@ -8,7 +8,7 @@
 Images, depth images and poses belong together in the order of the sorted file names.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,7 +18,7 @@ import numpy as np
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.poses import mend_pose, read_numbers
-from r3jax.formats.validation.images import image_pixels, image_size, masked_pixels
+from r3jax.formats.validation.images import first_size, image_pixels, masked_pixels
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 
@@ -94,42 +94,67 @@ def read_recording(path: Path | str, up: Up = "y") -> Recording:
     path = Path(path)
     if not path.is_dir():
         raise FormatError(path, "there is no such folder")
-    image_paths = _list_images(path / "images")
-    depth_paths = _list_images(path / "depth")
+    found, measured = (_list_images(path / name) for name in ("images", "depth"))
     poses = read_numbers(path / "poses.txt", columns=16).reshape(-1, 4, 4)
-    counts = {"images": len(image_paths), "depth images": len(depth_paths), "poses": len(poses)}
-    if len(set(counts.values())) != 1:
-        listed = ", ".join(f"{count} {what}" for what, count in counts.items())
-        raise FormatError(path, f"the numbers must be equal, found {listed}")
-    for image, depth in zip(image_paths, depth_paths, strict=True):
-        if image.stem != depth.stem:
-            raise FormatError(depth, f"the depth image of {image.name} should be here")
+    image_paths, depth_paths = pair_images(path, found, measured, len(poses))
     source = path / "poses.txt"
     poses = np.stack(
         [mend_pose(source, f"pose {i} (line {i + 1})", pose) for i, pose in enumerate(poses)]
     )
     if up == "y":
         poses = _Z_UP_FROM_Y_UP @ poses
-    camera = _read_camera(path / "K.txt", image_paths[0])
+    camera = _read_camera(path / "K.txt", image_paths)
     return Recording(path, camera, image_paths, depth_paths, poses)
 
 
-def _list_images(folder: Path) -> tuple[Path, ...]:
+def pair_images(
+    path: Path, images: Mapping[str, Path], depths: Mapping[str, Path], num_poses: int
+) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Pairs images with depth images by the names of their frames, which are in order.
+
+    Of a frame whose image was deleted the depth image says that there was one, and the other way
+    round: the pose is still known, and what is missing is noticed when it is read.
+
+    Args:
+        path: the capture, for messages.
+        images: images by the names of their frames.
+        depths: depth images by the names of their frames.
+        num_poses: frames that have a pose.
+
+    Raises:
+        FormatError: there are more or fewer frames than poses.
+    """
+    names = sorted({*images, *depths})
+    if len(names) != num_poses:
+        counts = f"{len(images)} images, {len(depths)} depth images, {num_poses} poses"
+        odd = next((name for name in images if name not in depths), None)
+        beside = "" if odd is None else f", and no depth image of {images[odd].name}"
+        raise FormatError(path, f"the numbers must be equal, found {counts}{beside}")
+
+    def in_order(files: Mapping[str, Path]) -> tuple[Path, ...]:
+        known, like = next(iter(files.items()))
+        gone = lambda name: like.with_name(like.name.replace(known, name))
+        return tuple(files.get(name) or gone(name) for name in names)
+
+    return in_order(images), in_order(depths)
+
+
+def _list_images(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         raise FormatError(folder, "the folder is missing")
-    found = tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")))
+    found = {p.stem: p for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")}
     if not found:
         raise FormatError(folder, "the folder holds no image (*.png, *.jpg)")
     return found
 
 
-def _read_camera(path: Path, first_image: Path) -> Camera:
-    """Intrinsics from K.txt, the size from the first image."""
+def _read_camera(path: Path, images: Sequence[Path]) -> Camera:
+    """Intrinsics from K.txt, the size from the first image that can be opened."""
     K = read_numbers(path, columns=3)
     if K.shape != (3, 3) or not np.all(np.isfinite(K)):
         raise FormatError(path, "expected a finite 3x3 matrix")
-    with naming(first_image):
-        width, height = image_size(first_image, _FORMATS)
+    with naming(images[0]):
+        width, height = first_size(images, _FORMATS)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if not (fx > 0.0 and fy > 0.0):
         raise FormatError(path, f"focal lengths must be positive, got {fx:g} and {fy:g}")

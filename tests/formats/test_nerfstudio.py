@@ -218,7 +218,7 @@ DAMAGES = {
     "applied scale": ({"applied_scale": 0.0}, "the applied_scale 0 makes no sense"),
     "applied": ({"applied_transform": [[1.0]]}, "`applied_transform` must be a 3x4"),
     "no size": (
-        {"w": None, "0.file_path": "gone"},
+        {"w": None, "0.file_path": "gone", "1.file_path": "gone too"},
         "gone: the file is missing, and its size",
     ),
 }

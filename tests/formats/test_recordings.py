@@ -88,13 +88,13 @@ def replace_pose(folder, change):
 DAMAGES = {
     "no poses": (lambda f: (f / "poses.txt").unlink(), r"poses\.txt: the file is missing"),
     "no intrinsics": (lambda f: (f / "K.txt").unlink(), r"K\.txt: the file is missing"),
-    "fewer images": (
-        lambda f: (f / "images" / "001.png").unlink(),
-        "2 images, 3 depth images, 3 poses",
+    "fewer frames": (
+        lambda f: [(f / name / "001.png").unlink() for name in ("images", "depth")],
+        "2 images, 2 depth images, 3 poses",
     ),
     "other names": (
         lambda f: (f / "depth" / "001.png").rename(f / "depth" / "0015.png"),
-        r"the depth image of 001\.png",
+        r"no depth image of 001\.png",
     ),
     "fewer poses": (
         lambda f: np.savetxt(f / "poses.txt", make_poses(2).reshape(2, 16)),
@@ -110,9 +110,9 @@ DAMAGES = {
         "outside the 10x8 images",
     ),
     "empty": (lambda f: (f / "K.txt").write_text(""), "no numbers"),
-    "not an image": (
-        lambda f: (f / "images" / "000.png").write_bytes(b"?"),
-        r"000\.png: the image cannot be read",
+    "no image": (
+        lambda f: [image.write_bytes(b"?") for image in (f / "images").iterdir()],
+        r"00[012]\.png: the image cannot be read",
     ),
 }
 
@@ -131,6 +131,21 @@ def test_a_damaged_recording_is_named(folder, damage):
     break_it(folder)
     with pytest.raises(FormatError, match=message):
         read_recording(folder)
+
+
+@pytest.mark.parametrize("gone", ["images/000.png", "images/002.png", "depth/001.png"])
+def test_the_others_keep_their_poses_where_a_file_was_deleted(folder, gone):
+    number = int(gone[-5])
+    before = read_recording(folder)
+    (folder / gone).unlink()
+    after = read_recording(folder)
+    np.testing.assert_array_equal(after.poses, before.poses)
+    for index in range(3):
+        if index != number:
+            found, expected = (np.asarray(r.frame(index).rgb) for r in (after, before))
+            np.testing.assert_array_equal(found, expected)
+    with pytest.raises(FormatError, match=rf"{gone[-7:]}: the file is missing"):
+        after.frame(number)
 
 
 def test_an_image_of_another_size_is_named_when_it_is_read(folder):

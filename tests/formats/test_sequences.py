@@ -154,7 +154,11 @@ DAMAGES = {
     "replica_slam": {
         "no pose": (put("traj.txt", ""), r"traj\.txt: the file holds no numbers"),
         "cut": (cut("traj.txt", 500), r"traj\.txt: line \d has \d+ numbers, not 16"),
-        "fewer": (remove("results/frame000001.jpg"), "2 images, 3 depth images, 3 poses"),
+        "fewer": (
+            lambda f: [remove(f"results/{name}000001.{end}")(f)
+                       for name, end in (("frame", "jpg"), ("depth", "png"))],
+            "2 images, 2 depth images, 3 poses",
+        ),
         "no camera": (remove("cam_params.json"), r"cam_params\.json: the file is missing"),
         "camera": (put("cam_params.json", '{"camera": {"w": 1}}'), "`camera` lacks cx"),
         "scale": (

@@ -11,6 +11,7 @@ from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints, p
 from r3jax.formats.colmap.text import read_text
 from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import Lens
+from r3jax.formats.moved_images import find_images
 from r3jax.formats.posed_images import PosedImages, SparsePoints
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.names import below, check_relative
@@ -65,8 +66,8 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
     Args:
         path: the folder of the model, or the capture's, with the model in `sparse/0` or the like;
             if there are several, `sparse/1` and so on, the one with most images is taken.
-        images: the folder that the images' names are relative to; by default `images` beside
-            the model or in one of the three folders above it.
+        images: the folder that the images' names are relative to; by default the one of the usual
+            names, beside the model or in one of the three folders above it, that holds most.
 
     Raises:
         FormatError: there is no model, or a file of it is damaged. Images that are missing are
@@ -80,13 +81,16 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
     models = {part: read_model(part) for part in _parts(path, folder)}
     folder = max(models, key=lambda part: len(models[part].images))
     model = models[folder]
-    base = Path(images) if images is not None else _image_folder(path, folder)
     ordered = sorted(model.images, key=lambda image: image.name)
-    image_paths = tuple(below(base, image.name) for image in ordered)
+    lenses = tuple(model.cameras[image.camera_id] for image in ordered)
+    here = folder.resolve()
+    names = dict(zip((image.name for image in ordered), lenses, strict=True))
+    found = images or find_images([path, here, *here.parents[:3]], names) or path / "images"
+    image_paths = tuple(below(Path(found), image.name) for image in ordered)
     return PosedImages(
         path=path,
         image_paths=image_paths,
-        lenses=tuple(model.cameras[image.camera_id] for image in ordered),
+        lenses=lenses,
         poses=np.stack([pose_of(image.quaternion, image.translation) for image in ordered]),
         depth_paths=(None,) * len(ordered),
         points=_sparse_points(model.points, {image.id: i for i, image in enumerate(ordered)}),
@@ -171,14 +175,6 @@ def _files(folder: Path) -> list[Path]:
     if not os.path.isdir(folder):
         return []
     return [entry for entry in folder.iterdir() if entry.is_file()]
-
-
-def _image_folder(path: Path, model: Path) -> Path:
-    here = model.resolve()
-    for folder in (here, *here.parents[:3]):
-        if (folder / "images").is_dir():
-            return folder / "images"
-    return path / "images"
 
 
 def _check_images(model: ColmapModel) -> None:

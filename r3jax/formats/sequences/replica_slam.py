@@ -18,6 +18,7 @@ from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import DepthUnit, PosedImages
 from r3jax.formats.poses import mend_pose, read_numbers
+from r3jax.formats.recordings import pair_images
 from r3jax.formats.sequences.scannet import UP
 from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.formats.validation.fields import check_fields
@@ -46,19 +47,10 @@ def read_replica_slam(path: Path | str) -> PosedImages:
             that makes no sense, poses that are not finite or not rigid.
     """
     path = Path(path)
-    images = _numbered(path / "results", "frame")
-    depths = _numbered(path / "results", "depth")
+    found, measured = (_numbered(path / "results", start) for start in ("frame", "depth"))
     source = path / "traj.txt"
     poses = read_numbers(source, columns=16).reshape(-1, 4, 4)
-    if not len(images) == len(depths) == len(poses):
-        raise FormatError(
-            path,
-            f"the numbers must be equal, found {len(images)} images, {len(depths)} depth images, "
-            f"{len(poses)} poses",
-        )
-    for image, depth in zip(images, depths, strict=True):
-        if image.stem.removeprefix("frame") != depth.stem.removeprefix("depth"):
-            raise FormatError(depth, f"the depth image of {image.name} should be here")
+    images, depths = pair_images(path, found, measured, len(poses))
     lens, unit = _camera(path)
     poses = np.stack(
         [mend_pose(source, f"pose {i} (line {i + 1})", pose) for i, pose in enumerate(poses)]
@@ -74,15 +66,15 @@ def read_replica_slam(path: Path | str) -> PosedImages:
     )
 
 
-def _numbered(folder: Path, start: str) -> tuple[Path, ...]:
-    """The images whose names start like this, by their names."""
+def _numbered(folder: Path, start: str) -> dict[str, Path]:
+    """The images whose names start like this, by what follows."""
     if not folder.is_dir():
         raise FormatError(folder, "the folder is missing")
     kinds = (".png", ".jpg", ".jpeg")
     found = [p for p in folder.glob(f"{start}*") if p.suffix.lower() in kinds]
     if not found:
         raise FormatError(folder, f"the folder holds no image {start}*.jpg or {start}*.png")
-    return tuple(sorted(found))
+    return {image.stem.removeprefix(start): image for image in found}
 
 
 def _camera(path: Path) -> tuple[Lens, DepthUnit]:

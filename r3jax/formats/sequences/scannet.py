@@ -11,6 +11,7 @@ Both cameras count as one place: ScanNet's own depth is registered to its colors
 (https://github.com/ScanNet/ScanNet)
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import IMAGE_FORMATS, PosedImages
 from r3jax.formats.poses import mend_pose, read_lines, to_floats
-from r3jax.formats.validation.images import image_size
+from r3jax.formats.validation.images import first_size
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -47,15 +48,16 @@ def read_scannet(path: Path | str) -> PosedImages:
     found = [(image, pose) for image, pose in zip(images, poses, strict=True) if pose is not None]
     if not found:
         raise FormatError(path / "pose", "no frame has a pose that is finite")
-    depths = tuple(path / "depth" / f"{image.stem}.png" for image, _ in found)
+    used = [image for image, _ in found]
+    depths = [path / "depth" / f"{image.stem}.png" for image in used]
     count = len(found)
     return PosedImages(
         path=path,
-        image_paths=tuple(image for image, _ in found),
-        lenses=(_lens(path / "intrinsic" / "intrinsic_color.txt", found[0][0]),) * count,
+        image_paths=tuple(used),
+        lenses=(_lens(path / "intrinsic" / "intrinsic_color.txt", used),) * count,
         poses=np.stack([pose for _, pose in found]),
-        depth_paths=depths,
-        depth_lenses=(_lens(path / "intrinsic" / "intrinsic_depth.txt", depths[0]),) * count,
+        depth_paths=tuple(depths),
+        depth_lenses=(_lens(path / "intrinsic" / "intrinsic_depth.txt", depths),) * count,
         up=UP,
         remark=lost(len(images) - count, len(images)),
     )
@@ -80,12 +82,12 @@ def scannet_lens(width: int, height: int, K: np.ndarray) -> Lens:
     return Lens("PINHOLE", width, height, tuple(float(value) for value in values))
 
 
-def _lens(source: Path, first_image: Path) -> Lens:
+def _lens(source: Path, images: Sequence[Path]) -> Lens:
     K = _matrix(source)
     if len(K) < 3:
         raise FormatError(source, f"expected a 4x4 matrix, got {len(K)} lines")
-    with naming(first_image):
-        width, height = image_size(first_image, IMAGE_FORMATS)
+    with naming(images[0]):
+        width, height = first_size(images, IMAGE_FORMATS)
     with naming(source):
         return scannet_lens(width, height, K)
 

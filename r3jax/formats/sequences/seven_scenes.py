@@ -21,6 +21,7 @@ from r3jax.formats.poses import mend_pose, read_numbers
 
 _LENS = Lens("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0))
 _UNIT = DepthUnit(0.001, invalid=65535)
+_DEPTH = ".depth.png"
 _SUFFIXES = (".jpeg", ".jpg", ".png")
 """Endings of images, in any case; where a frame has several, the last is the original."""
 
@@ -51,13 +52,14 @@ def read_seven_scenes(path: Path | str) -> PosedImages:
     found = _colors(path)
     if not found:
         raise FormatError(path, "the folder holds no frame-*.color.png or .jpg")
-    bases = sorted(found)
+    depths = {depth.name.removesuffix(_DEPTH) for depth in path.glob(f"frame-*{_DEPTH}")}
+    bases = sorted(depths.union(found))
     return PosedImages(
         path=path,
-        image_paths=tuple(found[base] for base in bases),
+        image_paths=tuple(found.get(base, path / f"{base}.color.png") for base in bases),
         lenses=(_lens(path),) * len(bases),
         poses=np.stack([_pose(path / f"{base}.pose.txt") for base in bases]),
-        depth_paths=tuple(path / f"{base}.depth.png" for base in bases),
+        depth_paths=tuple(path / f"{base}{_DEPTH}" for base in bases),
         depth_unit=_UNIT,
     )
 

@@ -13,6 +13,7 @@ camera's.
 (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats)
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from r3jax.formats.poses import read_lines, read_numbers, to_floats
 from r3jax.formats.quaternion_poses import quaternion_pose
 from r3jax.formats.sequences.scannet import UP
 from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.images import image_size
+from r3jax.formats.validation.images import first_size
 from r3jax.formats.validation.names import below
 
 _MAX_GAP = 0.02
@@ -66,7 +67,7 @@ def read_tum(path: Path | str) -> PosedImages:
             path, f"no image has a depth image and a pose within {_MAX_GAP:g} s of it"
         )
     poses = [_pose(source, table[pose_at[i]]) for i in chosen]
-    lens = _lens(path, images[chosen[0]])
+    lens = _lens(path, [images[i] for i in chosen])
     return PosedImages(
         path=path,
         image_paths=tuple(images[i] for i in chosen),
@@ -120,9 +121,9 @@ def _pose(source: Path, row: np.ndarray) -> np.ndarray:
     return quaternion_pose(source, f"the pose at {row[0]:.4f} s", row[1:4], row[4:])
 
 
-def _lens(path: Path, first_image: Path) -> Lens:
-    with naming(first_image):
-        width, height = image_size(first_image, IMAGE_FORMATS)
+def _lens(path: Path, images: Sequence[Path]) -> Lens:
+    with naming(images[0]):
+        width, height = first_size(images, IMAGE_FORMATS)
     source = path / "K.txt"
     if source.exists():
         K = read_numbers(source, columns=3)

@@ -5,7 +5,7 @@ Shape symbols: H, W image size.
 
 import io
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,21 @@ def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
             f"the image is {width} x {height}: more than {MAX_PIXELS} pixels are not read"
         )
     return width, height
+
+
+def first_size(paths: Iterable[Path], formats: Sequence[str]) -> tuple[int, int]:
+    """Width and height of the first image that can be opened, of some of one size [px].
+
+    Raises:
+        ForeignFileError, OSError: as `image_size`, of the first of them; none can be opened.
+    """
+    failed: Exception | None = None
+    for path in paths:
+        try:
+            return image_size(path, formats)
+        except (ForeignFileError, OSError) as error:
+            failed = failed or error
+    raise failed or ForeignFileError("there is no image")
 
 
 def image_pixels(
