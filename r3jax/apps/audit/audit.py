@@ -120,6 +120,18 @@ class Audit:
         return float(self.renderability.mean()) >= SATURATED
 
     @property
+    def shares(self) -> dict[str, float]:
+        """Share of what the frames show of each cause, and `unseen`; they sum to 1.
+
+        Of the capture's own pictures those without depth are counted, as unseen.
+        """
+        blank = len(self.faults.without_depth) if self.is_own_path else 0
+        total = len(self.frames) + blank
+        names = self.frames[0].score.shares
+        shares = {name: sum(f.score.shares[name] for f in self.frames) / total for name in names}
+        return shares | {"unseen": shares["unseen"] + blank / total}
+
+    @property
     def renderability(self) -> np.ndarray:
         """Renderability of every frame of the path, [n]."""
         return np.array([frame.score.renderability for frame in self.frames])
@@ -146,7 +158,8 @@ def audit(
 
     Raises:
         ValueError: a wish that makes no sense; depth images that contradict the poses.
-        FormatError, RunError: a file is missing or broken, or says nothing of depth.
+        FormatError: fewer than two images can be read, or nothing is said of depth.
+        RunError: a file of a run is missing or broken.
     """
     settings = AuditSettings() if settings is None else settings
     step = lambda: on_progress("", 1)
@@ -157,6 +170,8 @@ def audit(
     if survey.strays:
         stray = stray_finding(source, survey.strays, survey.chosen)
         faults = dataclasses.replace(faults, findings=(stray, *faults.findings))
+    unknown = np.array([*faults.left_out, *faults.without_depth], dtype=np.int64)
+    survey = dataclasses.replace(survey, chosen=np.setdiff1d(survey.chosen, unknown))
     on_progress("mapping", 2 * len(survey.chosen))
     seen = see(source, survey, settings.folds, step)
     unit = _WORTH_OF_UNSEEN * (survey.cell_size / survey.voxel_size) ** 2

@@ -118,6 +118,9 @@ class ViewScore:
     cause: str
     """What costs most: `unseen` (pixels without a voxel), `angle`, `noise` or `distance`."""
 
+    shares: dict[str, float]
+    """Share of all pixels of each of `CAUSES`, and `unseen`; they sum to 1."""
+
 
 CAUSE_OF_TERM = {"bias": "angle", "noise": "noise", "resolution": "distance"}
 """What a low factor means."""
@@ -140,10 +143,13 @@ def view_score(
     images = {name: np.asarray(getattr(seen, name))[is_hit] for name in TERMS}
     mean = {name: float(x.mean()) if x.size else 0.0 for name, x in images.items()}
     # log R = sum of the logarithms: what each term costs adds up over the pixels that show any.
+    costs = -np.log(np.maximum(np.stack([images[name] for name in TERMS]), LEAST))
     cost = {
-        CAUSE_OF_TERM[name]: -float(np.log(np.maximum(x, LEAST)).sum()) / is_hit.size
-        for name, x in images.items()
+        CAUSE_OF_TERM[name]: float(x.sum()) / is_hit.size
+        for name, x in zip(TERMS, costs, strict=True)
     }
+    count = np.asarray(state.count)[np.asarray(seen.row)[is_hit]]
+    pixels = np.bincount(cause_of(value[is_hit], costs, count), minlength=len(CAUSES))
     cost["unseen"] = (1.0 - coverage) * -np.log(LEAST)
     return ViewScore(
         renderability=float(value.mean()),
@@ -152,6 +158,10 @@ def view_score(
         noise=mean["noise"],
         resolution=mean["resolution"],
         cause=max(cost, key=lambda name: cost[name]),
+        shares={
+            **dict(zip(CAUSES, (pixels / is_hit.size).tolist(), strict=True)),
+            "unseen": 1.0 - coverage,
+        },
     )
 
 

@@ -125,6 +125,11 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "pictures": len(audit.source),
         "pictures_used": survey.chosen.tolist(),
         "pictures_diverged": list(survey.strays),
+        "pictures_left_out": [
+            {"index": index, "label": audit.source.labels[index], "why": why}
+            for index, why in audit.faults.left_out.items()
+        ],
+        "pictures_without_depth": list(audit.faults.without_depth),
         "voxel_size": survey.length(survey.voxel_size),
         "max_range": survey.length(float(audit.config.max_range)),
         "median_depth": survey.median_depth,
@@ -142,6 +147,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "path": {
             "own": audit.is_own_path,
             "mean": float(renderability.mean()),
+            "share": audit.shares,
             "frames": [
                 {
                     "index": frame.index,

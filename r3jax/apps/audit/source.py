@@ -177,6 +177,9 @@ def sparse_depth(
 MAX_SIDE = 640
 """Images are thinned out until their longer side has no more pixels."""
 
+_FEWEST_POINTS = 50
+"""Fewer points say nothing of a place: reconstructions have thousands."""
+
 _MAX_POINTS = 500_000
 """Larger clouds are thinned out: a voxel needs one point."""
 
@@ -218,7 +221,7 @@ class Source:
     """The thinned image of an index."""
 
     has_images: bool = True
-    """False where only points are there: their colors say nothing about noise."""
+    """False where no image is there, only depth or points: nothing is said of colors."""
 
     remark: str | None = None
     """What the capture holds beside its images, a sentence."""
@@ -272,7 +275,7 @@ def source_of(capture: Run | Recording | PosedImages, name: str) -> Source:
     if not len(capture.rows if isinstance(capture, Run) else capture):
         raise FormatError(capture.path, "there are no views to audit")
     if isinstance(capture, PosedImages):
-        return dataclasses.replace(_of_images(capture, name), remark=capture.remark)
+        return _of_images(capture, name)
     if isinstance(capture, Run):
         poses = np.stack([row.pose for row in capture.rows]).astype(np.float64)
         labels = tuple(f"view {row.step + 1}" for row in capture.rows)
@@ -301,15 +304,23 @@ def _of_images(images: PosedImages, name: str) -> Source:
         for lens in set(images.lenses):
             sampling_table(lens, stride)  # refuses a lens that it does not know
     labels = tuple(path.name for path in images.image_paths)
+    has_images = images.pixels is not None or any(path.is_file() for path in images.image_paths)
+    remark = images.remark
+    if not has_images:
+        none = (
+            f"None of the {len(images)} pictures is there (the first should be "
+            f"{images.image_paths[0]}): nothing is said of their sharpness, light or colors."
+        )
+        remark = none if remark is None else f"{none} {remark}"
     if any(path is not None for path in images.depth_paths):
         return Source(
             name, images.poses, images.lenses, labels, "depth", True, images.up, stride,
-            lambda index: _read_dense(images, index, stride),
+            lambda index: _read_dense(images, index, stride, has_images), has_images, remark,
         )  # fmt: skip
-    has_images = any(path.is_file() for path in images.image_paths)
     if images.points is not None and len(images.points.seen_point):
         kind: Kind = "tracks"
         xyz, rgb = images.points.xyz, images.points.rgb
+        count = len(np.unique(images.points.seen_point))
         order = np.argsort(images.points.seen_image, kind="stable")
         seen = images.points.seen_point[order]
         ends = np.searchsorted(images.points.seen_image[order], np.arange(len(images) + 1))
@@ -317,6 +328,13 @@ def _of_images(images: PosedImages, name: str) -> Source:
         kind = "cloud"
         xyz, rgb = _cloud(images)
         seen, ends = np.arange(len(xyz)), None
+        count = len(xyz)
+    if count < _FEWEST_POINTS:
+        raise FormatError(
+            images.points_path or images.path,
+            f"there are no depth images, and only {count} points: an audit needs one of them, "
+            f"and at least {_FEWEST_POINTS} points",
+        )
 
     def read(index: int) -> Picture:
         part = seen if ends is None else seen[ends[index] : ends[index + 1]]
@@ -330,8 +348,9 @@ def _of_images(images: PosedImages, name: str) -> Source:
         return colors, depth
 
     return Source(
-        name, images.poses, images.lenses, labels, kind, False, images.up, stride, read, has_images
-    )
+        name, images.poses, images.lenses, labels, kind, False, images.up, stride, read, has_images,
+        remark,
+    )  # fmt: skip
 
 
 def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:
@@ -339,11 +358,13 @@ def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:
     return max(-(-max(lens.width, lens.height) // MAX_SIDE) for lens in lenses)
 
 
-def _read_dense(images: PosedImages, index: int, stride: int) -> Picture:
+def _read_dense(images: PosedImages, index: int, stride: int, has_images: bool) -> Picture:
     table = sampling_table(images.lenses[index], stride)
     depth = images.depth(index)
     if depth is None:
         depth = np.zeros((images.lenses[index].height, images.lenses[index].width), np.float32)
+    if not has_images:
+        return np.zeros((*table.row.shape, 3), np.uint8), table.take(depth)
     colors, is_there = _thinned_colors(images, index, stride)
     return colors, np.where(is_there, table.take(depth), np.float32(0.0))
 
@@ -370,8 +391,6 @@ def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
             "there are neither depth images nor points: an audit needs one of them (COLMAP's "
             f"points3D, nerfstudio's ply_file_path or depth_file_path){beside}",
         )
-    if len(xyz) == 0:
-        raise FormatError(images.points_path or images.path, "there are no points in it")
     if len(xyz) > _MAX_POINTS:
         chosen = np.random.default_rng(0).choice(len(xyz), _MAX_POINTS, replace=False)
         xyz, rgb = xyz[chosen], rgb[chosen]

@@ -15,6 +15,7 @@ Shape symbols: n points; h, w size of an image.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -358,9 +359,13 @@ def _check(settings: AuditSettings) -> None:
 
 def _depth_images(source: Source, chosen: np.ndarray) -> list[DepthImage]:
     looked = chosen[np.unique(np.linspace(0, len(chosen) - 1, _SURVEYED).round().astype(int))]
-    return [
-        DepthImage(source.read(i)[1], source.camera(i), source.poses[i]) for i in looked.tolist()
-    ]
+    images: list[DepthImage] = []
+    for i in looked.tolist():
+        with suppress(FormatError):  # what cannot be read is named once all have been tried
+            images.append(DepthImage(source.read(i)[1], source.camera(i), source.poses[i]))
+    if not images:
+        source.read(int(looked[0]))  # says why
+    return images
 
 
 def _measured(source: Source, images: list[DepthImage]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,8 @@
 """Whole audits of a room in which it is known what is wrong."""
 
 import dataclasses
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +15,7 @@ from r3jax.apps.audit.bad_regions import bad_regions, unseen_edges, unseen_regio
 from r3jax.apps.audit.camera_paths import CameraPath
 from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
+from r3jax.apps.audit.pages.faults_section import faults_section
 from r3jax.apps.audit.pages.sentences import directions, method, verdict
 from r3jax.apps.audit.source import Source, source_of
 from r3jax.apps.audit.survey import MARGIN, AuditSettings, survey_of
@@ -256,6 +259,50 @@ def test_tracks_of_a_model_are_as_good_as_a_cloud(folder, cloud):
     assert found.diagnosis.fine_share > 0.3
 
 
+def test_without_depth_images_what_no_point_shows_is_not_known(cloud, corner):
+    """One measure for the headline and the frames: nothing is fine that no pixel shows."""
+    shares = cloud.shares
+    assert shares.keys() == {*CAUSES, "unseen"}
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert shares["unseen"] == pytest.approx(
+        1.0 - np.mean([frame.score.coverage for frame in cloud.frames])
+    )
+    assert cloud.renderability.mean() <= 1.0 - shares["unseen"]
+    assert shares["fine"] * FINE <= cloud.renderability.mean()
+    said = " ".join(verdict(cloud))
+    assert re.search(rf"\b{100 * shares['fine']:.0f}\s% of what the pictures show", said)
+    assert re.search(rf"\b{100 * shares['unseen']:.0f}\s% is not known", said)
+    assert "not known" not in " ".join(verdict(corner))
+    assert record_of(cloud)["path"]["share"] == shares
+
+
+def test_pictures_without_a_point_are_not_known_either(cloud):
+    blank = dataclasses.replace(cloud.faults, without_depth=(3, 5, 7, 9))
+    fewer = dataclasses.replace(cloud, faults=blank)
+    known = 1.0 - cloud.shares["unseen"]
+    assert 1.0 - fewer.shares["unseen"] == pytest.approx(known * 16 / 20)
+    assert sum(fewer.shares.values()) == pytest.approx(1.0)
+
+
+def test_what_cannot_be_read_and_what_has_no_depth_is_left_out_and_said(folder):
+    path = write_nerfstudio(folder / "partly", round_poses(12), depth=True)
+    content = json.loads((path / "transforms.json").read_text())
+    for frame in content["frames"][8:]:
+        del frame["depth_file_path"]
+    (path / "transforms.json").write_text(json.dumps(content))
+    (path / "images" / "002.png").unlink()
+    found = audit(source_of(read_transforms(path), "partly"), NO_VIEWS)
+    assert found.survey.chosen.tolist() == [0, 1, 3, 4, 5, 6, 7]
+    assert len(found.frames) == 7
+    first, second, *_ = verdict(found)
+    assert first.startswith("1 of the 12 pictures is left out")
+    assert "002.png: the file is missing" in first
+    assert second.startswith("4 of the 11 pictures have no depth")
+    record = record_of(found)
+    assert [entry["index"] for entry in record["pictures_left_out"]] == [2]
+    assert record["pictures_without_depth"] == [8, 9, 10, 11]
+
+
 def test_a_model_without_images_is_audited_by_its_points(folder):
     path = write_colmap(folder / "bare", round_poses(8))
     for image in (path / "images").iterdir():
@@ -265,6 +312,10 @@ def test_a_model_without_images_is_audited_by_its_points(folder):
     found = audit(source, dataclasses.replace(FEW_VIEWS, num_views=0))
     assert found.diagnosis.share("noise") == 0.0
     assert "nothing can be said about noise" in method(found)[-1]
+    assert verdict(found)[0].startswith("None of the 8 pictures is there")
+    page = faults_section(found)
+    assert "sharp" not in page
+    assert "where they say" not in page
 
 
 def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):

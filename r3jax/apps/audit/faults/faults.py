@@ -8,8 +8,9 @@ walk, damaged on purpose, and to a real recording.
 Shape symbols: n frames.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from r3jax.apps.audit.faults.offsets import Offsets, offsets
 from r3jax.apps.audit.faults.overlap import overlaps
 from r3jax.apps.audit.faults.repeats import repeats
 from r3jax.apps.audit.source import Source
+from r3jax.formats.errors import FormatError
 
 BLURRED = 0.45
 """Less of its neighbors' detail than this, and a frame is blurred: a motion of 3 pixels at the
@@ -101,6 +103,12 @@ class Faults:
     record: dict[str, Any]
     """Numbers of every frame, by name; None where nothing can be said."""
 
+    left_out: Mapping[int, str] = field(default_factory=dict[int, str])
+    """Images that cannot be read, by their numbers in the capture, and why not."""
+
+    without_depth: tuple[int, ...] = ()
+    """Images of which no depth is known: what they show cannot be told."""
+
 
 def find_faults(
     source: Source, chosen: np.ndarray, on_frame: Callable[[], None] = lambda: None
@@ -113,13 +121,28 @@ def find_faults(
         on_frame: called after each of them.
 
     Raises:
-        FormatError, RunError: a file is missing or broken.
+        FormatError: fewer than two images can be read.
+        RunError: a file of a run is missing or broken.
     """
     images: list[BlockImage] = []
+    failed: dict[int, FormatError] = {}
+    without_depth: list[int] = []
     for index in chosen.tolist():
-        images.append(block_image(*source.read(index), source.camera(index), source.poses[index]))
+        try:
+            rgb, depth = source.read(index)
+        except FormatError as error:
+            failed[index] = error
+        else:
+            images.append(block_image(rgb, depth, source.camera(index), source.poses[index]))
+            if not (depth > 0.0).any():
+                without_depth.append(index)
         on_frame()
-    return faults_of(images, chosen, source.labels, source.is_metric, source.has_images)
+    if len(images) < 2 and failed:
+        raise next(iter(failed.values()))
+    kept = np.setdiff1d(chosen, list(failed))
+    found = faults_of(images, kept, source.labels, source.is_metric, source.has_images)
+    left_out = {index: f"{error.path.name}: {error.reason}" for index, error in failed.items()}
+    return dataclasses.replace(found, left_out=left_out, without_depth=tuple(without_depth))
 
 
 def stray_finding(source: Source, strays: Sequence[int], chosen: np.ndarray) -> Finding:

@@ -47,7 +47,9 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         ),
         section(
             "What is wrong, and how much of it",
-            "Shares of the surface that one sees from where people could stand.",
+            "Shares of the surface that one sees from where people could stand."
+            if audit.source.is_dense
+            else "Shares of what the frames show, each judged by the other pictures.",
             _cause_table(audit),
         ),
         section(
@@ -65,37 +67,50 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
 
 def _cards(audit: Audit) -> dict[str, str]:
     found, plan = audit.diagnosis, audit.plan
-    bad = (1.0 - found.fine_share) * found.is_seen.sum() * audit.survey.voxel_size**2
-    cards = {
-        "pictures": str(len(audit.survey.chosen)),
-        "of the surface renders well": f"{100 * found.fine_share:.0f} %",
-        "of surface to mend": sentences.area(audit, float(bad)),
-        "mean R of the frames": f"{audit.renderability.mean():.2f}",
-    }
+    fine = f"{100 * sentences.cause_share(audit, 'fine'):.0f} %"
+    what = "pictures" if audit.source.has_images else "poses without pictures"
+    cards = {what: str(len(audit.survey.chosen))}
+    if audit.source.is_dense:
+        bad = (1.0 - found.fine_share) * found.is_seen.sum() * audit.survey.voxel_size**2
+        cards["of the surface renders well"] = fine
+        cards["of surface to mend"] = sentences.area(audit, float(bad))
+    else:
+        cards["of what they show renders well"] = fine
+        cards["of it is not known"] = f"{100 * audit.shares['unseen']:.0f} %"
+    zero = "" if audit.source.is_dense else ", what is not known as 0"
+    cards[f"mean R of the frames{zero}"] = f"{audit.renderability.mean():.2f}"
     if plan.views:
         gain = f"{found.mean:.2f} → {plan.after.mean:.2f}"
-        cards[f"mean R of the surfaces after {len(plan.views)} views"] = gain
+        where = "" if audit.source.is_dense else " with points"
+        cards[f"mean R of the surfaces{where} after {len(plan.views)} views"] = gain
     return cards
 
 
 def _cause_table(audit: Audit) -> str:
-    found = audit.diagnosis
+    found, is_dense = audit.diagnosis, audit.source.is_dense
     whole = float(found.is_seen.sum()) * audit.survey.voxel_size**2
     rows: list[str] = []
     for cause, meaning in sentences.MEANING.items():
-        share = found.share(cause) if cause != "unseen" else None
-        covers = audit.unseen_area if share is None else share * whole
-        if share is None and not audit.unseen:
+        is_edge = cause == "unseen" and is_dense  # where free space ends, which has an area only
+        if is_edge and not audit.unseen:
             continue
+        share = None if is_edge else sentences.cause_share(audit, cause)
+        covers = audit.unseen_area if share is None else share * whole
+        name, remedy = cause, sentences.REMEDY[cause]
+        if cause == "unseen" and not is_dense:
+            name, meaning, remedy = sentences.NOT_KNOWN
         bar = "" if share is None else _bar(share, COLOR_OF_CAUSE[cause])
         amount = "" if share is None else f"{100 * share:.0f} %"
+        about = sentences.area(audit, covers) if is_dense else ""
+        if cause == "noise" and not audit.source.has_images:
+            bar, amount, about = "", "not known", ""
         rows.append(
-            f"<tr><td class=k>{_dot(cause)}{cause}</td><td class=n>{amount}</td><td>{bar}</td>"
-            f"<td class=n>{sentences.area(audit, covers)}</td><td>{meaning}</td>"
-            f"<td>{sentences.REMEDY[cause]}</td></tr>"
+            f"<tr><td class=k>{_dot(cause)}{name}</td><td class=n>{amount}</td><td>{bar}</td>"
+            f"<td class=n>{about}</td><td>{meaning}</td><td>{remedy}</td></tr>"
         )
     head = (
-        "<tr><th>cause</th><th class=n>share</th><th></th><th class=n>about</th><th>meaning</th>"
+        "<tr><th>cause</th><th class=n>share</th><th></th>"
+        f"<th class=n>{'about' if is_dense else ''}</th><th>meaning</th>"
         "<th>what to do</th></tr>"
     )
     return f"<table>{head}{''.join(rows)}</table>"
@@ -139,7 +154,8 @@ def _region_table(audit: Audit) -> str:
         "<tr><th></th><th>mostly</th><th class=n>bad</th><th class=n>of the surface there</th>"
         "<th class=n>R of it</th><th class=n>middle (x, y, z)</th><th class=n>views</th></tr>"
     )
-    return f"<table>{head}{''.join(rows)}</table>" if rows else "<p>Nowhere.</p>"
+    where = "" if audit.source.is_dense else " among the surfaces with points"
+    return f"<table>{head}{''.join(rows)}</table>" if rows else f"<p>Nowhere{where}.</p>"
 
 
 def _shows(view: Suggestion, region: Region) -> bool:

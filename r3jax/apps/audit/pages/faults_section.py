@@ -38,12 +38,11 @@ def faults_section(audit: Audit) -> str:
     faults = audit.faults
     body = "".join(_finding(audit, finding) for finding in faults.findings)
     if not faults.findings:
-        good = ("sharp, evenly lit, and " if audit.source.has_images else "") + "where they say"
-        body = f"<p>Nothing that could be found: they are {good}.</p>"
-    alone = faults.looked_at - faults.compared
+        body = f"<p>{_nothing_found(audit)}</p>"
+    alone = faults.looked_at - faults.compared - len(faults.without_depth)
     if not faults.compared:
         body = "<p>Nobody can tell: no two pictures show the same surface.</p>"
-    elif alone:
+    elif alone > 0:
         body += (
             f"<p class=note>Nothing can be said of {alone} of the {faults.looked_at} pictures: no "
             "other one shows the same surface.</p>"
@@ -59,6 +58,23 @@ def faults_section(audit: Audit) -> str:
         "640 pixels wide; finer blur than a pixel of that does not show."
     )
     return section("What is wrong with the pictures", note, body)
+
+
+def _nothing_found(audit: Audit) -> str:
+    """What was looked for and not found; of the rest nothing is said."""
+    record = audit.faults.record
+    known = lambda name: any(value is not None for value in record.get(name, []))
+    good = [
+        word for word, name in (("sharp", "detail"), ("evenly lit", "brightness")) if known(name)
+    ]
+    if audit.source.is_dense and known("pose_off_by"):
+        good.append("where they say")
+    if not audit.source.has_images:
+        return "None of them is there" + (", the depth images are where they say." if good else ".")
+    if not good:
+        return "Nothing can be said of them."
+    listed = good[0] if len(good) == 1 else f"{', '.join(good[:-1])} and {good[-1]}"
+    return f"Nothing was found: as far as they can be compared, they are {listed}."
 
 
 def _finding(audit: Audit, finding: Finding) -> str:

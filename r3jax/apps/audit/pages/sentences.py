@@ -30,6 +30,13 @@ REMEDY = {
 }
 """What one can do."""
 
+NOT_KNOWN = (
+    "not known",
+    "no other picture has points there",
+    "let pictures overlap more; plain walls need depth images",
+)
+"""Name, meaning and remedy of what no voxel shows, where there are no depth images."""
+
 _SHORT = {
     "angle": "only from other angles",
     "rare": "too rarely",
@@ -42,6 +49,9 @@ _MOST_SAID = 4
 
 _DOUBTFUL = 5.0
 """A guess of the vertical that may be off by more is told first [deg]."""
+
+_MOST_NAMED = 6
+"""Pictures that cannot be read which a sentence names."""
 
 _ORDINARY = ("angle", "rare", "distance", "noise")
 
@@ -81,19 +91,24 @@ def origin(audit: Audit) -> str | None:
 def verdict(audit: Audit) -> list[str]:
     """What the audit comes to, a sentence each."""
     found, plan = audit.diagnosis, audit.plan
-    shares = {cause: found.share(cause) for cause in _ORDINARY}
+    shares = {cause: cause_share(audit, cause) for cause in _ORDINARY}
     ordered = sorted(shares, key=lambda cause: -shares[cause])
     parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
-    sentences = [
-        f"{100 * found.fine_share:.0f} % of the surface that one sees from where people could "
-        f"stand would render well (R ≥ {FINE:g})" + (f"; {_list(parts)}." if parts else ".")
-    ]
+    fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
+    if audit.source.is_dense:
+        start = f"{fine} of the surface that one sees from where people could stand"
+    else:
+        start = f"{fine} of what the {'pictures' if audit.is_own_path else 'frames'} show"
+        parts.append(f"{_unknown(audit)} is not known: no other picture has points there")
+    well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
+    sentences = [f"{start} would render well ({well})" + (f"; {_list(parts)}." if parts else ".")]
     if not audit.source.is_dense:
         sentences.append(
-            "Without depth images only surfaces with points are scored; plain walls may have none."
+            "Without depth images only surfaces with points are judged; plain walls may have none."
         )
     if (audit.survey.up.within or 0.0) > _DOUBTFUL:
         sentences.insert(0, vertical(audit))
+    sentences[:0] = [*unread(audit), *without_depth(audit)]
     if audit.source.remark is not None:
         sentences.insert(0, audit.source.remark)
     if audit.survey.doubt is not None:
@@ -108,12 +123,14 @@ def verdict(audit: Audit) -> list[str]:
     mean = float(audit.renderability.mean())
     worst = min(audit.frames, key=lambda frame: frame.score.renderability)
     what = "A frame of this capture" if audit.is_own_path else "A frame of the path"
+    known = mean / max(float(np.mean([frame.score.coverage for frame in audit.frames])), 1e-9)
+    beside = "" if audit.source.is_dense else f" ({known:.2f} where it is known, else 0)"
     if audit.is_saturated:
         sentences.append(f"{what} has a renderability of {mean:.2f} on average. {saturation()}")
     else:
         sentences.append(
-            f"{what} has a renderability of {mean:.2f} on average, the worst ({worst.label}) "
-            f"{worst.score.renderability:.2f}."
+            f"{what} has a renderability of {mean:.2f} on average{beside}, the worst "
+            f"({worst.label}) {worst.score.renderability:.2f}."
         )
     if plan.views:
         count = len(plan.views)
@@ -123,7 +140,8 @@ def verdict(audit: Audit) -> list[str]:
             else (f"{count} further views", "as many at random places")
         )
         sentences.append(
-            f"{views} would raise the mean over all surfaces from {found.mean:.2f} to "
+            f"{views} would raise the mean over all surfaces"
+            f"{'' if audit.source.is_dense else ' with points'} from {found.mean:.2f} to "
             f"{plan.after.mean:.2f}, as far as it can be foreseen; {drawn} "
             f"{plan.random_mean[-1]:.2f}."
         )
@@ -142,6 +160,45 @@ def vertical(audit: Audit) -> str:
         f"from {from_what}how the cameras were held. Where another direction is up, give it "
         f"(--up=z, or three numbers such as --up={numbers})."
     )
+
+
+def unread(audit: Audit) -> list[str]:
+    """Which pictures could not be read, and why: one sentence, or none."""
+    left_out = audit.faults.left_out
+    if not left_out:
+        return []
+    total = len(left_out) + audit.faults.looked_at
+    named = "; ".join(list(left_out.values())[:_MOST_NAMED])
+    more = len(left_out) - _MOST_NAMED
+    rest = f"; and {more} more, named in audit.json" if more > 0 else ""
+    verb = "is left out: it" if len(left_out) == 1 else "are left out: they"
+    return [f"{len(left_out)} of the {total} pictures {verb} cannot be read ({named}{rest})."]
+
+
+def without_depth(audit: Audit) -> list[str]:
+    """How many pictures say nothing of depth: one sentence, or none."""
+    count = len(audit.faults.without_depth)
+    if not count:
+        return []
+    what = "have no depth" if audit.source.is_dense else "show no point"
+    return [
+        f"{count} of the {audit.faults.looked_at} pictures {what}: they are left out, and what "
+        "they show is not known."
+    ]
+
+
+def cause_share(audit: Audit, cause: str) -> float:
+    """Share of what is evaluated that has this cause, or `fine`.
+
+    With depth images of the surface that one sees from where people could stand. Without, of what
+    the frames show: points are where pictures saw them, and say nothing of what has none.
+    """
+    return audit.diagnosis.share(cause) if audit.source.is_dense else audit.shares[cause]
+
+
+def _unknown(audit: Audit) -> str:
+    """Share of what the frames show of which nothing is known."""
+    return f"{100 * audit.shares['unseen']:.0f} %"
 
 
 def saturation() -> str:
