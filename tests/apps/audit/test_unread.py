@@ -18,7 +18,8 @@ POSES = round_poses(6)
 
 
 def cut(path):
-    path.write_bytes(path.read_bytes()[:-300])
+    data = path.read_bytes()
+    path.write_bytes(data[: 2 * len(data) // 3])
 
 
 BREAK = {
@@ -115,5 +116,5 @@ def test_some_tens_of_points_are_no_capture(tmp_path, count, is_enough):
     if is_enough:
         assert source_of(few, "scan").kind == "tracks"
     else:
-        with pytest.raises(FormatError, match=rf"only {count} points"):
+        with pytest.raises(FormatError, match=r"only \d+ points"):
             source_of(few, "scan")
