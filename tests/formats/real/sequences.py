@@ -55,7 +55,8 @@ def _replica() -> Files:
     return files
 
 
-_TUM = {"size": KINECT, "intrinsics": (525.0, 525.0, 320.0, 240.0), "poses_off": 2e-4}
+_Z = (0.0, 0.0, 1.0)
+_TUM = {"size": KINECT, "intrinsics": (525.0, 525.0, 320.0, 240.0), "poses_off": 2e-4, "up": _Z}
 _SEVEN = {"size": KINECT, "given": "data"}
 
 LAYOUTS = (
@@ -65,7 +66,8 @@ LAYOUTS = (
            **_SEVEN),
     Layout("3DMatch, another camera", lambda: _seven_scenes(_K, "png"),
            intrinsics=(570.34, 571.34, 320.0, 240.0), **_SEVEN),
-    Layout("Replica of NICE-SLAM", _replica, size=(64, 48), intrinsics=(70.0, 70.0, 32.0, 24.0)),
+    Layout("Replica of NICE-SLAM", _replica, size=(64, 48), intrinsics=(70.0, 70.0, 32.0, 24.0),
+           up=_Z),
 )  # fmt: skip
 
 
