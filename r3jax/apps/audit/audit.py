@@ -157,7 +157,8 @@ def audit(
         on_progress: for a progress bar.
 
     Raises:
-        ValueError: a wish that makes no sense; depth images that contradict the poses.
+        ValueError: a wish that makes no sense; depth images that contradict the poses; fewer than
+            two images whose depth is known.
         FormatError: fewer than two images can be read, or nothing is said of depth.
         RunError: a file of a run is missing or broken.
     """
@@ -172,6 +173,11 @@ def audit(
         faults = dataclasses.replace(faults, findings=(stray, *faults.findings))
     unknown = np.array([*faults.left_out, *faults.without_depth], dtype=np.int64)
     survey = dataclasses.replace(survey, chosen=np.setdiff1d(survey.chosen, unknown))
+    if len(survey.chosen) < 2:
+        raise ValueError(
+            f"{source.name}: {len(survey.chosen)} of its {len(source)} pictures shows a surface "
+            "of known depth: an audit judges each picture by the others, so it needs at least two"
+        )
     on_progress("mapping", 2 * len(survey.chosen))
     seen = see(source, survey, settings.folds, step)
     unit = _WORTH_OF_UNSEEN * (survey.cell_size / survey.voxel_size) ** 2

@@ -57,7 +57,8 @@ def strays(cameras: np.ndarray, depth: float, points_of: Callable[[int], np.ndar
     others = others[np.unique(np.linspace(0, len(others) - 1, _COMPARED).astype(np.int64))]
     shown = np.concatenate([points_of(i) for i in others.tolist()])
     tree = KDTree(shown)
-    return np.array([i for i in alone.tolist() if not _shares(cameras[i], points_of(i), tree)])
+    shares = [_shares(cameras[i], points_of(i), tree) for i in alone.tolist()]
+    return alone[~np.array(shares)]
 
 
 def _groups(cameras: np.ndarray, reach: float) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from r3jax.apps.audit.audit import audit
 from r3jax.apps.audit.faults.faults import find_faults
 from r3jax.apps.audit.source import source_of
 from r3jax.apps.audit.survey import AuditSettings, survey_of
@@ -118,3 +119,9 @@ def test_some_tens_of_points_are_no_capture(tmp_path, count, is_enough):
     else:
         with pytest.raises(FormatError, match=r"only \d+ points"):
             source_of(few, "scan")
+
+
+def test_a_single_picture_has_no_others_to_be_judged_by(tmp_path):
+    source = opened(write_nerfstudio(tmp_path / "scan", POSES[:1], depth=True))
+    with pytest.raises(ValueError, match="1 of its 1 pictures .* at least two"):
+        audit(source)
