@@ -14,9 +14,8 @@ Cell = Mapping[str, Any]
 """One record: the parsed JSON object."""
 
 POLICIES = (
-    "random", "uniform", "frontier", "unseen", "unseen-depth", "cover", "gavis", "active-gamer",
-    "gauss-mi", "fisherrf", "fisherrf-d-opt", "active-gs-no-depth", "active-gs", "active-gs-online",
-    "r3con", "ours", "ours-pano", "ours-ahead",
+    "random", "frontier", "cover", "gavis", "active-gamer", "gauss-mi", "fisherrf", "active-gs",
+    "active-gs-online", "r3con", "ours", "ours-pano", "ours-ahead",
 )  # fmt: skip
 """Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""
 

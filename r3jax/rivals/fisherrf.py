@@ -49,17 +49,6 @@ class FisherConfig(OnlineConfig):
 
 
 @dataclass(frozen=True)
-class DOptConfig(FisherConfig):
-    """Settings of `fisherrf-d-opt`."""
-
-    criterion: Criterion = "d-opt"
-    """`d-opt`: sum of log(1 + H_v / (H + lambda)) (POp-GS). `ratio`: FisherRF."""
-
-    quirk: bool = False
-    """The chain rule as it is: squares of all derivatives."""
-
-
-@dataclass(frozen=True)
 class FisherRF(OnlinePolicy):
     """Views that tell most of the least known parameters of a map that it trains while flying."""
 
@@ -81,14 +70,3 @@ class FisherRF(OnlinePolicy):
         found = scores(online.scene, camera, candidates.poses_on_device(), known, form)
         lots = draw_lots(len(candidates.valid), key=key)
         return candidates, {"utility": found.astype(np.float64)} | lots
-
-
-@dataclass(frozen=True)
-class FisherRFDOpt(FisherRF):
-    """FisherRF with the D-optimal criterion and the chain rule as it is: a stronger relative."""
-
-    config: DOptConfig = field(default_factory=DOptConfig)
-
-    name = "fisherrf-d-opt"
-    source = "POp-GS, Wilson et al., CVPR 2025: D-opt on FisherRF's diagonal"
-    Config = DOptConfig

@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera
-from r3jax.geometry.numerics import safe_norm
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.scoring.backend import rows_in_pixels, seen_in_view
@@ -47,9 +46,6 @@ class PixelView(eqx.Module):
 
     cells: Float[Array, ""]
     """Visible unexplored cells of the coarse grid; pixels without a voxel hide nothing."""
-
-    cell_distance: Float[Array, ""]
-    """Sum of their distances from the camera [m]."""
 
     max_range: Float[Array, ""]
     """The sensor's range [m]."""
@@ -113,7 +109,7 @@ def _score(
 
     def look(one: tuple[Array, tuple[Array, Array]]) -> Any:
         pose, (item, unexplored) = one
-        return value(pixel_view(voxels, cells, pose, config, item, unexplored, rows))
+        return value(pixel_view(voxels, pose, config, item, unexplored, rows))
 
     # All views in one call of the backend; what is made of their pixels, one after the other.
     return jax.lax.map(look, (poses, jax.vmap(shown)(poses)))
@@ -121,22 +117,20 @@ def _score(
 
 def pixel_view(
     voxels: MapState,
-    cells: Cells,
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
     item: Int[Array, "h w"],
     unexplored: Bool[Array, " c"],
     rows: Any = (),
 ) -> PixelView:
-    """One view of voxels and cells that are at hand.
+    """Gathers what a view shows of voxels that are at hand.
 
     Args:
         voxels: n voxels.
-        cells: c cells of the coarse grid.
         T_world_camera: pose of the view.
         config: the sensor's range.
         item: the voxel that each pixel shows; n where there is none.
-        unexplored: the unexplored cells that the view shows.
+        unexplored: which of the c unexplored cells the view shows.
         rows: arrays `[..., n]` with something about each voxel.
     """
     num, position = voxels.count.shape[0], T_world_camera[:3, 3]
@@ -145,7 +139,6 @@ def pixel_view(
     center = voxels.center_of(item.reshape(-1)).reshape(3, *item.shape)
     offset = position[:, None, None] - center
     axis = T_world_camera[:3, 2][:, None, None]
-    distance = safe_norm(jnp.stack([cells.x, cells.y, cells.z]) - position[:, None], axis=0)
     return PixelView(
         hit=hit,
         # The offset points towards the camera, the axis away from it: hence the sign.
@@ -153,6 +146,5 @@ def pixel_view(
         offset=offset,
         rows=jax.tree.map(lambda x: x[..., item], rows),
         cells=jnp.sum(unexplored, dtype=jnp.float32),
-        cell_distance=jnp.sum(jnp.where(unexplored, distance, 0.0)),
         max_range=config.max_range,
     )

@@ -62,13 +62,13 @@ def test_without_another_budget_a_finished_run_stays_as_it_is(part):
 def test_a_fork_keeps_the_first_views_and_goes_its_own_way(runs, tmp_path):
     words = ["--at", "2", "--out", str(tmp_path), "--budget", f"views:{VIEWS}"]
     fork = ["explore", "--fork", str(runs / "whole"), *words]
-    assert main_without_report([*fork, "--policy", "uniform", "--candidates", "20"]) == 0
-    run = read_run(tmp_path / "whole-uniform-from2")
+    assert main_without_report([*fork, "--policy", "frontier", "--candidates", "20"]) == 0
+    run = read_run(tmp_path / "whole-frontier-from2")
     assert len(run.rows) == VIEWS
     before, after = poses_of(runs / "whole"), poses_of(run.path)
     np.testing.assert_array_equal(after[:2], before[:2])
     assert np.abs(after[2:] - before[2:]).max() > 0.1
-    assert run.header.policy["name"] == "uniform"
+    assert run.header.policy["name"] == "frontier"
     assert run.header.parent == {"forked": str(runs / "whole"), "views": 2, "decided_from": 2}
     assert len(list(run.frames())) == VIEWS
 
@@ -81,7 +81,7 @@ def test_a_fork_by_the_same_policy_repeats_the_run(runs, tmp_path):
 
 
 def test_a_fork_that_is_cut_off_goes_on(runs, tmp_path):
-    words = ["--at", "2", "--out", str(tmp_path), "--policy", "uniform", "--candidates", "20"]
+    words = ["--at", "2", "--out", str(tmp_path), "--policy", "frontier", "--candidates", "20"]
     fork = ["explore", "--fork", str(runs / "whole"), *words]
     assert main_without_report([*fork, "--name", "long", "--budget", f"views:{VIEWS}"]) == 0
     assert main_without_report([*fork, "--name", "short", "--budget", "views:3"]) == 0

@@ -5,9 +5,8 @@ import copy
 import numpy as np
 
 SKILL = {
-    "random": 17.5, "uniform": 20.0, "frontier": 20.5, "unseen": 22.5,
-    "unseen-depth": 23.0, "cover": 21.0, "active-gamer": 22.0, "active-gs-no-depth": 20.2,
-    "active-gs": 25.0, "ours": 26.0, "ours-pano": 26.3,
+    "random": 17.5, "frontier": 20.5, "cover": 21.0, "active-gamer": 22.0, "active-gs": 25.0,
+    "ours": 26.0, "ours-pano": 26.3,
 }  # fmt: skip
 """PSNR that a policy ends with [dB]."""
 

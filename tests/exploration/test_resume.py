@@ -89,11 +89,11 @@ def whole(tmp_path_factory):
     "name",
     quick_and_full(
         [
-            "wander", "ours-pano", "active-gs", "gavis", "uniform", "frontier",
+            "wander", "ours-pano", "active-gs", "gavis", "frontier",
             "active-gs-online", "fisherrf", "gauss-mi",
         ],
         ["wander"],
-        slow=["uniform", "frontier", "fisherrf", "gauss-mi"],
+        slow=["frontier", "fisherrf", "gauss-mi"],
     ),
 )  # fmt: skip
 def test_a_run_in_two_parts_is_the_run_in_one(tmp_path, whole, name):
@@ -141,7 +141,7 @@ def damage(path, how):
         for file in (f for f in newest.rglob("*") if f.is_file()):
             file.write_bytes(b"")
     elif how == "another view's checkpoint":
-        run_in(path.with_name("earlier"), "uniform", CUT - 1)
+        run_in(path.with_name("earlier"), "wander", CUT - 1)
         shutil.rmtree(newest)
         shutil.copytree(path.with_name("earlier") / "checkpoints" / f"{CUT - 2:06d}", newest)
     elif how == "a checkpoint after the trace":
@@ -173,10 +173,10 @@ def damage(path, how):
     ),
 )
 def test_damage_costs_time_and_nothing_else(tmp_path, whole, how):
-    run_in(tmp_path / "run", "uniform", CUT)
+    run_in(tmp_path / "run", "wander", CUT)
     damage(tmp_path / "run", how)
-    run_in(tmp_path / "run", "uniform", VIEWS, resume=True)
-    assert_same_run(tmp_path / "run", whole("uniform"))
+    run_in(tmp_path / "run", "wander", VIEWS, resume=True)
+    assert_same_run(tmp_path / "run", whole("wander"))
     names = sorted(p.name for p in (tmp_path / "run" / "checkpoints").iterdir())
     assert names[-1] == f"{VIEWS - 1:06d}"
     assert len(names) <= 3
@@ -186,7 +186,7 @@ def test_damage_costs_time_and_nothing_else(tmp_path, whole, how):
 @pytest.mark.full
 def test_a_state_comes_back_from_its_tables(whole):
     """What is not an array comes from the first state, arrays keep shape and type."""
-    for name in ("ours-pano", "active-gs", "active-gamer", "frontier", "uniform", "wander"):
+    for name in ("ours-pano", "active-gs", "active-gamer", "frontier", "wander"):
         simulator, policy = BoxRoom(), policy_of(name)
         state = explore(simulator, policy, budget="views:2", config=CONFIG).state
         first = explore(simulator, policy, budget="views:1", config=CONFIG).state

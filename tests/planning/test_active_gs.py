@@ -14,7 +14,7 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.join import grow
 from r3jax.planning.candidates import candidates_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.policies.active_gs import ActiveGS, ActiveGSNoDepth, policy, regions
+from r3jax.planning.policies.active_gs import ActiveGS, policy, regions
 from r3jax.planning.policies.active_gs.confidence import no_sightings
 from r3jax.planning.policy import DecisionOutcome, Situation
 from r3jax.planning.robot.travel import plan_travel
@@ -73,7 +73,6 @@ def some_view() -> PixelView:
         offset=jnp.zeros((3, *shape)),
         rows=jnp.asarray(random.random(shape), jnp.float32),
         cells=jnp.asarray(17.0),
-        cell_distance=jnp.asarray(3.0),
         max_range=jnp.asarray(5.0),
     )
 
@@ -82,7 +81,7 @@ def law_pixels(modules: Modules) -> None:
     view = some_view()
     hit, depth, confidence = (np.asarray(x, float) for x in (view.hit, view.depth, view.rows))
     near = far = nothing = 0
-    with_depth, without = [], []
+    expected = []
     for i, j in np.ndindex(hit.shape):
         d, c = depth[i, j], confidence[i, j]
         if not hit[i, j]:
@@ -91,17 +90,11 @@ def law_pixels(modules: Modules) -> None:
             c, far = 1.0, far + 1
         else:
             near += 1
-        with_depth.append((1.0 - c) * d / 5.0)
-        without.append(1.0 - c)
+        expected.append((1.0 - c) * d / 5.0)
     assert min(near, far, nothing) > 5
-    module = modules["policy"]
-    for value, expected in (
-        (module.rendering_with_depth, with_depth),
-        (module.rendering_without_depth, without),
-    ):
-        cells, rendering = value(view)
-        assert float(cells) == 17.0
-        np.testing.assert_allclose(float(rendering), np.mean(expected), rtol=1e-5)
+    cells, rendering = modules["policy"].cells_and_doubt(view)
+    assert float(cells) == 17.0
+    np.testing.assert_allclose(float(rendering), np.mean(expected), rtol=1e-5)
 
 
 def wall_at(distance: float) -> tuple:
@@ -137,8 +130,6 @@ def law_scores(modules: Modules) -> None:
     np.testing.assert_allclose(u["rendering"], 0.75 * 3.0 / 5.0, atol=0.01)
     np.testing.assert_array_equal(u["exploration"], 0.0)
     np.testing.assert_allclose(u["utility"], u["rendering"])
-    bare = score(module.ActiveGSNoDepth, wall, 0.25)
-    np.testing.assert_allclose(bare["rendering"], 0.75, atol=1e-5)
     away = score(module.ActiveGS, wall, 0.25, direction=(-1.0, 0.0, 0.0))
     np.testing.assert_allclose(away["rendering"], 0.5, atol=1e-5)
     assert u["lot"].shape == (2,)
@@ -275,8 +266,6 @@ MUTANTS = [
     Mutant("policy", "0.5 * view.max_range", "view.max_range", law_pixels),
     Mutant("policy", "jnp.mean(doubt * depth)", "jnp.mean(doubt)", law_pixels),
     Mutant("policy", "1.0 - view.rows), 1.0)", "1.0 - view.rows), 0.0)", law_pixels),
-    Mutant("policy", "staticmethod(rendering_without_depth)", "staticmethod(rendering_with_depth)",
-           law_scores),
     Mutant("policy", "scoring, situation.memory.confidence",
            "scoring, 1.0 - situation.memory.confidence", law_scores),
     Mutant("policy", "_REACH = 3.0", "_REACH = 1.0", law_far_walls),
@@ -331,7 +320,7 @@ def decide(state, grid, policy_class=ActiveGS, memory=None, position=START, key=
     return chooser.decide(start, state, grid, pose_at(position), key=key)
 
 
-@pytest.mark.parametrize("policy_class", [ActiveGS, ActiveGSNoDepth])
+@pytest.mark.parametrize("policy_class", [ActiveGS])
 def test_a_decision_has_all_candidates_and_follows_the_score(policy_class):
     state = map_of(center(0, 6, 4)[None])
     decision, after, info = decide(state, flat(), policy_class)

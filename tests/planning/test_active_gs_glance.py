@@ -76,9 +76,8 @@ def test_a_look_may_raise_confidence_but_never_the_cosines_of_what_is_hidden():
     assert np.all(np.asarray(after.cosine_sum) >= np.asarray(touched.cosine_sum))
 
 
-@pytest.mark.parametrize("name", ["active-gs", "active-gs-no-depth"])
-def test_the_policy_takes_note_of_pixels_and_glances(name):
-    policy = make_policy(name)
+def test_the_policy_takes_note_of_pixels_and_glances():
+    policy = make_policy("active-gs")
     grid = empty_grid(np.array([[-1.0, -2.0, 0.0], [4.0, 2.0, 2.0]]), 0.2)
     state = policy.init(frames()[0].camera, grid, key=jax.random.key(0))
     expected = no_sightings()

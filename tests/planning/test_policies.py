@@ -269,10 +269,7 @@ def test_the_registry_makes_what_it_names():
         "ours",
         "ours-pano",
         "cover",
-        "unseen",
-        "unseen-depth",
         "frontier",
-        "uniform",
     }
     assert known | {"random"} <= set(policy_names())
     for name in policy_names():
@@ -289,6 +286,8 @@ def test_an_unknown_name_lists_the_known_ones():
             call("best")
         with pytest.raises(ValueError, match=r"'ours-demand' has left the package: .* e43d800"):
             call("ours-demand")
+        with pytest.raises(ValueError, match=r"'uniform' has left the package: .* fb13156"):
+            call("uniform")
     with pytest.raises(ValueError, match=r"no setting speed; known: num_candidates"):
         make_policy("ours", speed=1.0)
 

@@ -24,14 +24,10 @@ HOMES = {
         "ours-ahead": "ahead:OursAhead",
         "r3con": "r3con:R3con",
         "active-gs": "active_gs:ActiveGS",
-        "active-gs-no-depth": "active_gs:ActiveGSNoDepth",
         "active-gamer": "active_gamer:ActiveGamer",
         "cover": "cover:Cover",
         "gavis": "gavis:Gavis",
-        "unseen": "unseen:Unseen",
-        "unseen-depth": "unseen:UnseenDepth",
         "frontier": "frontier:Frontier",
-        "uniform": "uniform:Uniform",
         "random": "random:Random",
     }.items()
 } | {
@@ -40,7 +36,6 @@ HOMES = {
     for name, home in {
         "active-gs-online": "active_gs_online:ActiveGSOnline",
         "fisherrf": "fisherrf:FisherRF",
-        "fisherrf-d-opt": "fisherrf:FisherRFDOpt",
         "gauss-mi": "gauss_mi:GaussMI",
     }.items()
 }
@@ -49,7 +44,13 @@ HOMES = {
 FOREIGN = "r3jax.planning.policies.foreign.foreign:Foreign"
 """Module and class of the policy that asks a program."""
 
-RETIRED = {"ours-demand": "it lost 0.74 dB against ours-pano; commit e43d800 has it"}
+RETIRED = {
+    "ours-demand": "it lost 0.74 dB against ours-pano; commit e43d800 has it",
+    "fisherrf-d-opt": "use fisherrf with the settings criterion=d-opt, quirk=False",
+} | dict.fromkeys(
+    ("active-gs-no-depth", "unseen", "unseen-depth", "uniform"),
+    "no table rests on it; commit fb13156 has it",
+)
 """Policies that have left the package: the reason, and where their code is."""
 
 REGISTERED: dict[str, type] = {}

@@ -151,7 +151,7 @@ def explored(room, out, motion="free", policy="random", **loop):
 @pytest.mark.parametrize(
     ("motion", "policy", "loop"),
     [
-        ("free", "uniform", {"capture_every": 0.3}),
+        ("free", "random", {"capture_every": 0.3}),
         ("free", "frontier", {"capture_every": 0.2, "gaze": "ahead", "plan_while_moving": True}),
         ("ground", "random", {}),
         ("gimbal", "random", {"capture_rate": 4.0}),

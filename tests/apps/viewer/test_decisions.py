@@ -45,7 +45,7 @@ def test_the_scores_are_those_of_the_trace(run, offers):
 
 
 def test_another_policy_is_found_out(run, plan):
-    other = make_policy("uniform", num_candidates=20, num_frontier=6)
+    other = make_policy("frontier", num_candidates=20, num_frontier=6)
     with pytest.raises(RunError, match="decides otherwise today than it did at view 1"):
         dict(decide_again(run, other, plan.config))
 

@@ -25,13 +25,9 @@ from r3jax.splatting.views import fitted_size
 SCORED = (
     "ours",
     "active-gs",
-    "active-gs-no-depth",
     "active-gamer",
     "cover",
     "gavis",
-    "unseen",
-    "unseen-depth",
-    "uniform",
     "random",
 )
 """Policies that give a pose a score."""
@@ -100,7 +96,6 @@ _FISHER_WIDTH = 128
 
 MODEL_CHOOSERS: dict[str, Callable[[], Chooser]] = {
     "fisherrf": lambda: FisherChooser(Form()),
-    "fisherrf-d-opt": lambda: FisherChooser(Form("d-opt", quirk=False)),
 }
 """Choosers that look at the model, by name: rivals that need a radiance field, which is here the
 one in training."""

@@ -9,7 +9,7 @@ Shape symbols: C candidates, always `config.num_candidates`; h w pixels of a vie
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ from r3jax.planning.greedy import (
 )
 from r3jax.planning.policies.active_gs.confidence import aligned, glance, no_sightings, see
 from r3jax.planning.policies.active_gs.regions import aimed_views, low_confidence, regions_of
-from r3jax.scoring.pixels import PixelView, Value
+from r3jax.scoring.pixels import PixelView
 
 EXPLORATION_WEIGHT = 1000.0
 """Weight of the share of all cells that are unexplored and in view."""
@@ -47,23 +47,16 @@ _REACH = 3.0
 a measurement promises nothing, which is not the same as an unseen one."""
 
 
-def rendering_with_depth(view: PixelView) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Visible unexplored cells, and the mean over pixels of (1 - C) depth / d_max."""
-    doubt, depth = _doubt(view)
-    return view.cells, jnp.mean(doubt * depth) / view.max_range
+def cells_and_doubt(view: PixelView) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Counts visible unexplored cells, and averages (1 - C) depth / d_max over the pixels.
 
-
-def rendering_without_depth(view: PixelView) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Visible unexplored cells, and the mean over pixels of 1 - C."""
-    return view.cells, jnp.mean(_doubt(view)[0])
-
-
-def _doubt(view: PixelView) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """1 - C and the depth [m] of every pixel; `view.rows` is the confidence C."""
+    `view.rows` is the confidence C.
+    """
     # Known, but too far to be measured: a look from here would not add to its confidence.
     is_far = view.hit & (view.depth > view.max_range)
     doubt = jnp.where(view.hit, jnp.where(is_far, 0.0, 1.0 - view.rows), 1.0)
-    return doubt, jnp.where(view.hit, view.depth, 0.5 * view.max_range)
+    depth = jnp.where(view.hit, view.depth, 0.5 * view.max_range)
+    return view.cells, jnp.mean(doubt * depth) / view.max_range
 
 
 def draw_views(
@@ -104,9 +97,6 @@ class ActiveGS(GreedyPolicy):
     name = "active-gs"
     source = "Active-GS, Jin et al., RA-L 2025"
 
-    rendering: ClassVar[Value] = staticmethod(rendering_with_depth)
-    """What a view shows, in two numbers."""
-
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
         """No voxel was seen yet."""
         del camera, grid
@@ -136,7 +126,7 @@ class ActiveGS(GreedyPolicy):
         scoring, confidence = self.config.scoring, situation.memory.confidence
         reach = _REACH * float(scoring.max_range)
         cells, rendering = score_by_pixels(
-            situation, self.rendering, candidates, scoring, confidence, reach
+            situation, cells_and_doubt, candidates, scoring, confidence, reach
         )
         # Of all cells of the box, not of those left: the weight means the same throughout a run.
         exploration = cells / situation.grid.log_odds.size
@@ -153,13 +143,3 @@ class ActiveGS(GreedyPolicy):
         if not np.any(utilities["utility"][is_reachable]):
             return np.where(is_reachable, utilities["lot"], -np.inf)
         return super().weigh(utilities)
-
-
-@dataclass(frozen=True)
-class ActiveGSNoDepth(ActiveGS):
-    """Active-GS without its depth factor: mean of (1 - C) over pixels, whatever their depth."""
-
-    name = "active-gs-no-depth"
-    source = "Active-GS, Jin et al., RA-L 2025: an ablation"
-
-    rendering = staticmethod(rendering_without_depth)
