@@ -136,7 +136,7 @@ TABLES: dict[TableName, dict[str, Row]] = {
     # Where the camera looks on the way.
     "gaze": {
         gaze: Row("ours-ahead", "panorama", loop=ON_THE_WAY | {"gaze": gaze})
-        for gaze in ("panorama", "planned", "blend", "ahead")
+        for gaze in ("panorama", "ahead")
     },
     # How often it looks, for ours and for the rival; more frames need longer trainings.
     "spacing": {

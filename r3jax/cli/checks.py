@@ -348,12 +348,6 @@ def _check_captures(options: ExploreOptions, config: ExplorationConfig, motion: 
             )
     if options.blur != default.blur and options.exposure == 0.0:
         raise ValueError("--blur does nothing while nothing blurs: add --exposure, or leave it out")
-    # The default is no wish: a camera that is fixed looks ahead.
-    if motion.fixed_camera and options.gaze not in (default.gaze, "ahead"):
-        raise ValueError(
-            f"--gaze {options.gaze} turns the camera, and that of --motion {options.motion} is "
-            "fixed and looks ahead: leave one of them out"
-        )
     largest = (motion.speed or config.speed) / LEAST_PIECE
     if config.capture_rate is not None and config.capture_rate > largest * (1.0 + 1e-9):
         raise ValueError(

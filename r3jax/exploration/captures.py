@@ -2,7 +2,7 @@
 
 A path is cut into equal pieces, with a frame at the end of each. The flight takes as long as the
 decision says, with or without captures: the camera turns while it moves, never so far that it would
-be late for the chosen view (`planning.gaze`). Without captures a path is one piece.
+be late for the chosen view (`planning.turning`). Without captures a path is one piece.
 
 Shape symbols: n frames; K waypoints.
 """
@@ -16,9 +16,10 @@ import numpy as np
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.planning.gaze.gaze_plan import plan_gaze
-from r3jax.planning.gaze.turning import (
+from r3jax.planning.planner import Planner, observe
+from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.planning.robot.motion import Motion
+from r3jax.planning.turning import (
     Turning,
     along,
     axes_within,
@@ -29,9 +30,6 @@ from r3jax.planning.gaze.turning import (
     pose_towards,
     worthwhile_grid,
 )
-from r3jax.planning.planner import Planner, observe
-from r3jax.planning.policy import Decision, PlanInfo
-from r3jax.planning.robot.motion import Motion
 from r3jax.scoring.config import ScoringConfig
 
 
@@ -96,9 +94,6 @@ class Leg:
 
     taken: int = 0
     """Frames that were captured so far."""
-
-    directions: np.ndarray | None = None
-    """Directions of the frames on the way if they are planned together, [n - 1, 2] [rad]."""
 
     hidden: float = 0.0
     """Planning of the decision that the flight before it hid [s]."""
@@ -202,22 +197,6 @@ def points_along(waypoints: np.ndarray, num: int) -> np.ndarray:
     return np.stack([np.interp(at, done, waypoints[:, axis]) for axis in range(3)], axis=1)
 
 
-def with_plan(leg: Leg, planner: Planner, rules: Rules) -> Leg:
-    """The leg with the directions of all its frames, if the gaze is planned; else as it is.
-
-    Args:
-        leg: before its first frame.
-        planner: what is known then.
-        rules: where to look.
-    """
-    if rules.gaze != "planned" or leg.is_last:
-        return leg
-    grid = _grid_for(leg, planner)
-    places = leg.places[:-1]
-    plan = plan_gaze(planner.map_state, grid, rules.camera, places, leg.turning, rules.scoring)
-    return replace(leg, directions=plan.directions)
-
-
 def aim(leg: Leg, T_world_camera: np.ndarray, planner: Planner, rules: Rules) -> np.ndarray:
     """Finds the pose of the next frame on the way, [4, 4] float64.
 
@@ -229,23 +208,14 @@ def aim(leg: Leg, T_world_camera: np.ndarray, planner: Planner, rules: Rules) ->
     """
     now, piece, place = direction_of(T_world_camera), leg.taken, leg.places[leg.taken]
     turning = leg.turning
-    if leg.directions is not None:
-        return pose_towards(place, leg.directions[piece])
     if rules.gaze == "panorama":
-        grid = _grid_for(leg, planner)
+        exhausted = exhausted_cells(planner.policy_state)
+        grid = worthwhile_grid(planner.grid, leg.places[leg.taken :], exhausted)
         scores = panorama_scores(planner.map_state, grid, rules.camera, place, rules.scoring)
         axes, directions = axes_within(turning.elevations, len(scores))
         return pose_towards(place, turning.best(piece, now, directions, scores[axes]))
-    if rules.gaze == "ahead":
-        wanted = along(leg.places[piece + 1] - place, now)
-    else:
-        wanted = turning.at_share((piece + 1) / len(leg.places))
+    wanted = along(leg.places[piece + 1] - place, now)
     return pose_towards(place, turning.nearest(piece, now, wanted))
-
-
-def _grid_for(leg: Leg, planner: Planner) -> OccupancyGrid:
-    exhausted = exhausted_cells(planner.policy_state)
-    return worthwhile_grid(planner.grid, leg.places[leg.taken :], exhausted)
 
 
 def observe_on_the_way(planner: Planner, frame: Frame, rules: Rules) -> Planner:

@@ -43,8 +43,7 @@ class ModelClock:
 
     costs: dict[str, float]
     """Seconds per call, by stage; `reconsidering` a decision that was made on the way, `gaze` per
-    frame that is captured on the way, `gaze plan` per frame of a path whose directions are planned
-    together."""
+    frame that is captured while moving."""
 
     measures: bool = False
 
@@ -61,7 +60,6 @@ def model_clock(config: ExplorationConfig) -> ModelClock:
             "reconsidering": 0.05,
             "mapping": config.mapping_seconds,
             "gaze": 0.01,
-            "gaze plan": 0.1,
         }
     )
 

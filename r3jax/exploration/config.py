@@ -10,8 +10,14 @@ from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 
 ClockName = Literal["wall", "model"]
 
-GazeName = Literal["ahead", "blend", "panorama", "planned"]
-"""Where the camera looks on the way; `planning.gaze` says how each finds its directions."""
+GazeName = Literal["ahead", "panorama"]
+"""Where the camera looks on the way; `planning.turning` says how each finds its directions."""
+
+RETIRED_GAZES = {
+    "blend": "it lost 1.8 dB against panorama; commit fb13156 has it",
+    "planned": "it lost 0.7 dB against panorama; commit fb13156 has it",
+}
+"""Gazes that recorded runs may name: the reason, and where their code is."""
 
 LEAST_PIECE = 0.05
 """Frames that are captured on the way lie at least so far apart [m]: the edge of a voxel."""
@@ -147,6 +153,8 @@ class ExplorationConfig(MappingConfig):
             raise ValueError(f"capture_every must be at least {LEAST_PIECE:g} m, got {every}")
         if rate is not None and not 0.0 < rate < math.inf:
             raise ValueError(f"capture_rate must be positive and finite [Hz], got {rate}")
+        if self.gaze in RETIRED_GAZES:
+            raise ValueError(f"gaze {self.gaze!r} has left the package: {RETIRED_GAZES[self.gaze]}")
         if self.gaze not in get_args(GazeName):
             raise ValueError(f"gaze must be one of {get_args(GazeName)}, got {self.gaze!r}")
         if not 0.0 <= self.exposure < math.inf:

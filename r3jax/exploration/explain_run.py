@@ -24,7 +24,7 @@ from r3jax.exploration.replay import (
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
 from r3jax.planning.decision import explain_path, initial_state
-from r3jax.planning.gaze.turning import count_look
+from r3jax.planning.turning import count_look
 from r3jax.scoring.explain import Explanation
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run

@@ -19,7 +19,6 @@ from r3jax.exploration.captures import (
     aim,
     begin_leg,
     observe_on_the_way,
-    with_plan,
 )
 from r3jax.exploration.clock import timed
 from r3jax.exploration.coverage import measure_coverage, view_renderability
@@ -256,37 +255,19 @@ def _next_frame(
     pose = leg.decision.T_world_camera
     if not leg.is_last:
         mission.on_stage("gaze")
-        leg, pose, took = _aimed(state, mission, leg)
-        stages, before = stages | {"gaze": took.measured}, before | {"gaze": took.charged}
+        clock = mission.clock
+        pose, measured = timed(
+            aim, leg, state.T_world_camera, state.planner, mission.rules,
+            repeat_compiled=clock.measures,
+        )  # fmt: skip
+        stages = stages | {"gaze": measured}
+        before = before | {"gaze": clock.charge("gaze", measured)}
     seconds = sum(before.values()) + leg.flight
     # The view has to arrive within the budget, its path included.
     stop = _spent(state, mission, seconds=seconds, metres=leg.length)
     if stop is not None:
         return state, stop
     return _look(state, mission, _Shot(pose, leg), stages, before)
-
-
-class _Took(NamedTuple):
-    """What a stage took, and what it is charged [s]."""
-
-    measured: float
-    charged: float
-
-
-def _aimed(state: LoopState, mission: Mission, leg: Leg) -> tuple[Leg, np.ndarray, _Took]:
-    """The pose of the next frame on the way; before the first one they may be planned together."""
-    rules, clock = mission.rules, mission.clock
-    measured = charged = 0.0
-    if leg.taken == 0 and rules.gaze == "planned":
-        leg, measured = timed(with_plan, leg, state.planner, rules, repeat_compiled=clock.measures)
-        each = measured / (len(leg.places) - 1)
-        charged = (len(leg.places) - 1) * clock.charge("gaze plan", each)
-    pose, seconds = timed(
-        aim, leg, state.T_world_camera, state.planner, rules, repeat_compiled=clock.measures
-    )
-    if rules.gaze != "planned":
-        charged += clock.charge("gaze", seconds)
-    return leg, pose, _Took(measured + seconds, charged)
 
 
 def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
@@ -481,7 +462,7 @@ def _leg_again(state: LoopState, mission: Mission, chosen: _Chosen) -> tuple[Loo
     leg = begin_leg(chosen.decision, chosen.info, state.T_world_camera, mission.rules)
     if mission.config.plan_while_moving:
         state, _ = _plan_ahead(state, mission, leg)
-    return state, with_plan(leg, state.planner, mission.rules)
+    return state, leg
 
 
 def _observe(planner: Planner, frame: Frame, rules: Rules, *, captured: bool) -> Planner:

@@ -48,7 +48,7 @@ def test_rows_are_chosen_by_name_and_by_policy():
     assert set(rows_of(Options(table="turning", policies=("active-gs",)))) == {
         "active-gs", "active-gs, captures, plans on the way",
     }  # fmt: skip
-    assert list(rows_of(Options(table="gaze", rows=("blend",)))) == ["blend"]
+    assert list(rows_of(Options(table="gaze", rows=("ahead",)))) == ["ahead"]
     with pytest.raises(ValueError, match="'asleep' is none of"):
         rows_of(Options(table="gaze", rows=("asleep",)))
     with pytest.raises(ValueError, match="has no row of"):
@@ -141,9 +141,9 @@ def test_a_table_holds_the_times_that_were_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(
         captures, "write_page", lambda folder, name, rows, records, *_: written.extend(records)
     )
-    captures.main(Options(table="gaze", rows=("blend",), work=tmp_path, out=tmp_path))
+    captures.main(Options(table="gaze", rows=("ahead",), work=tmp_path, out=tmp_path))
     assert [line["snapshot"] for line in written] == ["seconds:60"]
-    assert written[0]["policy"] == "blend"
+    assert written[0]["policy"] == "ahead"
 
 
 def test_a_table_counts_views_where_they_are_the_budget(tmp_path, monkeypatch):
@@ -163,7 +163,7 @@ def test_a_table_counts_views_where_they_are_the_budget(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(captures, "keep_flights", lambda *given: pages.append(given))
     options = Options(
-        table="gaze", rows=("blend",), size="small", scenes=("flat",), seeds=(3,),
+        table="gaze", rows=("ahead",), size="small", scenes=("flat",), seeds=(3,),
         budget="views", snapshots=(30,), work=tmp_path / "work", out=tmp_path / "out",
     )  # fmt: skip
     folder = captures.main(options)

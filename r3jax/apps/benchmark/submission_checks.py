@@ -17,9 +17,9 @@ from r3jax.exploration.clock import model_clock
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.formats.submissions import Submission, SubmittedFrame
 from r3jax.geometry.cameras import Camera, angle_between
-from r3jax.planning.gaze.turning import Turning, along, direction_of, turn
 from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import Motion
+from r3jax.planning.turning import Turning, along, direction_of, turn
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.scenes.registry import scene_hash

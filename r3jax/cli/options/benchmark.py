@@ -22,7 +22,7 @@ class ExplorationOptions:
     capture_rate: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
     """The same by frames per second of the flight [Hz]."""
 
-    gaze: Literal["ahead", "blend", "panorama", "planned"] = "panorama"
+    gaze: Literal["ahead", "panorama"] = "panorama"
     """Where the camera looks on the way, as `r3jax explore --help` tells."""
 
     plan_while_moving: bool = False

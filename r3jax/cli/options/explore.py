@@ -113,10 +113,9 @@ class CaptureOptions:
     """The same by frames per second of the way [Hz]; none is taken while the camera turns at its
     end."""
 
-    gaze: Literal["ahead", "blend", "panorama", "planned"] = "panorama"
-    """Where the camera looks on the way: `ahead`: along the path; `blend`: it turns evenly from
-    view to view; `panorama`: at each place in the direction that adds most; `planned`: in those
-    that add most together."""
+    gaze: Literal["ahead", "panorama"] = "panorama"
+    """Where the camera points while moving: `ahead`: along the path; `panorama`: at each place in
+    the direction of highest utility."""
 
     exposure: float = 0.0
     """Time that the shutter is open for a frame on the way [s]; 0: turning blurs nothing."""

@@ -1,4 +1,4 @@
-"""Where the camera looks on its way: turns by hand, laws of what is feasible, plans against all."""
+"""Where the camera looks on its way: turns by hand, laws of what is feasible."""
 
 import itertools
 
@@ -10,23 +10,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from r3jax.geometry.cameras import pose_along
-from r3jax.planning.gaze.gaze_plan import _nodes, plan_gaze
-from r3jax.planning.gaze.turning import (
+from r3jax.planning.turning import (
     Turning,
     along,
     axes_within,
     direction_of,
-    panorama_scores,
     pose_towards,
     turn,
     worthwhile_grid,
 )
-from r3jax.scoring.panorama import panorama
-from tests.planning.known_hall import CAMERA, SCORING, after_view, for_scoring
 from tests.planning.rooms import center, grid_of, two_rooms
 
 ANYWHERE = (-0.5 * np.pi, 0.5 * np.pi)
-PLACES = np.array([[1.0, 0.9, 1.2], [1.3, 0.95, 1.2], [1.6, 1.0, 1.2]])
 
 
 @given(st.integers(0, 10**6))
@@ -47,8 +42,6 @@ def test_a_turn_goes_round_the_shorter_side():
     """From 170 to -170 degrees it is 20, by hand; and 20 up makes it the hypotenuse."""
     first, second = np.radians([170.0, 0.0]), np.radians([-170.0, 20.0])
     assert np.degrees(turn(first, second)) == pytest.approx(np.hypot(20.0, 20.0))
-    half = Turning(first, second, np.ones(2), ANYWHERE).at_share(0.5)
-    np.testing.assert_allclose(np.degrees(half), [180.0, 10.0])
 
 
 def test_no_look_is_feasible_that_would_make_the_camera_late():
@@ -65,7 +58,7 @@ def test_no_look_is_feasible_that_would_make_the_camera_late():
     assert not Turning(np.zeros(2), np.radians([121.0, 0.0]), allowed, ANYWHERE).is_possible
 
 
-@given(st.integers(0, 10**6), st.sampled_from(["wanted", "score", "evenly"]))
+@given(st.integers(0, 10**6), st.sampled_from(["wanted", "score"]))
 @settings(max_examples=60)
 def test_every_chain_of_looks_keeps_to_the_turning_rate_and_arrives(seed, how):
     rng = np.random.default_rng(seed)
@@ -82,11 +75,9 @@ def test_every_chain_of_looks_keeps_to_the_turning_rate_and_arrives(seed, how):
         if how == "wanted":
             wanted = np.array([rng.uniform(-np.pi, np.pi), rng.uniform(*ANYWHERE)])
             chain.append(turning.nearest(piece, chain[-1], wanted))
-        elif how == "score":
+        else:
             _, directions = axes_within(elevations)
             chain.append(turning.best(piece, chain[-1], directions, rng.random(len(directions))))
-        else:
-            chain.append(turning.evenly()[piece])
     for piece, (before, after) in enumerate(itertools.pairwise([*chain, end])):
         assert turn(before, after) <= allowed[piece] + 2e-6
         assert elevations[0] - 1e-9 <= after[1] <= elevations[1] + 1e-9
@@ -127,70 +118,3 @@ def test_cells_that_nobody_can_look_at_or_did_in_vain_do_not_count():
     assert not left[2:4, 2:4, 2].any()
     nowhere = worthwhile_grid(grid, center(12, 1, 1)[None], None)  # in a wall
     assert not np.asarray(nowhere.unexplored).any()
-
-
-def chain_gain(places, chain, numbers):
-    """What a chain adds, on the whole map: each view after those before it."""
-    world, total = for_scoring(), 0.0
-    for place, direction, number in zip(places, chain, numbers, strict=True):
-        at = jnp.asarray(place, jnp.float32)
-        total += float(panorama(*world, CAMERA, at, SCORING).direction_scores[number])
-        T = jnp.asarray(pose_towards(place, direction), jnp.float32)
-        world = after_view(world, T)
-    return total
-
-
-def best_of_all(turning, places, width):
-    """Exhaustive search over the same directions."""
-    state, grid = for_scoring()
-    nodes = [
-        _nodes(turning, panorama_scores(state, grid, CAMERA, place, SCORING), evenly, width)
-        for place, evenly in zip(places, turning.evenly(), strict=False)
-    ]
-    best, found = -np.inf, None
-    for chain in itertools.product(range(width), repeat=len(places)):
-        directions = [node.directions[i] for node, i in zip(nodes, chain, strict=True)]
-        ways = itertools.pairwise([turning.start, *directions, turning.end])
-        if any(
-            turn(a, b) > most + 1e-6 for (a, b), most in zip(ways, turning.allowed, strict=True)
-        ):
-            continue
-        axes = [node.axes[i] for node, i in zip(nodes, chain, strict=True)]
-        gain = chain_gain(places, directions, axes)
-        if gain > best:
-            best, found = gain, np.stack(directions)
-    return best, found
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(
-    ("num", "width", "allowed"),
-    [
-        pytest.param(2, 5, np.inf, marks=pytest.mark.slow),
-        pytest.param(2, 5, 1.0, marks=pytest.mark.slow),
-        pytest.param(3, 4, np.inf, marks=pytest.mark.slow),
-        (3, 4, 1.0),
-    ],
-)
-def test_a_plan_is_the_best_of_all_chains(num, width, allowed):
-    """Exact for two frames; for three the best chain to each direction is kept: hardly less."""
-    turning = Turning(np.zeros(2), np.array([1.2, 0.0]), np.full(num + 1, allowed), ANYWHERE)
-    places = PLACES[:num]
-    state, grid = for_scoring()
-    plan = plan_gaze(state, grid, CAMERA, places, turning, SCORING, width)
-    best, found = best_of_all(turning, places, width)
-    assert plan.gain <= best * (1.0 + 1e-4)
-    assert plan.gain >= best * (1.0 - (1e-4 if num == 2 else 0.03))
-    if num == 2:
-        np.testing.assert_allclose(plan.directions, found, atol=1e-6)
-    ways = itertools.pairwise([turning.start, *plan.directions, turning.end])
-    assert all(turn(a, b) <= allowed + 1e-6 for a, b in ways)
-
-
-@pytest.mark.full
-def test_a_plan_looks_at_what_the_frame_before_has_left():
-    """Two frames from one place: greedy by their own worth would look twice at the same."""
-    turning = Turning(np.zeros(2), np.zeros(2), np.full(3, np.inf), ANYWHERE)
-    state, grid = for_scoring()
-    plan = plan_gaze(state, grid, CAMERA, PLACES[[0, 0]], turning, SCORING, 8)
-    assert turn(*plan.directions) > np.radians(20.0)

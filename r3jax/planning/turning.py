@@ -67,21 +67,6 @@ class Turning:
         in_time = turn(now, directions) <= self.allowed[piece] + _SAME
         return in_time & (turn(directions, self.end) <= self.allowed[piece + 1 :].sum() + _SAME)
 
-    def evenly(self) -> np.ndarray:
-        """Directions after the pieces of a camera that turns straight to the end, [n, 2].
-
-        Each piece has the share of the turn that it has of what is allowed: feasible throughout.
-        """
-        is_free = np.isinf(self.allowed)
-        share = is_free.astype(float) if is_free.any() else self.allowed
-        done = np.cumsum(share) / max(share.sum(), 1e-12)
-        whole = _difference(self.start, self.end)
-        return self.start + done[:, None] * whole
-
-    def at_share(self, share: float) -> np.ndarray:
-        """The direction at a share of the straight turn from the start to the end, [2]."""
-        return self.start + share * _difference(self.start, self.end)
-
     def nearest(self, piece: int, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """The feasible direction nearest to a wanted one, [2]; to the spacing of a lattice."""
         wanted = np.array([wanted[0], np.clip(wanted[1], *self.elevations)])
