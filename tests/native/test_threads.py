@@ -32,6 +32,7 @@ def usual():
     return use()
 
 
+@pytest.mark.full
 def test_several_threads_at_once_with_numbas_own_threads_only(usual):
     found = used("3", NUMBA_THREADING_LAYER="workqueue", NUMBA_NUM_THREADS="3")
     assert len(found["results"]) == 3
@@ -42,6 +43,7 @@ def test_several_threads_at_once_with_numbas_own_threads_only(usual):
     assert "libgomp1" in said
 
 
+@pytest.mark.full
 def test_without_numba_plain_jax_serves_and_says_so_once(usual):
     found = used("1", "hidden")
     assert found["results"][0] == pytest.approx(usual, rel=1e-3)
