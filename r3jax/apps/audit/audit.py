@@ -163,11 +163,13 @@ def audit(
         RunError: a file of a run is missing or broken.
     """
     settings = AuditSettings() if settings is None else settings
+    if settings.depth_scale != 1.0 or settings.depth_along_ray:
+        source = source.with_depth(settings.depth_scale, is_along_ray=settings.depth_along_ray)
     step = lambda: on_progress("", 1)
     on_progress("looking at the capture", 0)
     survey = survey_of(source, settings)
     on_progress("comparing pictures", len(survey.chosen))
-    faults = find_faults(source, survey.chosen, step)
+    faults = find_faults(source, survey.chosen, step, fits=survey.doubt is None)
     if survey.strays:
         stray = stray_finding(source, survey.strays, survey.chosen)
         faults = dataclasses.replace(faults, findings=(stray, *faults.findings))

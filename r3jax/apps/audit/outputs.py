@@ -136,6 +136,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "far_depth": survey.far_depth,
         "up": survey.up.direction.tolist(),
         "up_is_within_degrees": survey.up.within,
+        "taken_from_one_place": survey.is_one_place,
         "folds": len(audit.seen.folds),
         "fine_from": FINE,
         "rare_below": FEW,
@@ -174,6 +175,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "faults": {
             "findings": [dataclasses.asdict(finding) for finding in audit.faults.findings],
             "pictures_compared": audit.faults.compared,
+            "depth_fits_cameras": audit.faults.fits,
             "of_each_picture": audit.faults.record,
         },
         "mean_after_random_views": list(plan.random_mean),

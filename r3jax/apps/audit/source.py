@@ -59,17 +59,29 @@ class SamplingTable(NamedTuple):
 def thinned(camera: Camera, stride: int) -> Camera:
     """The pinhole of every `stride`-th pixel, from the middle of the first block on."""
     sides = (camera.width, camera.height)
-    width, height = (len(_taken(side, stride)) for side in sides)
+    width, height = (len(taken(side, stride)) for side in sides)
     cx, cy = (
-        (float(center) - _taken(side, stride)[0] - 0.5) / stride + 0.5
+        (float(center) - taken(side, stride)[0] - 0.5) / stride + 0.5
         for center, side in zip((camera.cx, camera.cy), sides, strict=True)
     )
     return Camera(width, height, float(camera.fx) / stride, float(camera.fy) / stride, cx, cy)
 
 
-def _taken(side: int, stride: int) -> np.ndarray:
+def taken(side: int, stride: int) -> np.ndarray:
     """Which of `side` pixels in a row are taken; at least one."""
     return np.arange(min(stride // 2, side - 1), side, stride)
+
+
+def ray_lengths(shape: tuple[int, ...], lens: np.ndarray) -> np.ndarray:
+    """Lengths of the pixels' rays (x, y, 1), [h, w]: depth along the ray over z.
+
+    Args:
+        shape: h, w.
+        lens: fx, fy, cx, cy, [4].
+    """
+    fx, fy, cx, cy = lens
+    x, y = (np.arange(shape[1]) + 0.5 - cx) / fx, (np.arange(shape[0]) + 0.5 - cy) / fy
+    return np.sqrt(1.0 + x**2 + y[:, None] ** 2)
 
 
 @functools.lru_cache(maxsize=8)
@@ -79,7 +91,7 @@ def sampling_table(lens: Lens, stride: int) -> SamplingTable:
     Raises:
         ForeignFileError: a lens whose distortion is not known here.
     """
-    column, row = np.meshgrid(_taken(lens.width, stride), _taken(lens.height, stride))
+    column, row = np.meshgrid(taken(lens.width, stride), taken(lens.height, stride))
     if not lens.is_pinhole:
         fx, fy, cx, cy = lens.intrinsics
         x, y = distorted(lens, (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy)
@@ -238,6 +250,31 @@ class Source:
     def camera(self, index: int) -> Camera:
         """The pinhole of a thinned image."""
         return thinned(self.lenses[index].camera, self.stride)
+
+    def with_depth(self, scale: float = 1.0, *, is_along_ray: bool = False) -> "Source":
+        """The same with depth images converted; sparse points have no such mistakes.
+
+        Args:
+            scale: all depths are multiplied by this.
+            is_along_ray: True if they are distances along the pixels' rays: they become z.
+
+        Raises:
+            ValueError: depth comes from points; or a scale that is not positive.
+        """
+        if not self.is_dense:
+            raise ValueError("--depth-scale and --depth-along-ray are for depth images: here "
+                             "depth comes from points")  # fmt: skip
+        if not 0.0 < scale < np.inf:
+            raise ValueError(f"--depth-scale must be positive, got {scale}")
+
+        def read(index: int) -> Picture:
+            rgb, depth = self.read(index)
+            camera = self.camera(index)
+            lens = np.array([float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)])
+            lengths = ray_lengths(depth.shape, lens) if is_along_ray else 1.0
+            return rgb, (scale * depth / lengths).astype(np.float32)
+
+        return dataclasses.replace(self, read=read)
 
     def frame(self, index: int, alignment: Alignment) -> Frame:
         """One image in the audit's coordinates.

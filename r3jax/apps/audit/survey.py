@@ -1,17 +1,11 @@
 """A first look at some images: do they fit together, how large is the place, how fine to audit?
 
-Do depth images and poses tell of one world? A unit that is wrong shows without knowing any room: a
-point of one depth image is where another one sees a surface, unless something hides it. With
-depths that are too long or too short by a factor it is elsewhere, as soon as the cameras stood
-apart: so the factor that brings most points together is known from the images alone. (It is
-the scale of monocular reconstruction, asked the other way round.)
-
 Everything downstream counts in rooms: a range of 5, free cells of 0.2, a margin of 0.3. A capture
 in meters with depths of a room's size stays as it is; every other is scaled so that what its
 images show (95 % of the depths) lies within the range. COLMAP's models have no meters at all:
 their units stay their own in all that is written, and only the audit sees them scaled.
 
-Shape symbols: n points; h, w size of an image.
+Shape symbols: k depths.
 """
 
 from collections.abc import Sequence
@@ -21,152 +15,26 @@ from pathlib import Path
 
 import numpy as np
 
+from r3jax.apps.audit.agreement import DepthImage, check_agreement
 from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
 from r3jax.apps.audit.source import Source
 from r3jax.apps.audit.strays import strays
 from r3jax.apps.audit.vertical import Vertical, block_normals, estimated_up
 from r3jax.formats.errors import FormatError
 from r3jax.frame import FAR
-from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import INDEX_LIMIT
-
-FACTORS = np.concatenate([[1e-3, 1e-2], 1.08 ** np.arange(-30, 31), [1e2, 1e3]])
-"""Depths are tried as they are and multiplied by these: 0.1 to 10, and slips of units."""
-
-_TOLERANCE = 0.05
-"""Surfaces that lie so close agree, as a share of their distance: noise, edges, drift of poses."""
-
-_POINTS, _PICTURES = 100, 24
-"""Taken of each image, and images taken: 50,000 comparisons for each factor."""
-
-_FEWEST_POINTS = 400
-"""Fewer comparisons say nothing: the images hardly overlap."""
-
-_FITS = 0.9
-"""Share of the points that agree where nothing needs to be explained."""
-
-_THROUGH = 0.8
-"""Points that others look through, for each that they see: 0.01 to 0.03 in good captures, 0.4 if
-the poses are off by 5 cm, 1 and more if the poses belong to other images."""
-
-_SURE = 0.2
-"""A factor that brings fewer together explains nothing."""
-
-
-@dataclass(frozen=True)
-class DepthImage:
-    """One depth image."""
-
-    depth: np.ndarray
-    """z-depth [h, w]; 0 no measurement, inf nothing within range."""
-
-    camera: Camera
-    """Its pinhole."""
-
-    pose: np.ndarray
-    """`T_world_camera`, [4, 4] float64, in the unit of the depth."""
-
-    def points(self, most: int, rng: np.random.Generator) -> np.ndarray:
-        """Some of the points that it shows, in the camera's frame, [n, 3]."""
-        row, column = np.nonzero((self.depth > 0.0) & np.isfinite(self.depth))
-        if len(row) > most:
-            some = rng.choice(len(row), most, replace=False)
-            row, column = row[some], column[some]
-        z = self.depth[row, column].astype(np.float64)
-        x = (column + 0.5 - float(self.camera.cx)) / float(self.camera.fx)
-        y = (row + 0.5 - float(self.camera.cy)) / float(self.camera.fy)
-        return z[:, None] * np.stack([x, y, np.ones_like(x)], axis=1)
-
-
-def check_agreement(images: Sequence[DepthImage]) -> None:
-    """Refuses depth images that contradict the poses, or each other.
-
-    Nothing is said where images do not overlap, or were taken from one place: no depth is wrong
-    there.
-
-    Raises:
-        ValueError: another factor explains them far better; or nearly as many points lie where
-            another image looks through them as where it sees a surface.
-    """
-    chosen = np.unique(np.linspace(0, len(images) - 1, _PICTURES).round().astype(int))
-    pictures = _Pictures([images[i] for i in chosen])
-    count, share, seen_through = pictures.compare(1.0)
-    if count < _FEWEST_POINTS:
-        return
-    found = [(*pictures.compare(factor)[:2], factor) for factor in FACTORS.tolist()]
-    best, factor = max(
-        (share, factor) for number, share, factor in found if number >= _FEWEST_POINTS
-    )
-    is_better = best > 2.0 * share or 1.0 - share > 2.0 * (1.0 - best)
-    if best > _SURE and share < _FITS and is_better and not 0.8 < factor < 1.25:
-        raise ValueError(
-            f"the depth images contradict the poses: {100 * share:.0f} % of what one shows is "
-            f"where others see it, but {100 * best:.0f} % if every depth is multiplied by "
-            f"{factor:.2g}: is the unit of depth (or of the poses) wrong? --trust-depth audits it "
-            "all the same"
-        )
-    if seen_through > _THROUGH * share:
-        raise ValueError(
-            f"the frames contradict each other: {100 * seen_through:.0f} % of what one shows is "
-            f"where others look through, and {100 * share:.0f} % where others see it: are the "
-            "poses and the depth images of one recording, and do the axes fit? --trust-depth "
-            "audits it all the same"
-        )
-
-
-class _Pictures:
-    """Images that are compared, each with every other one."""
-
-    def __init__(self, images: Sequence[DepthImage]):
-        """Takes some points of each image."""
-        rng = np.random.default_rng(0)
-        self._local = [look.points(_POINTS, rng) for look in images]
-        self._poses = np.stack([look.pose for look in images])
-        lenses = [
-            [getattr(look.camera, name) for name in ("fx", "fy", "cx", "cy")] for look in images
-        ]
-        self._lens = np.asarray(lenses, dtype=np.float64).T[:, :, None]
-        sizes = np.array([look.depth.shape for look in images])
-        self._height, self._width = sizes.T[:, :, None]
-        self._first = (np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1))[:, None]
-        self._depth = np.concatenate([look.depth.ravel() for look in images]).astype(np.float64)
-
-    def compare(self, factor: float) -> tuple[int, float, float]:
-        """Compares them, all depths multiplied by a factor.
-
-        Returns:
-            Comparisons, the share of points that lie where the other image sees a surface, and
-            the share that it looks through.
-        """
-        numbers = np.zeros(3, dtype=np.int64)
-        for i, (pose, local) in enumerate(zip(self._poses, self._local, strict=True)):
-            ratio = self._ratios(factor * local @ pose[:3, :3].T + pose[:3, 3], i, factor)
-            is_there = np.abs(ratio - 1.0) < _TOLERANCE
-            numbers += len(ratio), is_there.sum(), (ratio <= 1.0 - _TOLERANCE).sum()
-        count, there, through = (int(number) for number in numbers)
-        return count, there / max(count, 1), through / max(count, 1)
-
-    def _ratios(self, world: np.ndarray, own: int, factor: float) -> np.ndarray:
-        """Depths of points [n, 3] over those of the surfaces that the others show there."""
-        offset = world[None] - self._poses[:, None, :3, 3]
-        x, y, z = np.moveaxis(offset @ self._poses[:, :3, :3], 2, 0)
-        is_in = z > 0.0
-        is_in[own] = False
-        z = np.where(is_in, z, 1.0)
-        fx, fy, cx, cy = self._lens
-        column, row = np.floor(fx * x / z + cx), np.floor(fy * y / z + cy)
-        is_in &= (column >= 0) & (column < self._width) & (row >= 0) & (row < self._height)
-        place = np.where(is_in, self._first + row * self._width + column, 0.0).astype(np.int64)
-        seen = self._depth[place]
-        is_in &= (seen > 0.0) & np.isfinite(seen)
-        return z[is_in] / (factor * seen[is_in])
-
 
 RANGE = 5.0
 """What is farther from a camera does not count as visible [audit units]."""
 
 MARGIN = 0.3
 """Standpoints keep this far from everything [audit units]."""
+
+_NEAREST, _TYPICAL = 0.01, 2.0
+"""Median depths of captures in meters: of no camera it is less, and of rooms about this [m]."""
+
+_ONE_PLACE = 0.1
+"""Cameras within this share of the median depth saw each surface from one direction: 6 degrees."""
 
 _ROOM = (2.0, 5.0)
 """Depths (95th percentile) of captures in meters that are rooms [m]."""
@@ -243,6 +111,12 @@ class AuditSettings:
     seed: int = 0
     """Seed of the random views that the suggested ones are compared with."""
 
+    depth_scale: float = 1.0
+    """Depths of depth images are multiplied by this."""
+
+    depth_along_ray: bool = False
+    """True: depth images hold distances along the pixels' rays, and not z."""
+
     trust_depth: bool = False
     """True: depth images are taken as they are, even if they contradict the poses."""
 
@@ -278,12 +152,20 @@ class Survey:
     far_depth: float
     """95th percentile of all that was measured [capture units]."""
 
+    span: float
+    """Twice the distance of the farthest camera from the median of all [capture units]."""
+
     unit: str
     """`m`, or `u` where nobody knows what a unit is."""
 
     doubt: str | None = None
     """How depth images and poses contradict each other, where they were to be trusted all the same;
     None: they do not, or the capture would have been refused."""
+
+    @property
+    def is_one_place(self) -> bool:
+        """True if surfaces were seen from one direction each: a tripod, a panorama head."""
+        return self.span < _ONE_PLACE * self.median_depth
 
     def length(self, in_audit: float) -> float:
         """A length of the audit, in the capture's units."""
@@ -314,7 +196,7 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
         except ValueError as error:
             if not settings.trust_depth:
                 raise
-            doubt = str(error).partition(" --trust-depth")[0]
+            doubt = str(error).partition("--trust-depth")[0].rstrip(" ;") + "."
     scale = RANGE / _range(far, source.is_metric, settings.max_range)
     cameras = source.poses[chosen, :3, 3]
     is_near = float(np.abs(cameras).max()) * scale < _FAR_AWAY
@@ -327,6 +209,7 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
     bounds = np.stack([low - 2 * MARGIN, high + 2 * MARGIN])
     voxel = _voxel_size(source, settings, scale, median)
     _check_voxel(voxel, bounds, scale)
+    gap = cameras - np.median(cameras, axis=0)
     least = float(np.cbrt(np.prod(bounds[1] - bounds[0]) / _MOST_CELLS))
     return Survey(
         alignment=alignment,
@@ -338,6 +221,7 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
         cell_size=max(_CELL, 2.0 * voxel, least),
         median_depth=median,
         far_depth=far,
+        span=2.0 * float(np.linalg.norm(gap, axis=1).max()),
         unit="m" if source.is_metric else "u",
         doubt=doubt,
     )
@@ -384,11 +268,12 @@ def _measured(source: Source, images: list[DepthImage]) -> tuple[np.ndarray, np.
 
 def _check_depth(images: list[DepthImage], median: float) -> None:
     """Refuses depth that no indoor camera measures, or that the poses contradict."""
-    if median > FAR:
+    if not _NEAREST < median < FAR:
+        factor = 10.0 ** round(np.log10(_TYPICAL / median))
         raise ValueError(
-            f"the median depth is {median:.4g} m: is its unit right (millimeters are 0.001 of a "
-            "meter; in a transforms.json: depth_unit_scale_factor)? --trust-depth audits it all "
-            "the same"
+            f"the median depth is {median:.4g} m: is its unit right? --depth-scale {factor:g} "
+            f"multiplies by {factor:g} (in a transforms.json: depth_unit_scale_factor); "
+            "--trust-depth audits it as it is"
         )
     check_agreement(images)
 

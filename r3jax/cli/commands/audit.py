@@ -43,6 +43,11 @@ def run_audit(options: AuditOptions) -> int:
             makes no sense; a folder that holds something else; a disk that is full.
     """
     progress = Console(stderr=True)
+    if options.live and (options.depth_scale != 1.0 or options.depth_along_ray):
+        raise UserError(
+            "--depth-scale and --depth-along-ray cannot be used with --live: audit the capture "
+            "with them once it is finished"
+        )
     try:
         if options.live:
             with tempfile.TemporaryDirectory(prefix="r3jax-") as scratch:
@@ -119,6 +124,8 @@ def _settings_of(options: AuditOptions) -> AuditSettings:
         folds=options.folds,
         num_views=options.views,
         seed=options.seed,
+        depth_scale=options.depth_scale,
+        depth_along_ray=options.depth_along_ray,
         trust_depth=options.trust_depth,
     )
 

@@ -33,6 +33,13 @@ class AuditTermOptions(BagOptions):
     folds: int = 8
     """Own frames are judged by a map without every N-th image, themselves among them."""
 
+    depth_scale: Annotated[float, tyro.conf.arg(metavar="FACTOR")] = 1.0
+    """Multiply all depths of depth images, where their unit is not the one that was read."""
+
+    depth_along_ray: bool = False
+    """Depth images hold the distance along each pixel's ray, as those of Hypersim and SceneNet do,
+    and not z: convert it."""
+
     trust_depth: bool = False
     """Take the depth images as they are, even if they contradict the poses or each other."""
 

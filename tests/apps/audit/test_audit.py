@@ -16,6 +16,7 @@ from r3jax.apps.audit.camera_paths import CameraPath
 from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
 from r3jax.apps.audit.pages.faults_section import faults_section
+from r3jax.apps.audit.pages.ground_plan import _value_picture
 from r3jax.apps.audit.pages.sentences import directions, method, verdict
 from r3jax.apps.audit.source import Source, source_of
 from r3jax.apps.audit.survey import MARGIN, AuditSettings, survey_of
@@ -80,7 +81,7 @@ def test_an_audit_in_coordinates_of_utm_says_so_and_comes_back_in_them(folder, t
     recording = read_recording(write_far_recording(folder / "far", corner_poses(), far), "z")
     found = audit(source_of(recording, "far"), dataclasses.replace(SETTINGS, num_views=1))
     assert "was subtracted" in " ".join(method(found))
-    written = write_outputs(found, tmp_path)
+    written = write_outputs(found, tmp_path, tmp_path / "capture")
     points, _ = read_points(written["causes"])
     local = np.asarray(points, np.float64) - far
     to_wall = np.minimum(np.abs(local), np.abs(local - SIZE)).min(axis=1)
@@ -402,6 +403,32 @@ def one_picture(depth: np.ndarray) -> Source:
                   lambda index: (rgb, depth))  # fmt: skip
 
 
+def test_of_pictures_from_one_place_no_share_is_said(corner):
+    survey = replace(corner.survey, span=0.05 * corner.survey.median_depth)
+    said = verdict(replace(corner, survey=survey))
+    assert "taken from one place" in said[0]
+    assert not any("%" in text or "renderability of" in text for text in said)
+    assert record_of(replace(corner, survey=survey))["taken_from_one_place"]
+    assert not corner.survey.is_one_place
+
+
+def test_where_nothing_fits_no_verdict_on_pictures_follows(corner):
+    faults = replace(corner.faults, findings=(), fits=False)
+    found = replace(corner, faults=faults)
+    assert any("not known" in text for text in verdict(found))
+    assert "sharp" not in faults_section(found)
+
+
+def test_a_raster_does_not_grow_with_the_place(corner):
+    """Voxels of 2 mm in a room 5 m wide would be a picture of 6 million pixels, and so on."""
+    small, _ = _value_picture(corner, 1.2)
+    tiny = replace(corner.survey, voxel_size=1e-7)
+    large, extent = _value_picture(replace(corner, survey=tiny), 1.2)
+    assert max(large.shape) <= 2001
+    assert extent[1] - extent[0] == pytest.approx(SIZE[0], abs=0.4)
+    assert np.nanmean(large) == pytest.approx(np.nanmean(small), abs=0.1)
+
+
 def test_a_capture_without_any_depth_is_refused():
     with pytest.raises(FormatError, match="no picture shows anything"):
         survey_of(one_picture(np.zeros((36, 48), np.float32)), AuditSettings())
@@ -423,6 +450,12 @@ def test_a_median_depth_that_no_room_has_is_refused_unless_it_is_meant():
         survey_of(millimeters, AuditSettings())
     assert survey_of(millimeters, AuditSettings(up="-y", trust_depth=True)).median_depth == 2000.0
     assert "unit" in str(survey_of(millimeters, AuditSettings(up="-y", trust_depth=True)).doubt)
+
+
+def test_meters_read_as_millimeters_are_refused_with_the_factor():
+    with pytest.raises(ValueError, match=r"--depth-scale 1000 ") as refusal:
+        survey_of(one_picture(np.full((36, 48), 0.002, np.float32)), AuditSettings())
+    assert "depth_unit_scale_factor" in str(refusal.value)
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,22 @@
 Sparse depth from points: each where the camera shows it, and nothing that is hidden.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from r3jax.apps.audit.source import distorted, sampling_table, source_of, sparse_depth, thinned
+from r3jax.apps.audit.source import (
+    Source,
+    distorted,
+    sampling_table,
+    source_of,
+    sparse_depth,
+    thinned,
+)
 from r3jax.formats.lenses import MODELS, Lens
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.formats.validation.errors import ForeignFileError
@@ -144,3 +153,27 @@ def test_pixels_that_alpha_cuts_out_have_no_depth(tmp_path):
     assert not rgb[:, :20].any()
     assert (depth[:, 20:] > 0).all()
     np.testing.assert_array_equal(depth, np.asarray(images.frame(0).depth))
+
+
+def dense_source() -> Source:
+    rgb, depth = picture(round_poses(1)[0])
+    lens = Lens("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
+    return Source("room", round_poses(1), (lens,), ("a",), "depth", True, None, 1,
+                  lambda index: (rgb, depth.astype(np.float32)))  # fmt: skip
+
+
+def test_depth_along_the_ray_and_in_other_units_is_converted():
+    source = dense_source()
+    _, z = source.read(0)
+    v, u = np.indices(z.shape) + 0.5
+    ray = np.sqrt(1 + ((u - WIDTH / 2) / FOCAL) ** 2 + ((v - HEIGHT / 2) / FOCAL) ** 2)
+    stored = replace(source, read=lambda index: (source.read(index)[0], 50.0 * z * ray))
+    _, found = stored.with_depth(0.02, is_along_ray=True).read(0)
+    np.testing.assert_allclose(found, z, rtol=1e-5)
+
+
+def test_depth_from_points_is_not_converted():
+    with pytest.raises(ValueError, match="--depth-along-ray"):
+        replace(dense_source(), kind="cloud").with_depth(is_along_ray=True)
+    with pytest.raises(ValueError, match="--depth-scale"):
+        dense_source().with_depth(-1.0)

@@ -1,11 +1,17 @@
-"""Depth images against poses: a wrong unit is found by itself, a right one never."""
+"""Depth images against poses: a common mistake is found by itself, what is right never is."""
+
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from r3jax.apps.audit.source import source_of
-from r3jax.apps.audit.survey import AuditSettings, DepthImage, check_agreement, survey_of
+from r3jax.apps.audit.agreement import DepthImage, check_agreement
+from r3jax.apps.audit.source import ray_lengths, source_of
+from r3jax.apps.audit.survey import AuditSettings, survey_of
 from r3jax.formats.recordings import read_recording
+from r3jax.geometry.cameras import Camera
 from tests.apps.audit.room import (
     LENS,
     picture,
@@ -32,9 +38,52 @@ def test_a_wrong_unit_of_depth_is_refused_and_the_right_one_named(factor):
     assert named == pytest.approx(1.0 / factor, rel=0.15)
 
 
-def test_axes_of_another_convention_are_refused():
-    with pytest.raises(ValueError, match="contradict"):
-        check_agreement(looks(turn=np.diag([1.0, -1.0, -1.0, 1.0])))
+def with_lens(fx: float = 1.0, fy: float = 1.0, dx: float = 0.0, dy: float = 0.0):
+    """The same images, as if the lens were another one: factors and shifts in widths."""
+    c = LENS.camera
+    shift = [float(c.cx) + dx * c.width, float(c.cy) + dy * c.width]
+    lens = Camera(c.width, c.height, float(c.fx) * fx, float(c.fy) * fy, *shift)
+    return [replace(look, camera=lens) for look in looks()]
+
+
+def changed(change) -> list[DepthImage]:
+    """The same images with other depths."""
+    return [replace(look, depth=change(look.depth)) for look in looks()]
+
+
+def rays(depth: np.ndarray) -> np.ndarray:
+    c = LENS.camera
+    return depth * ray_lengths(depth.shape, np.array([c.fx, c.fy, c.cx, c.cy], float))
+
+
+@pytest.mark.parametrize(
+    ("images", "named"),
+    [
+        (changed(rays), "--depth-along-ray"),
+        (changed(lambda depth: depth[::-1]), "upside down"),
+        (changed(lambda depth: depth[:, ::-1]), "mirrored"),
+        (changed(lambda depth: depth[::-1, ::-1]), "180 degrees"),
+        (changed(lambda depth: 8.0 / depth), "disparity"),
+        (with_lens(1.3, 1.3), "fl_x"),
+        (with_lens(0.8, 0.8), "fl_x"),
+        (with_lens(dx=0.15), "cx and cy"),
+        (with_lens(dx=-0.1, dy=0.1), "cx and cy"),
+        (looks(turn=np.diag([1.0, -1.0, -1.0, 1.0])), "axes of all cameras"),
+        ([replace(look, pose=np.linalg.inv(look.pose)) for look in looks()], "inverted"),
+    ],
+)
+def test_a_common_mistake_is_named(images, named):
+    with pytest.raises(ValueError, match="contradict the poses") as refusal:
+        check_agreement(images)
+    assert named in str(refusal.value)
+    assert "--trust-depth" in str(refusal.value)
+
+
+def test_what_a_focal_length_is_multiplied_by_is_what_it_was_divided_by():
+    with pytest.raises(ValueError, match="focal") as refusal:
+        check_agreement(with_lens(1.3, 1.3))
+    named = [float(x) for x in re.findall(r"(\d\.\d+) \(along", str(refusal.value))]
+    assert named == pytest.approx([1.0 / 1.3] * 2, abs=0.06)
 
 
 def test_what_fits_is_let_through():
@@ -44,9 +93,12 @@ def test_what_fits_is_let_through():
     drifted = [pose.copy() for _, pose in SHOWN]
     for pose in drifted:
         pose[:3, 3] += rng.normal(0.0, 0.02, 3)
-    check_agreement(
-        [DepthImage(depth, LENS.camera, pose) for depth, pose in zip(noisy, drifted, strict=True)]
-    )
+        pose[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, 0.005, 3)).as_matrix() @ pose[:3, :3]
+    holes = [np.where(rng.random(depth.shape) < 0.1, 0.0, depth) for depth in noisy]
+    images = [DepthImage(d, LENS.camera, pose) for d, pose in zip(holes, drifted, strict=True)]
+    check_agreement(images)
+    check_agreement(images[:3])
+    check_agreement(images[::4])
 
 
 def test_where_nothing_can_be_compared_nothing_is_said():

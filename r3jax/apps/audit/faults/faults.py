@@ -18,7 +18,7 @@ import numpy as np
 from r3jax.apps.audit.faults.blocks import BlockImage, block_image
 from r3jax.apps.audit.faults.blur import Sharpness, image_motion, sharpness
 from r3jax.apps.audit.faults.light import Light, light
-from r3jax.apps.audit.faults.offsets import Offsets, offsets
+from r3jax.apps.audit.faults.offsets import Offsets, Systematic, offsets
 from r3jax.apps.audit.faults.overlap import overlaps
 from r3jax.apps.audit.faults.repeats import repeats
 from r3jax.apps.audit.source import Source
@@ -56,13 +56,15 @@ _OFF_TYPICAL = 6.0
 """And so are those that are off by less than so many times what surfaces differ anyway. Both let
 5 cm in a room be found; of the recording by HoloLens (2.6 mm) no frame is off by 3 cm."""
 
-SCALE = 0.03
-"""Depths that fit the poses better by another factor than 1 +- this have a wrong scale."""
+_MISFIT = 0.08
+"""Where cameras and depth are off by more, blocks that seem to show one surface do not."""
 
 _NAMED = 5
 """Pictures that a sentence names."""
 
-Kind = Literal["blur", "focus", "brightness", "tint", "pose", "scale", "repeat", "stray"]
+Kind = Literal[
+    "blur", "focus", "brightness", "tint", "pose", "scale", "ray", "camera", "repeat", "stray"
+]
 
 
 @dataclass(frozen=True)
@@ -109,9 +111,17 @@ class Faults:
     without_depth: tuple[int, ...] = ()
     """Images of which no depth is known: what they show cannot be told."""
 
+    fits: bool = True
+    """False where depth and cameras contradict each other: what pictures show of the same surface
+    is not known then, nor are blur, exposure and white balance."""
+
 
 def find_faults(
-    source: Source, chosen: np.ndarray, on_frame: Callable[[], None] = lambda: None
+    source: Source,
+    chosen: np.ndarray,
+    on_frame: Callable[[], None] = lambda: None,
+    *,
+    fits: bool = True,
 ) -> Faults:
     """Looks for blur, changing light, depth that contradicts the poses, and repetition.
 
@@ -119,6 +129,7 @@ def find_faults(
         source: the capture.
         chosen: images that are looked at.
         on_frame: called after each of them.
+        fits: False if depth and poses are known to contradict each other.
 
     Raises:
         FormatError: fewer than two images can be read.
@@ -140,7 +151,7 @@ def find_faults(
     if len(images) < 2 and failed:
         raise next(iter(failed.values()))
     kept = np.setdiff1d(chosen, list(failed))
-    found = faults_of(images, kept, source.labels, source.is_metric, source.has_images)
+    found = faults_of(images, kept, source.labels, source.is_metric, source.has_images, fits=fits)
     left_out = {index: f"{error.path.name}: {error.reason}" for index, error in failed.items()}
     return dataclasses.replace(found, left_out=left_out, without_depth=tuple(without_depth))
 
@@ -177,6 +188,8 @@ def faults_of(
     labels: Sequence[str],
     is_metric: bool = True,
     has_colors: bool = True,
+    *,
+    fits: bool = True,
 ) -> Faults:
     """As `find_faults`, of images in blocks.
 
@@ -186,26 +199,30 @@ def faults_of(
         labels: names of all images of the capture.
         is_metric: True if a unit is a meter.
         has_colors: False if the colors are made up.
+        fits: False if depth and poses are known to contradict each other.
     """
     pairs = overlaps(images)
     poses = offsets(images, pairs)
     names = _Names(chosen, labels, "m" if is_metric else "u")
-    findings = [_scale(poses), _pose(poses, images, names)]
+    shared = poses.systematic
+    fits = fits and (shared is None or abs(shared.size) < _MISFIT)
+    findings = [_systematic(shared), _pose(poses, images, names) if fits else None]
     record: dict[str, Any] = {"pictures": chosen.tolist(), "pose_off_by": _numbers(poses.distance)}
-    if has_colors:
+    if has_colors and fits:
         sharp, lit = sharpness(images, pairs), light(images, pairs)
         findings = [
             *_blur(sharp, images, names),
             _brightness(lit, names),
             _tint(lit, names),
             *findings,
-            _repeat(images, names),
         ]
         record["detail"] = _numbers(sharp.share)
         record["brightness"] = _numbers(np.exp(lit.change(lit.brightness)))
+    if has_colors:
+        findings.append(_repeat(images, names))
     compared = {i for pair in pairs for i in (pair.first, pair.second)}
     found = tuple(finding for finding in findings if finding is not None)
-    return Faults(found, len(compared), len(images), record)
+    return Faults(found, len(compared), len(images), record, fits)
 
 
 @dataclass(frozen=True)
@@ -290,7 +307,8 @@ def _largest(lit: Light, values: np.ndarray) -> float:
     if not len(lit.pairs):
         return 0.0
     differences = np.sort(np.abs(np.subtract(*values[lit.pairs.T])))[::-1]
-    return float(differences[min(_PAIRS_OF_CHANCE, len(differences) - 1)])
+    # Of few pairs not so many are left out that the largest would be smaller than the median.
+    return float(differences[min(_PAIRS_OF_CHANCE, (len(differences) - 1) // 2)])
 
 
 def _brightness(lit: Light, names: _Names) -> Finding | None:
@@ -389,19 +407,41 @@ def _pose(poses: Offsets, images: Sequence[BlockImage], names: _Names) -> Findin
     return names.finding("pose", what, todo, numbers, captions, worst)
 
 
-def _scale(poses: Offsets) -> Finding | None:
-    if not abs(poses.scale - 1.0) > SCALE:  # NaN is not
+def _systematic(found: Systematic | None) -> Finding | None:
+    if found is None:
         return None
-    longer = "short" if poses.scale > 1.0 else "long"
-    what = (
-        f"All depths are {100 * abs(1.0 / poses.scale - 1.0):.0f} % too {longer} for the poses: "
-        f"they fit best if multiplied by {poses.scale:.3f}."
-    )
+    value = found.value
+    if found.kind == "scale":
+        what = (
+            f"All depths are {100 * abs(1.0 / value - 1.0):.0f} % too "
+            f"{'short' if value > 1.0 else 'long'} for the poses: they fit best if multiplied by "
+            f"{value:.3f}."
+        )
+        todo = (
+            f"Check the unit of the depth images and the calibration of the depth camera; "
+            f"--depth-scale {value:.3f} multiplies (in a transforms.json: depth_unit_scale_factor)."
+        )
+        return Finding("scale", what, todo, (), (), value)
+    if found.kind == "ray":
+        what = "All depths fit the poses best as distances along the rays of the pixels, not as z."
+        return Finding("ray", what, "Use --depth-along-ray, which converts them.", (), (), value)
+    if found.kind == "focal":
+        what = (
+            f"All focal lengths are {100 * abs(1.0 / value - 1.0):.0f} % too "
+            f"{'short' if value > 1.0 else 'long'} for depth and poses: they fit best if "
+            f"multiplied by {value:.3f}."
+        )
+    else:
+        aside = {"across": ("right", "left"), "down": ("down", "up")}[found.kind]
+        what = (
+            f"All principal points fit depth and poses best if moved {aside[value < 0.0]} by "
+            f"{100 * abs(value):.0f} % of the focal length."
+        )
     todo = (
-        "Check the unit of the depth images and the calibration of the depth camera "
-        "(depth_unit_scale_factor in a transforms.json)."
+        "Calibrate the camera, or check that the intrinsics are those of these images (in a "
+        "transforms.json: fl_x, fl_y, cx, cy)."
     )
-    return Finding("scale", what, todo, (), (), poses.scale)
+    return Finding("camera", what, todo, (), (), value)
 
 
 def _repeat(images: Sequence[BlockImage], names: _Names) -> Finding | None:

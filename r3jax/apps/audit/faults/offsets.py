@@ -9,8 +9,17 @@ with c the frame's own camera, by least squares that are weighted anew with Cauc
 most of the error lies where one frame does not show what the other does. What a frame's surfaces
 move beside its neighbors' is what its pose is off. A drift that all frames share does not show.
 
-With the poses as they are, the same equations with d(p) = s (p - c) and one s for all give the
-scale of the depths.
+With the poses as they are, the same equations with one unknown for all frames give a systematic
+error of the depths or of the camera. With x, y, z a point in its camera and r the length of the ray
+(x/z, y/z, 1), each moves it, in the camera's axes, by
+
+    scale of the depths      (x, y, z)
+    focal length            -(x, y, 0)
+    principal point         -(z, 0, 0) or -(0, z, 0), as a share of the focal length
+    depth along the ray     -(1 - 1 / r) (x, y, z)
+
+These are much alike where frames show little; so each is fitted alone, and the one that leaves the
+least is believed.
 
 Shape symbols: n frames; m matches of a pair; b blocks.
 """
@@ -50,9 +59,6 @@ _PRIOR = 0.02
 """Motions are sought that are small beside this, where nothing else decides: translations as a
 share of the median depth, rotations in radians."""
 
-_SURE_OF_SCALE = 0.01
-"""Standard deviation up to which the scale counts as known."""
-
 _ALIKE = 100.0
 """Matches that err together: those of a wall in a pair of frames."""
 
@@ -65,10 +71,37 @@ class _Matches:
     second: int
     rows: np.ndarray
     """What the twelve unknowns of both frames move each match along its normal, [m, 12]."""
-    longer: np.ndarray
-    """What longer depths move each match along its normal, [m]."""
+    shared: np.ndarray
+    """What each of `SYSTEMATIC` moves each match along its normal, [m, 5]."""
     error: np.ndarray
     """Distance along the normal, [m] [median depths]."""
+
+
+SYSTEMATIC = ("scale", "focal", "across", "down", "ray")
+"""Errors that all frames may share: the order of `_Matches.shared`."""
+
+_NAMED_FROM = {"scale": 0.03, "focal": 0.03, "across": 0.02, "down": 0.02, "ray": 0.5}
+"""Smaller ones are not named."""
+
+_SURE = 1.0 / 3.0
+"""Nor are those whose standard deviation is larger than this share of it."""
+
+
+@dataclass(frozen=True)
+class Systematic:
+    """An error that all frames share."""
+
+    kind: str
+    """One of `SYSTEMATIC`."""
+
+    value: float
+    """By which the depths or the focal lengths are to be multiplied, what is to be added to the
+    principal point [focal lengths], or about 1 for depth along the ray."""
+
+    @property
+    def size(self) -> float:
+        """How large it is; 0 where there is none."""
+        return float(np.log(self.value)) if self.kind in ("scale", "focal") else self.value
 
 
 @dataclass(frozen=True)
@@ -88,9 +121,8 @@ class Offsets:
     """Median distance of matching surfaces along their normals [capture units]: noise of the depth
     and of the poses; NaN: nothing could be compared."""
 
-    scale: float
-    """By which factor all depths would fit the poses better; NaN: nobody knows, as where the camera
-    only turned."""
+    systematic: Systematic | None
+    """What all frames have wrong; None: nothing, or not known, as where the camera only turned."""
 
 
 def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
@@ -100,11 +132,15 @@ def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
     points = [image.points / unit for image in images]
     normals = [_normals(p, image.shape) for p, image in zip(points, images, strict=True)]
     centers = [image.pose[:3, 3] / unit for image in images]
-    found = [_matched(pair, points, normals, centers) for pair in pairs]
+    shared = [
+        _shared(p - c, image.pose[:3, :3])
+        for p, c, image in zip(points, centers, images, strict=True)
+    ]
+    found = [_matched(pair, points, normals, centers, shared) for pair in pairs]
     matches = [match for match in found if len(match.error) >= FEWEST]
     if not matches:
         unknown = np.full(count, np.nan)
-        return Offsets(unknown, np.zeros(count, dtype=bool), float("nan"), float("nan"))
+        return Offsets(unknown, np.zeros(count, dtype=bool), float("nan"), None)
     motion = _solved(count, matches)
     linked = np.array([(match.first, match.second) for match in matches], dtype=np.int64)
     distance = np.full(count, np.nan)
@@ -116,7 +152,7 @@ def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
             distance[i] = unit * float(np.median(np.linalg.norm(beside, axis=1)))
     typical = float(np.median(np.abs(np.concatenate([match.error for match in matches]))))
     explained = _explained(count, matches, motion, typical)
-    return Offsets(distance, explained, unit * typical, _scale(matches))
+    return Offsets(distance, explained, unit * typical, _systematic(matches))
 
 
 def _explained(
@@ -156,8 +192,21 @@ def _normals(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return normal.reshape(-1, 3)
 
 
+def _shared(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """How each of `SYSTEMATIC` moves points at offsets [b, 3] from the camera, [5, b, 3]."""
+    local = offset @ rotation
+    z = local[:, 2:]
+    aside = offset - z * rotation[:, 2]
+    shorter = 1.0 - z / np.linalg.norm(local, axis=1, keepdims=True)
+    return np.stack([offset, -aside, -z * rotation[:, 0], -z * rotation[:, 1], -shorter * offset])
+
+
 def _matched(
-    pair: Overlap, points: list[np.ndarray], normals: list[np.ndarray], centers: list[np.ndarray]
+    pair: Overlap,
+    points: list[np.ndarray],
+    normals: list[np.ndarray],
+    centers: list[np.ndarray],
+    shared: list[np.ndarray],
 ) -> _Matches:
     """The equations of one pair."""
     is_near = np.abs(pair.ratio - 1.0) < _GATE
@@ -171,8 +220,10 @@ def _matched(
     turn = lambda x, i: np.cross(x - centers[i], normal)
     rows = np.concatenate([normal, turn(p, pair.first), -normal, -turn(q, pair.second)], axis=1)
     along = lambda x: np.einsum("ij,ij->i", normal, x)
-    longer = along((p - centers[pair.first]) - (q - centers[pair.second]))
-    return _Matches(pair.first, pair.second, rows, longer, along(p - q))
+    moves = shared[pair.first][:, own] - shared[pair.second][:, other]
+    return _Matches(
+        pair.first, pair.second, rows, np.einsum("kij,ij->ik", moves, normal), along(p - q)
+    )
 
 
 def _solved(count: int, matches: list[_Matches]) -> np.ndarray:
@@ -195,19 +246,34 @@ def _solved(count: int, matches: list[_Matches]) -> np.ndarray:
     return x.reshape(count, 6)
 
 
-def _scale(matches: list[_Matches]) -> float:
-    """The factor of all depths that fits the poses best; NaN where it changes next to nothing."""
+def _systematic(matches: list[_Matches]) -> Systematic | None:
+    """The one of `SYSTEMATIC` that leaves the least, if it is large and well known."""
     error = np.concatenate([match.error for match in matches])
-    longer = np.concatenate([match.longer for match in matches])
-    s = information = 0.0
+    shared = np.concatenate([match.shared for match in matches])
+    fits = [_fit(error, column) for column in shared.T]
+    scatter = _scatter(error)
+    left = [
+        np.log1p(((error + size * column) / scatter) ** 2).mean()
+        for (size, _), column in zip(fits, shared.T, strict=True)
+    ]
+    best = int(np.argmin(left))
+    kind, (size, deviation) = SYSTEMATIC[best], fits[best]
+    large = size if kind == "ray" else abs(size)
+    if large < _NAMED_FROM[kind] or deviation > _SURE * _NAMED_FROM[kind]:
+        return None
+    return Systematic(kind, float(np.exp(size)) if kind in ("scale", "focal") else size)
+
+
+def _fit(error: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
+    """How much of a move [m] takes errors [m] away, and its standard deviation."""
+    size = information = 0.0
     for _ in range(4 * _ROUNDS):
-        left = error + s * longer
+        left = error + size * moved
         weight = _weight(left, _scatter(left))
-        information = float((weight * longer**2).sum()) + 1e-12
-        s = -float((weight * longer * error).sum()) / information
+        information = float((weight * moved**2).sum()) + 1e-12
+        size = -float((weight * moved * error).sum()) / information
     # Neighboring matches err alike: so many of them count as one.
-    deviation = np.sqrt(_ALIKE / max(information, 1e-12))
-    return float(np.exp(s)) if deviation < _SURE_OF_SCALE else float("nan")
+    return size, float(np.sqrt(_ALIKE / max(information, 1e-12)))
 
 
 def _scatter(errors: np.ndarray) -> float:

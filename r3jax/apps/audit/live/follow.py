@@ -61,6 +61,8 @@ _WARNINGS: dict[Kind, str] = {
     "tint": "White balance has changed: lock it.",
     "pose": "The pose contradicts the depth: go back to what was seen before, slowly.",
     "scale": "The scale of the depth is wrong.",
+    "ray": "Depth is measured along the ray, and not along the axis.",
+    "camera": "The intrinsics of the camera are wrong.",
     "repeat": "Nothing new: move on.",
 }
 """What to say of the latest frame at once."""

@@ -67,6 +67,8 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
 
 def _cards(audit: Audit) -> dict[str, str]:
     found, plan = audit.diagnosis, audit.plan
+    if audit.survey.is_one_place:
+        return {"pictures": str(len(audit.survey.chosen)), "taken from": "one place"}
     fine = f"{100 * sentences.cause_share(audit, 'fine'):.0f} %"
     what = "pictures" if audit.source.has_images else "poses without pictures"
     cards = {what: str(len(audit.survey.chosen))}

@@ -4,6 +4,7 @@ import html
 
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.faults.faults import Finding
+from r3jax.apps.audit.pages.sentences import CONTRADICTED
 from r3jax.apps.audit.pages.thumbnails import small_png
 from r3jax.apps.report.page import image, section
 
@@ -20,6 +21,8 @@ TITLES = {
     "tint": "White balance changes",
     "pose": "Poses contradict the depth",
     "scale": "The scale of the depth is wrong",
+    "ray": "Depth is measured along the ray",
+    "camera": "The intrinsics of the camera are wrong",
     "repeat": "Pictures repeat each other",
     "stray": "Poses have diverged",
 }
@@ -38,11 +41,13 @@ def faults_section(audit: Audit) -> str:
     faults = audit.faults
     body = "".join(_finding(audit, finding) for finding in faults.findings)
     if not faults.findings:
-        body = f"<p>{_nothing_found(audit)}</p>"
+        body = f"<p>{_nothing_found(audit)}</p>" if faults.fits else ""
+    if not faults.fits:
+        body += f"<p>{html.escape(CONTRADICTED)}</p>"
     alone = faults.looked_at - faults.compared - len(faults.without_depth)
     if not faults.compared:
         body = "<p>Nobody can tell: no two pictures show the same surface.</p>"
-    elif alone > 0:
+    elif alone > 0 and faults.fits:
         body += (
             f"<p class=note>Nothing can be said of {alone} of the {faults.looked_at} pictures: no "
             "other one shows the same surface.</p>"

@@ -27,6 +27,9 @@ _MARKER = 0.24
 
 _PUSHES = 200
 
+_MOST_PIXELS = 2000
+"""Pixels along a side of the picture of renderability: in larger places voxels share them."""
+
 _HALO = withStroke(linewidth=2.0, foreground="white")
 
 _PALE = 0.55
@@ -116,12 +119,13 @@ def _below(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Mean renderability of every column of voxels, [x, y], NaN without any; and its extent."""
+    """Mean renderability of the columns of voxels, [x, y], NaN without any; and its extent."""
     centers, values = _below(audit, height)
-    size = audit.survey.voxel_size
+    low, high = np.percentile(centers[:, :2], [0.2, 99.8], axis=0)
+    size = max(audit.survey.voxel_size, float((high - low).max()) / _MOST_PIXELS)
     pixel = np.floor(centers[:, :2] / size).astype(np.int64)
-    low = np.percentile(pixel, 0.2, axis=0).astype(np.int64)
-    shape = np.percentile(pixel, 99.8, axis=0).astype(np.int64) - low + 1
+    low, high = (np.floor(end / size).astype(np.int64) for end in (low, high))
+    shape = high - low + 1
     pixel -= low
     inside = np.all((pixel >= 0) & (pixel < shape), axis=1)
     flat = np.ravel_multi_index(tuple(pixel[inside].T), tuple(shape))

@@ -53,6 +53,12 @@ _DOUBTFUL = 5.0
 _MOST_NAMED = 6
 """Pictures that cannot be read which a sentence names."""
 
+CONTRADICTED = (
+    "Blur, exposure, white balance and single poses are not known: depth and cameras contradict "
+    "each other, so pictures cannot be compared."
+)
+"""What is said of the pictures where nothing fits."""
+
 _ORDINARY = ("angle", "rare", "distance", "noise")
 
 
@@ -90,7 +96,41 @@ def origin(audit: Audit) -> str | None:
 
 def verdict(audit: Audit) -> list[str]:
     """What the audit comes to, a sentence each."""
-    found, plan = audit.diagnosis, audit.plan
+    sentences = [_surfaces(audit)]
+    first = int(audit.survey.is_one_place)  # nothing goes before that
+    if not audit.source.is_dense:
+        sentences.append(
+            "Without depth images only surfaces with points are judged; plain walls may have none."
+        )
+    if (audit.survey.up.within or 0.0) > _DOUBTFUL:
+        sentences.insert(first, vertical(audit))
+    sentences[first:first] = [*unread(audit), *without_depth(audit)]
+    if audit.source.remark is not None:
+        sentences.insert(first, audit.source.remark)
+    if audit.survey.doubt is not None:
+        sentences.insert(0, f"Do not believe this page: {audit.survey.doubt}")
+    if audit.faults.findings:
+        said = " ".join(finding.what for finding in audit.faults.findings[:_MOST_SAID])
+        sentences.append(f"The pictures themselves: {said}")
+    if not audit.faults.fits:
+        sentences.append(CONTRADICTED)
+    if audit.unseen:
+        sentences.append(
+            f"Free space ends in about {area(audit, audit.unseen_area)} that no picture shows."
+        )
+    return sentences if audit.survey.is_one_place else [*sentences, *_promises(audit)]
+
+
+def _surfaces(audit: Audit) -> str:
+    """How much of what was seen renders well; of pictures from one place that is not known."""
+    survey = audit.survey
+    if survey.is_one_place:
+        return (
+            f"All pictures were taken from one place (within {survey.span:.2g} {survey.unit}; half "
+            f"of what they show is {survey.median_depth:.2g} {survey.unit} away or more): every "
+            "surface was seen from one direction only, and how it would render from elsewhere is "
+            "not known. Take pictures from other places, a step apart."
+        )
     shares = {cause: cause_share(audit, cause) for cause in _ORDINARY}
     ordered = sorted(shares, key=lambda cause: -shares[cause])
     parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
@@ -101,25 +141,13 @@ def verdict(audit: Audit) -> list[str]:
         start = f"{fine} of what the {'pictures' if audit.is_own_path else 'frames'} show"
         parts.append(f"{_unknown(audit)} is not known: no other picture has points there")
     well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
-    sentences = [f"{start} would render well ({well})" + (f"; {_list(parts)}." if parts else ".")]
-    if not audit.source.is_dense:
-        sentences.append(
-            "Without depth images only surfaces with points are judged; plain walls may have none."
-        )
-    if (audit.survey.up.within or 0.0) > _DOUBTFUL:
-        sentences.insert(0, vertical(audit))
-    sentences[:0] = [*unread(audit), *without_depth(audit)]
-    if audit.source.remark is not None:
-        sentences.insert(0, audit.source.remark)
-    if audit.survey.doubt is not None:
-        sentences.insert(0, f"Do not believe this page: {audit.survey.doubt}")
-    if audit.faults.findings:
-        said = " ".join(finding.what for finding in audit.faults.findings[:_MOST_SAID])
-        sentences.append(f"The pictures themselves: {said}")
-    if audit.unseen:
-        sentences.append(
-            f"Free space ends in about {area(audit, audit.unseen_area)} that no picture shows."
-        )
+    return f"{start} would render well ({well})" + (f"; {_list(parts)}." if parts else ".")
+
+
+def _promises(audit: Audit) -> list[str]:
+    """How the frames would render, and what further views would add."""
+    found, plan = audit.diagnosis, audit.plan
+    sentences: list[str] = []
     mean = float(audit.renderability.mean())
     worst = min(audit.frames, key=lambda frame: frame.score.renderability)
     what = "A frame of this capture" if audit.is_own_path else "A frame of the path"

@@ -1,13 +1,17 @@
 """Findings on single frames: a rendered walk, the same damaged, and a real recording."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from r3jax.apps.audit.faults.blocks import block_image
 from r3jax.apps.audit.faults.faults import Faults, faults_of, find_faults
 from r3jax.apps.audit.source import source_of
 from r3jax.formats.recordings import read_recording
-from tests.apps.audit.faults.walk import VIEWS, blocks, scattered, walk
+from r3jax.geometry.cameras import Camera
+from tests.apps.audit.faults.walk import CAMERA, VIEWS, blocks, scattered, walk
 from tests.conftest import shared_path
 
 NAMES = [f"{i:02d}.png" for i in range(VIEWS)]
@@ -128,6 +132,49 @@ def test_a_wrong_scale_of_all_depths_is_found_and_measured(factor):
     (finding,) = [finding for finding in found.findings if finding.kind == "scale"]
     assert finding.value == pytest.approx(1.0 / factor, rel=0.01)
     assert ("short" if factor < 1.0 else "long") in finding.what
+
+
+def seen_through(fx: float, dx: float = 0.0) -> Faults:
+    """The walk, said to be of a camera with another focal length or principal point."""
+    c = CAMERA
+    lens = Camera(c.width, c.height, c.fx * fx, c.fy * fx, c.cx + dx, c.cy)
+    images = [block_image(rgb, depth, lens, pose) for rgb, depth, pose in walk()]
+    return faults_of(images, np.arange(VIEWS), NAMES)
+
+
+def test_a_wrong_focal_length_is_no_wrong_scale():
+    found = seen_through(1.06)
+    (finding,) = [f for f in found.findings if f.kind in ("scale", "camera", "ray")]
+    assert finding.kind == "camera"
+    assert finding.value == pytest.approx(1.0 / 1.06, rel=0.015)
+    assert "fl_x" in finding.todo
+
+
+def test_a_shifted_principal_point_is_named():
+    found = seen_through(1.0, 0.05 * float(CAMERA.fx))
+    (finding,) = [f for f in found.findings if f.kind in ("scale", "camera", "ray")]
+    assert (finding.kind, finding.value) == ("camera", pytest.approx(-0.05, abs=0.01))
+
+
+def test_nothing_is_said_of_pictures_where_depth_and_cameras_contradict_each_other():
+    for found in (
+        seen_through(1.25),
+        faults_of(blocks(walk()), np.arange(VIEWS), NAMES, fits=False),
+    ):
+        assert not found.fits
+        assert {f.kind for f in found.findings} <= {"scale", "camera", "ray", "repeat"}
+        assert "detail" not in found.record
+
+
+def test_the_largest_change_is_never_below_the_typical_one():
+    gains = (1.3, 1.0, 0.8)
+    pictures = [
+        (to_bytes(gain * rgb.astype(np.float64)), depth, pose)
+        for gain, (rgb, depth, pose) in zip(gains, walk()[:3], strict=True)
+    ]
+    (finding,) = [f for f in faults(pictures).findings if f.kind == "brightness"]
+    most, half = (float(x) for x in re.findall(r"(\d+) %", finding.what))
+    assert most >= half
 
 
 def test_frames_that_repeat_each_other_are_found_with_what_they_repeat():
