@@ -225,7 +225,7 @@ MISTAKES = (
         1.1 ** np.arange(-7.0, 8.0)[:, None] * [1.0, 1.0],
         (0.05, 0.02),
         lambda size: bool(np.abs(size - 1.0).max() < 0.1),
-        "all focal lengths are multiplied by {0:.2f} (along x) and {1:.2f} (along y)",
+        "all focal lengths are multiplied by about {0:.2f} (along x) and {1:.2f} (along y)",
         "check the intrinsics (in a transforms.json: fl_x and fl_y)",
     ),
     Mistake(
@@ -246,7 +246,7 @@ MISTAKES = (
         _SHIFTS,
         (0.05, 0.02),
         lambda size: bool(np.abs(size).max() < 0.04),
-        "all principal points are moved by {0:+.0%} of the width along x and {1:+.0%} along y",
+        "all principal points are moved by about {0:+.0%} of the width along x, {1:+.0%} along y",
         "check the intrinsics (in a transforms.json: cx and cy), and whether images were cropped",
     ),
     Mistake(
