@@ -222,7 +222,7 @@ def faults_of(
         findings.append(_repeat(images, names))
     compared = {i for pair in pairs for i in (pair.first, pair.second)}
     found = tuple(finding for finding in findings if finding is not None)
-    return Faults(found, len(compared), len(images), record, fits)
+    return Faults(found, len(compared), len(images), record, fits=fits)
 
 
 @dataclass(frozen=True)
