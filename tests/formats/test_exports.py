@@ -208,6 +208,7 @@ def test_a_run_without_a_map_has_no_points(run, tmp_path):
 CHAIN = (
     "r3jax.formats.lenses",
     "r3jax.formats.posed_images",
+    "r3jax.formats.moved_images",
     "r3jax.formats.nerfstudio",
     "r3jax.formats.colmap.model",
     "r3jax.formats.colmap.binary",

@@ -6,8 +6,7 @@ import pytest
 import trimesh
 from hypothesis import given
 
-from r3jax.simulators.raycast import rays as rays_module
-from r3jax.simulators.raycast.embree import library
+from r3jax.simulators.raycast import embree
 from r3jax.simulators.raycast.rays import TriangleScene
 from tests.simulators.rooms import box_quads, box_room, world_of
 
@@ -15,7 +14,7 @@ from tests.simulators.rooms import box_quads, box_room, world_of
 def single_rays(vertices, faces, monkeypatch):
     """A scene that has no library to trace packets with."""
     with monkeypatch.context() as patch:
-        patch.setattr(rays_module, "library", lambda: None)
+        patch.setattr(embree, "library", lambda: None)
         return TriangleScene(vertices, faces)
 
 
@@ -96,7 +95,7 @@ def test_rays_do_not_depend_on_their_batch_and_there_may_be_none(room):
 
 
 def test_the_package_brings_the_library_that_packets_need():
-    assert library() is not None
+    assert embree.library() is not None
 
 
 @given(
