@@ -150,14 +150,14 @@ def _promises(audit: Audit) -> list[str]:
     sentences: list[str] = []
     mean = float(audit.renderability.mean())
     worst = min(audit.frames, key=lambda frame: frame.score.renderability)
-    what = "A frame of this capture" if audit.is_own_path else "A frame of the path"
+    what = "From the other pictures alone, a picture" if audit.is_own_path else "A frame of the path"
     known = mean / max(float(np.mean([frame.score.coverage for frame in audit.frames])), 1e-9)
     beside = "" if audit.source.is_dense else f" ({known:.2f} where it is known, else 0)"
     if audit.is_saturated:
-        sentences.append(f"{what} has a renderability of {mean:.2f} on average. {saturation()}")
+        sentences.append(f"{what} renders with R {mean:.2f} on average. {saturation()}")
     else:
         sentences.append(
-            f"{what} has a renderability of {mean:.2f} on average{beside}, the worst "
+            f"{what} renders with R {mean:.2f} on average{beside}, the worst "
             f"({worst.label}) {worst.score.renderability:.2f}."
         )
     if plan.views:
