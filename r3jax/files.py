@@ -321,7 +321,7 @@ def whole_folder(path: Path) -> Generator[Path]:
         check_vacant(path)  # in a moment between, another process may have been faster
         raise
     finally:
-        # Libraries may have made names of their own from this one, which nobody else has.
+        # Libraries may have made names of their own from this one, which is unique.
         for left in partial.parent.glob(f"{glob.escape(partial.name)}*"):
             shutil.rmtree(left, ignore_errors=True)
 

@@ -21,7 +21,7 @@ EXCEPTIONS = {
     "planning/policies/foreign/launch.py": {"open"},
     # PyAV seeks in what it writes: a file in a folder that `whole_folder` has just made.
     "apps/viewer/film.py": {"open"},
-    # The null device, in the place of a pipe that nobody reads any more.
+    # The null device, in the place of a pipe without a reader.
     "cli/main.py": {"open"},
     # A scratch folder of the system's, and links in it to the frames of a capture that grows.
     "cli/commands/audit.py": {"TemporaryDirectory"},

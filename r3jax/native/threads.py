@@ -5,7 +5,7 @@ when two loops run at once; XLA calls kernels from several threads. Every parall
 through one symbol, `numba_parallel_for`. Here a function takes its place that shares a loop with
 threads of our own. It is machine code, since XLA's threads must not wait for Python's lock.
 
-Whoever starts a loop works on it, too, and does all of it where the others are not awake in time.
+The caller works on its loop, too, and takes over the parts that sleeping threads have not begun.
 """
 
 import ctypes

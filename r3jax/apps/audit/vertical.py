@@ -34,7 +34,7 @@ _FLAT, _SURE = 0.02, np.radians(6.0)
 """Blocks with larger residuals (of their depth) or errors of their normal are left out."""
 
 _ALIKE = 3.0
-"""Errors of neighboring pixels are alike: those of a normal are so many times larger."""
+"""Factor on a normal's error, since errors of neighboring pixels are correlated."""
 
 _LEVEL, _TILTED, _TILTED_SHARE = 4.0, 20.0, 0.25
 """How level cameras are held [deg], by most and by the rest of the poses."""
@@ -187,7 +187,7 @@ def _degrees(cosine: np.ndarray) -> np.ndarray:
 
 
 def _spaced(count: int, most: int) -> np.ndarray:
-    """Indices of at most so many of a sequence, evenly spaced."""
+    """Returns a limited number of indices of a sequence, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 

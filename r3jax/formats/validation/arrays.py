@@ -77,7 +77,7 @@ def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
 
 
 def _array(file: Any, name: str, size: int) -> np.ndarray:
-    """An array of so many bytes with its header, which may not promise more than there is."""
+    """Reads an array and its header, which may not declare more bytes than there are."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ForeignFileError(f"{name} has the unknown version {version}")

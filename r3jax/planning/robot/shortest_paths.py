@@ -78,7 +78,7 @@ def _steps(
 @functools.cache
 def _compiled() -> _Kernel:
     """The kernel; compiled on the first call, and the disk keeps it for the next process."""
-    return compiled_or_plain(_settle)  # only here: whoever plans no path does not wait for Numba
+    return compiled_or_plain(_settle)  # only here: a command without paths need not wait for Numba
 
 
 def _settle(

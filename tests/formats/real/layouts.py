@@ -83,7 +83,7 @@ def picture(index: int, size: tuple[int, int], kind: str = "jpeg") -> bytes:
 
 
 def depth_png(index: int, size: tuple[int, int], steps: float = 1000.0) -> bytes:
-    """Depth as a 16-bit PNG of so many steps per meter."""
+    """Writes depth as a 16-bit PNG with the given steps per meter."""
     return encoded(np.rint(steps * meters(index, *size)).astype(np.uint16))
 
 

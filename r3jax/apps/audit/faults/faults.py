@@ -307,7 +307,7 @@ def _largest(lit: Light, values: np.ndarray) -> float:
     if not len(lit.pairs):
         return 0.0
     differences = np.sort(np.abs(np.subtract(*values[lit.pairs.T])))[::-1]
-    # Of few pairs not so many are left out that the largest would be smaller than the median.
+    # Of few pairs enough are kept that the largest is not below the median.
     return float(differences[min(_PAIRS_OF_CHANCE, (len(differences) - 1) // 2)])
 
 
