@@ -150,7 +150,9 @@ def _promises(audit: Audit) -> list[str]:
     sentences: list[str] = []
     mean = float(audit.renderability.mean())
     worst = min(audit.frames, key=lambda frame: frame.score.renderability)
-    what = "From the other pictures alone, a picture" if audit.is_own_path else "A frame of the path"
+    what = (
+        "From the other pictures alone, a picture" if audit.is_own_path else "A frame of the path"
+    )
     known = mean / max(float(np.mean([frame.score.coverage for frame in audit.frames])), 1e-9)
     beside = "" if audit.source.is_dense else f" ({known:.2f} where it is known, else 0)"
     if audit.is_saturated:
