@@ -85,8 +85,8 @@ class ExplorationConfig(MappingConfig):
     """Frames per second of the way [Hz], instead of `capture_every`: at speed v the pieces are at
     most v / rate long. While the camera turns at the end of a path there is no frame."""
 
-    gaze: GazeName = "panorama"
-    """Where the camera looks when it captures a frame on the way."""
+    gaze: str = "panorama"
+    """Where the camera points when it captures a frame while moving: one of `GazeName`."""
 
     exposure: float = 0.0
     """Time that the shutter is open for a frame on the way [s]; 0: nothing blurs."""

@@ -63,12 +63,15 @@ class Recording:
             depth = image_pixels(depth_path, _FORMATS, size, _DEPTH_MODES, "depth must be 16-bit")
         if is_there is not None:
             depth = np.where(is_there, depth, 0)
-        return Frame(
-            rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
-            depth=jnp.asarray(depth.astype(np.float32) / np.float32(1000.0)),
-            T_world_camera=jnp.asarray(self.poses[index], dtype=jnp.float32),
-            camera=self.camera,
-        )
+        try:
+            return Frame(
+                rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
+                depth=jnp.asarray(depth.astype(np.float32) / np.float32(1000.0)),
+                T_world_camera=jnp.asarray(self.poses[index], dtype=jnp.float32),
+                camera=self.camera,
+            )
+        except ValueError as error:
+            raise FormatError(path, str(error)) from None
 
     def frames(self) -> Iterator[Frame]:
         """Every frame in order, read one by one."""

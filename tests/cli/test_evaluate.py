@@ -169,7 +169,7 @@ def test_a_mistake_gets_one_line(place, capsys, words, message):
         write_recording(place / "elsewhere", count=2)
         small = Image.new("RGB", (WIDTH - 2, HEIGHT))
         small.save(place / "elsewhere" / "images" / "001.png")
-        message = ["elsewhere", "size"]
+        message = ["elsewhere", "001.png", "pixels"]
     assert evaluate(*words) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("r3jax: ")

@@ -12,7 +12,7 @@ from r3jax.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
 
-RUN = ["explore", "--scene", "two-rooms", "--policy", "random", "--budget", "views:3"]
+RUN = ["explore", "--scene", "flat", "--policy", "random", "--budget", "views:3"]
 RUN += ["--clock", "model", "--resolution", "48", "--candidates", "10", "--name", "r"]
 
 

@@ -83,7 +83,7 @@ def test_two_processes_do_not_write_one_team(room, pair, tmp_path, capsys):
         assert main(["team", "--resume", str(pair)]) == 2
         assert "another process is writing this team" in capsys.readouterr().err
     (tmp_path / "pair").mkdir()
-    (tmp_path / "pair" / "transforms.json").touch()
+    (tmp_path / "pair" / "transforms.json").write_text("{}")
     assert team(room, tmp_path) == 2
     assert "holds something that is not a team" in capsys.readouterr().err
 

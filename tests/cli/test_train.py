@@ -110,7 +110,7 @@ def test_two_processes_do_not_train_one_model(recording, models, tmp_path, capsy
         assert train(recording, models, "--overwrite") == 2
     assert "another process is training here" in capsys.readouterr().err
     (tmp_path / "last").mkdir()
-    (tmp_path / "last" / "thesis.txt").touch()
+    (tmp_path / "last" / "thesis.txt").write_text("mine")
     assert train(recording, tmp_path, "--overwrite") == 2
     assert "holds something that is not a model" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "last").iterdir()] == ["thesis.txt"]

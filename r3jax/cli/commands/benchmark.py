@@ -40,7 +40,7 @@ from r3jax.cli.console import (
 from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import BenchmarkOptions
-from r3jax.files import lock_folder, own_folder
+from r3jax.files import MARKER, lock_folder, own_folder, remove_own
 from r3jax.formats.submissions import Submission, read_submission
 from r3jax.interrupts import check_interrupt, settle_interrupt
 
@@ -73,10 +73,16 @@ def run_benchmark(options: BenchmarkOptions) -> int:
         if options.jobs > 0 and visible_gpus():
             # The workers have the GPUs; planning must not hold on to their memory.
             jax.config.update("jax_platforms", "cpu")
+        is_new = not options.out.is_dir() or not any(options.out.iterdir())
         own_folder(options.out, "benchmark", "give another --out")
         with _only_one(options.out):
-            with console.status("planning ...") as status:
-                cells = _plan(options, lambda what: status.update(f"{what} ..."))
+            try:
+                with console.status("planning ...") as status:
+                    cells = _plan(options, lambda what: status.update(f"{what} ..."))
+            except BaseException:
+                if is_new:  # a benchmark that cannot be planned leaves nothing
+                    remove_own(options.out, ["lock", f"{MARKER}/*"])
+                raise
             left = cells_left(options.out, cells)
             _announce(console, options, cells, left)
             with BenchmarkProgress(console, len(cells), len(left), options.out) as progress:

@@ -13,6 +13,8 @@ from r3jax.apps.benchmark import run_cell as module
 from r3jax.apps.benchmark.cells import paths_of, snapshots_left
 from r3jax.apps.benchmark.record import collect, read_records
 from r3jax.apps.benchmark.run_cell import CellError, run_cell, steps_within
+from r3jax.files import own_folder
+from r3jax.formats.validation.json_text import unsealed
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import read_run
 from tests.apps.benchmark.tiny import SETTINGS, make_cells
@@ -77,7 +79,7 @@ def test_each_snapshot_leaves_a_record_of_the_schema(finished):
             assert column is None or len(column) == record["test_views"]["count"] == 4
         assert len(read_run(root / record["run"]).rows) == 3
     lines = collect(root).read_text().splitlines()
-    assert [json.loads(line) for line in lines] == records
+    assert [unsealed(json.loads(line)) for line in lines] == records
     assert all(not snapshots_left(root, cell) for cell in cells)
 
 
@@ -190,6 +192,7 @@ def test_a_snapshot_that_fails_leaves_the_others_and_a_reason(room, tmp_path, ca
 def test_a_recorded_exploration_is_never_deleted(finished, room, tmp_path, damage):
     (cell,) = make_cells(room, tmp_path)
     run = paths_of(tmp_path, cell).run
+    own_folder(paths_of(tmp_path, cell).folder, "cell")
     shutil.copytree(paths_of(finished[0], finished[1][0]).run, run)
     trace = run / "trace.jsonl"
     trace.write_bytes(b"".join(trace.read_bytes().splitlines(keepends=True)[:2]))  # cut off

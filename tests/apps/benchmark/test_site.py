@@ -121,7 +121,7 @@ def test_a_page_that_is_not_ours_stays(tmp_path, text):
     out, home = written(tmp_path / "out", [record(views=6)]), tmp_path / "home"
     home.mkdir()
     (home / "index.html").write_bytes(text.encode("latin-1"))
-    with pytest.raises(ValueError, match="no page of a benchmark, which stays as it is"):
+    with pytest.raises(OSError, match="home: holds something that is not a site"):
         write_site(out, home)
     assert (home / "index.html").read_bytes() == text.encode("latin-1")
     assert [path.name for path in home.iterdir()] == ["index.html"]

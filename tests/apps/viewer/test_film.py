@@ -12,7 +12,6 @@ from r3jax.apps.viewer.color_maps import UNSEEN
 from r3jax.apps.viewer.film import ENCODERS, HEIGHT, WIDTH, Film, export_film, write_video
 from r3jax.apps.viewer.stills import Sheet
 from r3jax.apps.viewer.story import Timeline
-from r3jax.formats.errors import FormatError
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import read_run
 from tests.apps.viewer.conftest import VIEWS
@@ -86,7 +85,7 @@ def test_scores_are_drawn_in_their_colors(run):
 
 def test_a_folder_that_holds_something_is_refused_and_left_alone(run, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(FormatError, match="something is there already"):
+    with pytest.raises(OSError, match="something is there already"):
         export_film(run, tmp_path, video=False)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 

@@ -150,7 +150,7 @@ def test_colors_differ_without_red_or_green():
         np.eye(3),
     ])  # fmt: skip
     policies = sorted({look.color for look in styles_of([*SKILL, "mine"]).values()})
-    assert len(policies) == len(SKILL) + 1 - 2  # two share the color of their sibling
+    assert len(policies) == len(SKILL) + 1
     for colors in (policies, OKABE_ITO):
         for eye in eyes:
             seen = [seen_by(eye, color) for color in colors]
