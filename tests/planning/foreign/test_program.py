@@ -197,6 +197,18 @@ def test_memory_is_that_of_all_processes_and_what_they_share(code):
         asked(f"receive()\n{code}\nsend(kind='fine')", memory=0.25)
 
 
+@pytest.mark.parametrize(
+    "file", ["open('/dev/shm/r3jax_test', 'wb')", "os.fdopen(os.memfd_create('x'), 'wb')"]
+)
+def test_a_file_in_memory_is_no_larger_than_the_limit(file):
+    if sys.platform != "linux":
+        pytest.skip("elsewhere there are no files in memory")
+    code = f"f = {file}\nif isinstance(f.name, str): os.unlink(f.name)\n"
+    code += "for _ in range(400): f.write(b'x' * (1 << 20))\nf.flush(); send(kind='fine')"
+    with pytest.raises(PolicyError, match="File too large"):
+        asked(f"receive()\n{code}", memory=0.25)
+
+
 def test_what_processes_share_counts_once():
     code = (
         "x = b'x' * (120 << 20)\nfor _ in range(4):\n    if os.fork() == 0: time.sleep(60)\n"

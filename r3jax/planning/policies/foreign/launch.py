@@ -31,6 +31,8 @@ def main(memory: int, network: str, command: list[str]) -> None:
         if memory:
             # Not the address space: that of GPUs and of sparse tables is reserved, never used.
             resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+            # Files in memory (/dev/shm, memfd) count for no process: none may be larger either.
+            resource.setrlimit(resource.RLIMIT_FSIZE, (memory, memory))
         if network == "none":
             leave_network()
         if sys.platform == "linux":
