@@ -185,7 +185,8 @@ def test_memory_has_a_limit():
 @pytest.mark.parametrize(
     "code",
     [
-        "import mmap; m = mmap.mmap(-1, 400 << 20)\nfor i in range(0, len(m), 4096): m[i] = 1",
+        "import mmap; m = mmap.mmap(-1, 400 << 20)\nfor i in range(0, len(m), 4096): m[i] = 1\n"
+        "time.sleep(1)",
         "for _ in range(4):\n    if os.fork() == 0: x = b'x' * (100 << 20); time.sleep(60)\n"
         "time.sleep(1)",
     ],
