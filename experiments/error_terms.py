@@ -27,6 +27,7 @@ from r3jax.apps.benchmark.reference_images import (
     read_reference_images,
     reference_path,
 )
+from r3jax.baselines.cover import SeenBins, coverage_of_pixels
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.image_metrics import psnr
 from r3jax.evaluation.maps import map_of
@@ -34,7 +35,6 @@ from r3jax.files import write_atomic
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
-from r3jax.planning.policies.cover import SeenBins, coverage_of_pixels
 from r3jax.scoring.backend import rows_in_pixels
 from r3jax.scoring.backends.reference import voxels_of_rows
 from r3jax.scoring.config import Forms, ScoringConfig

@@ -41,9 +41,9 @@ from experiments.pages.artifacts import (
     write_markdown,
 )
 from r3jax.apps.benchmark.record import machine, source_commit
-from r3jax.apps.report import style
 from r3jax.evaluation.areas import sparsification
 from r3jax.files import write_atomic
+from r3jax.plots import style
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.difficulty import voxel_difficulty
 from r3jax.scoring.expected_error import DISSIMILARITY, SQUARED, TERMS, Fit, error_terms

@@ -38,9 +38,9 @@ from r3jax.apps.forecast.psnr import (
     statistic,
     write_calibration,
 )
-from r3jax.apps.report import style
 from r3jax.evaluation.comparison import method_name, view_values
 from r3jax.exploration.replay import config_of, states_of
+from r3jax.plots import style
 from r3jax.trace.reader import read_run
 
 NAME = "forecast"

@@ -19,6 +19,8 @@ import numpy as np
 
 from experiments.error_terms import reference_images
 from r3jax.apps.benchmark.conditions import snapshot_slug
+from r3jax.baselines.fisher import Form, known_information
+from r3jax.baselines.fisher import scores as information_scores
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.evaluation.maps import map_of
@@ -27,8 +29,6 @@ from r3jax.formats.captures import open_capture
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.state import MapState
-from r3jax.rivals.fisher import Form, known_information
-from r3jax.rivals.fisher import scores as information_scores
 from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.raycast.raycast import RaycastSimulator

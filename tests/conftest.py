@@ -33,9 +33,9 @@ _LEFT_TO_TEST_ALL = (
     "exploration/test_captures.py", "exploration/test_guard.py", "exploration/test_motion.py",
     "exploration/test_plan_while_moving.py",
     "mapping/test_scans.py",
-    "planning/gaze", "planning/test_active_gamer.py", "planning/test_gavis.py",
-    "planning/test_motions_of_policies.py", "planning/test_next_views.py", "planning/test_r3con.py",
-    "planning/test_unseen.py",
+    "baselines/test_active_gamer.py", "baselines/test_gavis.py",
+    "baselines/test_r3con.py",
+    "planning/test_motions_of_policies.py", "planning/test_next_views.py",
     "scoring/test_explain.py", "scoring/test_leaks.py", "scoring/test_pixels.py",
     "scoring/test_simulated.py",
     "simulators/scenes/test_procedural.py", "simulators/test_free_space.py",
@@ -50,14 +50,14 @@ points of it. Single tests elsewhere are marked `full` themselves."""
 
 
 def pytest_ignore_collect(collection_path, config):
-    """Leaves files to `make test-all` unread, but for those whose mutants must find their snippets.
+    """Leaves files to `make test-all` unread.
 
     Reading them would import what is built on the method, a fifth of the time of `make test`.
     """
     if "not (full" not in config.option.markexpr or collection_path.suffix != ".py":
         return None
     is_left = str(collection_path).startswith(_left_to_test_all())
-    return True if is_left and "tests.mutants" not in collection_path.read_text("utf-8") else None
+    return True if is_left else None
 
 
 def _left_to_test_all() -> tuple[str, ...]:

@@ -26,7 +26,7 @@ def kernels_as_python() -> Generator[None]:
 
 def _python_compiler() -> ModuleType:
     """Stands for `compiled.py`: kernels stay Python, the counter needs no atomics."""
-    module = ModuleType("r3jax.native.compiled")
+    module = ModuleType("r3jax.kernels.native.compiled")
     for name in ("kernel", "inlined", "inlined_fast", "inlined_fused", "parallel_kernel"):
         setattr(module, name, lambda function: function)
 
@@ -50,7 +50,7 @@ def _plain_lowest_bit(word) -> int:
 
 def _numpy_arithmetic() -> ModuleType:
     """Stands for `arithmetic.py`."""
-    single, module = np.float32, ModuleType("r3jax.native.arithmetic")
+    single, module = np.float32, ModuleType("r3jax.kernels.native.arithmetic")
     bits_of = lambda value: single(value).view(np.uint32)
     # NaN becomes any number in machine code.
     biased = lambda index: int(np.nan_to_num(index)) + (1 << 20)
@@ -76,7 +76,7 @@ def _numpy_arithmetic() -> ModuleType:
 
 def _numpy_lanes() -> ModuleType:
     """Stands for `lanes.py`: vectors of 16 floats are arrays."""
-    single, module = np.float32, ModuleType("r3jax.splatting.backends.numba.lanes")
+    single, module = np.float32, ModuleType("r3jax.kernels.splatting.lanes")
 
     def store(array, index, value, count=16):
         array[index : index + count] = value[:count]

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from r3jax.mapping import table
-from tests.mutants import Mutant, assert_caught, each, load
+from tests.mutants import Mutant, assert_caught, load
 
 CHAIN = ("r3jax.mapping.table", "r3jax.mapping.join")
 
@@ -50,11 +50,3 @@ def test_a_caught_mutant_passes_and_a_survivor_fails():
 def test_a_stale_mutant_is_named(original, module, words):
     with pytest.raises(LookupError, match=words):
         load(CHAIN, mutant(original, "", module))
-
-
-def test_a_mutant_that_the_code_has_left_behind_is_named_when_tests_are_collected():
-    mutant = Mutant("join", "a line that is not there", "another", lambda modules: None)
-    with pytest.raises(
-        LookupError, match=r"0 places in files join\.py hold 'a line that is not there'"
-    ):
-        each([mutant])

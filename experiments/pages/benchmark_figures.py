@@ -14,7 +14,6 @@ from experiments.pages.policy_style import (
     styles_of,
 )
 from r3jax.apps.benchmark.tables import full_title
-from r3jax.apps.report import style
 from r3jax.evaluation.comparison import (
     EXPLORATION,
     Cell,
@@ -27,6 +26,7 @@ from r3jax.evaluation.comparison import (
     with_short_names,
 )
 from r3jax.evaluation.scores import METRICS
+from r3jax.plots import style
 
 _PANELS_PER_LINE = 4
 

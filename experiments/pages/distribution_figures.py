@@ -7,7 +7,6 @@ from matplotlib.figure import Figure
 
 from experiments.pages.policy_style import OKABE_ITO, legend_below, styles_of
 from r3jax.apps.benchmark.tables import full_title, metric_named
-from r3jax.apps.report import style
 from r3jax.evaluation.comparison import (
     Cell,
     check_equal_terms,
@@ -18,6 +17,7 @@ from r3jax.evaluation.comparison import (
 )
 from r3jax.evaluation.scores import POOR_PSNR
 from r3jax.evaluation.statistics import RESAMPLES, Estimate, kendall, spearman
+from r3jax.plots import style
 
 _RIDGE_HEIGHT = 1.5
 """Height of the highest ridge, in distances between lines: ridges may overlap by half a line."""

@@ -20,8 +20,8 @@ from experiments.error_analysis import (
 )
 from experiments.error_terms import KAPPAS, PRODUCTS, column
 from experiments.pages.policy_style import OKABE_ITO, legend_below
-from r3jax.apps.report import style
 from r3jax.evaluation.statistics import Estimate
+from r3jax.plots import style
 
 TITLES = {SCORE: "renderability R", COVERAGE: "coverage", COVER: "COVER"}
 """Predictions as axes call them; terms keep their names."""

@@ -12,8 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.figure import Figure
 
-from r3jax.apps.report import style
 from r3jax.evaluation.comparison import policy_of
+from r3jax.plots import style
 
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Colors of groups that are no policies."""

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from r3jax.apps.report import style
+from r3jax.plots import style
 
 _PANELS_PER_LINE = 4
 

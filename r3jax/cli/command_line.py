@@ -27,8 +27,8 @@ from r3jax.cli.options import (
     ViewOptions,
 )
 from r3jax.cli.options.parsing import number_rules, options_of, parser_class
-from r3jax.formats.validation.choices import did_you_mean
-from r3jax.native.ahead import cache_folder, compile_ahead
+from r3jax.kernels.native.ahead import cache_folder, compile_ahead
+from r3jax.validation.choices import did_you_mean
 
 COMMANDS = {
     "demo": DemoOptions,

@@ -1,4 +1,4 @@
-"""Compiles all kernels for CPUs, `python -m r3jax.cli.kernels NOTE`: what `native.ahead` starts."""
+"""Compiles all kernels, `python -m r3jax.cli.kernels NOTE`: what `kernels.native.ahead` starts."""
 
 import os
 import sys
@@ -11,19 +11,19 @@ def main(note: Path) -> None:
     """Compiles all kernels, and leaves a note."""
     # What takes longest first, then what is needed last: who waits opens a scene, renders, and
     # compiles the map's kernels meanwhile.
-    from r3jax.scoring.backends.numba import bridge as scoring
+    from r3jax.kernels.scoring import bridge as scoring
 
     for name in (scoring.SUMS, scoring.SUMS_OF_FEW, scoring.PIXELS):
         scoring.register(name)
-    from r3jax.mapping.backends.numba import bridge as mapping
+    from r3jax.kernels.mapping import bridge as mapping
 
     for name in (mapping.MARK, mapping.LOOK, mapping.ADD):
         mapping.register(name)
     scoring.register(scoring.CHANGES)
-    from r3jax.splatting.backends.numba import bridge as splatting
+    from r3jax.kernels.splatting import bridge as splatting
 
     splatting.register()
-    from r3jax.splatting.training.backends.numba import bridge as training
+    from r3jax.kernels.training import bridge as training
 
     for name in (training.LOSS, training.ADAM):
         training.register(name)

@@ -21,14 +21,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from r3jax.files import make_folder, write_atomic
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json
-from r3jax.formats.validation.versions import VersionError, check_version
 from r3jax.frame import Frame
 from r3jax.geometry.axis_views import LOOKS, poses_at
 from r3jax.geometry.cameras import Camera
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json
+from r3jax.validation.versions import VersionError, check_version
 
 SPACING = (1.0, 1.0, 0.75)
 """Replica-Dense's lattice [m]."""

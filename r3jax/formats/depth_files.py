@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.formats.validation.arrays import read_npy
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size
-from r3jax.formats.validation.packages import why_not_imported
+from r3jax.validation.arrays import read_npy
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.images import MAX_PIXELS, image_pixels, image_size
+from r3jax.validation.packages import why_not_imported
 
 DEPTH_MODES = ("I;16", "I;16B", "I")
 """Pillow's modes of a depth image of whole numbers."""

@@ -9,7 +9,7 @@ Shape symbols: H, W size of the color image; h, w size of the depth image.
 import numpy as np
 
 from r3jax.formats.lenses import Lens
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 
 
 def resample_depth(depth: np.ndarray, lens: Lens, depth_lens: Lens | None = None) -> np.ndarray:

@@ -4,8 +4,8 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import check_regular
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import check_regular
 
 
 class FormatError(ValueError):

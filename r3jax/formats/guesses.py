@@ -7,8 +7,8 @@ from pathlib import Path
 
 from r3jax.formats.errors import FormatError
 from r3jax.formats.phones.archives import SUFFIXES, open_zip
-from r3jax.formats.validation.database import check_database
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.database import check_database
+from r3jax.validation.errors import ForeignFileError
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff")
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi")

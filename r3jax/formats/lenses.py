@@ -8,8 +8,8 @@ a pinhole; distortion is kept as data and never applied.
 import math
 from dataclasses import dataclass
 
-from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import Camera
+from r3jax.validation.errors import ForeignFileError
 
 _SHARED_FOCAL, _TWO_FOCALS = "f cx cy", "fx fy cx cy"
 _FULL = "k1 k2 p1 p2 k3 k4"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import IMAGE_FORMATS
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.images import first_size
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.images import first_size
 
 COPIES = ("_2", "_4", "_8")
 """What the names of folders of smaller copies end with."""

@@ -30,15 +30,15 @@ from r3jax.formats.lenses import Lens
 from r3jax.formats.moved_images import COPIES
 from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields, check_type
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.images import first_size
-from r3jax.formats.validation.json_text import parse_json
-from r3jax.formats.validation.names import below
 from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields, check_type
+from r3jax.validation.files import read_bytes
+from r3jax.validation.images import first_size
+from r3jax.validation.json_text import parse_json
+from r3jax.validation.names import below
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns the camera's axes: `T_world_opengl = T_world_opencv @ this`; its own inverse."""

@@ -13,10 +13,10 @@ import numpy as np
 
 from r3jax.formats.errors import naming
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json
 
 NAME = "dataparser_transforms.json"
 

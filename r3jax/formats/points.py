@@ -17,9 +17,9 @@ import numpy as np
 
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import read_bytes
 from r3jax.mapping.state import MapState
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import read_bytes
 
 _MAX_BYTES = 4 << 30
 """Scans of buildings are no larger."""

@@ -20,10 +20,10 @@ from r3jax.formats.depth_files import stored_depth
 from r3jax.formats.depth_images import resample_depth
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.images import image_size, masked_pixels
 from r3jax.frame import Frame
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import read_bytes
+from r3jax.validation.images import image_size, masked_pixels
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 """What Pillow may try."""

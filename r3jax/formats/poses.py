@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.validation.files import plain_text, read_bytes
 from r3jax.geometry.cameras import rigid_error
+from r3jax.validation.files import plain_text, read_bytes
 
 MAX_DRIFT = 0.02
 """Rotations off by at most this (text with few digits, long chains of products) are mended."""

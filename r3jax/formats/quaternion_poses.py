@@ -7,7 +7,7 @@ import numpy as np
 from r3jax.formats.colmap.model import rotation_of
 from r3jax.formats.errors import FormatError
 from r3jax.formats.poses import MAX_DISTANCE
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 
 
 def quaternion_pose(source: Path, which: str, position: np.ndarray, xyzw: np.ndarray) -> np.ndarray:

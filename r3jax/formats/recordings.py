@@ -18,9 +18,9 @@ import numpy as np
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.poses import mend_pose, read_numbers
-from r3jax.formats.validation.images import first_size, image_pixels, masked_pixels
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.validation.images import first_size, image_pixels, masked_pixels
 
 Up = Literal["y", "z"]
 

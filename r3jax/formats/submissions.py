@@ -26,11 +26,6 @@ from r3jax.exploration.replay import check_decided_alone, config_of
 from r3jax.exploration.state import COMPLETE
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import build, check_type
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json
-from r3jax.formats.validation.versions import check_version
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.robot.motion import Motion, motion_of_record
@@ -38,6 +33,11 @@ from r3jax.trace.errors import RunError
 from r3jax.trace.paths import paths_to
 from r3jax.trace.reader import Run
 from r3jax.trace.rows import StepRow, rigid_pose, shortest_floats, table_of
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import build, check_type
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json
+from r3jax.validation.versions import check_version
 
 FORMAT = "r3jax-submission"
 """What the first line says it is."""

@@ -18,6 +18,7 @@ from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import is_traced, sound
 from r3jax.geometry.compaction import positions_of_set
 from r3jax.geometry.voxels import INDEX_LIMIT, check_near_origin, unpack, voxel_center
+from r3jax.kernels.native.platform import by_platform
 from r3jax.mapping.associate import (
     Groups,
     edge_pixels,
@@ -28,7 +29,6 @@ from r3jax.mapping.associate import (
 from r3jax.mapping.join import CHUNK, Statistics, grow, join
 from r3jax.mapping.seen import evidence_of_view, mark_seen, rows_in_view
 from r3jax.mapping.state import MapState, a_map
-from r3jax.native.platform import by_platform
 
 _NEAR = 1000.0
 """Up to here voxels of a millimeter have an index [m]."""
@@ -130,21 +130,21 @@ def _by_kernels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     """The same in machine code."""
-    from r3jax.mapping.backends import numba
+    from r3jax.kernels import mapping
 
     factor = sound(frame.camera, frame.T_world_camera)
     position, focal = frame.position, frame.camera.focal
     # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
-    state = numba.join_pixels(state, frame, factor * max_range, drop_edges)
+    state = mapping.join_pixels(state, frame, factor * max_range, drop_edges)
     state = eqx.tree_at(lambda m: m.voxel_size, state, factor * state.voxel_size)
-    codes, has_holes = numba.codes_of_rows(state, frame, max_range)
+    codes, has_holes = mapping.codes_of_rows(state, frame, max_range)
     # A branch: what hides what must be known only where depth has failed.
     shown_in_holes = jax.lax.cond(
         has_holes,
         lambda: rows_in_view(state, frame, max_range).astype(jnp.uint8),
         lambda: jnp.zeros(state.capacity, dtype=jnp.uint8),
     )
-    return numba.mark(state, codes, shown_in_holes, position, focal)
+    return mapping.mark(state, codes, shown_in_holes, position, focal)
 
 
 @jax.custom_jvp

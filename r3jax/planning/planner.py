@@ -23,12 +23,12 @@ from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import a_camera, a_pose, checked, one
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import check_near_origin
+from r3jax.kernels.native.ahead import compile_ahead
+from r3jax.kernels.native.platform import is_cpu_only
 from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
-from r3jax.native.ahead import compile_ahead
-from r3jax.native.platform import is_cpu_only
 from r3jax.planning.decision import PlannerState
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PlansAhead, Policy
 from r3jax.planning.registry import make_policy

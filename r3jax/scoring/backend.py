@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from r3jax.kernels.native.platform import by_platform, can_call_kernels
 from r3jax.mapping.state import MapState
-from r3jax.native.platform import by_platform, can_call_kernels
 from r3jax.scoring.backends import dense, reference
 from r3jax.scoring.backends.views import layout_of, over_views, row_of
 from r3jax.scoring.cells import Cells
@@ -39,9 +39,10 @@ def _by_platform(answer_by: Callable[[Any], Callable[..., Any]], edge: int = 1) 
     """
     if edge > LARGEST_BUFFER or not can_call_kernels():
         return answer_by(dense)
-    from r3jax.scoring.backends import numba
 
-    return by_platform(cpu=answer_by(numba), default=answer_by(dense))
+    from r3jax.kernels import scoring
+
+    return by_platform(cpu=answer_by(scoring), default=answer_by(dense))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(6,))

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.simulators.mesh_files import GLTF_SUFFIXES, MeshFile
 from r3jax.simulators.world import Material, World
+from r3jax.validation.errors import ForeignFileError
 
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _PLAIN = Material(color=(0.7, 0.7, 0.7))

@@ -8,7 +8,7 @@ import jax
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera
-from r3jax.native.platform import can_call_kernels
+from r3jax.kernels.native.platform import can_call_kernels
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 
@@ -62,7 +62,7 @@ def find_backend(name: str) -> Rasterize:
     if name == "numba" and not can_call_kernels():
         name = "xla"
     if name == "numba":
-        from r3jax.splatting.backends.numba import rasterize
+        from r3jax.kernels.splatting import rasterize
     elif name == "xla":
         from r3jax.splatting.backends.xla import rasterize
     elif name == "splax":

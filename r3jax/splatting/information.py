@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera
-from r3jax.native.platform import can_call_kernels
+from r3jax.kernels.native.platform import can_call_kernels
 from r3jax.splatting.backends.reference import composite_pixel
 from r3jax.splatting.config import RasterConfig, fitting_budget
 from r3jax.splatting.projection import project_gaussians
@@ -53,7 +53,7 @@ def pixel_squares(
         all sums are 0 then.
     """
     if _is_compiled(source):
-        from r3jax.splatting.backends.numba import squared_gradients
+        from r3jax.kernels.splatting import squared_gradients
 
         return squared_gradients(scene, camera, T_world_camera, background, config)
     return _dense_squares(scene, camera, T_world_camera, background), jnp.zeros((), jnp.int32)
@@ -89,7 +89,7 @@ def pixel_tallies(
     """
     least = jnp.array([least_through, least_weight], dtype=jnp.float32)
     if _is_compiled(source):
-        from r3jax.splatting.backends.numba import tallies
+        from r3jax.kernels.splatting import tallies
 
         return tallies(scene, camera, T_world_camera, value, counts, least, config)
     sums = _dense_tallies(scene, camera, T_world_camera, value, counts, least)

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.files import write_atomic
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import check_regular
 from r3jax.geometry.arguments import checked
 from r3jax.splatting.errors import SceneFileError
 from r3jax.splatting.scene import GaussianScene, a_scene
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import check_regular
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),

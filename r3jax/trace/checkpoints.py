@@ -23,10 +23,10 @@ from r3jax.checkpoints import (
     read_arrays,
     write_checkpoint,
 )
-from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.trace.errors import RunError
+from r3jax.validation.errors import ForeignFileError
 
 # Not one: if the newest is damaged, an older one still saves most of the mapping.
 KEPT = 3

@@ -11,18 +11,18 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import build, check_type
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.images import MAX_PIXELS
-from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
-from r3jax.formats.validation.names import check_relative
-from r3jax.formats.validation.versions import VersionError, check_version
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.policy import LivesOutside, Policy
 from r3jax.planning.robot.motion import Motion
 from r3jax.trace.errors import RunError
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import build, check_type
+from r3jax.validation.files import read_bytes
+from r3jax.validation.images import MAX_PIXELS
+from r3jax.validation.json_text import parse_json, sealed, unsealed
+from r3jax.validation.names import check_relative
+from r3jax.validation.versions import VersionError, check_version
 
 FORMAT = "r3jax-run"
 """What run.json says it is."""

@@ -7,10 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_type
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json, unsealed
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -20,6 +16,10 @@ from r3jax.trace.errors import RunError
 from r3jax.trace.header import RunHeader, read_header
 from r3jax.trace.images import content_hash, from_integers, read_png
 from r3jax.trace.rows import EndRow, StepRow, from_json
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_type
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json, unsealed
 
 _MAX_BYTES = 256 << 20
 """A trace has some kilobytes a view."""

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import build
-from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
 from r3jax.geometry.cameras import rigid_error
 from r3jax.planning.policy import Decision, PlanInfo
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import build
+from r3jax.validation.json_text import parse_json, sealed, unsealed
 
 TOP_CANDIDATES = 10
 """Candidates of a decision that a row keeps, the best ones by total utility."""

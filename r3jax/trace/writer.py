@@ -27,9 +27,6 @@ from r3jax.files import (
     sync_folder,
     write_atomic,
 )
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import sealed
 from r3jax.frame import Frame
 from r3jax.trace.checkpoints import CheckpointWriter
 from r3jax.trace.errors import RecordingStopped, RunError
@@ -37,6 +34,9 @@ from r3jax.trace.header import RunHeader, header_to_json, package_versions, read
 from r3jax.trace.images import encode_png, to_integers
 from r3jax.trace.reader import Run, complete_lines, read_run
 from r3jax.trace.rows import EndRow, StepRow, from_json, to_json
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import sealed
 
 _MAX_IMAGE_BYTES = 256 << 20
 """No encoded image of a run comes near it."""

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r3jax.baselines.births import grown
+from r3jax.baselines.online_map import Keyframes, _trained, empty_online_map
+from r3jax.baselines.settings import GAUSS_MI
 from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.rivals.births import grown
-from r3jax.rivals.online_map import Keyframes, _trained, empty_online_map
-from r3jax.rivals.settings import GAUSS_MI
 from tests.benchmarks.test_splatting import ROOM, room_cloud
 
 pytestmark = pytest.mark.full

@@ -17,7 +17,7 @@ from r3jax.formats.ros.bag_reader import read_bag
 from r3jax.formats.ros.messages import depth_of, is_color, lens_of, rgb_of
 from r3jax.formats.ros.names import Topics, parse_topics
 from r3jax.formats.ros.transforms import TransformTree
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 from tests.formats.bags import (
     COLOR,
     DEPTH,

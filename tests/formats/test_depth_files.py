@@ -11,7 +11,7 @@ from r3jax.formats.captures import open_capture
 from r3jax.formats.depth_files import stored_depth
 from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import read_transforms
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 from tests.formats.phones import LENS, OPENGL, exr, room_poses, view
 
 METERS = np.array([[0.0, np.nan, 1.5], [np.inf, -1.0, 2.25]], np.float32)

@@ -13,7 +13,7 @@ from r3jax.formats.ros.growing.bag import FollowedBag, growing_files, key_frames
 from r3jax.formats.ros.growing.mcap import McapFollower
 from r3jax.formats.ros.growing.rosbag1 import Rosbag1Follower
 from r3jax.formats.ros.unpack import MAX_CHUNK, unpack_chunk
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 from tests.formats.bags import Robot, camera_poses, moved, write_bag
 from tests.formats.phones import NUM
 

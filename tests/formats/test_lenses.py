@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from r3jax.formats.lenses import Lens, pinhole_lens
-from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import Camera
+from r3jax.validation.errors import ForeignFileError
 
 EXAMPLES = [
     (Lens("SIMPLE_PINHOLE", 3072, 2304, (2559.81, 1536.0, 1152.0)), (2559.81, 2559.81), {}),

@@ -12,7 +12,7 @@ from r3jax.formats.errors import FormatError
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.ros.rtabmap_database import read_rtabmap_database
 from r3jax.formats.ros.rvl import unpack_rvl
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 from tests.formats import rtabmap
 from tests.formats.bags import camera_poses, rvl
 from tests.formats.phones import FACTOR, LENS, NUM, Z_UP_FROM_ROOM

@@ -20,7 +20,7 @@ from r3jax.formats.submissions import (
     submission_text,
     write_submission,
 )
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 
 SCENE = {"name": "flat", "hash": "0" * 64, "noise": 0.01, "max_range": 5.0}
 SCENE |= {"up": None, "scale": 1.0, "cull_backfaces": False}

@@ -26,7 +26,7 @@ from r3jax.cli.commands import audit, benchmark, explore, replay, train
 from r3jax.cli.main import main
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.backends.numba import bridge as mapping
+from r3jax.kernels.mapping import bridge as mapping
 from r3jax.mapping.join import merge
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
+from r3jax.kernels import mapping
+from r3jax.kernels import visibility as visibility_kernels
 from r3jax.mapping import update
-from r3jax.mapping.backends import numba
 from r3jax.mapping.seen import mark_rows, rows_in_view
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate
-from r3jax.visibility.backends import numba as visibility_kernels
 from r3jax.visibility.selection import select
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.plain_kernels import kernels_as_python
@@ -25,7 +25,7 @@ from tests.plain_kernels import kernels_as_python
 WIDTH, HEIGHT, CAPACITY = 24, 40, 4096  # one shape: one compile; more rows than a block has
 CAMERA = Camera(WIDTH, HEIGHT, 40.0, 44.0, 11.0, 20.5)
 REACH = jnp.float32(3.0)
-MAPS = numba.__name__
+MAPS = mapping.__name__
 SIGHT = visibility_kernels.__name__
 CHAIN = (
     *(f"{SIGHT}.{name}" for name in ("views", "bricks")),
@@ -137,7 +137,7 @@ def asked(third: int = 2, reach: float = 3.0, drops: bool = True):
 
 
 def camera_of(state: MapState, frame: Frame) -> np.ndarray:
-    return np.array(numba._camera(state, frame.position, frame.camera.focal))
+    return np.array(mapping._camera(state, frame.position, frame.camera.focal))
 
 
 def law_add(modules: Modules) -> None:
@@ -154,12 +154,12 @@ def law_add(modules: Modules) -> None:
 def check_add(modules: Modules, third: int, reach: float = 3.0, *, drops: bool = True) -> None:
     state, frame, expected = asked(third, reach, drops)
     table = [np.array(getattr(state, name)) for name in ROWS]
-    numbers = numba._numbers(state, frame, jnp.float32(reach), jnp.asarray(drops))
+    numbers = mapping._numbers(state, frame, jnp.float32(reach), jnp.asarray(drops))
     lost = np.zeros(1, np.int32)
     with kernels_as_python():
         modules["add"].add_pass(
             table, camera_of(state, frame), np.array(frame.depth), np.array(frame.rgb),
-            np.array(numbers), *numba._tables(state.num_bins), 2, lost,
+            np.array(numbers), *mapping._tables(state.num_bins), 2, lost,
         )  # fmt: skip
     assert lost[0] == 0
     for name, found in zip(ROWS, table, strict=True):
@@ -220,7 +220,7 @@ def law_mark(modules: Modules) -> None:
     with kernels_as_python():
         modules["look"].mark_pass(
             visited, resolution, np.array(state.key), camera_of(state, frame), codes, in_holes,
-            *numba._tables(state.num_bins), 2,
+            *mapping._tables(state.num_bins), 2,
         )  # fmt: skip
     np.testing.assert_array_equal(visited, expected.visited)
     np.testing.assert_allclose(resolution, expected.resolution, rtol=1e-5)
@@ -228,7 +228,7 @@ def law_mark(modules: Modules) -> None:
 
 def law_nearest_bin(modules: Modules) -> None:
     """The nearest of all bins, also where the best is the last of a cell's candidates."""
-    table, lattice = numba._tables(64)
+    table, lattice = mapping._tables(64)
     size = np.float32(np.sqrt(len(table)))
     directions = np.random.default_rng(0).normal(size=(3000, 3))
     directions = (directions / np.linalg.norm(directions, axis=1)[:, None]).astype(np.float32)

@@ -6,13 +6,13 @@ import jax
 import numpy as np
 import pytest
 
+from r3jax.baselines.active_gamer import pool
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import empty_map
 from r3jax.planning import decision, greedy
 from r3jax.planning.candidates import Candidates, candidates_along, poses_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policies import frontier, random, renderability
-from r3jax.planning.policies.active_gamer import pool
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import MOTIONS, Motion
 from r3jax.planning.robot.travel import plan_travel
@@ -23,7 +23,7 @@ from tests.planning.test_motions_of_policies import CAMERA, CONSTRAINED, assert_
 CHAIN = (
     "r3jax.planning.decision",
     "r3jax.planning.greedy",
-    "r3jax.planning.policies.active_gamer.pool",
+    "r3jax.baselines.active_gamer.pool",
     "r3jax.planning.policies.renderability",
     "r3jax.planning.policies.random",
     "r3jax.planning.policies.frontier",

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 import r3jax
 from r3jax.geometry.voxels import pack
+from r3jax.kernels.native import platform
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.native import platform
 from r3jax.planning.candidates import poses_along
 from r3jax.scoring import backend
 from r3jax.scoring.backends import dense, reference

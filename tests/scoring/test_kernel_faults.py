@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
-from r3jax.scoring.backends import numba, reference
+from r3jax.kernels import scoring
+from r3jax.scoring.backends import reference
 from r3jax.scoring.backends.views import row_of
 from r3jax.scoring.cells import cells_of
 from r3jax.scoring.terms import score_voxels
@@ -29,8 +30,8 @@ from tests.scoring.test_backends import (
     world,
 )
 
-SIGHT, SCORES = numba.visibility_kernels.__name__, numba.__name__
-BINS = f"{numba.mapping_kernels.__name__}.bins"
+SIGHT, SCORES = scoring.visibility_kernels.__name__, scoring.__name__
+BINS = f"{scoring.mapping_kernels.__name__}.bins"
 CHAIN = (
     *(f"{SIGHT}.{name}" for name in ("views", "picture", "splat", "limit", "seen", "bricks")),
     BINS,

@@ -25,12 +25,12 @@ from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.formats.normalization import NAME, read_normalization
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields, check_type
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.reader import Run
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields, check_type
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json, sealed, unsealed
 
 _MAX_BYTES = 256 << 20
 """A pose takes some hundred bytes."""

@@ -22,8 +22,8 @@ from r3jax.apps.audit.pages.audit_colors import cause_colors, score_colors
 from r3jax.files import write_atomic
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.formats.points import write_points
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json
 
 FORMAT = 1
 """Version of audit.json."""

@@ -27,10 +27,10 @@ from r3jax.formats.lenses import Lens, pinhole_lens
 from r3jax.formats.points import read_points
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.recordings import Recording
-from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.trace.reader import Run
+from r3jax.validation.errors import ForeignFileError
 
 _RADIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE",

@@ -15,13 +15,13 @@ from r3jax.apps.benchmark.cells import Cell, paths_of
 from r3jax.apps.benchmark.conditions import snapshot_order
 from r3jax.evaluation.scores import METRICS, ViewRow, summarize
 from r3jax.files import write_atomic
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
-from r3jax.formats.validation.versions import VersionError, check_version
 from r3jax.trace.header import package_versions, plain_settings
 from r3jax.trace.rows import StepRow
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json, sealed, unsealed
+from r3jax.validation.versions import VersionError, check_version
 
 FORMAT = 1
 """Format version of a record."""

@@ -18,10 +18,10 @@ import numpy as np
 from r3jax.apps.benchmark.cells import Cell
 from r3jax.apps.benchmark.conditions import Conditions
 from r3jax.files import make_folder, write_atomic
-from r3jax.formats.validation.arrays import read_npz
-from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.splatting.views import Views
+from r3jax.validation.arrays import read_npz
+from r3jax.validation.errors import ForeignFileError
 
 FOLDER = "test_views"
 """Folder of a benchmark's test views: poses and images."""

@@ -24,11 +24,11 @@ from pathlib import Path
 import numpy as np
 
 from r3jax.files import write_atomic
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json
-from r3jax.formats.validation.versions import check_version
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json
+from r3jax.validation.versions import check_version
 
 MEAN = "mean"
 """Name of the statistic that is not a percentile; those are `p10`, `p50`, ..."""

@@ -31,11 +31,6 @@ from r3jax.files import (
 from r3jax.formats.captures import Capture
 from r3jax.formats.errors import FormatError
 from r3jax.formats.points import write_points
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_type
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
-from r3jax.formats.validation.versions import check_version
 from r3jax.splatting.harmonics import C0
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.scene import GaussianScene
@@ -43,6 +38,11 @@ from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.train import FitResult, History
 from r3jax.splatting.views import Views
 from r3jax.trace.header import package_versions
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_type
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json, sealed, unsealed
+from r3jax.validation.versions import check_version
 
 RECORD_FORMAT = 1
 """Format version of train.json."""

@@ -13,20 +13,20 @@ import numpy as np
 
 from r3jax.apps.models.folder import TrainedModel
 from r3jax.apps.models.test_sets import TestSet, frames_of, mapped_views
-from r3jax.apps.report import style
-from r3jax.apps.report.contact_sheet import SheetView, contact_sheet
 from r3jax.evaluation.evaluate import Evaluation, evaluate
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
 from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
 from r3jax.files import check_replaceable, holds, make_folder, write_atomic
 from r3jax.formats.captures import Capture
-from r3jax.formats.validation.json_text import sealed
 from r3jax.mapping.state import MapState
+from r3jax.plots import style
+from r3jax.plots.contact_sheet import SheetView, contact_sheet
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.views import Views, load_views
 from r3jax.trace.header import package_versions
+from r3jax.validation.json_text import sealed
 
 OnProgress = Callable[[str, int], None]
 """Told that a stage of so many steps begins, or, without a name, that so many steps are done."""

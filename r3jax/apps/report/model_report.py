@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from r3jax.apps.report import style
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields, check_type
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json, unsealed
+from r3jax.plots import style
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields, check_type
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json, unsealed
 
 _TITLES = {
     "psnr": ("PSNR [dB]", 2),

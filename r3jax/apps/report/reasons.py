@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from r3jax.apps.report import style
 from r3jax.exploration.explain_run import explain_run
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.plots import style
 from r3jax.scoring.explain import CAUSES
 from r3jax.trace.reader import Run
 

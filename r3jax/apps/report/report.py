@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from matplotlib.figure import Figure
 
 from r3jax.apps.forecast.outlook import Outlook
-from r3jax.apps.report import figures, style
+from r3jax.apps.report import figures
 from r3jax.apps.report.figures import outlook_figure, outlook_lines
 from r3jax.apps.report.model_report import (
     EvaluatedModel,
@@ -17,14 +17,16 @@ from r3jax.apps.report.model_report import (
     read_evaluated_model,
     training_figure,
 )
-from r3jax.apps.report.page import image, page, section
-from r3jax.apps.report.pictures import panorama_picture
 from r3jax.apps.report.reasons import reasons_figure, utility_by_cause
 from r3jax.apps.report.summary import StageTime, count_of_views, stage_times, summary
 from r3jax.exploration.replay import states_of
 from r3jax.files import make_folder, own_folder, write_atomic
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.plots import style
+from r3jax.plots.page import image, page, section
+from r3jax.plots.panorama import panorama_figure
+from r3jax.plots.pictures import panorama_picture
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import Run
 
@@ -111,7 +113,7 @@ def write_report(
         "progress": figures.progress_figure(run),
         "reasons": _reasons(run, outlook, on_progress),
         "forecast": _forecast(outlook, map_state, grid),
-        "panorama": figures.panorama_figure(panorama),
+        "panorama": panorama_figure(panorama),
         "views": figures.strip_figure(run),
         "cost": figures.cost_figure(run),
     }

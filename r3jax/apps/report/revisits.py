@@ -7,11 +7,11 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from r3jax.apps.report import style
 from r3jax.exploration.config import check_voxel_size
 from r3jax.formats.recordings import Recording
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
+from r3jax.plots import style
 from r3jax.scoring.renderability import renderability
 
 

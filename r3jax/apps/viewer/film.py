@@ -24,8 +24,8 @@ from r3jax.apps.viewer.stills import Sheet, Squares, compose, draw, lines, overv
 from r3jax.apps.viewer.story import Timeline
 from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic
 from r3jax.formats.errors import FormatError
-from r3jax.formats.validation.packages import why_not_imported
 from r3jax.trace.reader import Run
+from r3jax.validation.packages import why_not_imported
 
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "mpeg4")
 """Tried in this order: H.264 by three programs, and what every FFmpeg has."""

@@ -5,13 +5,13 @@ from collections import deque
 from r3jax.apps.forecast.outlook import Outlook
 from r3jax.apps.forecast.psnr import default_calibration, read_calibration
 from r3jax.apps.report.figures import LEVEL, outlook_figure, outlook_lines
-from r3jax.apps.report.style import PNG_MARK, to_png
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options import ForecastOptions
 from r3jax.cli.progress import Stages
 from r3jax.exploration.replay import states_of
 from r3jax.files import check_replaceable, write_atomic
+from r3jax.plots.style import PNG_MARK, to_png
 from r3jax.trace.errors import RunError
 from r3jax.trace.reader import read_run
 

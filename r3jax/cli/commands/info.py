@@ -39,7 +39,7 @@ def run_info(options: InfoOptions) -> int:
 
 
 def _show_inventory(console: Console) -> None:
-    from r3jax.native.platform import describe_kernels
+    from r3jax.kernels.native.platform import describe_kernels
     from r3jax.planning.registry import describe, policy_names
     from r3jax.simulators.scenes import registry
     from r3jax.trace.header import package_versions
@@ -86,7 +86,7 @@ def _show_run(console: Console, path: Path) -> None:
 
 def _show_recording(console: Console, options: InfoOptions, path: Path) -> None:
     from r3jax.apps.report.revisits import FrameReport, follow_recording, revisit_figure
-    from r3jax.apps.report.style import PNG_MARK, to_png
+    from r3jax.plots.style import PNG_MARK, to_png
 
     if options.plot is not None:
         check_replaceable(options.plot, PNG_MARK)

@@ -14,8 +14,8 @@ from r3jax.files import write_atomic
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import MODELS, NAMES, Lens
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import read_bytes
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import read_bytes
 
 _MAX_BYTES = 4 << 30
 """Models of cities are no larger."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from r3jax.formats.lenses import Lens
 from r3jax.formats.poses import MAX_DISTANCE, MAX_DRIFT
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 
 NO_POINT = -1
 """In place of a point's id, where a keypoint belongs to none."""

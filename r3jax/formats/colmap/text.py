@@ -12,8 +12,8 @@ from r3jax.files import write_atomic
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import Lens
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import plain_text, read_bytes
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import plain_text, read_bytes
 
 T = TypeVar("T")
 

@@ -13,10 +13,10 @@ import numpy as np
 from r3jax.formats.depth_files import DEPTH_MODES, stored_depth
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.posed_images import IMAGE_FORMATS
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import check_regular, read_bytes
-from r3jax.formats.validation.images import image_pixels, image_size
-from r3jax.formats.validation.json_text import parse_json
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import check_regular, read_bytes
+from r3jax.validation.images import image_pixels, image_size
+from r3jax.validation.json_text import parse_json
 
 SUFFIXES = (".zip", ".r3d")
 """Names of files that are zip archives."""

@@ -23,8 +23,8 @@ from r3jax.formats.phones.shots import UP_Z, Shot, complete_shots, confident_dep
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import mend_pose
 from r3jax.formats.sequences.tum import nearest
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import plain_text
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import plain_text
 
 _BEST = 2
 _TRAJECTORY, _CAMERAS = "lowres_wide.traj", "lowres_wide_intrinsics"

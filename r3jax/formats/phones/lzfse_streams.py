@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from r3jax.formats.errors import FormatError
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.packages import why_not_imported
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.packages import why_not_imported
 
 
 def load_decoder(path: Path) -> Any:

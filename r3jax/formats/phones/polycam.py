@@ -22,7 +22,7 @@ from r3jax.formats.phones.archives import Archive, find_archive, is_there
 from r3jax.formats.phones.shots import UP_Y, Shot, complete_shots, confident_depth, posed_images
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.formats.validation.fields import check_fields
+from r3jax.validation.fields import check_fields
 
 _BEST = 255
 _FARTHEST = 5.0

@@ -30,8 +30,8 @@ from r3jax.formats.phones.lzfse_streams import load_decoder, unpack_lzfse
 from r3jax.formats.phones.shots import MILLIMETERS, UP_Y, Shot, complete_shots, posed_images
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.quaternion_poses import quaternion_pose
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields, check_type
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields, check_type
 
 _BEST = 2
 _DEPTH_SIZES = ((256, 192), (640, 480))

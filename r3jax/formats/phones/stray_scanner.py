@@ -24,8 +24,8 @@ from r3jax.formats.phones.shots import UP_Y, Shot, complete_shots, confident_dep
 from r3jax.formats.phones.videos import Video
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.quaternion_poses import quaternion_pose
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import check_regular, plain_text
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import check_regular, plain_text
 
 _BEST = 2
 _POSE = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from r3jax.formats.errors import FormatError
-from r3jax.formats.validation.images import MAX_PIXELS
-from r3jax.formats.validation.packages import why_not_imported
+from r3jax.validation.images import MAX_PIXELS
+from r3jax.validation.packages import why_not_imported
 
 _AHEAD = 90
 """Frames so close before the next one asked for are decoded rather than jumped over."""

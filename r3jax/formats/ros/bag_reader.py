@@ -34,7 +34,7 @@ from r3jax.formats.ros.topics import (
 )
 from r3jax.formats.ros.transforms import TransformTree
 from r3jax.formats.sequences.tum import nearest
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 
 _MAX_GAP = 0.02
 """Color and depth farther apart than this do not belong together [s]."""

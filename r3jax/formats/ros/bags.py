@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.ros.unpack import unpack_chunk
-from r3jax.formats.validation.database import check_database
-from r3jax.formats.validation.files import check_regular
-from r3jax.formats.validation.packages import why_not_imported
+from r3jax.validation.database import check_database
+from r3jax.validation.files import check_regular
+from r3jax.validation.packages import why_not_imported
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Files of ROS 1, and of ROS 2's two storages."""

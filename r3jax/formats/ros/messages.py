@@ -15,8 +15,8 @@ from r3jax.formats.depth_files import DEPTH_MODES
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import IMAGE_FORMATS
 from r3jax.formats.ros.rvl import unpack_rvl
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.images import MAX_PIXELS, image_pixels, image_size
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"

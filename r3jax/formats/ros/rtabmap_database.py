@@ -33,9 +33,9 @@ from r3jax.formats.poses import mend_pose
 from r3jax.formats.ros.messages import clean_depth, rectified_lens
 from r3jax.formats.ros.rtabmap_export import COMMAND
 from r3jax.formats.ros.rvl import unpack_rvl
-from r3jax.formats.validation.database import check_database, query_database
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size
+from r3jax.validation.database import check_database, query_database
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.images import MAX_PIXELS, image_pixels, image_size
 
 _HEADER = 11
 _RVL = b"DEPTHRVL"

@@ -23,8 +23,8 @@ from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import read_numbers
 from r3jax.formats.quaternion_poses import quaternion_pose
 from r3jax.formats.ros.messages import rectified_lens
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import plain_text
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import plain_text
 
 COMMAND = "rtabmap-export --images_id --poses_camera --poses_format 11 {}"
 """What a user runs on a database."""

@@ -9,8 +9,8 @@ import struct
 
 import numpy as np
 
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.images import MAX_PIXELS
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.images import MAX_PIXELS
 
 _SIZE = struct.Struct("<II")
 """Columns and rows, before the stream."""

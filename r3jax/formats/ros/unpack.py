@@ -4,7 +4,7 @@ import bz2
 import sys
 from typing import Any
 
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 
 MAX_CHUNK = 256 << 20
 """Recorders begin another chunk after about a megabyte; some users let them wait longer [bytes]."""

@@ -20,10 +20,10 @@ from r3jax.formats.posed_images import DepthUnit, PosedImages
 from r3jax.formats.poses import mend_pose, read_numbers
 from r3jax.formats.recordings import pair_images
 from r3jax.formats.sequences.scannet import UP
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_fields
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_fields
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json
 
 _MAX_JSON = 1 << 20
 """A camera takes some hundred bytes."""

@@ -20,7 +20,7 @@ from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import IMAGE_FORMATS, PosedImages
 from r3jax.formats.poses import mend_pose, read_lines, to_floats
-from r3jax.formats.validation.images import first_size
+from r3jax.validation.images import first_size
 
 UP = np.array([0.0, 0.0, 1.0])
 

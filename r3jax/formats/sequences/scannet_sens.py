@@ -19,9 +19,9 @@ from r3jax.formats.lenses import Lens
 from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, Pixels, PosedImages
 from r3jax.formats.poses import mend_pose
 from r3jax.formats.sequences.scannet import UP, lost, scannet_lens
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.files import check_regular
-from r3jax.formats.validation.images import MAX_PIXELS, image_pixels, image_size
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import check_regular
+from r3jax.validation.images import MAX_PIXELS, image_pixels, image_size
 
 _VERSION = 4
 _COLOR_CODECS, _DEPTH_CODECS = (1, 2), (0, 1)

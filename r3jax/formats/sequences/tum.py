@@ -24,9 +24,9 @@ from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
 from r3jax.formats.poses import read_lines, read_numbers, to_floats
 from r3jax.formats.quaternion_poses import quaternion_pose
 from r3jax.formats.sequences.scannet import UP
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.images import first_size
-from r3jax.formats.validation.names import below
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.images import first_size
+from r3jax.validation.names import below
 
 _MAX_GAP = 0.02
 """Images and poses farther apart than this do not belong together [s]."""

@@ -10,33 +10,28 @@ import importlib.util
 import re
 from importlib.metadata import entry_points
 
-from r3jax.formats.validation.choices import did_you_mean
 from r3jax.planning.policies.foreign.commands import COMMAND, words_of
+from r3jax.validation.choices import did_you_mean
 
 GROUP = "r3jax.policies"
 """Entry points by which other packages offer policies: `name = "package.module:Class"`."""
 
 HOMES = {
-    name: f"r3jax.planning.policies.{home}"
+    name: f"r3jax.{home}"
     for name, home in {
-        "ours": "renderability:Ours",
-        "ours-pano": "renderability:OursPano",
-        "ours-ahead": "ahead:OursAhead",
-        "r3con": "r3con:R3con",
-        "active-gs": "active_gs:ActiveGS",
-        "active-gamer": "active_gamer:ActiveGamer",
-        "cover": "cover:Cover",
-        "gavis": "gavis:Gavis",
-        "frontier": "frontier:Frontier",
-        "random": "random:Random",
-    }.items()
-} | {
-    # These keep a radiance field, which nothing in `r3jax.planning` may.
-    name: f"r3jax.rivals.{home}"
-    for name, home in {
-        "active-gs-online": "active_gs_online:ActiveGSOnline",
-        "fisherrf": "fisherrf:FisherRF",
-        "gauss-mi": "gauss_mi:GaussMI",
+        "ours": "planning.policies.renderability:Ours",
+        "ours-pano": "planning.policies.renderability:OursPano",
+        "ours-ahead": "planning.policies.ahead:OursAhead",
+        "r3con": "baselines.r3con:R3con",
+        "active-gs": "baselines.active_gs:ActiveGS",
+        "active-gs-online": "baselines.active_gs_online:ActiveGSOnline",
+        "active-gamer": "baselines.active_gamer:ActiveGamer",
+        "cover": "baselines.cover:Cover",
+        "gavis": "baselines.gavis:Gavis",
+        "fisherrf": "baselines.fisherrf:FisherRF",
+        "gauss-mi": "baselines.gauss_mi:GaussMI",
+        "frontier": "planning.policies.frontier:Frontier",
+        "random": "planning.policies.random:Random",
     }.items()
 }
 """Module and class of every policy of this package."""

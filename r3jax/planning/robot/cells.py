@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from r3jax.native.platform import compiled_or_plain
+from r3jax.kernels.native.platform import compiled_or_plain
 
 BORDER = 1e-3
 """A segment that passes a corner closer than this counts as touching it [cells]."""

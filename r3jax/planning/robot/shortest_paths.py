@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from r3jax.native.platform import compiled_or_plain
+from r3jax.kernels.native.platform import compiled_or_plain
 
 _LONGEST = 6
 """Cells between the two ends of a diagonal step through space."""

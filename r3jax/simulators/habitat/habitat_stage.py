@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_type
-from r3jax.formats.validation.files import check_regular, read_bytes
-from r3jax.formats.validation.json_text import parse_json
 from r3jax.simulators.habitat.habitat_poses import BARE_GLB, habitat_from_axes
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_type
+from r3jax.validation.files import check_regular, read_bytes
+from r3jax.validation.json_text import parse_json
 
 _CONFIG = ".stage_config.json"
 _PLY = ".ply"

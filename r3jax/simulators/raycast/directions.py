@@ -12,9 +12,9 @@ Shape symbols: n rays; m pixels; S rays inside a pixel.
 import numpy as np
 from numba import prange
 
-from r3jax.native.arithmetic import fused
-from r3jax.native.compiled import called_from_python, inlined
-from r3jax.native.ffi import num_workers, require_threads
+from r3jax.kernels.native.arithmetic import fused
+from r3jax.kernels.native.compiled import called_from_python, inlined
+from r3jax.kernels.native.ffi import num_workers, require_threads
 
 _EDGE_CONTRAST = np.float32(12.0 / 255.0)
 """Neighbors that differ by less in every channel get no more rays: with a third of this, half as

@@ -22,8 +22,8 @@ import numpy as np
 from llvmlite import ir
 from numba import prange, types
 
-from r3jax.native.compiled import called_from_python, inlined, intrinsic
-from r3jax.native.ffi import num_workers, require_threads
+from r3jax.kernels.native.compiled import called_from_python, inlined, intrinsic
+from r3jax.kernels.native.ffi import num_workers, require_threads
 from r3jax.simulators.raycast.rays import MAX_LAYERS
 
 _LANES = 16

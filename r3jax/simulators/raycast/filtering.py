@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from r3jax.native.arithmetic import floor, fused, log2, whole
-from r3jax.native.compiled import in_wide_vectors, inlined, inlined_fused
+from r3jax.kernels.native.arithmetic import floor, fused, log2, whole
+from r3jax.kernels.native.compiled import in_wide_vectors, inlined, inlined_fused
 from r3jax.simulators.raycast.shading_tables import MAX_LEVELS
 
 PROBES = 2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.native.platform import missing_for_machine_code
+from r3jax.kernels.native.platform import missing_for_machine_code
 
 MAX_LAYERS = 64
 """Back faces that a ray may pass before it counts as a miss."""

@@ -24,15 +24,15 @@ from pathlib import Path
 import numpy as np
 from numba import prange
 
-from r3jax.native.arithmetic import exp2, fused, log2
-from r3jax.native.compiled import (
+from r3jax.kernels.native.arithmetic import exp2, fused, log2
+from r3jax.kernels.native.compiled import (
     called_from_python,
     forget_outdated_code,
     in_wide_vectors,
     inlined,
     inlined_fused,
 )
-from r3jax.native.ffi import num_workers, require_threads
+from r3jax.kernels.native.ffi import num_workers, require_threads
 from r3jax.simulators.raycast.filtering import (
     BLOCK,
     COLOR,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
-from r3jax.native.platform import num_cores
+from r3jax.kernels.native.platform import num_cores
 from r3jax.simulators.world import World
 
 MAX_LEVELS = 14

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 
 from r3jax.geometry.cameras import Camera
-from r3jax.native.ahead import compile_ahead
-from r3jax.native.platform import is_cpu_only, missing_for_machine_code
+from r3jax.kernels.native.ahead import compile_ahead
+from r3jax.kernels.native.platform import is_cpu_only, missing_for_machine_code
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.habitat.habitat import HabitatSimulator

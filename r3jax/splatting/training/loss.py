@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r3jax.native.platform import by_platform
+from r3jax.kernels.native.platform import by_platform
 
 RADIUS = 5
 """The window of SSIM has 2 x 5 + 1 pixels a side."""
@@ -49,7 +49,7 @@ def _by_kernels(
     target: Float[Array, "H W 3"],
     lambda_dssim: Float[Array, ""] | float,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    from r3jax.splatting.training.backends.numba import image_loss
+    from r3jax.kernels.training import image_loss
 
     return image_loss(rgb, target, lambda_dssim)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.native.platform import by_platform
+from r3jax.kernels.native.platform import by_platform
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
 
@@ -111,7 +111,7 @@ def _by_kernels(
     config: TrainConfig,
     is_wanted: Bool[Array, ""],
 ) -> tuple[GaussianScene, Moments, Bool[Array, ""]]:
-    from r3jax.splatting.training.backends.numba import adam_step
+    from r3jax.kernels.training import adam_step
 
     rates = [rate_of_means, config.rate_quats, config.rate_log_scales, config.rate_opacities]
     rates += [config.rate_sh, config.rate_sh * _HIGHER_HARMONICS]

@@ -21,8 +21,8 @@ from r3jax.apps.audit.source import (
 )
 from r3jax.formats.lenses import MODELS, Lens
 from r3jax.formats.nerfstudio import read_transforms
-from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import Camera
+from r3jax.validation.errors import ForeignFileError
 from tests.apps.audit.room import (
     FOCAL,
     HEIGHT,

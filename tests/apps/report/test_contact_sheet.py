@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from r3jax.apps.report import style
-from r3jax.apps.report.contact_sheet import ERROR_SCALE, SheetView, contact_sheet, error_picture
-from r3jax.apps.report.pictures import BEYOND
+from r3jax.plots import style
+from r3jax.plots.contact_sheet import ERROR_SCALE, SheetView, contact_sheet, error_picture
+from r3jax.plots.pictures import BEYOND
 from tests.evaluation.test_scores import row
 
 HEIGHT, WIDTH = 6, 8

@@ -13,9 +13,7 @@ import pytest
 from matplotlib.collections import LineCollection
 
 from r3jax.apps.forecast.forecast import forecast_map
-from r3jax.apps.report import style
 from r3jax.apps.report.figures import plan_figure, progress_figure
-from r3jax.apps.report.pictures import floor_picture, panorama_picture
 from r3jax.apps.report.reasons import COLORS, reasons_figure, shares_of, utility_by_cause
 from r3jax.apps.report.report import write_report
 from r3jax.apps.report.summary import map_row_bytes, stage_times, summary
@@ -26,6 +24,8 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
+from r3jax.plots import style
+from r3jax.plots.pictures import floor_picture, panorama_picture
 from r3jax.scoring.explain import CAUSES
 from r3jax.trace.errors import RunError
 from r3jax.trace.header import camera_fields

@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import spearmanr
 
 from r3jax.apps.report.revisits import follow_recording, revisit_figure
-from r3jax.apps.report.style import to_png
 from r3jax.formats.recordings import read_recording
+from r3jax.plots.style import to_png
 
 VOXEL, RANGE = 0.05, 5.0
 

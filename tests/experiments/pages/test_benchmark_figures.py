@@ -16,7 +16,7 @@ from experiments.pages.benchmark_figures import (
     sweep_figure,
 )
 from experiments.pages.policy_style import OKABE_ITO, legend_below, styles_of
-from r3jax.apps.report import style
+from r3jax.plots import style
 from tests.evaluation.records import SKILL, benchmark, record
 
 SNAPSHOTS = (10, 30, 60)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.pages.positions_figure import positions_figure
-from r3jax.apps.report import style
+from r3jax.plots import style
 from tests.experiments.pages.test_benchmark_figures import assert_drawn_inside
 
 LOW, HIGH = np.zeros(3), np.array([6.0, 5.0, 2.5])

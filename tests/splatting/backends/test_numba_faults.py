@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.cameras import invert_pose
+from r3jax.kernels.splatting import records
 from r3jax.splatting.backends import reference
-from r3jax.splatting.backends.numba import records
 from r3jax.splatting.config import ALPHA_MIN, TILE, RasterConfig
 from r3jax.splatting.information import pixel_squares, pixel_tallies
 from r3jax.splatting.projection import project_gaussians
@@ -21,7 +21,7 @@ from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.plain_kernels import kernels_as_python
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
-PACKAGE = "r3jax.splatting.backends.numba"
+PACKAGE = "r3jax.kernels.splatting"
 CHAIN = tuple(
     f"{PACKAGE}.{name}"
     for name in (

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numba import njit
 
-from r3jax.splatting.backends.numba import lanes
+from r3jax.kernels.splatting import lanes
 
 rows = hnp.arrays(np.float32, 16, elements=st.floats(-100.0, 100.0, width=32))
 

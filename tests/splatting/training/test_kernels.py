@@ -6,16 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.native import ffi
-from r3jax.native.compiled import flush_denormals, parallel_kernel
+from r3jax.kernels import training
+from r3jax.kernels.native import ffi
+from r3jax.kernels.native.compiled import flush_denormals, parallel_kernel
 from r3jax.splatting.scene import GaussianScene, empty_scene
 from r3jax.splatting.training import loss, optimizer
-from r3jax.splatting.training.backends import numba
 from r3jax.splatting.training.config import TrainConfig
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.plain_kernels import kernels_as_python
 
-CHAIN = tuple(f"{numba.__name__}.{name}" for name in ("image_loss", "adam"))
+CHAIN = tuple(f"{training.__name__}.{name}" for name in ("image_loss", "adam"))
 WEIGHT = 0.3
 SIZES = ((7, 5), (24, 20), (70, 33), (1, 1))
 """Of images: lower than the window, of whole vectors, of several bands, a pixel."""

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib import colormaps
 
 from r3jax.apps.audit.diagnosis import FINE
-from r3jax.apps.report import style
-from r3jax.apps.report.pictures import floor_picture
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
 from r3jax.planning.planner import Planner
+from r3jax.plots import style
+from r3jax.plots.pictures import floor_picture
 from r3jax.scoring.renderability import voxel_renderability
 
 _PLACES = 6

@@ -3,7 +3,7 @@
 import numpy as np
 
 from r3jax.apps.audit.diagnosis import CAUSES, Diagnosis
-from r3jax.apps.report import style
+from r3jax.plots import style
 
 COLOR_OF_CAUSE = {
     "fine": "#a7c4a0",

@@ -13,10 +13,10 @@ from r3jax.apps.audit.bad_regions import BLOCK, Region
 from r3jax.apps.audit.pages.audit_colors import COLOR_OF_CAUSE
 from r3jax.apps.audit.pages.ground_plan import letter
 from r3jax.apps.audit.suggest import Suggestion
-from r3jax.apps.report import style
-from r3jax.apps.report.figures import empty_directions, show_renderability
-from r3jax.apps.report.pictures import panorama_picture
 from r3jax.mapping.state import MapState
+from r3jax.plots import style
+from r3jax.plots.panorama import empty_directions, show_renderability
+from r3jax.plots.pictures import panorama_picture
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
 from r3jax.scoring.simulated import simulate_view

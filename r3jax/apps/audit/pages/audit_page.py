@@ -16,9 +16,9 @@ from r3jax.apps.audit.pages.audit_figures import region_figure
 from r3jax.apps.audit.pages.faults_section import faults_section
 from r3jax.apps.audit.pages.ground_plan import letter, plan_figure
 from r3jax.apps.audit.suggest import Suggestion
-from r3jax.apps.report import style
-from r3jax.apps.report.page import image, page, section
 from r3jax.files import write_atomic
+from r3jax.plots import style
+from r3jax.plots.page import image, page, section
 
 
 def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path:

@@ -6,7 +6,7 @@ from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.faults.faults import Finding
 from r3jax.apps.audit.pages.sentences import CONTRADICTED
 from r3jax.apps.audit.pages.thumbnails import small_png
-from r3jax.apps.report.page import image, section
+from r3jax.plots.page import image, section
 
 _SHOWN = 8
 """Pictures of a finding that are shown."""

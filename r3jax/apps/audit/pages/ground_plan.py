@@ -10,8 +10,8 @@ from r3jax.apps.audit.alignment import Alignment
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import BLOCK, Region
 from r3jax.apps.audit.pages.audit_colors import COLOR_OF_CAUSE
-from r3jax.apps.report import style
-from r3jax.apps.report.pictures import floor_picture
+from r3jax.plots import style
+from r3jax.plots.pictures import floor_picture
 
 _HEADROOM = 0.35
 """As in `floor_picture`: what lies higher above the cameras is left out [audit units]."""

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from r3jax.apps.benchmark.cells import Cell
-from r3jax.native.platform import num_cores
+from r3jax.kernels.native.platform import num_cores
 
 if TYPE_CHECKING:
     from r3jax.apps.benchmark.cells import Cell

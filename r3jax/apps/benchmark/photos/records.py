@@ -16,8 +16,8 @@ from r3jax.evaluation.evaluate import ImageMetric
 from r3jax.evaluation.scores import summarize
 from r3jax.evaluation.statistics import Estimate, mean_over_scenes, paired_difference
 from r3jax.files import make_folder, write_atomic
-from r3jax.formats.validation.files import read_bytes
-from r3jax.formats.validation.json_text import parse_json, sealed, unsealed
+from r3jax.validation.files import read_bytes
+from r3jax.validation.json_text import parse_json, sealed, unsealed
 
 FORMAT = 1
 """Format version of a record."""

@@ -25,8 +25,8 @@ from r3jax.formats.ros.growing.rosbag1 import Rosbag1Follower
 from r3jax.formats.ros.messages import CAMERA_INFO, COMPRESSED, IMAGE
 from r3jax.formats.ros.names import Topics
 from r3jax.formats.ros.topics import POSES, TF
-from r3jax.formats.validation.errors import ForeignFileError
 from r3jax.geometry.cameras import angle_between
+from r3jax.validation.errors import ForeignFileError
 
 _ACTIVE = ".bag.active"
 _READ = (IMAGE, COMPRESSED, CAMERA_INFO, *TF, *POSES)

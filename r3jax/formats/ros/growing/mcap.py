@@ -13,7 +13,7 @@ from pathlib import Path
 
 from r3jax.formats.ros.growing.record_files import Channel, GrowingFile, Note
 from r3jax.formats.ros.unpack import unpack_chunk
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from r3jax.formats.ros.growing.record_files import Channel, GrowingFile, Note
 from r3jax.formats.ros.unpack import unpack_chunk
-from r3jax.formats.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7

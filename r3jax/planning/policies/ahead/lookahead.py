@@ -27,8 +27,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import shortest_path
 
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.native.platform import num_cores
 from r3jax.mapping.state import MapState
-from r3jax.native.platform import num_cores
 from r3jax.planning.candidates import Candidates, best_views, poses_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.robot.limits import Limits

@@ -16,8 +16,6 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.formats.validation.errors import ForeignFileError
-from r3jax.formats.validation.fields import check_type
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -40,6 +38,8 @@ from r3jax.planning.policies.foreign.program import Program, limits_memory, netw
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PolicyError, Situation
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.travel import Travel
+from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.fields import check_type
 
 PROTOCOL = 1
 """Version of the messages."""

@@ -18,8 +18,8 @@ from r3jax.apps.benchmark.photos.pool import (
 from r3jax.apps.benchmark.photos.protocol import PhotoTerms, run_photos
 from r3jax.apps.benchmark.photos.records import kept_or_made, record_path, table_rows
 from r3jax.cli.main import main
-from r3jax.formats.validation.json_text import unsealed
 from r3jax.splatting.scene import GaussianScene
+from r3jax.validation.json_text import unsealed
 from tests.apps.benchmark.photos.room import NUM, TERMS, write_recording
 
 

@@ -1,0 +1,401 @@
+"""A Gaussian map that grows with every key frame: the one map that all rivals here keep.
+
+After a frame: Gaussians are born where the map renders it wrongly, some steps of Adam follow over
+this and earlier frames, and now and then what is faint goes. All randomness follows from the key
+of the run and the number of key frames, so that the same frames make the same map.
+
+Shape symbols: n rows of the scene; F key frames; h w their size; m marks per Gaussian.
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
+
+from r3jax.baselines.births import born_in, grown, kept_rows
+from r3jax.baselines.settings import MapSettings
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.splatting.backend import find_backend
+from r3jax.splatting.config import DILATION, FRUSTUM_MARGIN, NEAR, RasterConfig
+from r3jax.splatting.harmonics import C0
+from r3jax.splatting.information import on_cpu, pixel_tallies, with_room
+from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene, empty_scene
+from r3jax.splatting.training.config import TrainConfig
+from r3jax.splatting.training.optimizer import Moments, adam_update, empty_moments
+from r3jax.splatting.views import fitted_size, load_views
+
+FIRST_CAPACITY = 1 << 14
+"""Rows at the start; they double when they are used up."""
+
+FIRST_ERROR = 10.0
+"""Error of a key frame that has not been trained on: it comes first."""
+
+_OPAQUE = 1e-3
+"""Colors count where the map is more opaque than this."""
+
+_REACH = 3.4
+"""Standard deviations beyond which no Gaussian is drawn: alpha is below 1/255 there."""
+
+SUPPORT = 0.03
+"""A key frame sees a Gaussian that weighs more than this at one of its pixels with depth."""
+
+_LONGEST_STEP = 3.2
+"""Steps of Adam are at most so many learning rates long: (1 - beta1) / sqrt(1 - beta2)."""
+
+
+class Keyframes(eqx.Module):
+    """Images that the map is trained on. On the host: they grow by one at a time."""
+
+    rgb: UInt8[np.ndarray, "F h w 3"]
+    """Color in steps of 1/255."""
+
+    depth: Float[np.ndarray, "F h w"]
+    """z-depth [m]; 0 or inf: none."""
+
+    T_world_camera: Float[np.ndarray, "F 4 4"]
+    """Poses, float32."""
+
+    error: Float[np.ndarray, " F"]
+    """Color and depth error when it was last trained on."""
+
+    def __len__(self) -> int:
+        return self.rgb.shape[0]
+
+
+class OnlineMap(eqx.Module):
+    """The Gaussians, what a rival notes of each, and the frames behind them."""
+
+    scene: GaussianScene
+    """Rows in use come first."""
+
+    marks: Float[Array, "n m"]
+    """Numbers that a rival keeps per Gaussian."""
+
+    frames: Keyframes
+    """All frames so far."""
+
+    camera: Camera
+    """Camera of the key frames."""
+
+    seed: UInt32[np.ndarray, "..."]
+    """Words of the key that all randomness follows from."""
+
+    @property
+    def num_gaussians(self) -> int:
+        """Rows in use."""
+        return int(jnp.sum(self.scene.is_alive))
+
+
+def empty_online_map(
+    camera: Camera, settings: MapSettings, key: Array, num_marks: int = 0
+) -> OnlineMap:
+    """Makes the map before the first frame.
+
+    Args:
+        camera: of the frames to come.
+        settings: size of the training images.
+        key: of all randomness.
+        num_marks: numbers per Gaussian that the rival keeps.
+    """
+    width, height = fitted_size(camera.width, camera.height, settings.image_width)
+    is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return OnlineMap(
+        scene=empty_scene(FIRST_CAPACITY, 0),
+        marks=jnp.zeros((FIRST_CAPACITY, num_marks)),
+        frames=Keyframes(
+            rgb=np.zeros((0, height, width, 3), np.uint8),
+            depth=np.zeros((0, height, width), np.float32),
+            T_world_camera=np.zeros((0, 4, 4), np.float32),
+            error=np.zeros(0, np.float32),
+        ),
+        camera=camera.resized(width, height),
+        seed=np.asarray(jax.random.key_data(key) if is_typed else key),
+    )
+
+
+def add_frame(
+    online: OnlineMap, frame: Frame, max_range: float, settings: MapSettings
+) -> OnlineMap:
+    """Adds a key frame: births, training, and every few frames pruning. Not to be jitted.
+
+    Args:
+        online: the map before.
+        frame: a posed RGB-D image.
+        max_range: depth beyond this is not measured [m].
+        settings: how.
+    """
+    online = _with_frame(online, frame, max_range)
+    rng = np.random.default_rng([*online.seed.ravel().tolist(), len(online.frames)])
+    online = _with_births(online, settings, rng)
+    online = _trained(online, settings, rng)
+    if len(online.frames) % settings.prune_every == 0:
+        online = _pruned(online, settings)
+    return online
+
+
+def _with_frame(online: OnlineMap, frame: Frame, max_range: float) -> OnlineMap:
+    height, width = online.frames.depth.shape[1:]
+    view = load_views([frame], max(height, width))
+    depth = np.asarray(view.depth)
+    depth = np.where((depth > 0.0) & (depth <= max_range), depth, 0.0)
+    before = online.frames
+    frames = Keyframes(
+        rgb=np.concatenate([before.rgb, np.asarray(view.rgb)]),
+        depth=np.concatenate([before.depth, depth.astype(np.float32)]),
+        T_world_camera=np.concatenate([before.T_world_camera, np.asarray(view.T_world_camera)]),
+        error=np.append(before.error, np.float32(FIRST_ERROR)),
+    )
+    return replace(online, frames=frames)
+
+
+class Seen(eqx.Module):
+    """What the map shows of a view, composited on black."""
+
+    rgb: Float[Array, "h w 3"]
+    """Sum of weight x color."""
+
+    depth: Float[Array, "h w"]
+    """Sum of weight x z-depth [m]."""
+
+    alpha: Float[Array, "h w"]
+    """Sum of the weights."""
+
+
+@jax.jit
+def _show(
+    config: RasterConfig, scene: GaussianScene, camera: Camera, pose: Array
+) -> tuple[Seen, Array]:
+    offsets = jnp.zeros((scene.capacity, 2))
+    result = find_backend(config.backend)(scene, camera, pose, offsets, config)
+    return Seen(result.rgb, result.depth_sum, result.alpha), result.overflow
+
+
+def show(scene: GaussianScene, camera: Camera, T_world_camera: Any) -> Seen:
+    """Renders a view of the map; the budget grows until it fits."""
+    pose = jnp.asarray(T_world_camera, dtype=jnp.float32)
+    return with_room(_show, scene, camera, pose)
+
+
+def _with_births(online: OnlineMap, settings: MapSettings, rng: np.random.Generator) -> OnlineMap:
+    """Adds Gaussians where the latest frame is rendered wrongly."""
+    frames, num = online.frames, online.num_gaussians
+    seen = show(online.scene, online.camera, frames.T_world_camera[-1])
+    born = born_in(
+        frames.rgb[-1], frames.depth[-1], frames.T_world_camera[-1], online.camera,
+        (np.asarray(seen.rgb), np.asarray(seen.depth), np.asarray(seen.alpha)), settings, rng,
+    )  # fmt: skip
+    more = len(born.means)
+    capacity = max(online.scene.capacity, _length_for(num + more))
+    scene, marks = grown((online.scene, online.marks), capacity)
+    # On the host: on the device, every number of births would compile anew.
+    scene, rows = jax.tree.map(np.array, scene), slice(num, num + more)
+    scene.means[rows], scene.quats[rows] = born.means, born.quats
+    scene.log_scales[rows], scene.opacity_logits[rows] = born.log_scales, 0.0
+    scene.sh[rows, 0] = (born.colors - 0.5) / C0
+    return replace(online, scene=jax.tree.map(jnp.asarray, scene), marks=marks)
+
+
+def rows_in_view(
+    means: Float[np.ndarray, "n 3"], camera: Camera, T_world_camera: Any, settings: MapSettings
+) -> Int[np.ndarray, " r"]:
+    """Finds the Gaussians that a view may show while they are trained on a key frame.
+
+    Those within the planes of the image's edges, with room for the largest Gaussian, for what
+    the training may move it by, and for what the image of the smallest one is dilated by. The
+    planes are exact, the rest errs to the safe side: what is left out would have no gradient.
+
+    Args:
+        means: centers [m].
+        camera: of the view.
+        T_world_camera: its pose.
+        settings: largest Gaussian, learning rate and steps.
+    """
+    pose = np.asarray(T_world_camera, np.float32)
+    x, y, z = ((means - pose[:3, 3]) @ pose[:3, :3]).T
+    drift = np.sqrt(3.0) * _LONGEST_STEP * settings.rate_means * settings.steps
+    is_in = z > NEAR - drift
+    for along, focal, middle, size in (
+        (x, float(camera.fx), float(camera.cx), camera.width),
+        (y, float(camera.fy), float(camera.cy), camera.height),
+    ):
+        edges = np.array([-middle, size - middle]) / focal
+        # The Jacobian is taken at most this far outside, where it stretches a ball most.
+        stretch = np.hypot(1.0, np.abs(edges).max() + FRUSTUM_MARGIN * size / focal)
+        dilated = _REACH * np.sqrt(DILATION) / focal
+        for edge, outward in zip(edges, (-1.0, 1.0), strict=True):
+            room = _REACH * settings.max_size * stretch + drift * np.hypot(1.0, edge)
+            is_in &= outward * (along - edge * z) <= room + dilated * (z + drift)
+    return np.flatnonzero(is_in)
+
+
+@partial(jax.jit, static_argnames="settings")
+def _gradient_of_view(
+    config: RasterConfig,
+    scene: GaussianScene,
+    camera: Camera,
+    frame: Any,
+    rows: Int[Array, " r"],
+    settings: MapSettings,
+) -> tuple[tuple[GaussianScene, Float[Array, ""]], Array]:
+    """Gradient of a key frame's loss by some rows, its color and depth error, and the overflow."""
+
+    def loss(part: GaussianScene) -> tuple[Array, tuple[Array, Array]]:
+        seen, overflow = _show(config, part, camera, frame.T_world_camera)
+        rgb = frame.rgb.astype(jnp.float32) / 255.0
+        opaque = (seen.alpha > _OPAQUE).astype(jnp.float32)
+        valid = (frame.depth > 0.0).astype(jnp.float32)
+        color = _mean_over(jnp.mean(jnp.abs(seen.rgb - rgb), axis=-1), opaque)
+        depth = _mean_over(jnp.abs(seen.depth - frame.depth), valid)
+        weighted = settings.color_weight * color + settings.depth_weight * depth
+        return weighted, (color + depth, overflow)
+
+    part = jax.tree.map(lambda x: x.at[rows].get(mode="clip"), scene)
+    logits = jnp.where(rows < scene.capacity, part.opacity_logits, DEAD_LOGIT)
+    part = eqx.tree_at(lambda s: s.opacity_logits, part, logits)
+    gradient, (error, overflow) = jax.grad(loss, has_aux=True)(part)
+    return (gradient, error), overflow
+
+
+@partial(jax.jit, donate_argnums=0)
+def _added(total: GaussianScene, part: GaussianScene, rows: Int[Array, " r"]) -> GaussianScene:
+    """The total with a part added to its rows; those beyond its capacity go nowhere."""
+    add = lambda t, p: t.at[rows].add(p, mode="drop", unique_indices=True)
+    return jax.tree.map(add, total, part)
+
+
+def _unevenness(scene: GaussianScene) -> Float[Array, ""]:
+    """Mean difference between a Gaussian's sizes and their mean [m]."""
+    sizes = jnp.exp(scene.log_scales)
+    uneven = jnp.mean(jnp.abs(sizes - sizes.mean(axis=1, keepdims=True)), axis=1)
+    return _mean_over(uneven, scene.is_alive.astype(jnp.float32))
+
+
+def _mean_over(values: Array, mask: Array) -> Float[Array, ""]:
+    return jnp.sum(values * mask) / jnp.maximum(jnp.sum(mask), 1.0)
+
+
+def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator) -> OnlineMap:
+    """Takes the steps of Adam of one key frame."""
+    scene, frames, camera = online.scene, online.frames, online.camera
+    moments, error = empty_moments(scene), frames.error.copy()
+    means, rows = np.asarray(scene.means)[: online.num_gaussians], dict[int, np.ndarray]()
+    function = partial(_gradient_of_view, settings=settings)
+    for _ in range(settings.steps):
+        batch = drawn_batch(error, settings, rng)
+        total = jax.tree.map(jnp.zeros_like, scene)
+        for number in batch:
+            frame = jax.tree.map(lambda x, number=number: x[number], frames)
+            if number not in rows:
+                in_view = rows_in_view(means, camera, frame.T_world_camera, settings)
+                rows[number] = _filled_up(in_view, scene.capacity)
+            gradient, found = with_room(function, scene, camera, frame, rows[number])
+            total, error[number] = _added(total, gradient, rows[number]), float(found)
+        scene, moments = _stepped(scene, moments, total, len(batch), settings)
+    return replace(online, scene=scene, frames=replace(frames, error=error))
+
+
+def _filled_up(rows: np.ndarray, capacity: int) -> Int[np.ndarray, " r"]:
+    """Rows to one of few lengths, as each compiles anew; the last ones lie beyond the capacity."""
+    beyond = capacity + np.arange(_length_for(len(rows)) - len(rows))
+    return np.concatenate([rows, beyond]).astype(np.int32)
+
+
+def _length_for(num: int) -> int:
+    """The first of the few lengths that holds so many rows."""
+    length = FIRST_CAPACITY
+    while length < num:
+        length *= 2
+    return length
+
+
+def drawn_batch(error: np.ndarray, settings: MapSettings, rng: np.random.Generator) -> list[int]:
+    """Draws the key frames of a step: the latest, and some earlier ones.
+
+    Args:
+        error: last error of each key frame [F].
+        settings: how many of each, and whether by their errors.
+        rng: what is drawn.
+    """
+    num = len(error)
+    recent = list(range(max(0, num - settings.recent), num))
+    earlier = num - len(recent)
+    share = error[:earlier].astype(np.float64) + 1e-9
+    size = min(settings.older, earlier)
+    odds = share / share.sum() if settings.by_error else None
+    drawn = rng.choice(earlier, size, replace=False, p=odds) if size else []
+    return [*recent, *(int(number) for number in drawn)]
+
+
+@partial(jax.jit, static_argnames="settings")
+def _stepped(
+    scene: GaussianScene,
+    moments: Moments,
+    total: GaussianScene,
+    num: Array,
+    settings: MapSettings,
+) -> tuple[GaussianScene, Moments]:
+    """One step of Adam down the mean gradient of a batch of `num` key frames."""
+    gradient = jax.tree.map(lambda g: g / num, total)
+    if settings.isotropy > 0.0:
+        uneven = jax.grad(_unevenness)(scene)
+        weight = settings.isotropy / num  # beside the sum, of which this is the mean
+        gradient = jax.tree.map(lambda g, u: g + weight * u, gradient, uneven)
+    if settings.flat:
+        # The third axis of a disc has no size to learn.
+        gradient = eqx.tree_at(
+            lambda g: g.log_scales, gradient, gradient.log_scales.at[:, 2].set(0.0)
+        )
+    config = TrainConfig(
+        rate_quats=settings.rate_quats,
+        rate_log_scales=settings.rate_log_scales,
+        rate_opacities=settings.rate_opacities,
+        # The color is 0.5 + C0 times the coefficient.
+        rate_sh=settings.rate_color / C0,
+    )
+    rate = jnp.asarray(settings.rate_means)
+    scene, moments = adam_update(scene, gradient, moments, rate, config, jnp.asarray(True))
+    largest = jnp.log(settings.max_size)
+    scene = eqx.tree_at(lambda s: s.log_scales, scene, jnp.minimum(scene.log_scales, largest))
+    return scene, moments
+
+
+@jax.jit
+def _supported(
+    config: RasterConfig, scene: GaussianScene, camera: Camera, pose: Array, depth: Array
+) -> tuple[Bool[Array, " n"], Array]:
+    is_valid = (depth > 0.0).astype(jnp.float32)
+    tallies, overflow = pixel_tallies(
+        scene, camera, pose, is_valid, is_valid, config, least_weight=SUPPORT
+    )
+    return tallies[:, 1] > 0.0, overflow
+
+
+def supported_by(online: OnlineMap, number: int) -> Bool[np.ndarray, " n"]:
+    """Finds the Gaussians that a key frame sees, by the map as it is."""
+    frames = online.frames
+    frame = jnp.asarray(frames.T_world_camera[number]), jnp.asarray(frames.depth[number])
+    # To the host, so that it may join arrays on an accelerator.
+    return np.asarray(with_room(_supported, *on_cpu((online.scene, online.camera, *frame))))
+
+
+def _pruned(online: OnlineMap, settings: MapSettings) -> OnlineMap:
+    """Drops what is faint, and what no key frame sees any more; the rest moves up."""
+    opaque = jax.nn.sigmoid(online.scene.opacity_logits) >= settings.prune_opacity
+    is_seen = np.zeros(online.scene.capacity, dtype=bool)
+    for number in range(len(online.frames)):
+        is_seen |= supported_by(online, number)
+    keep = np.asarray(online.scene.is_alive & opaque) & is_seen
+    scene, marks = kept_rows((online.scene, online.marks), keep)
+    return replace(online, scene=scene, marks=marks)
+
+
+def colored(scene: GaussianScene, values: Float[Array, " n"]) -> GaussianScene:
+    """The scene with a gray of any value >= 0 per Gaussian: rendering composites the values."""
+    sh = jnp.broadcast_to(((values - 0.5) / C0)[:, None, None], scene.sh.shape)
+    return eqx.tree_at(lambda s: s.sh, scene, sh)

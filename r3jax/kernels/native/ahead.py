@@ -1,0 +1,62 @@
+"""Compiles the kernels for CPUs in a process of its own, while the first planner begins.
+
+Numba holds Python's lock while it compiles, over a minute of one core for all kernels. Whoever
+has another core to spare finds them on the disk, or waits for the one that it needs
+(`ffi.register_handlers`). Afterwards the disk has them, and nothing is started.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+
+COMPILER = "r3jax.cli.kernels"
+"""What the process runs; it knows all kernels."""
+
+_PACKAGE = Path(__file__).parents[2]
+
+
+def cache_folder() -> Path:
+    """Where this package keeps what would take long to make again."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "r3jax"
+
+
+@functools.cache
+def compile_ahead(cache: Path | None = None) -> None:
+    """Starts the process, unless it came to its end once with these sources on this machine.
+
+    Args:
+        cache: folder for the note that it did; None: in the package's own.
+    """
+    if find_spec("numba") is None:
+        return
+    note = _note_in(cache_folder() / "kernels" if cache is None else cache)
+    # Where a program embeds Python, it is the executable, and would start once more.
+    is_python = Path(sys.executable or "").name.startswith("python")
+    if note.exists() or not is_python:
+        return
+    # What cannot be started is compiled where it is needed.
+    with contextlib.suppress(OSError):
+        subprocess.Popen(
+            [sys.executable, "-m", COMPILER, str(note)],
+            # Kernels are for CPUs: a GPU's memory is that of who starts this.
+            env={**os.environ, "JAX_PLATFORMS": "cpu"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C ends the command, and not what the next one needs
+        )
+
+
+def _note_in(cache: Path) -> Path:
+    """The file that is there once all kernels of these sources were compiled."""
+    sources = sorted(_PACKAGE.glob("kernels/**/*.py"))
+    parts = [f"{path} {path.stat().st_mtime_ns}" for path in sources]
+    parts += [version("numba"), version("jaxlib"), platform.python_version(), platform.node()]
+    return cache / hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

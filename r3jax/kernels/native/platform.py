@@ -1,0 +1,105 @@
+"""Kernels on CPUs, plain JAX elsewhere: the choice that is made where a program is lowered."""
+
+import functools
+import os
+import warnings
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Any
+
+import jax
+from jax.extend import backend
+
+from r3jax.kernels.native.structs import misread
+
+
+def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that is `cpu` where a program runs on a CPU, and `default` elsewhere.
+
+    Args:
+        cpu: calls kernels. Not asked where XLA's interface is another than theirs.
+        default: the same in plain JAX.
+    """
+    if not can_call_kernels():
+        return default
+    # Both would be traced, which takes a fifth of a short run, for one that nobody can ask for.
+    if is_cpu_only():
+        return cpu
+    return functools.partial(jax.lax.platform_dependent, cpu=cpu, default=default)
+
+
+def is_cpu_only() -> bool:
+    """Whether JAX has found no other device."""
+    return set(backend.backends()) == {"cpu"}
+
+
+def can_call_kernels() -> bool:
+    """Whether kernels run here; warns once if they do not, or only one after the other."""
+    problem = missing_for_kernels()
+    if problem and jax.default_backend() == "cpu":
+        _warn(
+            f"no machine code for CPUs, since {problem}; mapping, scoring, training and rendering "
+            "(backend='xla') run in plain JAX, which is slower"
+        )
+    if not problem and _start()[0] == "workqueue":
+        _warn(
+            "Numba finds neither OpenMP nor TBB: kernels run one after the other, which is slower "
+            "where several are due at once (planning while moving). To run them side by side, "
+            "install OpenMP (Debian: `apt install libgomp1`, macOS: `brew install libomp`) or "
+            "`pip install tbb`"
+        )
+    return not problem
+
+
+def missing_for_kernels() -> str:
+    """Says why XLA can call no kernel here; empty: it can."""
+    if problem := misread():
+        has = "jaxlib 0.10 to 0.12 have them where they are read"
+        return f"the structs of jaxlib {version('jaxlib')} cannot be read: {problem} ({has})"
+    return missing_for_machine_code()
+
+
+def missing_for_machine_code() -> str:
+    """Says why Numba compiles nothing here; empty: it does."""
+    return _start()[1]
+
+
+def describe_kernels() -> str:
+    """Says how this machine maps, scores and trains on its CPU."""
+    if problem := missing_for_kernels():
+        return f"plain JAX, since {problem}"
+    return f"machine code on {num_cores()} cores, Numba's threading layer {_start()[0]}"
+
+
+@functools.cache
+def _start() -> tuple[str, str]:
+    """Starts the threads of kernels: Numba's layer, and what failed."""
+    try:
+        from r3jax.kernels.native.ffi import require_threads
+
+        return require_threads(), ""
+    # Of any kind: a Numba that does not fit its NumPy, or this processor, fails in many ways.
+    except Exception as error:
+        first = next(iter(str(error).splitlines()), "")
+        return "", f"Numba fails with {type(error).__name__}: {first.rstrip('.')}"
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    warnings.warn(text, RuntimeWarning, stacklevel=1)
+
+
+def compiled_or_plain(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compiles a function that Python calls; it stays Python, slow, where Numba cannot be used."""
+    if missing_for_machine_code():
+        return function
+    from r3jax.kernels.native.compiled import called_from_python
+
+    return called_from_python()(function)
+
+
+def num_cores() -> int:
+    """Cores that this process may use, which a scheduler may keep below those of the machine."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS, which ties no process to cores
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

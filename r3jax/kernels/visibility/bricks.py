@@ -1,0 +1,329 @@
+"""Voxels and points, sorted into bricks: what a view cannot see is skipped by the brick.
+
+The index is built anew in every call, by counting: a share of the time of one panorama.
+"""
+
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
+import math
+
+import numpy as np
+from numba import prange
+
+from r3jax.geometry.voxels import INDEX_LIMIT
+from r3jax.kernels.native.compiled import inlined, kernel, parallel_kernel
+from r3jax.kernels.visibility.views import LENS, POSITION, RANGE, ROTATION
+
+EDGE = 3
+"""log2 of the voxels along a brick, unless that makes too many bricks."""
+
+MOST = 1 << 19
+"""Bricks at most."""
+
+POINTS_EDGE = 0.8
+"""Edge of a brick of points [m], unless that makes too many bricks."""
+
+_LIMIT = np.int64(INDEX_LIMIT)
+_LOW = np.int64((1 << 21) - 1)
+_ONE = np.float32(1.0)
+
+
+@inlined
+def voxel_of(key, row):
+    """Index of the voxel in a row of the map along x, y and z (`geometry.voxels.unpack`)."""
+    low, high = np.int64(key[0, row]), np.int64(key[1, row])
+    y = (low >> 21) | ((high & 1023) << 11)
+    return (low & _LOW) - _LIMIT, y - _LIMIT, ((high >> 10) & _LOW) - _LIMIT
+
+
+@inlined
+def _clipped(value):
+    return np.int64(min(max(value, -np.float64(INDEX_LIMIT)), np.float64(INDEX_LIMIT)))
+
+
+@kernel
+def box_of(views, is_sound, voxel_size):
+    """Indices of the voxels that bound what the views may see: [2, 3], the upper ones included."""
+    box = np.empty((2, 3), np.int64)
+    box[0], box[1] = _LIMIT, -_LIMIT
+    for view in range(views.shape[0]):
+        if is_sound[view]:
+            for axis in range(3):
+                middle, far = np.float64(views[view, POSITION + axis]), views[view, RANGE]
+                low = _clipped(math.floor((middle - far) / voxel_size) - 1.0)
+                high = _clipped(math.floor((middle + far) / voxel_size) + 1.0)
+                box[0, axis], box[1, axis] = min(box[0, axis], low), max(box[1, axis], high)
+    return box
+
+
+@inlined
+def _brick_of(key, row, box, shift, dims):
+    """Number of a row's brick; -1 outside the box."""
+    x, y, z = voxel_of(key, row)
+    is_in = (x >= box[0, 0]) & (x <= box[1, 0]) & (y >= box[0, 1]) & (y <= box[1, 1])
+    is_in = is_in & (z >= box[0, 2]) & (z <= box[1, 2])
+    i, j, k = (x - box[0, 0]) >> shift, (y - box[0, 1]) >> shift, (z - box[0, 2]) >> shift
+    return (i * dims[1] + j) * dims[2] + k if is_in else np.int64(-1)
+
+
+@kernel
+def divide(box, most):
+    """Chooses the edge of the bricks (its log2); their number along each axis follows."""
+    shift = EDGE
+    dims = np.zeros(3, np.int64)
+    while True:
+        for axis in range(3):
+            dims[axis] = max((box[1, axis] - box[0, axis] + (1 << shift)) >> shift, 0)
+        if np.float64(dims[0]) * dims[1] * dims[2] <= most:
+            return shift, dims
+        shift += 1
+
+
+@parallel_kernel
+def count_rows(key, count, box, shift, dims, bricks, counts):
+    """Finds the brick of every row, -1: none, and counts them, for each share of the rows apart."""
+    shares, num = counts.shape[0], count.shape[0]
+    for share in prange(shares):
+        own = counts[share]
+        own[:] = 0
+        for row in range(num * share // shares, num * (share + 1) // shares):
+            brick = _brick_of(key, row, box, shift, dims) if count[row] > 0.0 else np.int64(-1)
+            bricks[row] = brick
+            if brick >= 0:
+                own[brick] += 1
+
+
+@kernel
+def begin_bricks(counts, starts, bricks):
+    """Where bricks begin, and where each share of the rows writes; empty bricks are left out.
+
+    Returns:
+        The number of bricks that hold something; `bricks` has their numbers.
+    """
+    total, used = 0, 0
+    for brick in range(counts.shape[1]):
+        begin = total
+        for share in range(counts.shape[0]):
+            own = counts[share, brick]
+            counts[share, brick] = total
+            total += own
+        if total > begin:
+            starts[used], bricks[used] = begin, brick
+            used += 1
+    starts[used] = total
+    return used
+
+
+@parallel_kernel
+def number_slots(counts, slots):
+    """Replaces the brick of every row by its slot, in the order of the map within a brick.
+
+    Slots by row, not rows by slot: what is gathered is then read in the order in which it lies.
+    """
+    shares, num = counts.shape[0], slots.shape[0]
+    for share in prange(shares):
+        own = counts[share]
+        for row in range(num * share // shares, num * (share + 1) // shares):
+            brick = slots[row]
+            if brick >= 0:
+                slots[row] = own[brick]
+                own[brick] += 1
+
+
+@kernel
+def spheres_round(bricks, dims, low, edge):
+    """Finds spheres round bricks: middle and radius [b, 4] [m].
+
+    Args:
+        bricks: their numbers [b].
+        dims: bricks along each axis.
+        low: where the first one begins along each axis [m].
+        edge: of a brick [m].
+    """
+    spheres = np.empty((bricks.shape[0], 4), np.float32)
+    for b in range(bricks.shape[0]):
+        i, rest = bricks[b] // (dims[1] * dims[2]), bricks[b] % (dims[1] * dims[2])
+        cell = (i, rest // dims[2], rest % dims[2])
+        for axis in range(3):
+            spheres[b, axis] = low[axis] + (cell[axis] + 0.5) * edge
+        # More than half the diagonal: rounding may put a point just outside of its brick.
+        spheres[b, 3] = 0.9 * edge
+    return spheres
+
+
+@kernel
+def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
+    """Sorts the rows that some view may see into bricks.
+
+    Args:
+        key: of the map.
+        count: observations; 0 where there is no voxel.
+        views: one a row.
+        is_sound: False for views that see nothing.
+        voxel_size: edge [m].
+        most: bricks at most; 1 keeps the order of the map.
+        workers: threads.
+
+    Returns:
+        The slot of every row [N], -1 for those out of range; where each brick begins among the
+        slots [b + 1]; and a sphere round each brick [b, 4] [m].
+    """
+    box = box_of(views, is_sound, voxel_size)
+    shift, dims = divide(box, most)
+    num_bricks = dims[0] * dims[1] * dims[2]
+    counts = np.empty((workers, num_bricks), np.int32)
+    slots = np.empty(count.shape[0], np.int32)
+    count_rows(key, count, box, shift, dims, slots, counts)
+    starts, bricks = np.empty(num_bricks + 1, np.int64), np.empty(num_bricks, np.int64)
+    used = begin_bricks(counts, starts, bricks)
+    number_slots(counts, slots)
+    low, edge = voxel_size * box[0].astype(np.float64), np.float64(voxel_size) * (1 << shift)
+    return slots, starts[: used + 1], spheres_round(bricks[:used], dims, low, edge)
+
+
+@kernel
+def divide_points(points, most):
+    """Chooses bricks for points [3, n], all of them finite: lower corner, edge [m], numbers."""
+    low, high, dims, edge = np.empty(3), np.empty(3), np.empty(3), POINTS_EDGE
+    for axis in range(3):
+        low[axis] = high[axis] = points[axis, 0]
+        for i in range(1, points.shape[1]):
+            low[axis] = min(low[axis], points[axis, i])
+            high[axis] = max(high[axis], points[axis, i])
+    while True:
+        for axis in range(3):
+            dims[axis] = math.floor((high[axis] - low[axis]) / edge) + 1.0
+        if dims[0] * dims[1] * dims[2] <= most:
+            return low, edge, dims.astype(np.int64)
+        edge *= 2.0
+
+
+@kernel
+def are_finite(numbers):
+    """Whether all of some numbers [a, b] are finite."""
+    found = True
+    for i in range(numbers.shape[0]):
+        for j in range(numbers.shape[1]):
+            found = found and math.isfinite(numbers[i, j])
+    return found
+
+
+@kernel
+def sorted_points(points, most):
+    """Sorts points into bricks.
+
+    Args:
+        points: x, y and z [3, n] [m].
+        most: bricks at most.
+
+    Returns:
+        The order of the points [n], by brick, as they stand within a brick; where each brick
+        begins in it [b + 1]; and a sphere round each brick [b, 4] [m].
+    """
+    num = points.shape[1]
+    order, slots = np.empty(num, np.int32), np.empty(num, np.int64)
+    if num == 0 or not are_finite(points):
+        # One brick, that any view may see.
+        starts, spheres = np.empty(2, np.int64), np.empty((1, 4), np.float32)
+        starts[0], starts[1] = 0, num
+        for axis in range(3):
+            spheres[0, axis] = 0.0
+        spheres[0, 3] = np.inf
+        for i in range(num):
+            order[i] = i
+        return order, starts, spheres
+    low, edge, dims = divide_points(points, most)
+    counts = np.zeros((1, dims[0] * dims[1] * dims[2]), np.int32)
+    for i in range(num):
+        brick = np.int64(0)
+        for axis in range(3):
+            brick = brick * dims[axis] + np.int64((points[axis, i] - low[axis]) / edge)
+        slots[i] = brick
+        counts[0, brick] += 1
+    starts = np.empty(counts.shape[1] + 1, np.int64)
+    bricks = np.empty(counts.shape[1], np.int64)
+    used = begin_bricks(counts, starts, bricks)
+    for i in range(num):
+        order[counts[0, slots[i]]] = i
+        counts[0, slots[i]] += 1
+    return order, starts[: used + 1], spheres_round(bricks[:used], dims, low, edge)
+
+
+@inlined
+def bounds_of(view, wraps, shape):
+    """The range of a view [m] and the planes that bound it, as `may_see` takes them.
+
+    Each plane by its slope, `along = slope z`, and by how far along a margin reaches.
+    """
+    fx, fy, cx, cy = view[LENS], view[LENS + 1], view[LENS + 2], view[LENS + 3]
+    left, right = -cx / fx, (np.float32(shape[1]) - cx) / fx
+    top, bottom = -cy / fy, (np.float32(shape[0]) - cy) / fy
+    r = ROTATION
+    return (
+        wraps, view[RANGE], (view[POSITION], view[POSITION + 1], view[POSITION + 2]),
+        (view[r], view[r + 3], view[r + 6]), (view[r + 1], view[r + 4], view[r + 7]),
+        (view[r + 2], view[r + 5], view[r + 8]), (left, right, top, bottom),
+        (_slant(left), _slant(right), _slant(top), _slant(bottom)),
+    )  # fmt: skip
+
+
+@inlined
+def _slant(slope):
+    return math.sqrt(_ONE + slope * slope)
+
+
+@inlined
+def may_see(bounds, x, y, z, radius, margin):
+    """False only if no voxel whose center lies in a sphere can appear in a view.
+
+    Args:
+        bounds: of the view.
+        x: of the sphere's middle, like the next two [m].
+        y: see x.
+        z: see x.
+        radius: of the sphere [m].
+        margin: how far outside of an image a voxel appears in it at that distance [m].
+    """
+    wraps, far, position, along_x, along_y, along_z, slopes, slants = bounds
+    dx, dy, dz = x - position[0], y - position[1], z - position[2]
+    reach, wide = far + radius, radius + margin
+    is_in_range = dx * dx + dy * dy + dz * dz <= reach * reach
+    right = along_x[0] * dx + along_x[1] * dy + along_x[2] * dz
+    down = along_y[0] * dx + along_y[1] * dy + along_y[2] * dz
+    ahead = along_z[0] * dx + along_z[1] * dy + along_z[2] * dz
+    is_between = (right - slopes[0] * ahead >= -wide * slants[0]) & (
+        slopes[1] * ahead - right >= -wide * slants[1]
+    )
+    is_between = is_between & (down - slopes[2] * ahead >= -wide * slants[2])
+    is_between = is_between & (slopes[3] * ahead - down >= -wide * slants[3])
+    # No branch: loops over voxels become vectors.
+    return is_in_range & (wraps | (is_between & (ahead > -wide)))
+
+
+@kernel
+def find_runs(view, wraps, shape, voxel_size, starts, spheres, runs):
+    """Finds the runs of sorted voxels that may appear in a view; neighbors in memory join.
+
+    Args:
+        view: one row.
+        wraps: True for an octahedral map.
+        shape: height and width [px].
+        voxel_size: edge [m].
+        starts: of the bricks among the voxels [b + 1].
+        spheres: round the bricks [b, 4] [m].
+        runs: written; the first voxel and the one after the last of each run [b, 2].
+
+    Returns:
+        How many runs there are.
+    """
+    num, bounds = 0, bounds_of(view, wraps, shape)
+    for brick in range(spheres.shape[0]):
+        x, y, z, radius = spheres[brick]
+        if may_see(bounds, x, y, z, radius, voxel_size):
+            if num > 0 and runs[num - 1, 1] == starts[brick]:
+                runs[num - 1, 1] = starts[brick + 1]
+            else:
+                runs[num, 0], runs[num, 1] = starts[brick], starts[brick + 1]
+                num += 1
+    return num

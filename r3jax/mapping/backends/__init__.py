@@ -1,1 +1,0 @@
-"""How frames are mapped fast on a platform; each backend is held to the plain formulas."""

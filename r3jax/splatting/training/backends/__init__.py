@@ -1,1 +1,0 @@
-"""How training is fast on a platform; each backend is held to the plain formulas."""

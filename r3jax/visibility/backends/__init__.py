@@ -1,1 +1,0 @@
-"""How depth buffers are made fast on a platform; each is held to `visibility.reference`."""
