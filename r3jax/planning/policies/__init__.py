@@ -36,6 +36,9 @@ HOMES = {
 }
 """Module and class of every policy of this package."""
 
+ALIASES = {"r3": "ours", "r3-pano": "ours-pano", "r3-ahead": "ours-ahead"}
+"""Other names of policies."""
+
 FOREIGN = "r3jax.planning.policies.foreign.foreign:Foreign"
 """Module and class of the policy that asks a program."""
 
@@ -64,7 +67,7 @@ def plugins() -> dict[str, str]:
 def known_names() -> tuple[str, ...]:
     """Lists all names: this package's, other packages', this process's."""
     # A dictionary drops repeats and keeps the order, which a set would lose.
-    return tuple(dict.fromkeys([*HOMES, *plugins(), *REGISTERED]))
+    return tuple(dict.fromkeys([*HOMES, *ALIASES, *plugins(), *REGISTERED]))
 
 
 def home_of(name: str) -> str:
@@ -79,6 +82,7 @@ def home_of(name: str) -> str:
     if name in RETIRED:
         raise ValueError(f"policy {name!r} has left the package: {RETIRED[name]}")
     # Before plug-ins: in recorded runs these names mean policies of this package.
+    name = ALIASES.get(name, name)
     if name in HOMES:
         return HOMES[name]
     if name in plugins():
