@@ -1,12 +1,12 @@
 """Pages of results: tables and figures of experiments/results, and the details beside them.
 
-A page names what it wants by a comment, alone on its line or behind a link, and gets it in its place:
+A page names what it wants by a comment, alone on its line or behind a link:
 
     <!-- results: beyond/small/beyond.md -->
 
-Everything beside it (figures, CSV) is copied and linked. `experiments/results/NAME/README.md`, the details
-of a page, becomes `results/details/NAME.md`. A table that no page names is a warning, which fails a strict
-build: nothing that was measured goes unreported.
+Everything beside it (figures, CSV) is copied and linked. `experiments/results/NAME/README.md`, the
+details of a page, becomes `results/details/NAME.md`. A table that no page names is a warning, which
+fails a strict build: nothing that was measured goes unreported.
 """
 
 import posixpath

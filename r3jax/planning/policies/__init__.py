@@ -67,7 +67,7 @@ def plugins() -> dict[str, str]:
 def known_names() -> tuple[str, ...]:
     """Lists all names: this package's, other packages', this process's."""
     # A dictionary drops repeats and keeps the order, which a set would lose.
-    return tuple(dict.fromkeys([*HOMES, *ALIASES, *plugins(), *REGISTERED]))
+    return tuple(dict.fromkeys([*HOMES, *plugins(), *REGISTERED]))
 
 
 def home_of(name: str) -> str:
