@@ -30,7 +30,7 @@ INSTEAD = {
     r"for ever": "forever, without end",
     r"who chooses": "the policy",
     r"what carries": "the robot, the platform",
-    r"(?:frames?|captures?|captured|looks?|looking|plans?) on the way": "while moving, along the path",
+    r"(?:frames?|captures?|captured|looks?|looking|plans?) on the way": "while moving",
 }
 """Patterns, and what to write in their place."""
 
