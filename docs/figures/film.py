@@ -18,9 +18,9 @@ import tyro
 from PIL import Image
 
 import r3jax
+from docs.figures.stills import Sheet, Squares, compose, draw, lines, overview
 from r3jax.apps.viewer.blocks import block_colors, cut_height, known_at, scoring_of
 from r3jax.apps.viewer.overlays import frustum_segments, path_segments
-from r3jax.apps.viewer.stills import Sheet, Squares, compose, draw, lines, overview
 from r3jax.apps.viewer.story import Timeline
 from r3jax.trace.reader import Run, read_run
 

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from r3jax.apps.forecast.goal import parse_goal
+from r3jax.apps.forecast.psnr import parse_goal
 from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
 from r3jax.cli.options import (
     AuditOptions,

@@ -31,6 +31,9 @@ INCONSISTENT = "#dc2626"
 TOO_FAR = "#f59e0b"
 """What was seen from farther away only."""
 
+CAUSE_COLORS = (NEVER_SEEN, TOO_OBLIQUE, INCONSISTENT, TOO_FAR)
+"""Colors of the causes of a utility, in the order of `scoring.explain.CAUSES`."""
+
 PATH_MAP = "plasma"
 """Colors of acquisition order."""
 

@@ -9,6 +9,7 @@ z from the residuals of the calibration. The views of a place mix these distribu
 forecast is a statistic of the mixture: its mean, or a percentile. How far forecasts are off is
 not known from the residuals (the views of a scene err together), but from scenes that were left
 out of the calibration, one at a time. Calibrations are files; one comes with the package.
+A goal is a statistic that a forecast must reach for the views to be enough.
 
 On the host, NumPy, float64. Shape symbols: V views; L of their residual levels.
 """
@@ -16,10 +17,12 @@ On the host, NumPy, float64. Shape symbols: V views; L of their residual levels.
 import dataclasses
 import functools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -258,3 +261,59 @@ def _parse(data: bytes) -> Calibration:
         raise ForeignFileError(f"the errors of {', '.join(missing)} are not told")
     location, log_scale, residuals = (tuple(found[name]) for name in list(_KINDS)[1:4])
     return Calibration(PsnrModel(location, log_scale, residuals), errors, found["source"])
+
+
+_EXAMPLE = "use psnr:25 for the mean of all views, psnr:20@p10 for all but the worst tenth"
+
+
+@runtime_checkable
+class PsnrForecast(Protocol):
+    """What a goal asks of a forecast, which takes JAX to make."""
+
+    def value(self, name: str) -> float:
+        """A statistic of the PSNR [dB]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A statistic of the PSNR of free-space views, and what it is to reach."""
+
+    psnr: float
+    """[dB]."""
+
+    statistic: str = MEAN
+    """`mean`, or a percentile: `p10`."""
+
+    def reached(self, forecast: PsnrForecast) -> bool:
+        """True if the forecast is at least as good."""
+        return forecast.value(self.statistic) >= self.psnr
+
+    def __str__(self) -> str:
+        """As `parse_goal` reads it."""
+        return f"psnr:{self.psnr!r}@{self.statistic}"
+
+
+def parse_goal(text: str) -> Goal:
+    """Reads `psnr:27` or `psnr:27@p10`.
+
+    Raises:
+        ValueError: anything else.
+    """
+    quantity, separator, rest = text.strip().partition(":")
+    amount_text, _, name = rest.partition("@")
+    if quantity != "psnr" or not separator:
+        raise ValueError(f"goal {text!r} is not understood: {_EXAMPLE}")
+    try:
+        amount = float(amount_text)
+    except ValueError:
+        raise ValueError(f"goal {text!r}: {amount_text!r} is not a number; {_EXAMPLE}") from None
+    if not math.isfinite(amount):
+        raise ValueError(f"goal {text!r}: the PSNR must be a finite number; {_EXAMPLE}")
+    name = name or MEAN
+    if name != MEAN:
+        try:
+            percent_of(name)
+        except ValueError as error:
+            raise ValueError(f"goal {text!r}: {error}") from None
+    return Goal(amount, name)

@@ -2,7 +2,6 @@
 
 import csv
 import hashlib
-import html
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,31 +160,23 @@ def training_figure(history: dict[str, np.ndarray]) -> Figure:
     return figure
 
 
-def quality_table(evaluation: dict[str, Any]) -> str:
-    """The metrics as an HTML table."""
-    head = "".join(
-        f'<th class="n">{title}</th>'
-        for title in ("mean", "95 % interval", "median", "5th percentile", "worst", "&lt; 20 dB")
-    )
-    rows: list[str] = []
+def quality_rows(evaluation: dict[str, Any]) -> list[list[str]]:
+    """The metrics as a table: name, mean, interval, median, tail, worst, share of poor ones."""
+    rows: list[list[str]] = []
     for name, metric in evaluation["metrics"].items():
         title, digits = _TITLES.get(name, (name, 3))
         low, high = metric["interval"]
         poor = metric["poor_share"]
-        cells = [
+        rows.append([
+            title,
             f"{metric['mean']:.{digits}f}",
             f"{low:.{digits}f} – {high:.{digits}f}",
             f"{metric['median']:.{digits}f}",
             f"{metric['percentile_5']:.{digits}f}{_TAIL.get(name, '')}",
             f"{metric['worst']:.{digits}f} (view {metric['worst_view']})",
             "" if poor is None else f"{100 * poor:.0f} %",
-        ]
-        rows.append(
-            f"<tr><td>{html.escape(title)}</td>"
-            + "".join(f'<td class="n">{cell}</td>' for cell in cells)
-            + "</tr>"
-        )
-    return f"<table><tr><th></th>{head}</tr>{''.join(rows)}</table>"
+        ])  # fmt: skip
+    return rows
 
 
 def quality_note(evaluation: dict[str, Any]) -> str:

@@ -1,1 +1,1 @@
-"""Looking at a run: in the browser while it runs or afterwards, and as pictures without one."""
+"""The viewer: a run in the browser, while it runs or afterwards, and as pictures without one."""

@@ -9,15 +9,15 @@ import matplotlib
 import numpy as np
 from matplotlib.colors import to_rgb
 
-from r3jax.apps.report.reasons import COLORS
+from r3jax.plots import style
 
 UNSEEN = (150, 155, 163)
 """Color of what no position sees, and of pixels that show nothing known."""
 
-SCORES = "RdYlGn"
+SCORES = style.SCORE_MAP
 """Colors of R and its terms, 0 to 1: red is bad."""
 
-ORDER = "plasma"
+ORDER = style.PATH_MAP
 """Colors of the order of acquisition."""
 
 UTILITY_MAP = "viridis"
@@ -29,7 +29,7 @@ def to_bytes(rgb: np.ndarray) -> np.ndarray:
     return np.rint(np.asarray(rgb, dtype=np.float64).clip(0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-CAUSE_COLORS = tuple(to_bytes(np.asarray(to_rgb(color))) for color in COLORS)
+CAUSE_COLORS = tuple(to_bytes(np.asarray(to_rgb(color))) for color in style.CAUSE_COLORS)
 """Colors of the causes of a utility, [3] uint8 each, in the order of `scoring.explain.CAUSES`."""
 
 

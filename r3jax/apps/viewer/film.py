@@ -1,14 +1,21 @@
 """A run as pictures and as a film that browsers play, without a browser.
 
-Shape symbols: n blocks; H W picture size.
+viser renders in a connected browser only, so matplotlib draws: blocks as squares, the nearest last,
+and the path and the cameras over them.
+
+Shape symbols: H W picture size.
 """
 
-import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from PIL import Image
 
 from r3jax.apps.viewer.blocks import (
@@ -18,56 +25,19 @@ from r3jax.apps.viewer.blocks import (
     cut_height,
     known_at,
     scoring_of,
+    title_of,
 )
+from r3jax.apps.viewer.color_maps import SCORES, UNSEEN, css_color
 from r3jax.apps.viewer.overlays import frustum_segments, path_segments
-from r3jax.apps.viewer.stills import Sheet, Squares, compose, draw, lines, overview
 from r3jax.apps.viewer.story import Timeline
 from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic
 from r3jax.formats.errors import FormatError
+from r3jax.plots import style
 from r3jax.trace.reader import Run
 from r3jax.validation.packages import why_not_imported
 
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "mpeg4")
 """Tried in this order: H.264 by three programs, and what every FFmpeg has."""
-
-
-def write_video(path: Path, pictures: Iterable[np.ndarray], rate: int) -> str:
-    """Writes an MP4.
-
-    Args:
-        path: the file.
-        pictures: [H, W, 3] uint8 each, of one size; H and W even.
-        rate: pictures a second.
-
-    Returns:
-        The encoder that was used.
-
-    Raises:
-        ImportError: PyAV is not installed; the message names the extra.
-        ValueError: no picture, or odd sizes.
-        OSError: the disk is full, not writable, ...
-    """
-    av = load_av()
-    name = next(encoder for encoder in ENCODERS if _is_known(encoder))
-    stream = None
-    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
-        for picture in pictures:
-            height, width = picture.shape[:2]
-            if stream is None:
-                if width % 2 or height % 2:
-                    raise ValueError(f"a film needs even sizes, got {width} x {height}")
-                stream = container.add_stream(name, rate=rate)
-                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-                if name == "libx264":
-                    stream.options = {"crf": "18"}
-                else:
-                    stream.bit_rate = 4_000_000
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            container.mux(stream.encode(frame))
-        if stream is None:
-            raise ValueError("a film needs at least one picture")
-        container.mux(stream.encode(None))
-    return name
 
 
 def load_av() -> ModuleType:
@@ -85,36 +55,45 @@ def load_av() -> ModuleType:
     return av
 
 
-def _is_known(encoder: str) -> bool:
-    av = load_av()
-    try:
-        av.Codec(encoder, "w")
-    except ValueError:  # how PyAV says that FFmpeg was built without it
-        return False
-    return True
-
-
 WIDTH, HEIGHT = 1280, 720
 """Size of every picture [px]; even numbers, which H.264 wants."""
 
-BUDGET = 400_000
+BUDGET = 200_000
 """Blocks in a picture at most."""
 
+SCENE = (0.0, 0.08, 0.74, 0.80)
+"""Where the map stands in a picture: left, bottom, width, height, as shares of it."""
+
+_RIGHT, _SIDE = 0.76, 0.22
+"""Left edge and width of the column beside it."""
+
+_DPI = 100
 _TURN = 24.0
-"""How far the film's camera goes round the place [deg]."""
+"""How far the film goes round the place [deg]."""
 
 _LAST_FOR = 2.0
 """How long the film stays on its last picture [s]."""
 
-_INK = np.array((31, 41, 55), np.uint8)
-_NOW = np.array((220, 38, 38), np.uint8)
+_COVER = 1.3
+"""Width of a drawn block over its edge: seen at an angle a cube covers more than one side."""
+
+_OUTLINE = 0.8
+"""Lightness of the edges of blocks beside that of their faces."""
+
+_TITLES = {
+    "renderability": "Renderability R, mean over places that see the voxel",
+    "bias": "Angle term b: how near to a direction it was seen from",
+    "noise": "Consistency term: do its colors agree?",
+    "resolution": "Resolution term: was it seen from close enough?",
+    "color": "Mean color of the voxels",
+}
 
 
 class Film:
     """Draws the moments of one run, all from the same place and on the same terms."""
 
     def __init__(self, run: Run, timeline: Timeline):
-        """Places the camera by the last map."""
+        """Frames the last map."""
         self.run, self._timeline = run, timeline
         self._config = scoring_of(run.header)
         self._last = self._known(len(run.rows) - 1)
@@ -124,62 +103,114 @@ class Film:
         positions = np.stack([row.pose[:3, 3] for row in run.rows])
         self._extent = np.concatenate([shown, positions]) if len(shown) else positions
 
-    def still(self, quantity: str, *, from_above: bool) -> np.ndarray:
-        """The last map, [H, W, 3] uint8.
+    def still(self, quantity: str, *, from_above: bool) -> bytes:
+        """The last map, PNG.
 
         Args:
             quantity: one of `QUANTITIES`.
             from_above: straight down, or at an angle.
         """
-        elevation = 89.0 if from_above else 48.0
-        picture = self._scene(self._last, quantity, elevation=elevation, azimuth=-90.0, fine=2)
-        return compose(picture, self._sheet(self._last.moment.step, quantity))
+        return self._drawn(self._last, quantity, -90.0, 90.0 if from_above else 48.0)
 
-    def picture(self, step: int, quantity: str = "renderability") -> np.ndarray:
-        """The map after one view, [H, W, 3] uint8; the camera goes round as views go by."""
-        known = self._known(step)
+    def picture(self, step: int, quantity: str = "renderability") -> bytes:
+        """The map after one view, PNG; the film goes round the place as views go by."""
         share = step / max(len(self.run.rows) - 1, 1)
-        azimuth = -90.0 + _TURN * (share - 0.5)
-        picture = self._scene(known, quantity, elevation=48.0, azimuth=azimuth, fine=1)
-        return compose(picture, self._sheet(step, quantity))
+        return self._drawn(self._known(step), quantity, -90.0 + _TURN * (share - 0.5), 48.0)
 
     def _known(self, step: int) -> Known:
         return known_at(self._timeline.at(step), self.run.camera, self._config, BUDGET)
 
-    def _scene(
-        self, known: Known, quantity: str, *, elevation: float, azimuth: float, fine: int
-    ) -> np.ndarray:
-        """Blocks, path and frusta; drawn `fine` times as large and made smaller again."""
-        width, height = fine * Sheet.scene_width(WIDTH), fine * HEIGHT
-        narrow = 12.0 if elevation > 80.0 else 32.0  # from above, walls should not lean
-        camera, pose = overview(self._extent, width, height, azimuth, elevation, narrow)
-        blocks, step = known.blocks, known.moment.step
-        colors = block_colors(blocks, known.moment.map_state, known.terms, quantity)
-        low = blocks.centers[:, 2] < self._cut
-        layers = [Squares(blocks.centers[low], colors[low], blocks.edge)]
-        layers += self._lines(step, least=2.0 * fine)
-        picture = draw(camera, pose, layers)
-        image = Image.fromarray(picture)
-        return np.asarray(image.resize((width // fine, HEIGHT), Image.Resampling.BOX))
+    def _drawn(self, known: Known, quantity: str, azimuth: float, elevation: float) -> bytes:
+        figure = Figure((WIDTH / _DPI, HEIGHT / _DPI), dpi=_DPI, facecolor="white")
+        figure.text(0.016, 0.94, title_of(self.run.header)[:60], fontsize=17, color=style.INK)
+        figure.text(0.016, 0.90, _TITLES[quantity], fontsize=11, color=style.MUTED)
+        self._draw_scene(figure, known, quantity, azimuth, elevation)
+        if quantity != "color":
+            _draw_scale(figure)
+        self._draw_column(figure, known.moment.step)
+        return style.to_png(figure)
 
-    def _lines(self, step: int, least: float) -> list[Squares]:
-        """The path so far, the views along it, and the newest one larger."""
-        rows = self.run.rows[: step + 1]
-        segments, colors = path_segments(rows, len(self.run.rows))
+    def _draw_scene(
+        self, figure: Figure, known: Known, quantity: str, azimuth: float, elevation: float
+    ) -> None:
+        """Blocks, path and frusta, seen along a direction without perspective."""
+        across, outward = _view_axes(azimuth, elevation)
+        axes = figure.add_axes(SCENE)
+        axes.axis("off")
+        extent = self._extent @ across
+        middle, size = 0.5 * (extent.min(axis=0) + extent.max(axis=0)), np.ptp(extent, axis=0) + 0.2
+        room = np.array([SCENE[2] * WIDTH, SCENE[3] * HEIGHT])
+        meters = float((size / room).max())  # of a pixel
+        axes.set_xlim(middle[0] - 0.5 * meters * room[0], middle[0] + 0.5 * meters * room[0])
+        axes.set_ylim(middle[1] - 0.5 * meters * room[1], middle[1] + 0.5 * meters * room[1])
+        blocks = known.blocks
+        low = np.flatnonzero(blocks.centers[:, 2] < self._cut)
+        low = low[np.argsort(blocks.centers[low] @ outward, kind="stable")]  # the nearest last
+        colors = block_colors(blocks, known.moment.map_state, known.terms, quantity)[low] / 255.0
+        side = 72.0 / _DPI * _COVER * blocks.edge / meters
+        axes.scatter(
+            *(blocks.centers[low] @ across).T, s=side**2, c=colors, marker="s", linewidths=0.3,
+            edgecolors=(_OUTLINE * colors).tolist(),
+        )  # fmt: skip
+        rows = self.run.rows[: known.moment.step + 1]
+        segments, order = path_segments(rows, len(self.run.rows))
+        sizes = [0.05 if row.captured else 0.14 for row in rows]
         frusta = [
-            frustum_segments(self.run.camera, row.pose, 0.05 if row.captured else 0.14)
-            for row in rows
+            frustum_segments(self.run.camera, row.pose, size)
+            for row, size in zip(rows, sizes, strict=True)
         ]
         newest = frustum_segments(self.run.camera, rows[-1].pose, 0.45)
-        return [
-            lines(segments, colors[:, 0], 0.02, 1.5 * least),
-            lines(np.concatenate(frusta), _INK, 0.006, 0.6 * least),
-            lines(newest, _NOW, 0.02, 1.2 * least, lift=0.3),
-        ]
+        for ends, color, width in (
+            (segments, order[:, 0] / 255.0, 2.0),
+            (np.concatenate(frusta), style.INK, 0.7),
+            (newest, style.INCONSISTENT, 1.8),
+        ):
+            axes.add_collection(LineCollection(list(ends @ across), colors=color, linewidths=width))
 
-    def _sheet(self, step: int, quantity: str) -> Sheet:
-        image, _ = self.run.images(step)
-        return Sheet.of_run(self.run, step, image, quantity)
+    def _draw_column(self, figure: Figure, step: int) -> None:
+        """The photo of a view, its numbers, and mean renderability over the views so far."""
+        run, row = self.run, self.run.rows[step]
+        photo = style.blank(figure.add_axes((_RIGHT, 0.56, _SIDE, 0.40)))
+        photo.imshow(run.images(step)[0])
+        facts = {
+            "view": f"{step + 1} of {len(run.rows)}",
+            "mission clock": f"{row.seconds:.1f} s",
+            "path": f"{row.metres:.1f} m",
+            "explored": f"{100 * row.coverage.known_share:.0f} %",
+            "mean renderability": f"{row.coverage.mean_renderability:.2f}",
+            "R before this view": f"{row.coverage.arrival_renderability:.2f}",
+        }
+        for line, (name, value) in enumerate(facts.items()):
+            y = 0.52 - 0.034 * line
+            figure.text(_RIGHT, y, name, fontsize=10, color=style.MUTED)
+            figure.text(_RIGHT + _SIDE, y, value, fontsize=10, color=style.INK, ha="right")
+        curve = style.dress(figure.add_axes((_RIGHT + 0.02, 0.07, _SIDE - 0.02, 0.21)))
+        curve.set_title("mean renderability over views", fontsize=9, color=style.MUTED, loc="left")
+        mean = [r.coverage.mean_renderability for r in run.rows[: step + 1]]
+        curve.plot(np.arange(1, step + 2), mean, color=style.ACCENT, linewidth=2.0)
+        curve.plot(step + 1, mean[-1], color=style.INCONSISTENT, marker="o")
+        curve.set_xlim(0.5, len(run.rows) + 0.5)
+        curve.set_ylim(0.0, 1.0)
+
+
+def _view_axes(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Right and up of a picture [3, 2], and the direction towards the eye [3] [deg]."""
+    a, e = np.deg2rad(azimuth), np.deg2rad(elevation)
+    outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    return np.stack([right, np.cross(outward, right)], axis=1), outward
+
+
+def _draw_scale(figure: Figure) -> None:
+    """The colors from 0 to 1, and that of what no place sees."""
+    scale = figure.add_axes((0.016, 0.045, 0.17, 0.016))
+    mapped = ScalarMappable(Normalize(0.0, 1.0), SCORES)
+    bar = figure.colorbar(mapped, cax=scale, orientation="horizontal", ticks=[0.0, 0.5, 1.0])
+    bar.outline.set_visible(False)
+    scale.tick_params(labelsize=8, colors=style.MUTED, length=2)
+    unseen = Patch(facecolor=css_color(UNSEEN), label="seen from none of the places")
+    figure.legend(handles=[unseen], loc=(0.2, 0.03), fontsize=9, frameon=False,
+                  labelcolor=style.MUTED)  # fmt: skip
 
 
 def export_film(
@@ -225,29 +256,44 @@ def _fill(
     pictures = folder / "views"
     make_folder(pictures)
     for step in range(num_views):
-        _save(pictures / f"{step:06d}.png", film.picture(step))
+        write_atomic(pictures / f"{step:06d}.png", film.picture(step))
         on_picture(step + 1, total)
     written = [pictures]
     for number, (name, above) in enumerate(stills, start=1):
         path = folder / f"{'above' if above else 'oblique'}-{name}.png"
-        _save(path, film.still(name, from_above=above))
+        write_atomic(path, film.still(name, from_above=above))
         written.append(path)
         on_picture(num_views + number, total)
     if video:
         path = folder / "run.mp4"
         rate = int(np.clip(num_views / 12.0, 2, 12))
-        write_video(path, _read_back(pictures, num_views, round(_LAST_FOR * rate)), rate)
+        steps = [*range(num_views), *[num_views - 1] * round(_LAST_FOR * rate)]
+        _write_video(path, [pictures / f"{step:06d}.png" for step in steps], rate)
         written.append(path)
     return written
 
 
-def _save(path: Path, picture: np.ndarray) -> None:
-    data = io.BytesIO()
-    Image.fromarray(picture).save(data, "png", compress_level=6)
-    write_atomic(path, data.getvalue())
+def _write_video(path: Path, pictures: Iterable[Path], rate: int) -> None:
+    """Writes an MP4 of pictures of `WIDTH` x `HEIGHT`, so many a second."""
+    av = load_av()
+    encoder = next(name for name in ENCODERS if _is_known(name))
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream(encoder, rate=rate)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        if encoder == "libx264":
+            stream.options = {"crf": "18"}
+        else:
+            stream.bit_rate = 4_000_000
+        for picture in pictures:
+            with Image.open(picture) as image:
+                container.mux(stream.encode(av.VideoFrame.from_image(image.convert("RGB"))))
+        container.mux(stream.encode(None))
 
 
-def _read_back(folder: Path, num_views: int, last_for: int) -> Iterator[np.ndarray]:
-    """The pictures in order; the last one stays for a while."""
-    for step in [*range(num_views), *[num_views - 1] * last_for]:
-        yield np.asarray(Image.open(folder / f"{step:06d}.png").convert("RGB"))
+def _is_known(encoder: str) -> bool:
+    av = load_av()
+    try:
+        av.Codec(encoder, "w")
+    except ValueError:  # how PyAV says that FFmpeg was built without it
+        return False
+    return True

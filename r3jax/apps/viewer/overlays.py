@@ -6,6 +6,7 @@ Shape symbols: n points or Gaussians; s segments; C candidates.
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from r3jax.apps.viewer.color_maps import ORDER, paint
 from r3jax.geometry.cameras import Camera
@@ -117,7 +118,7 @@ def splat_arrays(
         area = scales.prod(axis=1) / scales.min(axis=1)
         best = np.sort(np.argsort(-opacity * area, kind="stable")[:budget])
         alive, opacity, scales = alive[best], opacity[best], scales[best]
-    axes = _rotations(np.asarray(scene.quats, dtype=np.float64)[alive]) * scales[:, None, :]
+    axes = _matrices(np.asarray(scene.quats, dtype=np.float64)[alive]) * scales[:, None, :]
     rgb = np.asarray(scene.sh, dtype=np.float64)[alive, 0] * C0 + 0.5
     arrays = (
         np.asarray(scene.means)[alive],
@@ -129,37 +130,20 @@ def splat_arrays(
     return centers, covariances, colors, opacities
 
 
-def _rotations(wxyz: np.ndarray) -> np.ndarray:
-    """Matrices [n, 3, 3] of quaternions [n, 4] of any length but 0."""
-    w, x, y, z = (wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+def _matrices(wxyz: np.ndarray) -> np.ndarray:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] of any length but 0."""
+    return Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
 
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
     """The unit quaternion wxyz of a rotation matrix [3, 3], w >= 0."""
-    # The eigenvector of Bar-Itzhack's matrix (2000) with the largest eigenvalue.
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(R, dtype=np.float64)
-    K = np.array(
-        [
-            [a - e - i, d + b, g + c, h - f],
-            [d + b, e - a - i, h + f, c - g],
-            [g + c, h + f, i - a - e, d - b],
-            [h - f, c - g, d - b, a + e + i],
-        ]
-    )
-    x, y, z, w = np.linalg.eigh(K / 3.0)[1][:, -1]
-    sign = -1.0 if w < 0.0 else 1.0
-    return float(sign * w), float(sign * x), float(sign * y), float(sign * z)
+    w, x, y, z = Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True).tolist()
+    return w, x, y, z
 
 
 def pose_of(wxyz: np.ndarray, position: np.ndarray) -> np.ndarray:
     """`T_world_camera` [4, 4] float64 of a quaternion wxyz and a position [m]."""
     pose = np.eye(4)
-    pose[:3, :3] = _rotations(np.asarray(wxyz, dtype=np.float64)[None])[0]
+    pose[:3, :3] = _matrices(wxyz)
     pose[:3, 3] = position
     return pose

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from r3jax.apps.viewer.color_maps import UTILITY_MAP, paint, spread, to_bytes
 from r3jax.geometry.cameras import Camera
@@ -150,13 +150,7 @@ def _splats(around: Surroundings, pose: Float[Array, "4 4"]) -> np.ndarray | Non
     return np.asarray(render(around.model, camera, pose, background).rgb).clip(0.0, 1.0)
 
 
-_INK, _PAPER, _MUTED = (31, 41, 55), (255, 255, 255), (107, 114, 128)
-
-
-@functools.cache
-def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The letters of all pictures."""
-    return ImageFont.load_default(size)
+_INK, _PAPER = (31, 41, 55), (255, 255, 255)
 
 
 @functools.cache
@@ -208,25 +202,6 @@ def panorama_image(look: CameraPreview, width: int = 360) -> np.ndarray:
     for color, radius, thick in ((_INK, 10, 5), ((239, 68, 68), 9, 3)):
         pen.ellipse([u - radius, v - radius, u + radius, v + radius], outline=color, width=thick)
     return np.asarray(image)
-
-
-def fitted(picture: np.ndarray, width: int, height: int, *, is_photo: bool = False) -> np.ndarray:
-    """A picture made to fit into a frame, in its middle, [height, width, 3] uint8.
-
-    Args:
-        picture: [H, W, 3] uint8.
-        width: of the frame [px].
-        height: of the frame [px].
-        is_photo: whether its pixels may be smoothed when it is made larger.
-    """
-    image = Image.fromarray(np.ascontiguousarray(picture))
-    scale = min(width / image.width, height / image.height)
-    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
-    larger = Image.Resampling.BICUBIC if is_photo else Image.Resampling.NEAREST
-    way = larger if scale > 1.0 else Image.Resampling.BOX
-    canvas = Image.new("RGB", (width, height), _PAPER)
-    canvas.paste(image.resize(size, way), ((width - size[0]) // 2, (height - size[1]) // 2))
-    return np.asarray(canvas)
 
 
 def quick_preview_image(glance: QuickPreview, term: str) -> np.ndarray:

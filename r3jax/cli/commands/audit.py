@@ -4,14 +4,14 @@ import dataclasses
 import tempfile
 from pathlib import Path
 
+from r3jax.apps.audit import sentences
 from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.audit_page import write_report
 from r3jax.apps.audit.camera_paths import CameraPath, path_of
+from r3jax.apps.audit.ground_plan import letter
 from r3jax.apps.audit.live.follow import follow
-from r3jax.apps.audit.live.page import open_guide
+from r3jax.apps.audit.live.guide_page import open_guide
 from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_outputs
-from r3jax.apps.audit.pages import sentences
-from r3jax.apps.audit.pages.audit_page import write_report
-from r3jax.apps.audit.pages.ground_plan import letter
 from r3jax.apps.audit.source import Source, source_of
 from r3jax.apps.audit.survey import AuditSettings
 from r3jax.cli.console import Console, Table

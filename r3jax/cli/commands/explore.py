@@ -91,8 +91,8 @@ def _open_page(options: ExploreOptions, stack: contextlib.ExitStack) -> Callable
         UserError: viser is not installed, or the port is in use.
     """
     check_viser()
-    from r3jax.apps.viewer.page.live import open_live
-    from r3jax.apps.viewer.page.server import close_server, open_server
+    from r3jax.apps.viewer.live import open_live
+    from r3jax.apps.viewer.server import close_server, open_server
 
     try:
         server = open_server("127.0.0.1", options.port)

@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from r3jax.apps.forecast.outlook import Outlook
+from r3jax.apps.forecast.forecast import Outlook
 from r3jax.apps.forecast.psnr import default_calibration, read_calibration
 from r3jax.apps.report.figures import LEVEL, outlook_figure, outlook_lines
 from r3jax.cli.console import Console

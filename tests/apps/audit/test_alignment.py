@@ -9,7 +9,6 @@ from r3jax.apps.audit import alignment as real
 from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
 from r3jax.geometry.cameras import rigid_error
 from tests.formats.colmap_models import random_pose, random_rotation
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 seeds = st.integers(0, 10_000)
 
@@ -21,11 +20,7 @@ def random_alignment(seed: int, kind: type[Alignment] = Alignment) -> Alignment:
 
 @given(seeds)
 def test_points_poses_and_directions_come_back(seed):
-    law_back({"alignment": real}, seed)
-
-
-def law_back(modules: Modules, seed: int = 5) -> None:
-    found = random_alignment(seed, modules["alignment"].Alignment)
+    found = random_alignment(seed, real.Alignment)
     rng = np.random.default_rng(seed)
     points = rng.normal(0.0, 20.0, (5, 3))
     np.testing.assert_allclose(found.points_back(found.points(points)), points, atol=1e-9)
@@ -40,12 +35,8 @@ def law_back(modules: Modules, seed: int = 5) -> None:
 
 @given(seeds)
 def test_what_a_camera_sees_stays_where_it_is_in_the_image(seed):
-    law_same_image({"alignment": real}, seed)
-
-
-def law_same_image(modules: Modules, seed: int = 5) -> None:
     """Coordinates in the camera change by the scale only, so pixels do not change."""
-    found = random_alignment(seed, modules["alignment"].Alignment)
+    found = random_alignment(seed, real.Alignment)
     points = np.random.default_rng(seed).normal(0.0, 20.0, (5, 3))
     pose = random_pose(seed)
     in_camera = lambda points, T: (points - T[:3, 3]) @ T[:3, :3]
@@ -56,13 +47,9 @@ def law_same_image(modules: Modules, seed: int = 5) -> None:
 
 @given(seeds)
 def test_up_becomes_z_by_the_smallest_rotation(seed):
-    law_up({"alignment": real}, seed)
-
-
-def law_up(modules: Modules, seed: int = 5) -> None:
     up = np.random.default_rng(seed).normal(size=3)
     up /= np.linalg.norm(up)
-    R = modules["alignment"].rotation_to_z(up)
+    R = real.rotation_to_z(up)
     np.testing.assert_allclose(R @ up, [0, 0, 1], atol=1e-9)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) > 0
@@ -85,29 +72,3 @@ def test_up_may_be_any_direction():
     for nothing in ("1,2", "0,0,0", "nan,0,1", "1e999,0,0", "up", ""):
         with pytest.raises(ValueError, match="--up"):
             up_of(nothing)
-
-
-CHAIN = ("r3jax.apps.audit.alignment",)
-MUTANTS = [
-    Mutant("alignment", "(points_capture - self.origin)", "(points_capture)", law_back),
-    Mutant("alignment", "= self.rotation.T @ moved", "= self.rotation @ moved", law_back),
-    Mutant("alignment", "self.scale * (points_capture", "(points_capture", law_same_image),
-    Mutant(
-        "alignment",
-        "directions_audit.astype(np.float64) @ self.rotation",
-        "directions_audit",
-        law_back,
-    ),
-    Mutant("alignment", "K @ K / (1.0 + c)", "K @ K / (1.0 - c)", law_up),
-]
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    for law in (law_back, law_same_image, law_up):
-        law(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

@@ -11,13 +11,13 @@ import pytest
 from r3jax.apps.audit import capture_maps
 from r3jax.apps.audit.alignment import Alignment
 from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.audit_page import picture_faults
 from r3jax.apps.audit.bad_regions import bad_regions, unseen_edges, unseen_regions
 from r3jax.apps.audit.camera_paths import CameraPath
 from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
+from r3jax.apps.audit.ground_plan import _value_picture
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
-from r3jax.apps.audit.pages.faults_section import faults_section
-from r3jax.apps.audit.pages.ground_plan import _value_picture
-from r3jax.apps.audit.pages.sentences import directions, method, verdict
+from r3jax.apps.audit.sentences import CONTRADICTED, directions, method, verdict
 from r3jax.apps.audit.source import Source, source_of
 from r3jax.apps.audit.survey import MARGIN, AuditSettings, survey_of
 from r3jax.apps.audit.vertical import Vertical
@@ -314,9 +314,9 @@ def test_a_model_without_images_is_audited_by_its_points(folder):
     assert found.diagnosis.share("noise") == 0.0
     assert "nothing can be said about noise" in method(found)[-1]
     assert verdict(found)[0].startswith("None of the 8 pictures is there")
-    page = faults_section(found)
-    assert "sharp" not in page
-    assert "where they say" not in page
+    (remark,) = picture_faults(found)["remarks"]
+    assert "sharp" not in remark
+    assert "where they say" not in remark
 
 
 def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
@@ -416,7 +416,7 @@ def test_where_nothing_fits_no_verdict_on_pictures_follows(corner):
     faults = replace(corner.faults, findings=(), fits=False)
     found = replace(corner, faults=faults)
     assert any("not known" in text for text in verdict(found))
-    assert "sharp" not in faults_section(found)
+    assert picture_faults(found)["remarks"] == [CONTRADICTED]
 
 
 def test_a_raster_does_not_grow_with_the_place(corner):

@@ -16,7 +16,6 @@ from r3jax.formats.recordings import read_recording
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate
 from tests.apps.audit.room import round_poses, write_recording
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 pytestmark = pytest.mark.full
 
@@ -67,22 +66,18 @@ def assert_same(a: MapState, b: MapState) -> None:
         np.testing.assert_allclose(value, second[key], atol=2e-5)
 
 
-def law_statistics(modules: Modules) -> None:
+def test_colors_and_counts_are_those_of_plain_integration():
     """Colors and counts are those of plain integration, of all and of all but a fold."""
-    found = modules["capture_maps"].see(*room(), folds=4)
+    found = real.see(*room(), folds=4)
     assert_same(found.state, plain(range(NUM)))
     for fold in (0, 3):
         others = [i for i in range(NUM) if i % 4 != fold]
         assert_same(found.without(fold), plain(others))
 
 
-def test_colors_and_counts_are_those_of_plain_integration():
-    law_statistics({"capture_maps": real})
-
-
-def law_marks(modules: Modules) -> None:
+def test_marks_leave_with_their_picture():
     """No mark comes from a picture that is left out, and none is missing."""
-    found = modules["capture_maps"].see(*room(), folds=NUM)
+    found = real.see(*room(), folds=NUM)
     for fold in (1, 5):
         without, part = found.without(fold), found.folds[fold]
         union = np.asarray(without.visited) | np.asarray(part.visited)
@@ -93,10 +88,6 @@ def law_marks(modules: Modules) -> None:
         assert only.any()  # so the picture's own marks do leave with it
         # A picture marks one direction of a voxel.
         assert np.bitwise_count(np.asarray(part.visited)).sum(axis=0).max() == 1
-
-
-def test_marks_leave_with_their_picture():
-    law_marks({"capture_maps": real})
 
 
 def test_every_part_has_the_rows_of_the_whole():
@@ -144,25 +135,3 @@ def test_more_folds_than_pictures_leave_one_each():
     found = see(source, survey, folds=99)
     assert len(found.folds) == NUM
     jax.tree.map(np.testing.assert_array_equal, found.state.key, seen().state.key)
-
-
-CHAIN = ("r3jax.apps.audit.capture_maps",)
-MUTANTS = [
-    Mutant("capture_maps", "if i != fold", "if i == fold", law_statistics),
-    Mutant("capture_maps", "(b.count, b.mean, b.m2)", "(a.count, b.mean, b.m2)", law_statistics),
-    Mutant("capture_maps", "(b.count, b.mean, b.m2)", "(b.count, b.mean, a.m2)", law_statistics),
-    Mutant("capture_maps", "a.visited | b.visited", "a.visited & b.visited", law_marks),
-    Mutant("capture_maps", "whole, marks(part)), frame", "whole, marks(whole)), frame", law_marks),
-]
-
-
-@pytest.mark.mutant
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    law_statistics(modules)
-    law_marks(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

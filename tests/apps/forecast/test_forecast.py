@@ -1,7 +1,5 @@
 """The forecast of a small room: from its own views, and higher the more is known."""
 
-import functools
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -17,9 +15,7 @@ from r3jax.planning.planner import add_frame, first_grid
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import renderability
 from tests.exploration.toys import BoxRoom
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
-CHAIN = ("r3jax.apps.forecast.forecast",)
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14)
 
 
@@ -41,16 +37,15 @@ def known():
     return room.camera, {views: found[views] for views in (1, 4, 12)}
 
 
-def law_of_more(modules: Modules, known) -> None:
+@pytest.mark.full
+def test_more_views_promise_more(known):
     camera, states = known
-    values = [
-        modules["forecast"].forecast_map(*states[views], camera).value("mean")
-        for views in (1, 4, 12)
-    ]
+    values = [real.forecast_map(*states[views], camera).value("mean") for views in (1, 4, 12)]
     assert values[0] + 2.0 < values[1] < values[2]
 
 
-def law_of_the_mixture(modules: Modules, known) -> None:
+@pytest.mark.full
+def test_a_forecast_is_the_mixture_of_its_views(known):
     """Its views one by one: R and coverage of each, and the mixture of all that show something."""
     camera, states = known
     state, grid = states[12]
@@ -64,55 +59,28 @@ def law_of_the_mixture(modules: Modules, known) -> None:
     alone = [float(renderability(state, camera, pose, config)) for pose in jnp.asarray(poses)]
     np.testing.assert_allclose(value, alone, atol=1e-5)
     assert (value <= coverage + 1e-6).all()
-    forecast = modules["forecast"].forecast_map(state, grid, camera)
+    forecast = real.forecast_map(state, grid, camera)
     model = default_calibration().model
     expected = np.sort(model.mixture(coverage, value), axis=None)
     assert forecast.mixture.shape == expected.shape
     np.testing.assert_allclose(forecast.mixture, expected, atol=1e-3)
 
 
-def law_of_the_void(modules: Modules, known) -> None:
+def test_a_view_into_the_void_does_not_count(known):
     """A view that shows no surface counts as a failure only while there may be some."""
     camera, states = known
     state, grid = states[12]
     done = jnp.where(grid.unexplored, 4.0, grid.log_odds).astype(jnp.float32)
     open_grid = eqx.tree_at(lambda g: g.log_odds, grid, done)
-    forecast = modules["forecast"].forecast_map(empty_map(*_size(state)), open_grid, camera)
+    forecast = real.forecast_map(empty_map(*_size(state)), open_grid, camera)
     assert forecast.mixture.size == 0
     assert forecast.value("mean") == -np.inf
-    blamed = modules["forecast"].forecast_map(empty_map(*_size(state)), grid, camera)
+    blamed = real.forecast_map(empty_map(*_size(state)), grid, camera)
     assert blamed.mixture.size > 0
 
 
 def _size(state):
     return state.capacity, float(state.voxel_size), CONFIG.num_bins
-
-
-@pytest.mark.full
-def test_more_views_promise_more(known):
-    law_of_more(load(CHAIN), known)
-
-
-@pytest.mark.full
-def test_a_forecast_is_the_mixture_of_its_views(known):
-    law_of_the_mixture(load(CHAIN), known)
-
-
-def test_a_view_into_the_void_does_not_count(known):
-    law_of_the_void(load(CHAIN), known)
-
-
-MUTANTS = [
-    Mutant("forecast", "(unexplored > 0.0)", "(unexplored >= 0.0)", law_of_the_void),
-    Mutant("forecast", "jnp.mean(shown)", "jnp.mean(shown) ** 2", law_of_the_mixture),
-    Mutant("forecast", "np.arange(NUM_VIEWS) %", "0 * np.arange(NUM_VIEWS) %", law_of_the_mixture),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant, known):
-    with_room = mutant._replace(law=functools.partial(mutant.law, known=known))
-    assert_caught(CHAIN, with_room)
 
 
 def test_a_width_goes_both_ways(known):

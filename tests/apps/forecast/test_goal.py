@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.apps.forecast.forecast import Forecast
-from r3jax.apps.forecast.goal import Goal, parse_goal
-from r3jax.apps.forecast.psnr import default_calibration
+from r3jax.apps.forecast.psnr import Goal, default_calibration, parse_goal
 
 
 @given(st.floats(-50.0, 80.0), st.sampled_from(["mean", "p10", "p50", "p2.5"]))

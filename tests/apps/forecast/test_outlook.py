@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.forecast import outlook as real
-from r3jax.apps.forecast.forecast import forecast_map, stopping_rule
-from r3jax.apps.forecast.outlook import Outlook
+from r3jax.apps.forecast import forecast as real
+from r3jax.apps.forecast.forecast import Outlook, forecast_map, stopping_rule
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.replay import states_of
@@ -22,29 +21,29 @@ from tests.exploration.toys import BoxRoom
 from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.trace.runs import make_header
 
-CHAIN = ("r3jax.apps.forecast.outlook",)
+CHAIN = ("r3jax.apps.forecast.forecast",)
 
 
 def law_of_doubling(modules: Modules, slope: float = 3.0, views: int = 40) -> None:
     """Where every doubling adds `slope` dB, so does the next: by the formula, and walked there."""
     taken = np.arange(views // 8, views + 1, views // 8)
     curve = lambda n: 12.0 + slope * np.log2(n)
-    more = modules["outlook"].more_views(taken, curve(taken), 1.0)
+    more = modules["forecast"].more_views(taken, curve(taken), 1.0)
     assert curve(taken[-1] + more) >= curve(taken[-1]) + 1.0 - 1e-6
     assert curve(taken[-1] + more - 1) < curve(taken[-1]) + 1.0 + 1e-6
     # What came before the second half does not matter.
     early = np.where(2 * taken < taken[-1], 0.0, curve(taken))
-    assert modules["outlook"].more_views(taken, early, 1.0) == more
+    assert modules["forecast"].more_views(taken, early, 1.0) == more
 
 
 @given(st.floats(0.2, 20.0), st.integers(2, 40))
 def test_more_views_follow_the_doubling(slope, eighth):
-    law_of_doubling({"outlook": real}, slope, 8 * eighth)
+    law_of_doubling({"forecast": real}, slope, 8 * eighth)
 
 
 def law_of_no_gain(modules: Modules) -> None:
     views = np.array([10, 20, 30, 40])
-    more = modules["outlook"].more_views
+    more = modules["forecast"].more_views
     assert more(views, np.array([20.0, 25.0, 25.0, 25.0])) is None
     assert more(views, np.array([20.0, 25.0, 25.03, 25.05])) is None  # not worth a count
     assert more(views, np.array([20.0, 26.0, 25.5, 25.0])) is None  # it fell
@@ -60,10 +59,10 @@ def test_no_gain_is_no_number():
 
 
 MUTANTS = [
-    Mutant("outlook", "(gain / per_doubling) - 1.0", "(gain / per_doubling)", law_of_doubling),
-    Mutant("outlook", "np.log2(views[late])", "np.log(views[late])", law_of_doubling),
-    Mutant("outlook", "& (2 * views >= views[-1])", "", law_of_doubling),
-    Mutant("outlook", "_LEAST_GAIN = 0.1", "_LEAST_GAIN = 0.001", law_of_no_gain),
+    Mutant("forecast", "(gain / per_doubling) - 1.0", "(gain / per_doubling)", law_of_doubling),
+    Mutant("forecast", "np.log2(views[late])", "np.log(views[late])", law_of_doubling),
+    Mutant("forecast", "& (2 * views >= views[-1])", "", law_of_doubling),
+    Mutant("forecast", "_LEAST_GAIN = 0.1", "_LEAST_GAIN = 0.001", law_of_no_gain),
 ]  # fmt: skip
 
 

@@ -13,8 +13,13 @@ import pytest
 from matplotlib.collections import LineCollection
 
 from r3jax.apps.forecast.forecast import forecast_map
-from r3jax.apps.report.figures import plan_figure, progress_figure
-from r3jax.apps.report.reasons import COLORS, reasons_figure, shares_of, utility_by_cause
+from r3jax.apps.report.figures import (
+    plan_figure,
+    progress_figure,
+    reasons_figure,
+    shares_of,
+    utility_by_cause,
+)
 from r3jax.apps.report.report import write_report
 from r3jax.apps.report.summary import map_row_bytes, stage_times, summary
 from r3jax.exploration import explore
@@ -152,7 +157,9 @@ def test_the_bars_of_a_view_are_its_shares():
         assert [bar.get_y() for bar in bars] == pytest.approx([0.0, *below])
     # A logarithm shows no 0.
     amounts = [[nan, 48.0, nan, nan], [nan, 24.0, nan, 1.0], [nan, 8.0, nan, 1.0]]
-    for line, color, amount in zip(lower.lines, COLORS, [*amounts, [nan] * 3 + [2.0]], strict=True):
+    for line, color, amount in zip(
+        lower.lines, style.CAUSE_COLORS, [*amounts, [nan] * 3 + [2.0]], strict=True
+    ):
         assert line.get_color() == color
         np.testing.assert_array_equal(line.get_xdata(), [1, 2, 3, 4])
         np.testing.assert_array_equal(line.get_ydata(), amount)

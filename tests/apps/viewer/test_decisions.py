@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r3jax.apps.runs.settings import settings_of_run
-from r3jax.apps.viewer.decisions import decide_again, offer_segments
+from r3jax.apps.viewer.story import decide_again, offer_segments
 from r3jax.planning.registry import make_policy
 from r3jax.trace.errors import RunError
 

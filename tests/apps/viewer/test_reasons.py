@@ -1,18 +1,15 @@
-"""Why a view was taken: in the panel, and on the voxels that it was to see."""
+"""Why a view was taken: as a run is replayed, and on the voxels that it was to see."""
 
 import dataclasses
-import re
 
 import numpy as np
 import pytest
 
-from r3jax.apps.report.reasons import COLORS
 from r3jax.apps.viewer.blocks import Blocks, block_causes, cause_colors
 from r3jax.apps.viewer.color_maps import UNSEEN
-from r3jax.apps.viewer.page.facts import reason_html
 from r3jax.apps.viewer.story import RecordedStory
 from r3jax.exploration.explain_run import Reason, explain_run
-from r3jax.scoring.explain import CAUSES
+from r3jax.plots import style
 from tests.apps.viewer.conftest import VIEWS
 
 pytestmark = pytest.mark.full
@@ -76,28 +73,6 @@ def make_reason() -> Reason:
     )
 
 
-def test_the_panel_tells_the_shares():
-    text = reason_html(make_reason())
-    assert "<b>80</b>" in text
-    found = re.findall(r"<span style=\"flex:1\">([^<]*)</span><span[^>]*>(\d+) (\w+)", text)
-    numbers = ["3", "3", "2", "2"]
-    units = ["cells", "voxels", "voxels", "voxels"]
-    assert found == list(zip(CAUSES, numbers, units, strict=True))
-    assert re.findall(r">([\d.]+) %<", text) == ["60.0", "30.0", "10.0", "0.0"]
-    widths = re.findall(r"width:([\d.]+)%;background:(#\w+)", text)
-    assert [float(width) for width, _ in widths] == [60.0, 30.0, 10.0, 0.0]
-    assert tuple(color for _, color in widths) == COLORS
-
-
-def test_a_view_that_promised_nothing_has_no_shares():
-    nothing = dataclasses.replace(make_reason(), totals=np.zeros(4))
-    assert re.findall(r">([\d.]+) %<", reason_html(nothing)) == ["0.0"] * 4
-
-
-def test_the_panel_tells_why_nothing_is_known_as_text():
-    assert "&lt;b&gt;broken&lt;/b&gt;" in reason_html("<b>broken</b>")
-
-
 def test_a_block_has_the_cause_that_took_most_of_its_voxels():
     # Rows 3 and 6 are one block, 5 and 7 the second, 9 the third, 1 the fourth.
     blocks = Blocks(
@@ -114,7 +89,7 @@ def test_a_block_has_the_cause_that_took_most_of_its_voxels():
 
 
 def test_causes_have_the_colors_of_the_report():
-    rgb = [tuple(int(color[i : i + 2], 16) for i in (1, 3, 5)) for color in COLORS]
+    rgb = [tuple(int(color[i : i + 2], 16) for i in (1, 3, 5)) for color in style.CAUSE_COLORS]
     own = np.tile(np.asarray(UNSEEN, np.uint8).mean().round().astype(np.uint8), (4, 3))
     colors = cause_colors(np.arange(4), own)
     assert colors[1:].tolist() == [list(color) for color in rgb[1:]]

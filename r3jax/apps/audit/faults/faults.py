@@ -15,12 +15,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from r3jax.apps.audit.faults.blocks import BlockImage, block_image
-from r3jax.apps.audit.faults.blur import Sharpness, image_motion, sharpness
-from r3jax.apps.audit.faults.light import Light, light
+from r3jax.apps.audit.faults.appearance import (
+    Light,
+    Sharpness,
+    image_motion,
+    light,
+    repeats,
+    sharpness,
+)
+from r3jax.apps.audit.faults.blocks import BlockImage, block_image, overlaps
 from r3jax.apps.audit.faults.offsets import Offsets, Systematic, offsets
-from r3jax.apps.audit.faults.overlap import overlaps
-from r3jax.apps.audit.faults.repeats import repeats
 from r3jax.apps.audit.source import Source
 from r3jax.formats.errors import FormatError
 

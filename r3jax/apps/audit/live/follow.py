@@ -19,7 +19,7 @@ from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
 from r3jax.apps.audit.faults.blocks import BlockImage, block_image
 from r3jax.apps.audit.faults.faults import Kind, faults_of
 from r3jax.apps.audit.live.growing import Arrival, GrowingCapture
-from r3jax.apps.audit.live.page import GuidePage
+from r3jax.apps.audit.live.guide_page import GuidePage
 from r3jax.apps.audit.source import Source
 from r3jax.apps.audit.vertical import Normals, block_normals, estimated_up
 from r3jax.formats.ros.names import Topics

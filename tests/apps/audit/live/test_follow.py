@@ -13,8 +13,7 @@ import pytest
 import r3jax
 from r3jax.apps.audit.live import follow as module
 from r3jax.apps.audit.live.follow import follow
-from r3jax.apps.audit.live.page import open_guide
-from r3jax.apps.audit.live.progress import mean_value
+from r3jax.apps.audit.live.guide_page import mean_value, open_guide
 from tests.apps.audit.room import LENS, SIZE, picture, round_poses, write_recording
 
 pytestmark = pytest.mark.full

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from r3jax.apps.audit.live import growing
-from r3jax.apps.audit.live.growing import GrowingCapture
-from r3jax.apps.audit.live.staging import complete_lines
+from r3jax.apps.audit.live.growing import GrowingCapture, complete_lines
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from tests.apps.audit.room import picture, round_poses, write_nerfstudio, write_recording
 from tests.formats.bags import camera_poses, write_bag

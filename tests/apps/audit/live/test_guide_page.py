@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import r3jax
-from r3jax.apps.audit.live.page import open_guide
+from r3jax.apps.audit.live.guide_page import open_guide
 from tests.apps.audit.room import LENS, SIZE, picture, round_poses
 
 pytest.importorskip("playwright.sync_api", reason="the page is tested with playwright")

@@ -1,0 +1,312 @@
+"""The figures of an audit, except the map from above."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+
+from r3jax.apps.audit.audit import Audit, EvaluatedFrame
+from r3jax.apps.audit.bad_regions import BLOCK, Region
+from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, letter
+from r3jax.apps.audit.suggest import Suggestion
+from r3jax.mapping.state import MapState
+from r3jax.plots import style
+from r3jax.plots.pictures import empty_directions, panorama_picture, show_renderability
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.renderability import term_images
+from r3jax.scoring.simulated import simulate_view
+
+_FINE_BUFFER = 320
+"""Pixels along the longer side of images of the map."""
+
+_SAMPLED = 500
+"""Voxels of a view that are looked for in other images."""
+
+_EMPTY = 0.93
+"""Gray of pixels that show no voxel."""
+
+
+def frames_figure(audit: Audit) -> Figure:
+    """Renderability of every frame along the path, colored by what costs most; its histogram."""
+    figure = style.new_figure(10.0, 3.2)
+    left, right = figure.subplots(1, 2, width_ratios=[2.6, 1.0], sharey=True)
+    value = audit.renderability
+    causes = [frame.score.cause for frame in audit.frames]
+    style.dress(left, "Frame by frame", "frame", "renderability R")
+    left.plot(value, color="#9ca3af", linewidth=1.0, zorder=1)
+    colors = [COLOR_OF_CAUSE[cause] for cause in causes]
+    left.scatter(np.arange(len(value)), value, c=colors, s=18, zorder=2)
+    left.set_ylim(0.0, 1.0)
+    handles = [
+        Line2D([], [], marker="o", linestyle="none", markersize=5, color=COLOR_OF_CAUSE[cause],
+               label=f"costs most: {cause}")
+        for cause in dict.fromkeys(causes)
+    ]  # fmt: skip
+    left.legend(handles=handles, fontsize=8, frameon=False, loc="lower left", ncols=len(handles))
+    style.dress(right, "How many frames", "frames")
+    right.hist(value, bins=np.linspace(0.0, 1.0, 21).tolist(), orientation="horizontal",
+               color=style.ACCENT, alpha=0.75)  # fmt: skip
+    right.axhline(float(value.mean()), color=style.SECOND, linewidth=1.5)
+    right.annotate(f"mean {value.mean():.2f}", (0.98, float(value.mean())), fontsize=9, ha="right",
+                   xycoords=("axes fraction", "data"), va="bottom", color=style.SECOND)  # fmt: skip
+    return figure
+
+
+def gain_figure(audit: Audit) -> Figure:
+    """Mean renderability of all surfaces after each suggested view, and after random ones."""
+    figure = style.new_figure(10.0, 2.7)
+    axes = style.dress(
+        figure.subplots(), "What the views promise", "views taken", "mean R of the surfaces"
+    )
+    start = audit.diagnosis.mean
+    chosen = [start, *(view.mean_after for view in audit.plan.views)]
+    drawn = [start, *audit.plan.random_mean]
+    axes.plot(chosen, color=style.ACCENT, linewidth=2.0, marker="o", label="suggested, in order")
+    axes.plot(drawn, color="#9ca3af", linewidth=1.5, marker="o", markersize=3,
+              label="at random places and directions")  # fmt: skip
+    axes.set_xticks(range(len(chosen)))
+    figure.legend(fontsize=8, frameon=False, ncols=2, loc="outside upper right")
+    return figure
+
+
+def panorama_strip(audit: Audit, count: int = 3) -> Figure:
+    """All directions from some standpoints: colors above, renderability below."""
+    standpoints = audit.standpoints[:count]
+    figure = style.new_figure(10.0, 2.55 * len(standpoints))
+    grid = figure.subplots(len(standpoints), 2, squeeze=False)
+    image = None
+    for number, (line, position) in enumerate(zip(grid, standpoints, strict=True), start=1):
+        pose = np.eye(4)
+        pose[:3, 3] = position
+        picture = panorama_picture(
+            audit.seen.state, audit.seen.grid, audit.camera, pose, float(audit.config.max_range)
+        )
+        place = audit.survey.alignment.points_back(position[None])[0]
+        where = ", ".join(f"{value:.2f}" for value in place)
+        for axes, title in zip(line, (f"{number}: from ({where})", "renderability R"), strict=True):
+            style.blank(axes, title)
+            axes.title.set_fontsize(9)
+        line[0].imshow(picture.rgb)
+        image = show_renderability(line[1], picture)
+    if image is not None:
+        bar = figure.colorbar(image, ax=grid, shrink=0.4, pad=0.01)
+        bar.outline.set_visible(False)
+        bar.ax.tick_params(labelsize=8, colors=style.MUTED)
+        figure.legend(handles=empty_directions(), fontsize=8, frameon=False, ncols=2,
+                      loc="outside lower center")  # fmt: skip
+    return figure
+
+
+def view_figures(audit: Audit) -> list[Figure]:
+    """Draws the nearest image, the map, and R before and after for each suggested view."""
+    fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
+    figures: list[Figure] = []
+    state = audit.seen.state
+    for view in audit.plan.views:
+        pose = jnp.asarray(view.pose, dtype=jnp.float32)
+        after, _ = simulate_view(state, audit.camera, pose, audit.config)
+        colors, before = _pictures(state, audit, view.pose, fine)
+        _, later = _pictures(after, audit, view.pose, fine)
+        like, _ = likest_picture(audit, view)
+        photo, _ = audit.source.read(like)
+        named = f"most similar so far: {_short(audit.source.labels[like])}"
+        figures.append(
+            _row((named, photo), ("the map from here", colors), ("R now", before),
+                 ("R once it is taken", later))
+        )  # fmt: skip
+        state = after
+    return figures
+
+
+def worst_frames(audit: Audit, count: int = 4) -> list[EvaluatedFrame]:
+    """The frames with the lowest renderability, the worst first."""
+    order = np.argsort(audit.renderability, kind="stable")
+    return [audit.frames[i] for i in order[:count].tolist()]
+
+
+def worst_figure(audit: Audit, count: int = 4) -> Figure:
+    """The worst frames: the image (or the map, where there is none) above its renderability."""
+    fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
+    frames = worst_frames(audit, count)
+    pictures: list[tuple[np.ndarray, np.ndarray]] = []
+    for frame in frames:
+        state = audit.seen.state
+        if audit.is_own_path:
+            place = int(np.searchsorted(audit.survey.chosen, frame.index))
+            state = audit.seen.without(int(audit.seen.fold_of[place]))
+        colors, value = _pictures(state, audit, frame.pose, fine)
+        shown = audit.source.read(frame.index)[0] if audit.is_own_path else colors
+        pictures.append((shown, value))
+    aspect = audit.camera.height / audit.camera.width
+    figure = style.new_figure(10.0, 2.0 * (10.0 / count * aspect + 0.16))
+    grid = figure.subplots(2, count, squeeze=False)
+    for axes in grid.flat:
+        style.blank(axes)
+    for (upper, lower), frame, (shown, value) in zip(grid.T, frames, pictures, strict=False):
+        upper.imshow(shown)
+        upper.set_title(_short(frame.label), fontsize=8, color=style.MUTED, loc="left", pad=2)
+        lower.set_facecolor("#e5e7eb")
+        lower.imshow(value, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
+        lower.set_title(
+            f"R {frame.score.renderability:.2f}, {frame.score.cause}", fontsize=8,
+            color=style.INK, loc="left", pad=2,
+        )  # fmt: skip
+    return figure
+
+
+def likest_picture(audit: Audit, view: Suggestion) -> tuple[int, float]:
+    """The image with most of what a view shows, and how far away it was taken [audit units].
+
+    What hides it is not asked. A radian between the two axes and a unit between the two places
+    cost a tenth of the view each.
+    """
+    poses = audit.survey.alignment.poses(audit.source.poses[audit.survey.chosen])
+    distance = np.linalg.norm(poses[:, :3, 3] - view.pose[:3, 3], axis=1)
+    angle = np.arccos(np.clip(poses[:, :3, 2] @ view.pose[:3, 2], -1.0, 1.0))
+    centers = np.asarray(audit.seen.state.center, np.float64).T[view.shown]
+    centers = centers[:: max(1, len(centers) // _SAMPLED)]
+    shares: list[float] = []
+    for index, pose in zip(audit.survey.chosen.tolist(), poses, strict=True):
+        camera = audit.source.camera(index)
+        x, y, z = ((centers - pose[:3, 3]) @ pose[:3, :3]).T
+        z_safe = np.where(z > 0.05, z, np.inf)
+        column = float(camera.fx) * x / z_safe + float(camera.cx)
+        row = float(camera.fy) * y / z_safe + float(camera.cy)
+        is_in = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        shares.append(float((is_in & (z > 0.05)).mean()) if len(centers) else 0.0)
+    best = int(np.argmax(np.asarray(shares) - 0.1 * (distance + angle)))
+    return int(audit.survey.chosen[best]), float(distance[best])
+
+
+def _pictures(
+    state: MapState, audit: Audit, pose: np.ndarray, config: ScoringConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean colors [h, w, 3] and renderability [h, w] (NaN without a voxel) of a view of a map."""
+    seen = term_images(state, audit.camera, jnp.asarray(pose, dtype=jnp.float32), config)
+    row = np.asarray(seen.row)
+    is_hit = row < state.capacity
+    row = np.where(is_hit, row, 0)
+    colors = np.where(is_hit[..., None], np.asarray(state.mean).T[row], _EMPTY)
+    return colors, np.where(is_hit, np.asarray(seen.value), np.nan)
+
+
+def _row(*pictures: tuple[str, np.ndarray]) -> Figure:
+    """Images side by side, each under its name; those without colors are renderability."""
+    heights = [picture.shape[0] / picture.shape[1] for _, picture in pictures]
+    figure = style.new_figure(10.0, 10.0 / len(pictures) * max(heights) + 0.25)
+    line = np.atleast_1d(np.asarray(figure.subplots(1, len(pictures))))
+    for axes, (name, picture) in zip(line, pictures, strict=True):
+        style.blank(axes)
+        axes.set_title(name, fontsize=8, color=style.MUTED, loc="left", pad=2)
+        if picture.ndim == 2:
+            axes.set_facecolor("#e5e7eb")
+            axes.imshow(picture, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
+        else:
+            axes.imshow(picture)
+    return figure
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 24 else f"…{name[-23:]}"
+
+
+_TRIED = 6
+"""Images of which the depth is looked at."""
+
+_SLACK = 0.5
+"""A region this far behind or before the depth of its pixel is not what the image shows there
+[audit units]."""
+
+_BEST_DISTANCE = 2.0
+"""From here a region is in the image with what is around it [audit units]."""
+
+_PER_LINE = 5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An image that shows a region."""
+
+    index: int
+    """Number of the image in the capture."""
+
+    column: float
+    """Column of the region's middle in the thinned image [px]."""
+
+    row: float
+    """Row of the region's middle in the thinned image [px]."""
+
+    radius: float
+    """Radius of the region [px]."""
+
+
+def best_picture(audit: Audit, region: Region) -> Finding | None:
+    """The image with the region near its middle, at a good distance, and not hidden.
+
+    Only depth images tell what is hidden. None: no image has the region's middle in it.
+    """
+    poses = audit.survey.alignment.poses(audit.source.poses[audit.survey.chosen])
+    local = np.einsum("nji,nj->ni", poses[:, :3, :3], region.center - poses[:, :3, 3])
+    found: list[tuple[float, float, Finding]] = []
+    for index, (x, y, z) in zip(audit.survey.chosen.tolist(), local, strict=True):
+        if z < 0.1:
+            continue
+        camera = audit.source.camera(index)
+        column = float(camera.fx) * x / z + float(camera.cx)
+        row = float(camera.fy) * y / z + float(camera.cy)
+        if not (0.0 <= column < camera.width and 0.0 <= row < camera.height):
+            continue
+        aside = np.hypot(column / camera.width - 0.5, row / camera.height - 0.5)
+        penalty = float(aside + 0.3 * abs(np.log(z / _BEST_DISTANCE)))
+        radius = 0.5 * BLOCK * float(camera.focal) / z
+        found.append((penalty, float(z), Finding(index, column, row, radius)))
+    found.sort(key=lambda entry: entry[0])
+    for _, z, finding in found[:_TRIED]:
+        if _shows(audit, finding, z):
+            return finding
+    return None
+
+
+def _shows(audit: Audit, finding: Finding, z: float) -> bool:
+    """False where something else is measured there."""
+    if not audit.source.is_dense:
+        return True
+    depth = audit.source.read(finding.index)[1][int(finding.row), int(finding.column)]
+    return depth == 0.0 or abs(float(depth) * audit.survey.alignment.scale - z) <= _SLACK
+
+
+def region_figure(audit: Audit) -> Figure | None:
+    """The worst regions in images of the capture; None where no image shows any."""
+    shown = [
+        (number, region, finding)
+        for number, region in enumerate(audit.regions)
+        if (finding := best_picture(audit, region)) is not None
+    ]
+    if not shown or not audit.source.has_images:
+        return None
+    lines = -(-len(shown) // _PER_LINE)
+    aspect = audit.camera.height / audit.camera.width
+    figure = style.new_figure(10.0, lines * (10.0 / _PER_LINE * aspect + 0.22))
+    grid = figure.subplots(lines, _PER_LINE, squeeze=False)
+    for axes in grid.flat:
+        style.blank(axes)
+    for axes, (number, region, finding) in zip(grid.flat, shown, strict=False):
+        photo, _ = audit.source.read(finding.index)
+        axes.imshow(photo)
+        radius = min(finding.radius, 0.45 * photo.shape[0])
+        color = COLOR_OF_CAUSE[region.cause]
+        for width, ring in ((3.2, "white"), (1.8, color)):
+            axes.add_patch(
+                Circle((finding.column, finding.row), radius, fill=False, edgecolor=ring,
+                       linewidth=width)
+            )  # fmt: skip
+        axes.set_xlim(0, photo.shape[1])
+        axes.set_ylim(photo.shape[0], 0)
+        axes.set_title(
+            f"{letter(number)}: {region.cause}", fontsize=9, color=color, loc="left", pad=2,
+            fontweight="bold",
+        )  # fmt: skip
+    return figure

@@ -1,0 +1,250 @@
+"""The report of an audit: one HTML page that opens from disk, with everything inside."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r3jax.apps.audit import audit_figures, sentences
+from r3jax.apps.audit.audit import Audit
+from r3jax.apps.audit.bad_regions import Region
+from r3jax.apps.audit.faults.faults import Finding
+from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, letter, plan_figure
+from r3jax.apps.audit.outputs import suggested_poses
+from r3jax.apps.audit.suggest import Suggestion
+from r3jax.files import write_atomic
+from r3jax.plots.page import render
+from r3jax.plots.pictures import small_png
+from r3jax.plots.style import to_png
+
+_SHOWN = 8
+"""Pictures of a finding that are shown."""
+
+_SIDE = 230
+"""Longer side of a picture on the page [px]."""
+
+_BAR = 90
+"""Width of the bar of a cause that takes everything [px]."""
+
+TITLES = {
+    "blur": "Blurred by motion",
+    "focus": "Out of focus",
+    "brightness": "Brightness changes",
+    "tint": "White balance changes",
+    "pose": "Poses contradict the depth",
+    "scale": "The scale of the depth is wrong",
+    "ray": "Depth is measured along the ray",
+    "camera": "The intrinsics of the camera are wrong",
+    "repeat": "Pictures repeat each other",
+    "stray": "Poses have diverged",
+}
+"""Heading of each kind of finding."""
+
+
+def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path:
+    """Writes `report.html`.
+
+    Args:
+        audit: what was found.
+        folder: a folder that exists.
+        files: what lies beside the page, to be named on it.
+
+    Returns:
+        The page; its images are inside it, so that it can be sent as one file.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    region_figure = audit_figures.region_figure(audit)
+    is_ranked = not audit.is_saturated
+    page = render(
+        "apps/audit/audit_page.html",
+        kind="audit",
+        title=f"Audit of {audit.source.name}",
+        lead=sentences.verdict(audit),
+        cards=_cards(audit),
+        colors=COLOR_OF_CAUSE,
+        is_dense=audit.source.is_dense,
+        is_own_path=audit.is_own_path,
+        pictures=picture_faults(audit),
+        plan=to_png(plan_figure(audit)),
+        causes=_causes(audit),
+        block=sentences.length(audit, 1.0),
+        region_pictures=None if region_figure is None else to_png(region_figure),
+        regions=_regions(audit),
+        gain=to_png(audit_figures.gain_figure(audit)) if audit.plan.views else None,
+        views=_views(audit),
+        frames=to_png(audit_figures.frames_figure(audit)),
+        worst=to_png(audit_figures.worst_figure(audit)) if is_ranked else None,
+        saturation=sentences.saturation(),
+        panorama=to_png(audit_figures.panorama_strip(audit)),
+        method=sentences.method(audit),
+        files=[path.name for path in files],
+    )
+    path = folder / "report.html"
+    write_atomic(path, page.encode())
+    return path
+
+
+def _cards(audit: Audit) -> dict[str, str]:
+    found, plan = audit.diagnosis, audit.plan
+    if audit.survey.is_one_place:
+        return {"pictures": str(len(audit.survey.chosen)), "taken from": "one place"}
+    fine = f"{100 * sentences.cause_share(audit, 'fine'):.0f} %"
+    what = "pictures" if audit.source.has_images else "poses without pictures"
+    cards = {what: str(len(audit.survey.chosen))}
+    if audit.source.is_dense:
+        bad = (1.0 - found.fine_share) * found.is_seen.sum() * audit.survey.voxel_size**2
+        cards["of the surface renders well"] = fine
+        cards["of surface to mend"] = sentences.area(audit, float(bad))
+    else:
+        cards["of what they show renders well"] = fine
+        cards["of it is not known"] = f"{100 * audit.shares['unseen']:.0f} %"
+    zero = "" if audit.source.is_dense else ", what is not known as 0"
+    cards[f"mean R of the frames{zero}"] = f"{audit.renderability.mean():.2f}"
+    if plan.views:
+        gain = f"{found.mean:.2f} → {plan.after.mean:.2f}"
+        where = "" if audit.source.is_dense else " with points"
+        cards[f"mean R of the surfaces{where} after {len(plan.views)} views"] = gain
+    return cards
+
+
+def picture_faults(audit: Audit) -> dict[str, Any]:
+    """What is wrong with single pictures: findings, remarks where there are none, and notes."""
+    faults = audit.faults
+    findings = [_finding(audit, finding) for finding in faults.findings]
+    remarks = [] if findings or not faults.fits else [_nothing_found(audit)]
+    if not faults.fits:
+        remarks.append(sentences.CONTRADICTED)
+    notes: list[str] = []
+    alone = faults.looked_at - faults.compared - len(faults.without_depth)
+    if not faults.compared:
+        findings, remarks = [], ["Nobody can tell: no two pictures show the same surface."]
+    elif alone > 0 and faults.fits:
+        notes.append(
+            f"Nothing can be said of {alone} of the {faults.looked_at} pictures: no other one "
+            "shows the same surface."
+        )
+    unsaid = sum(value is None for value in faults.record.get("detail", []))
+    if unsaid > alone:
+        notes.append(
+            f"Nobody can tell whether {unsaid} of the {faults.looked_at} pictures are blurred: it "
+            "takes two others of the same surface, from about the same side."
+        )
+    return {"findings": findings, "remarks": remarks, "notes": notes}
+
+
+def _nothing_found(audit: Audit) -> str:
+    """What was looked for and not found; of the rest nothing is said."""
+    record = audit.faults.record
+    known = lambda name: any(value is not None for value in record.get(name, []))
+    good = [
+        word for word, name in (("sharp", "detail"), ("evenly lit", "brightness")) if known(name)
+    ]
+    if audit.source.is_dense and known("pose_off_by"):
+        good.append("where they say")
+    if not audit.source.has_images:
+        return "None of them is there" + (", the depth images are where they say." if good else ".")
+    if not good:
+        return "Nothing can be said of them."
+    return f"Nothing was found: as far as they can be compared, they are {sentences.listed(good)}."
+
+
+def _finding(audit: Audit, finding: Finding) -> dict[str, Any]:
+    labels = audit.source.labels
+    shown = zip(finding.frames[:_SHOWN], finding.captions, strict=False)
+    return {
+        "title": TITLES[finding.kind],
+        "what": finding.what,
+        "todo": finding.todo,
+        "shown": [
+            {"png": _thumbnail(audit, index), "label": labels[index], "caption": caption}
+            for index, caption in shown
+        ],
+        "more": [labels[index] for index in finding.frames[_SHOWN:]],
+    }
+
+
+def _thumbnail(audit: Audit, index: int) -> bytes:
+    """A small PNG of an image of the capture, its upper edge up."""
+    rgb, _ = audit.source.read(index)
+    up = audit.survey.alignment.rotation.T @ [0.0, 0.0, 1.0]
+    return small_png(rgb, audit.source.poses[index], up, _SIDE)
+
+
+def _causes(audit: Audit) -> list[dict[str, Any]]:
+    """A row for each cause."""
+    found, is_dense = audit.diagnosis, audit.source.is_dense
+    whole = float(found.is_seen.sum()) * audit.survey.voxel_size**2
+    rows: list[dict[str, Any]] = []
+    for cause, meaning in sentences.MEANING.items():
+        is_edge = cause == "unseen" and is_dense  # where free space ends, which has an area only
+        if is_edge and not audit.unseen:
+            continue
+        share = None if is_edge else sentences.cause_share(audit, cause)
+        covers = audit.unseen_area if share is None else share * whole
+        name, remedy = cause, sentences.REMEDY[cause]
+        if cause == "unseen" and not is_dense:
+            name, meaning, remedy = sentences.NOT_KNOWN
+        row = {"cause": cause, "name": name, "meaning": meaning, "remedy": remedy}
+        if cause == "noise" and not audit.source.has_images:
+            rows.append(row | {"share": "not known", "width": None, "about": ""})
+            continue
+        rows.append(
+            row
+            | {
+                "share": "" if share is None else f"{100 * share:.0f} %",
+                "width": None if share is None else round(_BAR * share),
+                "about": sentences.area(audit, covers) if is_dense else "",
+            }
+        )
+    return rows
+
+
+def _regions(audit: Audit) -> list[dict[str, Any]]:
+    """A row for each bad region, and for each place where the capture ends."""
+    rows: list[dict[str, Any]] = []
+    for number, region in enumerate((*audit.regions, *audit.unseen)):
+        is_unseen = region.cause == "unseen"
+        center = audit.survey.alignment.points_back(region.center[None])[0]
+        rows.append(
+            {
+                "letter": letter(number),
+                "cause": region.cause,
+                "area": sentences.area(audit, region.area),
+                "share": "" if is_unseen else f"{100 * region.bad_share:.0f} %",
+                "value": "" if is_unseen else f"{region.renderability:.2f}",
+                "middle": sentences.point(center),
+                "views": [i for i, view in enumerate(audit.plan.views, 1) if _shows(view, region)],
+            }
+        )
+    return rows
+
+
+def _shows(view: Suggestion, region: Region) -> bool:
+    """True if a view shows most of a region."""
+    shown = view.cells if region.cause == "unseen" else view.shown
+    return len(region.rows) > 0 and float(np.isin(region.rows, shown).mean()) >= 0.5
+
+
+def _views(audit: Audit) -> list[dict[str, Any]]:
+    """Every suggested view: the way to it, why it is suggested, where it is, what it shows."""
+    described: list[dict[str, Any]] = []
+    figures = audit_figures.view_figures(audit)
+    regions = (*audit.regions, *audit.unseen)
+    for view, pose, figure in zip(audit.plan.views, suggested_poses(audit), figures, strict=True):
+        like, gap = audit_figures.likest_picture(audit, view)
+        letters = [letter(i) for i, region in enumerate(regions) if _shows(view, region)]
+        described.append(
+            {
+                "directions": sentences.directions(audit, view, like),
+                "reason": sentences.reason(audit, view, letters),
+                "near": audit.source.labels[like],
+                "gap": sentences.length(audit, gap),
+                "position": sentences.point(pose[:3, 3]),
+                "ahead": sentences.point(pose[:3, 2]),
+                "png": to_png(figure),
+            }
+        )
+    return described

@@ -1,0 +1,276 @@
+"""The capture from above: what is there, how well it would render, and where to go next.
+
+Its colors and letters are those of the point clouds and of all figures.
+"""
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+from matplotlib.patheffects import withStroke
+
+from r3jax.apps.audit.alignment import Alignment
+from r3jax.apps.audit.audit import Audit
+from r3jax.apps.audit.bad_regions import BLOCK, Region
+from r3jax.apps.audit.diagnosis import CAUSES, Diagnosis
+from r3jax.plots import style
+from r3jax.plots.pictures import floor_picture
+
+COLOR_OF_CAUSE = {
+    "fine": "#a7c4a0",
+    "angle": style.TOO_OBLIQUE,
+    "rare": "#9333ea",
+    "distance": style.TOO_FAR,
+    "noise": style.INCONSISTENT,
+    "unseen": style.NEVER_SEEN,
+}
+"""Hexadecimal, by cause."""
+
+HIDDEN = "#9ca3af"
+"""Color of voxels that no standpoint sees."""
+
+
+def score_colors(value: np.ndarray) -> np.ndarray:
+    """RGB [n, 3] uint8 of renderabilities [n] in [0, 1]: red, yellow, green."""
+    rgba = colormaps[style.SCORE_MAP](np.clip(value, 0.0, 1.0))
+    return np.rint(255.0 * np.asarray(rgba)[..., :3]).astype(np.uint8)
+
+
+def cause_colors(diagnosis: Diagnosis) -> np.ndarray:
+    """RGB [N, 3] uint8 of every voxel's cause."""
+    table = np.array([_rgb(COLOR_OF_CAUSE[name]) for name in CAUSES], np.uint8)
+    return np.where(
+        diagnosis.is_seen[:, None], table[diagnosis.cause], np.array(_rgb(HIDDEN), np.uint8)
+    )
+
+
+def _rgb(color: str) -> tuple[int, int, int]:
+    value = int(color.removeprefix("#"), 16)
+    return value >> 16, (value >> 8) & 255, value & 255
+
+
+_HEADROOM = 0.35
+"""As in `floor_picture`: what lies higher above the cameras is left out [audit units]."""
+
+_WEDGE = 0.45
+"""Length of a suggested view's field of view [audit units]."""
+
+_TOO_NEAR = 0.35
+"""Letters nearer to each other than this would cover each other [audit units]."""
+
+_MARKER = 0.24
+"""Width of a numbered marker [inch]."""
+
+_PUSHES = 200
+
+_MOST_PIXELS = 2000
+"""Pixels along a side of the picture of renderability: in larger places voxels share them."""
+
+_HALO = withStroke(linewidth=2.0, foreground="white")
+
+_PALE = 0.55
+"""How much white covers the colors below marks."""
+
+
+def letter(number: int) -> str:
+    """A, B, ... of the regions."""
+    return chr(ord("A") + number) if number < 26 else str(number + 1)
+
+
+def plan_figure(audit: Audit) -> Figure:
+    """Two maps: regions, frames and suggested views; and renderability of all surfaces."""
+    heights = np.array([frame.pose[2, 3] for frame in audit.frames])
+    height = float(np.median(heights))
+    picture, extent = floor_picture(audit.seen.state, audit.seen.grid, height)
+    low, high = _used(audit, height)
+    size = high - low
+    is_wide = size[0] > 1.15 * size[1]
+    panel = 8.6 if is_wide else 4.3  # inches
+    height_of_all = (2.0 if is_wide else 1.0) * (panel * size[1] / size[0] + 0.55)
+    figure = style.new_figure(10.0, float(np.clip(height_of_all, 3.5, 16.0)))
+    panels = figure.subplots(*((2, 1) if is_wide else (1, 2)))
+    unit = 1.0 / audit.survey.alignment.scale
+    shown = tuple(unit * value for value in extent)
+    for axes, title in zip(
+        panels, ("What to mend, and from where", "Renderability of the surfaces"), strict=True
+    ):
+        labels = [ground_label(audit, axis) for axis in (0, 1)]
+        style.dress(axes, title, *labels).grid(visible=False)
+        axes.set_xlim(unit * low[0], unit * high[0])
+        axes.set_ylim(unit * low[1], unit * high[1])
+        axes.set_aspect("equal")
+    left, right = panels
+    pale = _PALE + (1.0 - _PALE) * picture
+    left.imshow(pale, origin="lower", extent=shown, interpolation="nearest")
+    left.set_facecolor("#eef0f3")
+    _draw_path(left, audit, unit)
+    _draw_regions(left, audit, unit)
+    _draw_views(left, audit, unit, float(_MARKER * max(size) / panel))
+    values, where = _value_picture(audit, height)
+    right.set_facecolor("#eef0f3")
+    image = right.imshow(
+        values.T, origin="lower", extent=[unit * v for v in where], cmap=style.SCORE_MAP, vmin=0,
+        vmax=1, interpolation="nearest",
+    )  # fmt: skip
+    bar = figure.colorbar(image, ax=panels, shrink=0.5, pad=0.01)
+    bar.set_label("renderability R", fontsize=9, color=style.MUTED)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=8, colors=style.MUTED)
+    return figure
+
+
+def ground_label(audit: Audit, axis: int) -> str:
+    """Name of a horizontal axis of the map, in the capture's words where it has any."""
+    name = axis_name(audit.survey.alignment, axis)
+    return f"{name or ('along the ground', 'across')[axis]} [{audit.survey.unit}]"
+
+
+def axis_name(alignment: Alignment, axis: int) -> str | None:
+    """The capture's axis that an axis of the audit is, such as `-z`; None: none of them."""
+    direction = alignment.rotation[axis]
+    best = int(np.argmax(np.abs(direction)))
+    if abs(direction[best]) < 0.9999 or np.any(alignment.origin != 0.0):
+        return None
+    return ("-" if direction[best] < 0.0 else "") + "xyz"[best]
+
+
+def _used(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """The rectangle that holds nearly all surfaces, and all cameras: [2] each [audit units]."""
+    centers = _below(audit, height)[0][:, :2]
+    marks = [np.stack([frame.pose[:2, 3] for frame in audit.frames])]
+    marks += [view.pose[None, :2, 3] for view in audit.plan.views]
+    marks.append(np.percentile(centers, [0.5, 99.5], axis=0))
+    points = np.concatenate(marks)
+    return points.min(axis=0) - 0.4, points.max(axis=0) + 0.4
+
+
+def _below(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centers [m, 3] of the evaluated voxels below the cut, and their renderability [m]."""
+    state, found = audit.seen.state, audit.diagnosis
+    centers = np.asarray(state.center, np.float64).T
+    is_below = found.is_seen & (centers[:, 2] < height + _HEADROOM)
+    if not is_below.any():
+        is_below = np.asarray(state.occupied)
+    return centers[is_below], found.value[is_below]
+
+
+def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Mean renderability of the columns of voxels, [x, y], NaN without any; and its extent."""
+    centers, values = _below(audit, height)
+    low, high = np.percentile(centers[:, :2], [0.2, 99.8], axis=0)
+    size = max(audit.survey.voxel_size, float((high - low).max()) / _MOST_PIXELS)
+    pixel = np.floor(centers[:, :2] / size).astype(np.int64)
+    low, high = (np.floor(end / size).astype(np.int64) for end in (low, high))
+    shape = high - low + 1
+    pixel -= low
+    inside = np.all((pixel >= 0) & (pixel < shape), axis=1)
+    flat = np.ravel_multi_index(tuple(pixel[inside].T), tuple(shape))
+    count = np.bincount(flat, minlength=int(np.prod(shape)))
+    total = np.bincount(flat, weights=values[inside], minlength=int(np.prod(shape)))
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape)
+    corner, end = low * size, (low + shape) * size
+    return mean, (corner[0], end[0], corner[1], end[1])
+
+
+def _draw_path(axes: Axes, audit: Audit, unit: float) -> None:
+    """The evaluated frames: a line in their order, a dot each, colored by renderability."""
+    places = unit * np.stack([frame.pose[:2, 3] for frame in audit.frames])
+    ahead = np.stack([frame.pose[:2, 2] for frame in audit.frames])
+    axes.plot(*places.T, color=style.INK, linewidth=0.8, alpha=0.35, zorder=2)
+    axes.quiver(
+        *places.T, *(0.16 * unit * ahead.T), angles="xy", scale_units="xy", scale=1.0,
+        width=0.0025, color=style.INK, alpha=0.5, headwidth=0, headlength=0, headaxislength=0,
+        zorder=3,
+    )  # fmt: skip
+    axes.scatter(
+        *places.T, c=audit.renderability, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0, s=16,
+        edgecolors=style.INK, linewidths=0.4, zorder=4,
+    )  # fmt: skip
+
+
+def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
+    """Bad regions as lettered circles in the color of their cause; unseen ones dotted."""
+    regions = (*audit.regions, *audit.unseen)
+    for region in regions:
+        is_unseen = region.cause == "unseen"
+        center, color = unit * region.center[:2], COLOR_OF_CAUSE[region.cause]
+        radius = 0.5 * unit * BLOCK
+        axes.add_patch(
+            Circle(
+                (center[0], center[1]),
+                radius,
+                facecolor="none" if is_unseen else color,
+                edgecolor=color,
+                alpha=0.5 if is_unseen else 0.3,
+                linewidth=1.2,
+                linestyle=":" if is_unseen else "-",
+                zorder=3,
+            )
+        )
+    for center, names, color in _labels(regions):
+        axes.annotate(
+            names, tuple(unit * center), ha="center", va="center", fontsize=9,
+            fontweight="bold", color=color, zorder=5, path_effects=[_HALO],
+        )  # fmt: skip
+
+
+def _labels(regions: tuple[Region, ...]) -> list[tuple[np.ndarray, str, str]]:
+    """Where to write which letters in which color: regions above each other share a place."""
+    places: list[tuple[np.ndarray, str, str]] = []
+    for number, region in enumerate(regions):
+        center = region.center[:2]
+        for i, (place, names, color) in enumerate(places):
+            if np.linalg.norm(place - center) < _TOO_NEAR:
+                places[i] = place, f"{names} {letter(number)}", color
+                break
+        else:
+            places.append((center, letter(number), COLOR_OF_CAUSE[region.cause]))
+    return places
+
+
+def apart(places: np.ndarray, least: float) -> np.ndarray:
+    """Places [n, 2] moved as little as it takes for each two to be `least` apart, about.
+
+    Pairs that are too near push each other away, again and again; two on one spot part sideways.
+    """
+    moved = np.array(places, dtype=np.float64)
+    for _ in range(_PUSHES):
+        gap = moved[:, None] - moved[None]
+        distance = np.linalg.norm(gap, axis=-1)
+        is_near = (distance < least) & ~np.eye(len(moved), dtype=bool)
+        if not is_near.any():
+            break
+        order = np.sign(np.arange(len(moved))[:, None] - np.arange(len(moved))[None])
+        aside = np.stack([order.astype(float), np.zeros_like(distance)], axis=-1)
+        safe = np.maximum(distance, 1e-9)[..., None]
+        direction = np.where(distance[..., None] > 1e-9, gap / safe, aside)
+        push = np.where(is_near, 0.5 * (least - distance), 0.0)[..., None] * direction
+        moved += push.sum(axis=1)
+    return moved
+
+
+def _draw_views(axes: Axes, audit: Audit, unit: float, least: float) -> None:
+    """Suggested views: a wedge over the field of view, and numbers that do not cover each other."""
+    camera = audit.camera
+    half = float(np.arctan(0.5 * camera.width / float(camera.fx)))
+    eyes = np.array([view.pose[:2, 3] for view in audit.plan.views]).reshape(-1, 2)
+    labels = apart(eyes, least)
+    for number, (view, label) in enumerate(zip(audit.plan.views, labels, strict=True), start=1):
+        eye, ahead = view.pose[:2, 3], view.pose[:2, 2]
+        azimuth, level = np.arctan2(ahead[1], ahead[0]), float(np.linalg.norm(ahead))
+        angles = azimuth + np.linspace(-half, half, 9)
+        reach = _WEDGE * max(level, 0.35)  # short where it looks up or down
+        rim = eye + reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        corners = unit * np.concatenate([eye[None], rim])
+        axes.add_patch(
+            Polygon(corners, closed=True, facecolor="#0ea5e9", edgecolor="#075985", alpha=0.65,
+                    linewidth=0.9, zorder=6)
+        )  # fmt: skip
+        axes.annotate(
+            str(number), tuple(unit * eye), tuple(unit * label), ha="center", va="center",
+            fontsize=8.5, fontweight="bold", color="white", zorder=7,
+            arrowprops={"arrowstyle": "-", "color": "#075985", "linewidth": 0.8},
+            bbox={"boxstyle": "circle,pad=0.18", "facecolor": "#075985", "edgecolor": "white",
+                  "linewidth": 0.8},
+        )  # fmt: skip

@@ -1,0 +1,317 @@
+"""A guide's page in the browser: where to go next, what is done, what is wrong with the pictures.
+
+    with open_guide() as page:
+        print(page.url)
+        planner = r3jax.observe(planner, frame)
+        page.observed(planner, frame)              # what is done
+        decision, planner, info = r3jax.decide(planner, frame.T_world_camera, key)
+        page.decided(frame, decision)              # and where to go next
+
+It is served by the standard library, not by viser as the viewer's page: a robot or a headless
+machine that is scanned with needs no extra for it. It only answers: no request changes anything.
+
+Shape symbols: N rows of the map; h, w image size; k places.
+"""
+
+import contextlib
+import http
+import json
+import threading
+from collections.abc import Generator, Iterable
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from matplotlib import colormaps
+
+from r3jax.apps.audit.diagnosis import FINE
+from r3jax.apps.audit.sentences import steps_between
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.state import MapState
+from r3jax.network import LOOPBACK, check_free
+from r3jax.planning.planner import Planner
+from r3jax.planning.policy import Decision
+from r3jax.plots import style
+from r3jax.plots.page import render
+from r3jax.plots.pictures import floor_picture, png, small_png
+from r3jax.scoring.renderability import voxel_renderability
+
+_LATEST = 480
+"""Longer side of the latest picture [px]."""
+
+
+class GuidePage:
+    """What the page shows. Calls may come from any thread."""
+
+    def __init__(self, url: str):
+        """Shows that it waits."""
+        self.url = url
+        """Where the page is."""
+        self._lock = threading.Lock()
+        self._path: list[np.ndarray] = []
+        self._pose, self._target = np.eye(4), list[np.ndarray]()
+        self._page = render("apps/audit/live/guide_page.html").encode()
+        self._pictures: dict[str, bytes] = {}
+        self._news: dict[str, Any] = {"version": 0, "warnings": []}
+        self._tell(next="Waiting for the first frame ...", note="", is_current=False)
+
+    def _tell(self, **news: Any) -> None:
+        with self._lock:
+            self._news |= news
+            self._news["version"] += 1
+
+    def say(self, text: str, note: str = "") -> None:
+        """Shows a sentence in place of where to go next."""
+        if (self._news["next"], self._news["note"]) == (text, note):
+            return
+        self._tell(next=text, note=note, is_current=False)
+
+    def forget(self) -> None:
+        """Forgets the path: poses were corrected, and all frames will come again."""
+        self._path, self._target = [], []
+
+    def passed(self, frame: Frame) -> None:
+        """Takes note of a frame on the path that need not be shown, as others have come since."""
+        self._path.append(np.asarray(frame.T_world_camera, np.float64)[:3, 3])
+
+    def observed(
+        self, planner: Planner, frame: Frame, *, name: str = "", warnings: Iterable[str] = ()
+    ) -> None:
+        """Shows what is known after a frame, and the way from it to where to go next.
+
+        Args:
+            planner: has observed the frame.
+            frame: the latest one; z up, meters.
+            name: of the frame.
+            warnings: what is wrong with it, sentences.
+        """
+        self._pose = np.asarray(frame.T_world_camera, np.float64)
+        self._path.append(self._pose[:3, 3])
+        done = scan_progress(planner, frame.camera, np.stack(self._path))
+        rgb = np.rint(255.0 * np.asarray(frame.rgb)).astype(np.uint8)
+        latest = small_png(rgb, self._pose, np.array([0.0, 0.0, 1.0]), _LATEST)
+        with self._lock:
+            self._pictures |= {"plan.png": png(done.plan), "latest.png": latest}
+        self._tell(
+            done=f"{100 * done.fine_share:.0f} % of the {done.area:.0f} m² seen so far would "
+            f"render well; {len(self._path)} pictures.",
+            fine_share=done.fine_share,
+            extent=done.extent,
+            path=[[float(x), float(y)] for x, y, _ in self._path],
+            camera=_from_above(self._pose, frame.camera),
+            name=name or f"{len(self._path)}",
+            warnings=list(warnings),
+            **self._advice(),
+        )
+
+    def decided(self, frame: Frame, decision: Decision | None) -> None:
+        """Shows where to go next.
+
+        Args:
+            frame: whose camera goes there.
+            decision: None if there is no view to take.
+        """
+        if decision is None:
+            self._target = []
+            text = "Nothing new can be reached from here."
+            note = "Step back and look around; or end the scan."
+            self._tell(next=text, note=note, is_current=True, target=None, way=[])
+            return
+        self._target = [decision.T_world_camera]
+        self._tell(
+            target=_from_above(decision.T_world_camera, frame.camera),
+            way=[[float(x), float(y)] for x, y, _ in decision.waypoints],
+            **self._advice(),
+        )
+
+    def _advice(self) -> dict[str, Any]:
+        """The way from the latest frame to the target, in words."""
+        target = self._target
+        if not target:
+            return {"next": "Keep on scanning ...", "note": "looking for the best view",
+                    "is_current": False}  # fmt: skip
+        words = ", ".join(steps_between(self._pose, target[0], lambda x: f"{x:.1f} m"))
+        note = "Seen from the latest picture. Go slowly; take pictures on the way."
+        return {"next": f"{words[:1].upper()}{words[1:]}.", "note": note, "is_current": True}
+
+    def answer(self, path: str) -> tuple[str, bytes] | None:
+        """Kind and content of what is asked for; None: there is no such thing."""
+        name = path.partition("?")[0].lstrip("/")
+        with self._lock:
+            if name == "":
+                return "text/html; charset=utf-8", self._page
+            if name == "news.json":
+                return "application/json", json.dumps(self._news, allow_nan=False).encode()
+            found = self._pictures.get(name)
+        return None if found is None else ("image/png", found)
+
+
+def _from_above(pose: np.ndarray, camera: Camera) -> dict[str, float]:
+    """Place, azimuth and half the field of view of a camera."""
+    forward = pose[:3, 2]
+    level = float(np.hypot(*forward[:2]))
+    half = float(np.arctan(0.5 * camera.width / float(camera.fx)))
+    # A camera that looks down shows what is below its upper edge.
+    ahead = forward if level > 0.05 else -pose[:3, 1]
+    azimuth = float(np.arctan2(ahead[1], ahead[0]))
+    return {"x": float(pose[0, 3]), "y": float(pose[1, 3]), "azimuth": azimuth, "half": half}
+
+
+@contextlib.contextmanager
+def open_guide(host: str = "127.0.0.1", port: int = 8080) -> Generator[GuidePage]:
+    """Serves a page until the block is left.
+
+    Args:
+        host: address to listen at; nobody else can reach what listens at 127.0.0.1.
+        port: 0 takes any free one.
+
+    Raises:
+        ValueError: no number of a port.
+        OSError: the port is in use or not permitted, or the address is not one of this machine.
+    """
+    check_free(host, port)
+    server = _Server((host, port), _Handler)
+    address = f"[{host}]" if ":" in host else host
+    page = GuidePage(f"http://{address}:{server.server_port}")
+    server.page, server.is_private = page, host in LOOPBACK
+    thread = threading.Thread(target=server.serve_forever, name="guide", daemon=True)
+    thread.start()
+    try:
+        yield page
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class _Server(ThreadingHTTPServer):
+    """Serves one page."""
+
+    daemon_threads = True
+    page: GuidePage
+
+    is_private: bool
+    """True if nobody but this machine can reach it."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers the page's questions."""
+
+    def do_GET(self) -> None:
+        """Sends the page, its news or a picture."""
+        server = self.server
+        assert isinstance(server, _Server)
+        found = server.page.answer(self.path) if self._is_known_name(server) else None
+        if found is None:
+            self.send_error(http.HTTPStatus.NOT_FOUND)
+            return
+        kind, content = found
+        self.send_response(http.HTTPStatus.OK)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.wfile.write(content)
+
+    def _is_known_name(self, server: _Server) -> bool:
+        """False if somebody else's page asks, under a name that it has given this machine."""
+        name = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+        return name in LOOPBACK or not server.is_private
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Says nothing on the console."""
+
+
+_PLACES = 6
+"""Places where the camera was, spread over its path, from which surfaces are evaluated."""
+
+_HEADROOM = 0.35
+"""As in `floor_picture` [m]."""
+
+_FARTHEST = 5.0
+"""What is farther from a place is not asked of it [m]."""
+
+_MARGIN = 0.6
+"""Shown round what is known [m]."""
+
+_COLORED = 0.75
+"""How much of the color of a surface on the plan is that of its renderability."""
+
+
+@dataclass(frozen=True)
+class ScanProgress:
+    """What is done."""
+
+    fine_share: float
+    """Share of the surfaces seen so far that would render well from where the camera was."""
+
+    area: float
+    """Area of the surfaces seen so far, a voxel's face each [square meters]."""
+
+    plan: np.ndarray
+    """The place from above, surfaces from red to green, [h, w, 3] uint8; row 0 at the largest y."""
+
+    extent: tuple[float, float, float, float]
+    """Left, right, bottom and top of the plan [m]."""
+
+
+def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanProgress:
+    """Evaluates what was seen.
+
+    Args:
+        planner: map and grid.
+        camera: would render.
+        places: where the camera was, [k, 3], k >= 1.
+    """
+    state = planner.map_state
+    value = mean_value(state, camera, places)
+    is_seen = np.isfinite(value)
+    share = float((value[is_seen] >= FINE).mean()) if is_seen.any() else 0.0
+    area = float(is_seen.sum()) * float(state.voxel_size) ** 2
+    plan, extent = _plan(planner, value, places)
+    return ScanProgress(share, area, plan, extent)
+
+
+def mean_value(state: MapState, camera: Camera, places: np.ndarray) -> np.ndarray:
+    """Mean renderability of every voxel from some of the places within 5 m of it, [N]; NaN: none.
+
+    Whether something stands between is not asked: that would take a depth buffer for each place.
+    """
+    spread = np.unique(np.linspace(0, len(places) - 1, _PLACES).round().astype(int))
+    center = np.asarray(state.center, np.float32).T
+    total, count = np.zeros(len(center)), np.zeros(len(center))
+    for place in places[spread].astype(np.float32):
+        near = np.sum((center - place) ** 2, axis=1) < _FARTHEST**2
+        total += near * np.asarray(voxel_renderability(state, place, camera.focal).value)
+        count += near
+    known = np.asarray(state.occupied) & (count > 0)
+    return np.where(known, total / np.maximum(count, 1), np.nan)
+
+
+def _plan(
+    planner: Planner, value: np.ndarray, places: np.ndarray
+) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """The place from above, cut to what is known; and its extent."""
+    height = float(np.median(places[:, 2]))
+    picture, (left, right, bottom, _) = floor_picture(planner.map_state, planner.grid, height)
+    pixel = (right - left) / picture.shape[1]
+    center = np.asarray(planner.map_state.center, np.float64).T
+    shown = np.isfinite(value) & (center[:, 2] < height + _HEADROOM)
+    order = np.flatnonzero(shown)[np.argsort(center[shown, 2], kind="stable")]
+    column, row = np.floor((center[order, :2] - [left, bottom]) / pixel).astype(int).T
+    inside = (column >= 0) & (column < picture.shape[1]) & (row >= 0) & (row < picture.shape[0])
+    column, row, order = column[inside], row[inside], order[inside]
+    colors = colormaps[style.SCORE_MAP](value[order])[:, :3]
+    picture[row, column] = _COLORED * colors + (1.0 - _COLORED) * picture[row, column]
+    known = np.concatenate([center[shown, :2], places[:, :2]])
+    low, high = known.min(axis=0) - _MARGIN, known.max(axis=0) + _MARGIN
+    x0, y0 = np.maximum(np.floor((low - [left, bottom]) / pixel), 0).astype(int)
+    x1, y1 = np.ceil((high - [left, bottom]) / pixel).astype(int)
+    cut = picture[y0:y1, x0:x1]
+    extent = (left + x0 * pixel, left + (x0 + cut.shape[1]) * pixel,
+              bottom + y0 * pixel, bottom + (y0 + cut.shape[0]) * pixel)  # fmt: skip
+    return np.rint(255.0 * cut[::-1]).clip(0, 255).astype(np.uint8), extent

@@ -1,1 +1,0 @@
-"""The report of an audit: its page, figures, map from above, words and colors."""

@@ -1,0 +1,388 @@
+"""What an audit says in words, on the page and on the console; the path to a view as directions."""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from r3jax.apps.audit.alignment import AXES
+from r3jax.apps.audit.audit import SATURATED, Audit
+from r3jax.apps.audit.diagnosis import FEW, FINE
+from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
+
+MEANING = {
+    "fine": f"R of at least {FINE:g} for those who stand about",
+    "angle": "seen, but only from directions far from those in which one would look at it",
+    "rare": f"seen in fewer than {FEW} pictures",
+    "distance": "only seen from farther away than one would look at it",
+    "noise": "its color differs from picture to picture: reflections, exposure, poses that are off",
+    "unseen": "free space ends there in something that no picture shows",
+}
+"""Remedy of every cause, for the table."""
+
+REMEDY = {
+    "fine": "",
+    "angle": "go round it: pictures from the missing sides",
+    "rare": "take more pictures of it, from several places",
+    "distance": "go nearer",
+    "noise": "lock exposure and white balance; avoid reflections; check the poses",
+    "unseen": "look into it, if it belongs to the place",
+}
+"""What one can do."""
+
+NOT_KNOWN = (
+    "not known",
+    "no other picture has points there",
+    "let pictures overlap more; plain walls need depth images",
+)
+"""Name, meaning and remedy of what no voxel shows, where there are no depth images."""
+
+_SHORT = {
+    "angle": "only from other angles",
+    "rare": "too rarely",
+    "distance": "only from too far away",
+    "noise": "in contradictory colors",
+}
+
+_MOST_SAID = 4
+"""Findings on single pictures that the summary repeats."""
+
+_DOUBTFUL = 5.0
+"""A guess of the vertical that may be off by more is told first [deg]."""
+
+_MOST_NAMED = 6
+"""Pictures that cannot be read which a sentence names."""
+
+CONTRADICTED = (
+    "Blur, exposure, white balance and single poses are not known: depth and cameras contradict "
+    "each other, so pictures cannot be compared."
+)
+"""What is said of the pictures where nothing fits."""
+
+_ORDINARY = ("angle", "rare", "distance", "noise")
+
+
+def length(audit: Audit, in_audit: float) -> str:
+    """A length of the audit, in the capture's units."""
+    return f"{audit.survey.length(in_audit):.3g} {audit.survey.unit}"
+
+
+def area(audit: Audit, in_audit: float) -> str:
+    """An area of the audit to two digits, in the capture's units: voxels count no finer."""
+    return f"{two_digits(in_audit * audit.survey.length(1.0) ** 2)} {audit.survey.unit}²"
+
+
+def two_digits(value: float) -> str:
+    """A positive number with two digits that count: 0.012, 2.0, 76, 1200."""
+    rounded = float(f"{value:.2g}")
+    return f"{rounded:.0f}" if rounded >= 10.0 else f"{rounded:#.2g}"
+
+
+def point(position: np.ndarray) -> str:
+    """Coordinates, to be read."""
+    return ", ".join(f"{value:.2f}" for value in position)
+
+
+def origin(audit: Audit) -> str | None:
+    """The point that was subtracted from a capture far from its origin; None: none."""
+    subtracted = audit.survey.alignment.origin
+    if not np.any(subtracted):
+        return None
+    return (
+        f"The capture is far from its origin: ({point(subtracted)}) was subtracted from all "
+        "coordinates before they were computed with, and added to all that are written."
+    )
+
+
+def verdict(audit: Audit) -> list[str]:
+    """What the audit comes to, a sentence each."""
+    sentences = [_surfaces(audit)]
+    first = int(audit.survey.is_one_place)  # nothing goes before that
+    if not audit.source.is_dense:
+        sentences.append(
+            "Without depth images only surfaces with points are judged; plain walls may have none."
+        )
+    if (audit.survey.up.within or 0.0) > _DOUBTFUL:
+        sentences.insert(first, vertical(audit))
+    sentences[first:first] = [*unread(audit), *without_depth(audit)]
+    if audit.source.remark is not None:
+        sentences.insert(first, audit.source.remark)
+    if audit.survey.doubt is not None:
+        sentences.insert(0, f"Do not believe this page: {audit.survey.doubt}")
+    if audit.faults.findings:
+        said = " ".join(finding.what for finding in audit.faults.findings[:_MOST_SAID])
+        sentences.append(f"The pictures themselves: {said}")
+    if not audit.faults.fits:
+        sentences.append(CONTRADICTED)
+    if audit.unseen:
+        sentences.append(
+            f"Free space ends in about {area(audit, audit.unseen_area)} that no picture shows."
+        )
+    return sentences if audit.survey.is_one_place else [*sentences, *_promises(audit)]
+
+
+def _surfaces(audit: Audit) -> str:
+    """How much of what was seen renders well; of pictures from one place that is not known."""
+    survey = audit.survey
+    if survey.is_one_place:
+        return (
+            f"All pictures were taken from one place (within {survey.span:.2g} {survey.unit}; half "
+            f"of what they show is {survey.median_depth:.2g} {survey.unit} away or more): every "
+            "surface was seen from one direction only, and how it would render from elsewhere is "
+            "not known. Take pictures from other places, a step apart."
+        )
+    shares = {cause: cause_share(audit, cause) for cause in _ORDINARY}
+    ordered = sorted(shares, key=lambda cause: -shares[cause])
+    parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
+    fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
+    if audit.source.is_dense:
+        start = f"{fine} of the surface that one sees from where people could stand"
+    else:
+        start = f"{fine} of what the {'pictures' if audit.is_own_path else 'frames'} show"
+        parts.append(f"{_unknown(audit)} is not known: no other picture has points there")
+    well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
+    return f"{start} would render well ({well})" + (f"; {listed(parts)}." if parts else ".")
+
+
+def _promises(audit: Audit) -> list[str]:
+    """How the frames would render, and what further views would add."""
+    found, plan = audit.diagnosis, audit.plan
+    sentences: list[str] = []
+    mean = float(audit.renderability.mean())
+    worst = min(audit.frames, key=lambda frame: frame.score.renderability)
+    what = (
+        "From the other pictures alone, a picture" if audit.is_own_path else "A frame of the path"
+    )
+    known = mean / max(float(np.mean([frame.score.coverage for frame in audit.frames])), 1e-9)
+    beside = "" if audit.source.is_dense else f" ({known:.2f} where it is known, else 0)"
+    if audit.is_saturated:
+        sentences.append(f"{what} renders with R {mean:.2f} on average. {saturation()}")
+    else:
+        sentences.append(
+            f"{what} renders with R {mean:.2f} on average{beside}, the worst "
+            f"({worst.label}) {worst.score.renderability:.2f}."
+        )
+    if plan.views:
+        count = len(plan.views)
+        views, drawn = (
+            ("One further view", "one at a random place")
+            if count == 1
+            else (f"{count} further views", "as many at random places")
+        )
+        sentences.append(
+            f"{views} would raise the mean over all surfaces"
+            f"{'' if audit.source.is_dense else ' with points'} from {found.mean:.2f} to "
+            f"{plan.after.mean:.2f}, as far as it can be foreseen; {drawn} "
+            f"{plan.random_mean[-1]:.2f}."
+        )
+    return sentences
+
+
+def vertical(audit: Audit) -> str:
+    """Which way is up, and how sure that is."""
+    up = audit.survey.up
+    if up.within is None:
+        return f"Up is {_up_name(up.direction)} of the capture."
+    from_what = "floors, walls and " if audit.source.is_dense else ""
+    numbers = ",".join(f"{value:.2f}" for value in up.direction)
+    return (
+        f"Up is a guess, within {up.within:.0f} degrees: {_up_name(up.direction)} of the capture, "
+        f"from {from_what}how the cameras were held. Where another direction is up, give it "
+        f"(--up=z, or three numbers such as --up={numbers})."
+    )
+
+
+def unread(audit: Audit) -> list[str]:
+    """Which pictures could not be read, and why: one sentence, or none."""
+    left_out = audit.faults.left_out
+    if not left_out:
+        return []
+    total = len(left_out) + audit.faults.looked_at
+    named = "; ".join(list(left_out.values())[:_MOST_NAMED])
+    more = len(left_out) - _MOST_NAMED
+    rest = f"; and {more} more, named in audit.json" if more > 0 else ""
+    verb = "is left out: it" if len(left_out) == 1 else "are left out: they"
+    return [f"{len(left_out)} of the {total} pictures {verb} cannot be read ({named}{rest})."]
+
+
+def without_depth(audit: Audit) -> list[str]:
+    """How many pictures say nothing of depth: one sentence, or none."""
+    count = len(audit.faults.without_depth)
+    if not count:
+        return []
+    what = "have no depth" if audit.source.is_dense else "show no point"
+    return [
+        f"{count} of the {audit.faults.looked_at} pictures {what}: they are left out, and what "
+        "they show is not known."
+    ]
+
+
+def cause_share(audit: Audit, cause: str) -> float:
+    """Share of what is evaluated that has this cause, or `fine`.
+
+    With depth images of the surface that one sees from where people could stand. Without, of what
+    the frames show: points are where pictures saw them, and say nothing of what has none.
+    """
+    return audit.diagnosis.share(cause) if audit.source.is_dense else audit.shares[cause]
+
+
+def _unknown(audit: Audit) -> str:
+    """Share of what the frames show of which nothing is known."""
+    return f"{100 * audit.shares['unseen']:.0f} %"
+
+
+def saturation() -> str:
+    """What R cannot say of a capture that is covered well."""
+    return (
+        f"With a mean of {SATURATED:g} or more, R says that these pictures show what others show "
+        "well enough, and not which of them renders better: of a kitchen of 250 pictures with a "
+        "mean of 0.96, each held out once, R and PSNR had a rank correlation of -0.00. So these "
+        "pictures are not ranked; what is left to gain among them lies in the pictures themselves."
+    )
+
+
+def listed(parts: list[str]) -> str:
+    """Words in a row: a, b and c."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
+    """Why a view is suggested."""
+    face = audit.survey.voxel_size**2
+    parts: list[str] = []
+    total = sum(view.causes.values())
+    if view.num_mended:
+        parts.append(f"makes about {area(audit, view.num_mended * face)} render well")
+    if total:
+        named = sorted(view.causes, key=lambda cause: -view.causes[cause])
+        shares = [f"{100 * view.causes[c] / total:.0f} % {c}" for c in named]
+        parts.append(
+            f"of {area(audit, total * face)} in sight that do not yet: {', '.join(shares)}"
+        )
+    if len(view.cells):
+        cells = area(audit, len(view.cells) * audit.survey.cell_size**2)
+        parts.append(f"looks into about {cells} of what no picture shows")
+    names = list(letters)
+    if names:
+        parts.append(f"regions {', '.join(names)}" if len(names) > 1 else f"region {names[0]}")
+    return "; ".join(parts) or "adds a direction to what it shows"
+
+
+def directions(audit: Audit, view: Suggestion, like: int) -> str:
+    """The way from an image of the capture to a suggested view, as a person would follow it."""
+    here = audit.survey.alignment.poses(audit.source.poses[[like]])[0]
+    way = steps_between(here, view.pose, lambda value: length(audit, value))
+    parts = [f"Stand where {audit.source.labels[like]} was taken", *way]
+    return f"{', '.join(parts[:-1])} and {parts[-1]}."
+
+
+def method(audit: Audit) -> list[str]:
+    """How the numbers came about, a sentence or two each."""
+    survey, source = audit.survey, audit.source
+    depth = {
+        "depth": "depth images",
+        "tracks": "the points whose tracks name the picture",
+        "cloud": "the cloud's points that no nearer one hides",
+    }[source.kind]
+    sentences = [
+        f"{len(survey.chosen)} of {len(source)} pictures, every {_ordinal(source.stride)} pixel "
+        f"along rows and columns; depth from {depth}.",
+        f"Voxels of {length(audit, survey.voxel_size)}, cells of free space of "
+        f"{length(audit, survey.cell_size)}, visible up to {length(audit, 5.0)}; the depths have "
+        f"the median {survey.median_depth:.3g} {survey.unit} and the 95th percentile "
+        f"{survey.far_depth:.3g} {survey.unit}, and the sizes follow from them where they are not "
+        "given.",
+        vertical(audit),
+        "Renderability R (arXiv 2601.07484) of a surface for a place to look from is bias × noise "
+        "× resolution: the angle to the nearest direction it was seen from, the consistency of "
+        "its color, and the best distance it was seen from.",
+        f"Surfaces: every voxel is asked from those of {len(audit.standpoints)} "
+        "standpoints that see it, with the camera of most pictures; its numbers are the means. "
+        "Areas count a face of a voxel each; where depth is noisy, walls are several voxels thick, "
+        "and areas too large by that.",
+    ]
+    if audit.is_own_path:
+        count = len(audit.seen.folds)
+        sentences.append(
+            f"Frames: the capture's own, each scored by a map without every {_ordinal(count)} "
+            "picture, itself among them: what a model trained without these would have to invent. "
+            "R of a frame is the mean over its pixels; one that shows no voxel counts 0."
+        )
+    else:
+        sentences.append(
+            "Frames: the path's, scored by the map of all pictures. R of a frame is the mean over "
+            "its pixels; one that shows no voxel counts 0."
+        )
+    where = (
+        f"in space known to be free, {length(audit, 0.3)} from everything else, connected to where "
+        "the camera was and at its heights"
+        if source.is_dense
+        else f"within the hull of the camera's positions and {length(audit, 0.3)} round it, "
+        f"{length(audit, 0.3)} from every voxel"
+    )
+    sentences.append(
+        f"Views: of {len(audit.places)} places {where}, {DIRECTIONS} directions each, those of "
+        f"which {100 * OVERLAP:.0f} % or more show what is known (or a picture could not be "
+        "registered); "
+        "of all these the one that raises the renderability of all surfaces most is imagined as "
+        "taken before the next one is chosen. What cannot be foreseen: surfaces that nobody has "
+        "seen, and colors."
+    )
+    if (moved := origin(audit)) is not None:
+        sentences.append(moved)
+    if not source.is_metric:
+        sentences.append("Nobody knows what a unit of this capture is: u stands for one.")
+    if not source.has_images:
+        sentences.append("The images are missing: nothing can be said about noise.")
+    return sentences
+
+
+def _ordinal(count: int) -> str:
+    if 10 <= count % 100 <= 20:
+        return f"{count}th"
+    return f"{count}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(count % 10, 'th') }"
+
+
+def _up_name(up: np.ndarray) -> str:
+    best = int(np.argmax(np.abs(up)))
+    if abs(up[best]) > 0.9999:
+        return ("-" if up[best] < 0.0 else "") + list(AXES)[best]
+    return f"({point(up)})"
+
+
+def steps_between(here: np.ndarray, there: np.ndarray, length: Callable[[float], str]) -> list[str]:
+    """What to do to get from one view to another: go, hold higher, turn, look up.
+
+    Forward and left are those of the view where one is, in the plane; a view that looks straight up
+    or down is faced as its upper edge.
+
+    Args:
+        here: `T_world_camera`, [4, 4], z up.
+        there: the same, of the view to take.
+        length: writes a length of that world.
+    """
+    axis = here[:3, 2] if np.hypot(*here[:2, 2]) > 0.05 else -here[:3, 1]
+    forward = axis[:2] / np.hypot(*axis[:2])
+    offset = there[:3, 3] - here[:3, 3]
+    ahead = float(offset[:2] @ forward)
+    left = float(forward[0] * offset[1] - forward[1] * offset[0])
+    moves = [
+        f"{length(abs(amount))} {forth if amount > 0 else back}"
+        for amount, forth, back in (
+            (ahead, "forward", "back"), (left, "to the left", "to the right"),
+        )
+        if abs(amount) >= 0.05
+    ]  # fmt: skip
+    parts = [f"go {' and '.join(moves)}"] if moves else []
+    if abs(offset[2]) >= 0.05:
+        higher = "higher" if offset[2] > 0 else "lower"
+        parts.append(f"hold the camera {length(abs(float(offset[2])))} {higher}")
+    looks = there[:3, 2]
+    elevation = np.degrees(np.arcsin(np.clip(looks[2], -1.0, 1.0)))
+    if abs(elevation) < 80.0:
+        turn = np.degrees(np.arctan2(forward[0] * looks[1] - forward[1] * looks[0],
+                                     forward @ looks[:2]))  # fmt: skip
+        side = "left" if turn > 0 else "right"
+        parts.append(f"turn {abs(turn):.0f}° {side}" if abs(turn) >= 5.0 else "do not turn")
+    way = "up" if elevation > 0 else "down"
+    parts.append("look level" if abs(elevation) < 5.0 else f"look {abs(elevation):.0f}° {way}")
+    return parts

@@ -1,0 +1,1 @@
+"""Trained models in their folders, and their judgment by test views."""

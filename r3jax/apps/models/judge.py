@@ -1,0 +1,253 @@
+"""A model judged by test views: metrics, what the map expected, and the files that keep them."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.apps.models.folder import TrainedModel
+from r3jax.apps.models.test_sets import TestSet, frames_of, mapped_views
+from r3jax.evaluation.evaluate import Evaluation, evaluate
+from r3jax.evaluation.image_metrics import load_lpips
+from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
+from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
+from r3jax.files import check_replaceable, holds, make_folder, write_atomic
+from r3jax.formats.captures import Capture
+from r3jax.mapping.state import MapState
+from r3jax.plots import style
+from r3jax.plots.contact_sheet import SheetView, contact_sheet
+from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.ply import read_scene
+from r3jax.splatting.views import Views, load_views
+from r3jax.trace.header import package_versions
+from r3jax.validation.json_text import sealed
+
+OnProgress = Callable[[str, int], None]
+"""Told that a stage of so many steps begins, or, without a name, that so many steps are done."""
+
+NETWORKS = {"alex": "AlexNet", "vgg": "VGG16"}
+"""The networks of LPIPS."""
+
+
+@dataclass(frozen=True)
+class JudgeSettings:
+    """How a model is judged."""
+
+    lpips: Literal["alex", "vgg", "none"] = "alex"
+    """Network of LPIPS; `none` leaves it out."""
+
+    resolution: int | None = None
+    """Longer side of the images [px]; None: that of the training."""
+
+    with_map: bool = True
+    """The training views are mapped, and the map's expectation is set beside the result."""
+
+    seed: int = 0
+    """Seed of the bootstrap."""
+
+    backend: Literal["auto", "numba", "xla", "splax"] = "auto"
+    """Rasterizer."""
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """All that is shown and written of a judged model."""
+
+    model: TrainedModel
+    test: TestSet
+    settings: JudgeSettings
+    num_gaussians: int
+    views: Views
+    evaluation: Evaluation
+    summaries: tuple[Summary, ...]
+
+    state: MapState | None
+    """The map of the training views; None without one."""
+
+    @property
+    def described(self) -> str:
+        """How many views of what, at which size."""
+        size = f"{self.views.width}x{self.views.height} px"
+        return f"{len(self.views)} {self.test.title} of {self.test.capture.path} at {size}"
+
+
+def judge(
+    capture: Capture,
+    model: TrainedModel,
+    test: TestSet,
+    settings: JudgeSettings,
+    on_progress: OnProgress,
+) -> Judgment:
+    """Renders the test views by the model and compares them.
+
+    Args:
+        capture: what the model was looked up for: its map is made of it.
+        model: the model.
+        test: the views that judge.
+        settings: how.
+        on_progress: told what happens.
+
+    Raises:
+        ValueError: a view or the model cannot be read, or views that cannot be compared.
+        ImportError: LPIPS is not installed; says how to get it.
+    """
+    # What can be refused quickly comes first.
+    lpips = None if settings.lpips == "none" else load_lpips(settings.lpips)
+    scene = read_scene(model.path)
+    on_progress(f"reading {len(test.numbers)} views", 0)
+    views = load_views(test.frames(), settings.resolution or model.record.get("resolution"))
+    state, expected = None, None
+    mapped = mapped_views(model, test, capture) if settings.with_map else []
+    if mapped:
+        on_progress(f"mapping {len(mapped)} training views", 0)
+        state = _map(capture, mapped)
+        expected = expected_renderability(state, test.frames())
+    on_progress("rendering", len(views))
+    evaluation = evaluate(
+        scene,
+        views,
+        RasterConfig(backend=settings.backend),
+        background=jnp.asarray(model.background),
+        lpips=lpips,
+        renderability=expected,
+        numbers=test.numbers,
+        on_view=lambda _: on_progress("", 1),
+    )
+    summaries = summarize(evaluation.rows, seed=settings.seed)
+    return Judgment(model, test, settings, scene.capacity, views, evaluation, summaries, state)
+
+
+def _map(capture: Capture, numbers: list[int]) -> MapState:
+    """The map of some views, on the terms of the run if it is one."""
+    config = capture.run.header.config if capture.run is not None else {}
+    return map_of(
+        frames_of(capture, numbers),
+        voxel_size=float(config.get("voxel_size", 0.05)),
+        max_range=float(config.get("max_range", 5.0)),
+    )
+
+
+_MARKS = {
+    "json": b'"bootstrap_seed"',
+    "csv": b"view,psnr,",
+    "parquet": b"renderability",
+    "png": style.PNG_MARK,
+}
+"""What the files of a judgment hold, by their suffix."""
+
+
+def check_judgment_folder(folder: Path) -> None:
+    """Refuses a folder with files of a judgment's names that are of no judgment.
+
+    Raises:
+        NotOursError: names the file.
+    """
+    if holds(folder / "evaluation.json", _MARKS["json"]):  # earlier versions marked no picture
+        return
+    for suffix, mark in _MARKS.items():
+        check_replaceable(folder / f"evaluation.{suffix}", mark)
+
+
+def write_judgment(
+    judgment: Judgment, folder: Path, spec: str, rows: Literal["csv", "parquet"], worst: int
+) -> dict[str, Path]:
+    """Writes rows, summary and contact sheet.
+
+    Args:
+        judgment: what came out.
+        folder: where to.
+        spec: how the test views were asked for.
+        rows: kind of the file with one row per view.
+        worst: views on the contact sheet; 0 draws none.
+
+    Returns:
+        The files, by what they hold.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+        ImportError: no package writes parquet.
+    """
+    make_folder(folder)
+    written = {"rows": folder / f"evaluation.{rows}", "summary": folder / "evaluation.json"}
+    write_rows(written["rows"], judgment.evaluation.rows)
+    record = _record(judgment, spec)
+    if worst:
+        written["worst views"] = folder / "evaluation.png"
+        sheet = style.to_png(_sheet(judgment, worst))
+        record["sheet_sha256"] = hashlib.sha256(sheet).hexdigest()
+        write_atomic(written["worst views"], sheet)
+    text = json.dumps(sealed(record), indent=1, allow_nan=False)
+    write_atomic(written["summary"], text.encode())
+    return written
+
+
+def _record(judgment: Judgment, spec: str) -> dict[str, Any]:
+    """Everything that the numbers depend on, and the numbers."""
+    settings = judgment.settings
+    summaries: dict[str, Any] = {}
+    for summary in judgment.summaries:
+        plain = dataclasses.asdict(summary)
+        summaries[plain.pop("metric")["name"]] = plain
+    return {
+        "format": 1,
+        "model": str(judgment.model.path),
+        "gaussians": judgment.num_gaussians,
+        "data": str(judgment.test.capture.path),
+        "views": spec,
+        "numbers": judgment.test.numbers,
+        "trained_on": judgment.test.num_trained,
+        "width": judgment.views.width,
+        "height": judgment.views.height,
+        "lpips": None
+        if settings.lpips == "none"
+        else {"network": NETWORKS[settings.lpips], "version": "0.1", "input": [-1, 1]},
+        "bootstrap_seed": settings.seed,
+        "metrics": summaries,
+        "packages": package_versions(),
+    }
+
+
+def _sheet(judgment: Judgment, worst: int):
+    """The contact sheet of the worst views."""
+    rows, renders = judgment.evaluation.rows, judgment.evaluation.renders
+    place = {row.view: i for i, row in enumerate(rows)}
+    lines: list[SheetView] = []
+    for row in worst_rows(rows, worst):
+        i, expected, beyond = place[row.view], None, None
+        if judgment.state is not None:
+            frame = judgment.test.capture.source.frame(row.view)
+            expected = expected_image(judgment.state, frame)
+            beyond = np.isinf(np.asarray(frame.depth))
+        truth = np.asarray(judgment.views.rgb[i])
+        lines.append(SheetView(row, truth, renders[i], expected, beyond))
+    psnr = judgment.summaries[0]
+    title = (
+        f"The worst {len(lines)} of {judgment.described}\n"
+        f"mean PSNR {psnr.mean:.2f} dB, median {psnr.median:.2f} dB"
+    )
+    return contact_sheet(lines, title)
+
+
+def warnings_of(judgment: Judgment) -> list[str]:
+    """Says what makes the numbers mean less than they seem to."""
+    test, warnings = judgment.test, list[str]()
+    if test.num_trained:
+        warnings.append(
+            f"the model was trained on {test.num_trained} of these {len(test.numbers)} views; "
+            "this says how well it fits, not how well it predicts"
+        )
+    if test.num_trained is None:
+        warnings.append(
+            "it is not known whether the model was trained on these views (no train.json beside it)"
+        )
+    trained = judgment.model.record.get("resolution")
+    longer = max(judgment.views.width, judgment.views.height)
+    if trained is not None and longer != trained:
+        warnings.append(f"the model was trained at {trained} px and is judged at {longer} px")
+    return warnings

@@ -1,0 +1,398 @@
+"""What the page says of a view, of the dragged camera and of what is drawn, as HTML.
+
+The parts are macros of `facts.html`, which escapes what comes from files. Every quantity has a
+tooltip: a name that `HINTS` does not know is an error.
+"""
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from r3jax.apps.viewer.blocks import CAUSE
+from r3jax.apps.viewer.color_maps import ORDER, SCORES, UNSEEN, UTILITY_MAP, css_color, paint
+from r3jax.apps.viewer.preview import TERMS, CameraPreview, QuickPreview
+from r3jax.apps.viewer.story import why_no_choice
+from r3jax.exploration.explain_run import Reason
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.plots import style
+from r3jax.plots.page import data_url, render_macro
+from r3jax.scoring.explain import CAUSES
+from r3jax.trace.rows import Choice, StepRow
+
+HINTS = {
+    # The view on the slider.
+    "mission clock": "Time that the mission has taken so far: planning, mapping and flight. "
+    "Rendering the simulator's images does not count.",
+    "this view cost": "Time that this view added to the clock: planning, mapping and flight.",
+    "path": "Length of the path flown so far.",
+    "explored": "Share of the cells in the scene's box that are known to be free or occupied. "
+    "Nothing ever shows the insides of walls and furniture, so it stays below 100 %.",
+    "mean renderability": "Renderability, averaged over fixed test views in the free space that is "
+    "known. 1 is perfect.",
+    "R before this view": "Renderability of this very view just before it joined the map. A low "
+    "value means that the view was worth taking, a high one that it repeated what was known.",
+    # The camera that is dragged.
+    "renderability R": "How well an image from this camera could be rendered from the views so "
+    "far: 0 is not at all, 1 is perfect. R = bias x noise x resolution, averaged over the pixels.",
+    "bias": "Viewing angle: 1 where a surface was seen from this very direction, falling to 0 as "
+    "the nearest direction from which it was seen turns away.",
+    "noise": "Color agreement: 1 where the views agree on a surface's color, less on shiny or "
+    "transparent surfaces.",
+    "resolution": "Closeness: 1 where some view was at least as close to the surface as this "
+    "camera, less where all of them were farther away.",
+    "known surface": "Share of the pixels that show a surface in the map. All other pixels count "
+    "as R = 0.",
+    "unexplored cells": "U_G: cells of the coarse grid in view that no view has shown yet.",
+    "missing quality": "U_R: the sum of 1 - R over the voxels in view. High means that a view "
+    "from here would improve much.",
+    "utility this way": "Utility of looking straight ahead from here: unexplored cells (weighted "
+    "by lambda1) plus missing quality.",
+    "utility the best way": "The same for the best direction from this position: the ring in the "
+    "picture below, and the red arrow in the scene.",
+    # Candidates and causes.
+    "candidates": "Poses that the planner could choose from, best score first. Score = share of "
+    "the utility minus lambda2 times share of the path.",
+    "promise": "Utility of the chosen view, worked out pixel by pixel and divided among four "
+    "causes: unexplored cells (weighted by lambda1) plus the sum of 1 - R over the voxels in view. "
+    "The planner's own number in the list above may differ, for planners estimate it faster.",
+    **dict(
+        zip(
+            CAUSES,
+            (
+                "Unexplored space that the view was to show.",
+                "Surfaces seen only from directions far from this view's.",
+                "Surfaces whose color differed from view to view.",
+                "Surfaces seen only from farther away.",
+            ),
+            strict=True,
+        )
+    ),
+}
+"""Tooltips by the name of the quantity on the page."""
+"""Tooltips by the name of the quantity on the page."""
+
+PLACES = ("places in free space", "the dragged camera")
+"""From where the map's colors are seen."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One entry of the menu."""
+
+    name: str
+    """Name in the menu."""
+
+    surface: str
+    """What is drawn: voxels, splats, points or mesh."""
+
+    quantity: str
+    """What it is colored by: one of `blocks.QUANTITIES`, or `CAUSE`."""
+
+    title: str
+    """What the legend says of it."""
+
+    @property
+    def has_score(self) -> bool:
+        """Whether the colors are those of R or of a term, which depend on a place."""
+        return self.quantity not in ("color", CAUSE)
+
+    @property
+    def is_of_one_view(self) -> bool:
+        """Whether it shows what was known after a view; all else shows the whole run."""
+        return self.surface == "voxels"
+
+
+LAYERS = (
+    Layer("splats", "splats", "color", "Splats trained on this run"),
+    Layer("colors", "voxels", "color", "Map in its own colors"),
+    Layer("renderability R", "voxels", "renderability", "Renderability R of the map"),
+    Layer("bias: viewing angle", "voxels", "bias", "Bias: seen from the right angle?"),
+    Layer("noise: color agreement", "voxels", "noise", "Noise: do the views agree on the color?"),
+    Layer("resolution: closeness", "voxels", "resolution", "Resolution: seen from close enough?"),
+    Layer("why this view was chosen", "voxels", CAUSE, "Why this view was chosen"),
+    Layer("measured points", "points", "color", "Measured points of all views"),
+    Layer("scene mesh", "mesh", "color", "The scene's own mesh"),
+)
+"""The menu, in order."""
+
+
+def menu_of(surfaces: tuple[str, ...], *, with_causes: bool) -> tuple[Layer, ...]:
+    """The entries of a menu, the first to be opened on: splats if there are any, else colors.
+
+    Args:
+        surfaces: what there is to draw.
+        with_causes: whether it can be known why a view was chosen.
+    """
+    return tuple(
+        layer
+        for layer in LAYERS
+        if layer.surface in surfaces and (with_causes or layer.quantity != CAUSE)
+    )
+
+
+_SHOWN = 5
+"""Candidates that are listed."""
+
+_COARSE = 160
+"""Width from which a picture is smoothed when it is made larger [px]."""
+
+_STOPS = 12
+"""Colors of a bar: a browser blends between them."""
+
+
+def _part(macro: str, **values: Any) -> str:
+    return render_macro("apps/viewer/facts.html", macro, hints=HINTS, **values)
+
+
+def head_html(text: str) -> str:
+    """The line below the title."""
+    return _part("head", text=text)
+
+
+def note_html(text: str) -> str:
+    """A line about what went wrong, or is missing."""
+    return _part("note", text=text)
+
+
+def view_html(row: StepRow, num_views: int, image: np.ndarray, reason: Reason | str) -> str:
+    """The photo of a view, what the trace says of it, and why it was chosen.
+
+    Args:
+        row: of the trace.
+        num_views: of the run so far.
+        image: the photo, [H, W, 3] uint8.
+        reason: what the view promised, or why that is not known.
+    """
+    coverage = row.coverage
+    return _part(
+        "view",
+        view_number=row.step + 1,
+        num_views=num_views,
+        photo=_picture(image),
+        facts={
+            "mission clock": f"{row.seconds:.1f} s",
+            "this view cost": f"{sum(row.charged.values()):.1f} s",
+            "path": f"{row.metres:.1f} m",
+            "explored": f"{100 * coverage.known_share:.0f} %",
+            "mean renderability": f"{coverage.mean_renderability:.2f}",
+            "R before this view": f"{coverage.arrival_renderability:.2f}",
+        },
+        costs=" + ".join(f"{name} {seconds:.1f} s" for name, seconds in row.charged.items()),
+        choice=row.choice,
+        why_not=None if row.choice else why_no_choice(row),
+        best=best_candidates(row.choice) if row.choice else [],
+        promise=promise_of(reason),
+    )
+
+
+def best_candidates(choice: Choice) -> list[dict[str, Any]]:
+    """The best candidates of a decision in words."""
+    chosen = chosen_rank(choice)
+    lines: list[dict[str, Any]] = []
+    for rank in range(min(len(choice.top.get("total", [])), _SHOWN)):
+        values = {name: column[rank] for name, column in choice.top.items() if rank < len(column)}
+        utility, path = values.get("utility"), values.get("path")
+        parts = [
+            f"score {_number(values['total'])}"
+            if utility is None
+            else f"utility {_number(utility)}",
+            "out of reach" if path is None else f"{path:.1f} m away",
+        ]
+        hint = ", ".join(f"{_PARTS.get(name, name)} {_number(v)}" for name, v in values.items())
+        lines.append({
+            "rank": _ordinal(rank + 1),
+            "text": " · ".join([*parts, "chosen"] if rank == chosen else parts),
+            "hint": hint,
+            "is_chosen": rank == chosen,
+        })  # fmt: skip
+    return lines
+
+
+def chosen_rank(choice: Choice) -> int | None:
+    """Which of the best candidates was taken, from 0; None if it is not among them."""
+    for rank, total in enumerate(choice.top.get("total", [])):
+        if total is not None and math.isclose(total, choice.score, rel_tol=1e-5, abs_tol=1e-12):
+            return rank
+    return None
+
+
+_PARTS = {
+    "total": "score",
+    "path": "path with turns [m]",
+    "exploration": "unexplored cells",
+    "rendering": "missing quality",
+}
+"""Names of a candidate's numbers in words."""
+
+
+def _ordinal(number: int) -> str:
+    return f"{number}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(number, 'th') }"
+
+
+def promise_of(reason: Reason | str) -> dict[str, Any] | str:
+    """What a view promised when it was chosen, by cause; or why that is not known."""
+    if isinstance(reason, str):
+        return reason
+    total = reason.utility
+    shares = reason.totals / total if total > 0.0 else np.zeros(len(CAUSES))
+    counts = [_count(len(reason.cells), "cell")] + [
+        _count(voxels, "voxel") for voxels in (reason.shares > 0.0).sum(axis=1).tolist()
+    ]
+    causes = [
+        {"name": name, "color": color, "count": count, "percent": f"{100.0 * share:.1f}"}
+        for name, color, count, share in zip(
+            CAUSES, style.CAUSE_COLORS, counts, shares, strict=True
+        )
+    ]
+    return {"utility": f"{total:,.0f}", "causes": causes}
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number:,} {name}" if number == 1 else f"{number:,} {name}s"
+
+
+def pending_html() -> str:
+    """Before the first numbers."""
+    return _part("pending")
+
+
+def stale_html(content: str, text: str = "") -> str:
+    """What belongs to another pose or view, faint, below what is going on.
+
+    Args:
+        content: from this module.
+        text: what is being computed.
+    """
+    faint = content.replace('data-state="done"', 'data-state="computing"')
+    return _part("stale", content=faint, text=text)
+
+
+def preview_html(glance: QuickPreview, look: CameraPreview | None, view: int) -> str:
+    """R of the dragged camera, its terms, and the utility of looking there.
+
+    Args:
+        glance: what takes milliseconds.
+        look: the rest, once it is there.
+        view: number of the last view in the map that it is scored on, from 1.
+    """
+    facts = {"known surface": f"{100 * glance.seen:.0f} % of its pixels"}
+    if look is not None:
+        this, best = _utilities(look)
+        facts["unexplored cells"] = f"{look.exploration:,.0f}"
+        facts["missing quality"] = f"{look.rendering:,.0f}"
+        facts["utility this way"] = f"{this:,.0f}"
+        facts["utility the best way"] = f"{best:,.0f}"
+    terms = [
+        {"name": name, "percent": f"{100.0 * value:.0f}", "color": _color(value, SCORES),
+         "value": f"{value:.2f}"}
+        for name, value in ((name, glance.means[name]) for name in TERMS[1:])
+    ]  # fmt: skip
+    renderability = f"{glance.renderability:.3f}"
+    return _part("preview", renderability=renderability, view_number=view, terms=terms, facts=facts)
+
+
+def pictures_html(pictures: Sequence[tuple[str, np.ndarray]], panorama: np.ndarray) -> str:
+    """The dragged camera's pictures and its panorama, each with its name.
+
+    Args:
+        pictures: names and pictures, [H, W, 3] uint8 each.
+        panorama: utility of every direction, [h, w, 3] uint8.
+    """
+    return _part(
+        "pictures",
+        shown=[(name, _picture(image)) for name, image in pictures],
+        panorama=_picture(panorama),
+        low=_color(0.0, UTILITY_MAP),
+        high=_color(1.0, UTILITY_MAP),
+    )
+
+
+def _picture(image: np.ndarray) -> dict[str, Any]:
+    """A picture [H, W, 3] uint8 for the template."""
+    return {"url": image_url(image), "is_coarse": _is_coarse(image)}
+
+
+def image_url(image: np.ndarray) -> str:
+    """A picture [H, W, 3] uint8 as an address that holds it."""
+    file, kind = io.BytesIO(), "png" if _is_coarse(image) else "jpeg"
+    Image.fromarray(np.ascontiguousarray(image)).save(file, kind, quality=88)
+    return data_url(file.getvalue(), kind)
+
+
+def _is_coarse(picture: np.ndarray) -> bool:
+    """Few pixels stay squares: they are measurements, no photo."""
+    return picture.shape[1] < _COARSE
+
+
+def _utilities(look: CameraPreview) -> tuple[float, float]:
+    """The utility where the camera looks, and the best one from its position."""
+    lattice = fibonacci_lattice(len(look.direction_scores))
+    here = int(np.argmax(lattice @ look.T_world_camera[:3, 2]))
+    return float(look.direction_scores[here]), float(look.direction_scores.max())
+
+
+def _color(share: float, name: str) -> str:
+    return css_color(paint(np.asarray([share]), name)[0])
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "unknown"
+    return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+
+@dataclass(frozen=True)
+class Caption:
+    """What is drawn."""
+
+    layer: Layer
+    moment: str
+    """Such as `after view 37 of 100`."""
+
+    detail: str
+    """Such as how many voxels are drawn."""
+
+
+def legend_html(caption: Caption, with_candidates: bool = False) -> str:
+    """The legend of what is drawn, of which moment, and what its colors mean.
+
+    Args:
+        caption: what is drawn.
+        with_candidates: whether the candidates of a view are drawn too.
+    """
+    layer = caption.layer
+    entries: list[dict[str, Any] | list[tuple[str, str]]] = []
+    if layer.has_score:
+        hint = HINTS["renderability R" if layer.quantity == "renderability" else layer.quantity]
+        entries.append(_bar(SCORES, "0 poor", "1 perfect", hint))
+        entries.append([(css_color(UNSEEN), "seen from none of these places")])
+    elif layer.quantity == CAUSE:
+        causes = zip(style.CAUSE_COLORS, CAUSES, strict=True)
+        entries.append([*causes, (css_color(UNSEEN), "not in its view")])
+    order = "Order in which the views were taken."
+    entries.append(_bar(ORDER, "path: first view", "last view", order))
+    if with_candidates:
+        entries.append(_bar(UTILITY_MAP, "candidates: worst", "best", HINTS["candidates"]))
+    return _part(
+        "legend",
+        title=layer.title,
+        moment=caption.moment,
+        detail=caption.detail,
+        entries=entries,
+    )
+
+
+def _bar(name: str, low: str, high: str, hint: str) -> dict[str, Any]:
+    """A color map from left to right, and what its ends mean."""
+    stops = [css_color(color) for color in paint(np.linspace(0.0, 1.0, _STOPS), name)]
+    return {"hint": hint, "stops": stops, "low": low, "high": high}
+
+
+def busy_html(text: str, legend: str) -> str:
+    """What is being computed, above the legend of what is drawn until then; "": nothing is yet."""
+    return _part("busy", text=text, until_then=legend)
