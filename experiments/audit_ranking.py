@@ -28,13 +28,13 @@ from experiments.pages.artifacts import (
     write_figure,
     write_markdown,
 )
+from experiments.rank_statistics import partial_spearman, spearman
 from r3jax.apps.audit.audit import audit
 from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE
 from r3jax.apps.audit.source import source_of
 from r3jax.apps.audit.survey import AuditSettings
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.evaluation.evaluate import evaluate
-from r3jax.evaluation.statistics import partial_spearman, spearman
 from r3jax.files import write_atomic
 from r3jax.formats.captures import Capture, open_capture
 from r3jax.plots import style

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from scipy.optimize import minimize
 from scipy.stats import spearmanr
 
+from experiments.curves import sparsification
 from experiments.error_terms import prediction_columns
 from experiments.judged_models import (
     FISHER,
@@ -41,7 +42,6 @@ from experiments.pages.artifacts import (
     write_markdown,
 )
 from r3jax.apps.benchmark.record import machine, source_commit
-from r3jax.evaluation.areas import sparsification
 from r3jax.files import write_atomic
 from r3jax.plots import style
 from r3jax.scoring.config import ScoringConfig

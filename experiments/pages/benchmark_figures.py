@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
+from experiments.curves import EXPLORATION, snapshot_kind, values_by_seed
 from experiments.pages.policy_style import (
     OKABE_ITO,
     PolicyStyle,
@@ -15,14 +16,11 @@ from experiments.pages.policy_style import (
 )
 from r3jax.apps.benchmark.tables import full_title
 from r3jax.evaluation.comparison import (
-    EXPLORATION,
     Cell,
     check_equal_terms,
     method_name,
     methods_of,
     scenes_of,
-    snapshot_kind,
-    values_by_seed,
     with_short_names,
 )
 from r3jax.evaluation.scores import METRICS
@@ -40,8 +38,8 @@ def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Fi
 
     Args:
         cells: records of one kind of snapshot (`views:N`, `seconds:S` or `meters:M`).
-        x: of `equal_terms.EXPLORATION`.
-        y: of `equal_terms.EXPLORATION`, or a metric, then its mean over the test views.
+        x: of `curves.EXPLORATION`.
+        y: of `curves.EXPLORATION`, or a metric, then its mean over the test views.
 
     Raises:
         ValueError: records not on equal terms, several kinds of snapshots, an unknown quantity.

@@ -8,6 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from experiments.curves import (
+    EXPLORATION,
+    area_under,
+    common_range,
+    snapshot_kind,
+    sparsification,
+    values_by_seed,
+)
 from r3jax.apps.benchmark.tables import (
     MISSING,
     Entry,
@@ -22,9 +30,7 @@ from r3jax.apps.benchmark.tables import (
     with_bounds,
     with_name,
 )
-from r3jax.evaluation.areas import area_under, common_range, sparsification
 from r3jax.evaluation.comparison import (
-    EXPLORATION,
     Cell,
     check_equal_terms,
     method_name,
@@ -32,8 +38,6 @@ from r3jax.evaluation.comparison import (
     scenes_of,
     scores_by_method,
     seeds_by_method,
-    snapshot_kind,
-    values_by_seed,
     view_values,
     with_short_names,
 )

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.pages.policy_style import OKABE_ITO, legend_below, styles_of
+from experiments.rank_statistics import kendall, spearman
 from r3jax.apps.benchmark.tables import full_title, metric_named
 from r3jax.evaluation.comparison import (
     Cell,
@@ -16,7 +17,7 @@ from r3jax.evaluation.comparison import (
     with_short_names,
 )
 from r3jax.evaluation.scores import POOR_PSNR
-from r3jax.evaluation.statistics import RESAMPLES, Estimate, kendall, spearman
+from r3jax.evaluation.statistics import RESAMPLES, Estimate
 from r3jax.plots import style
 
 _RIDGE_HEIGHT = 1.5

@@ -19,15 +19,6 @@ POLICIES = (
 )  # fmt: skip
 """Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""
 
-EXPLORATION = {
-    "views": "views",
-    "seconds": "mission clock [s]",
-    "metres": "path [m]",
-    "known_share": "share of the box explored",
-    "mean_renderability": "mean renderability",
-}
-"""Quantities of a record's exploration, and their names on axes."""
-
 
 def method_name(cell: Cell) -> str:
     """The policy with the settings it was given: `active-gs`, `ours (lambda1=0.3)`."""
@@ -188,18 +179,6 @@ def snapshots_of(cells: Sequence[Cell]) -> list[str]:
     return sorted({cell["snapshot"] for cell in cells}, key=key)
 
 
-def snapshot_kind(cells: Sequence[Cell]) -> str:
-    """What the snapshots count: views, seconds or meters.
-
-    Raises:
-        ValueError: not all the same; then they are no points of one curve.
-    """
-    kinds = sorted({snapshot.partition(":")[0] for snapshot in snapshots_of(cells)})
-    if len(kinds) > 1:
-        raise ValueError(f"a curve has snapshots of one kind, got {' and '.join(kinds)}")
-    return kinds[0]
-
-
 def view_values(cell: Cell, metric: str) -> np.ndarray | None:
     """One column of the record's test views, [V]; NaN for null, None if the column is null."""
     column = cell["views"].get(metric)
@@ -237,21 +216,3 @@ def seeds_by_method(cells: Sequence[Cell]) -> dict[str, dict[str, list[int]]]:
         if cell["seed"] not in known:  # it has other snapshots too
             known.append(cell["seed"])
     return seeds
-
-
-def values_by_seed(cells: Sequence[Cell], quantity: str) -> np.ndarray:
-    """A quantity of one method in one scene, [seeds, snapshots]; NaN where there is none.
-
-    Args:
-        cells: of one method and scene.
-        quantity: of `EXPLORATION`, or a column of the test views, then its mean.
-    """
-    seeds, snapshots = sorted({cell["seed"] for cell in cells}), snapshots_of(cells)
-    values = np.full((len(seeds), len(snapshots)), np.nan)
-    for cell in cells:
-        place = seeds.index(cell["seed"]), snapshots.index(cell["snapshot"])
-        if quantity in EXPLORATION:
-            values[place] = cell["exploration"][quantity]
-        elif (views := view_values(cell, quantity)) is not None and not np.isnan(views).all():
-            values[place] = np.nanmean(views)
-    return values

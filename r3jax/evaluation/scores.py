@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from r3jax.files import write_atomic
 
 POOR_PSNR = 20.0
 """Views below this count as poor [dB]."""
 
-_RESAMPLES = 4000
-_RESAMPLES_AT_A_TIME = 500
+_RESAMPLES, _RESAMPLES_AT_A_TIME = 4000, 500
 
 
 @dataclass(frozen=True)
@@ -149,11 +149,17 @@ def _summary(metric: Metric, views: np.ndarray, values: np.ndarray, seed: int) -
 
 def bootstrap_interval(values: np.ndarray, *, seed: int = 0) -> tuple[float, float]:
     """95 % interval of the mean by resampling the values, [n], n >= 1."""
-    rng = np.random.default_rng(seed)
-    shape = (_RESAMPLES_AT_A_TIME, len(values))
-    rounds = range(_RESAMPLES // _RESAMPLES_AT_A_TIME)
-    means = [values[rng.integers(0, len(values), shape)].mean(axis=1) for _ in rounds]
-    low, high = np.percentile(np.concatenate(means), [2.5, 97.5])
+    if len(values) == 1:
+        return float(values[0]), float(values[0])
+    found = stats.bootstrap(
+        (values,),
+        np.mean,
+        n_resamples=_RESAMPLES,
+        batch=_RESAMPLES_AT_A_TIME,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    )
+    low, high = found.confidence_interval
     return float(low), float(high)
 
 

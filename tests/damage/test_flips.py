@@ -12,13 +12,12 @@ import jax
 import numpy as np
 import pytest
 
-from r3jax.apps.models.folder import find_model
 from r3jax.apps.report.model_report import read_evaluated_model
 from r3jax.apps.runs.settings import open_run_scene, settings_of_run
 from r3jax.cli.main import main
 from r3jax.exploration import explore
 from r3jax.exploration.recording import state_tables
-from r3jax.formats.captures import open_capture
+from r3jax.splatting.model import find_model
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import empty_scene
 from r3jax.splatting.training.checkpoints import read_checkpoint, settings_record
@@ -45,7 +44,7 @@ class Reading:
         self.path, self.recorded = run, read_run(run)
         self.plan = settings_of_run(self.recorded)
         self.simulator = open_run_scene(self.recorded)
-        config = find_model(open_capture(run)).record["config"]
+        config = find_model(run / "models", run).record["config"]
         views, _ = split_views(len(self.recorded.rows), 4)
         self.views = load_views(self.recorded.frames(), 48).take(views)
         self.config = TrainConfig(iterations=20, num_gaussians=200, capacity=config["capacity"])
@@ -95,7 +94,7 @@ class Reading:
 
     def training(self) -> object:
         """What is known of the training."""
-        return repr(find_model(open_capture(self.path)))
+        return repr(find_model(self.path / "models", self.path))
 
     def training_state(self) -> object:
         """What a resumed training goes on from."""

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from experiments.curves import sparsification
 from experiments.error_statistics import Draws
-from r3jax.evaluation.areas import sparsification
-from r3jax.evaluation.statistics import partial_spearman
+from experiments.rank_statistics import partial_spearman
 from tests.mutants import Mutant, assert_caught, each, load
 
 CHAIN = ("experiments.error_statistics",)

@@ -8,12 +8,13 @@ import pytest
 from PIL import Image
 
 from experiments import error_analysis, renderability_vs_error
+from experiments.curves import ause
 from experiments.error_analysis import COVERAGE, PREDICTORS, from_columns
 from experiments.error_terms import PRODUCTS, on_seen
 from experiments.pages.artifacts import Origin
 from experiments.pages.error_figures import budget_name, told
-from r3jax.evaluation.areas import ause
-from r3jax.evaluation.statistics import Estimate, kendall, partial_spearman, spearman
+from experiments.rank_statistics import kendall, partial_spearman, spearman
+from r3jax.evaluation.statistics import Estimate
 from tests.evaluation.records import record
 
 SOURCE = Origin("python -m experiments.some", "a machine", "abc")

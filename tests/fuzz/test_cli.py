@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from r3jax.apps.models import judge
 from r3jax.apps.report import revisits
 from r3jax.cli import command_line, kernels
 from r3jax.cli.commands import audit, benchmark, explore, replay, train
 from r3jax.cli.main import main
+from r3jax.evaluation import judge
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.mapping import bridge as mapping

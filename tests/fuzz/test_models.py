@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r3jax.apps.models.folder import find_model
-from r3jax.apps.models.test_sets import choose_views, mapped_views
 from r3jax.apps.report.model_report import (
     quality_note,
     quality_table,
     read_evaluated_model,
     training_figure,
 )
+from r3jax.evaluation.judge import choose_views, mapped_views
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
+from r3jax.splatting.errors import SceneFileError
+from r3jax.splatting.model import find_model
 from r3jax.trace.errors import RunError
 from tests.fuzz import test_runs
 from tests.fuzz.harness import CASES_SLOW
@@ -70,7 +71,7 @@ def make(rng: np.random.Generator, files: Files) -> tuple[Files, str]:
 
 def read(folder: Path) -> None:
     capture = open_capture(folder)
-    trained = find_model(capture)
+    trained = find_model(capture.models, capture.path)
     test = choose_views("heldout", capture, trained)
     assert all(0 <= number < len(capture) for number in test.numbers)
     assert all(0 <= n < len(capture) for n in mapped_views(trained, test, capture))
@@ -85,7 +86,7 @@ def read(folder: Path) -> None:
             training_figure(model.history)
 
 
-READER = Reader(seeds, read, (FormatError, RunError), make=make)
+READER = Reader(seeds, read, (FormatError, SceneFileError, RunError), make=make)
 
 
 def test_damaged_models_are_refused_or_read(harness):

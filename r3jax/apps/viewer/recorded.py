@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.apps.models.folder import find_model, newest_name
 from r3jax.apps.runs.settings import scene_of_run, settings_of_run
 from r3jax.apps.viewer.app import App
 from r3jax.apps.viewer.blocks import scoring_of, title_of
@@ -16,10 +15,10 @@ from r3jax.apps.viewer.overlays import recorded_points
 from r3jax.apps.viewer.queries import Extras, Sources, picture_camera
 from r3jax.apps.viewer.server import close_server, open_server, url_of
 from r3jax.apps.viewer.story import Offer, RecordedStory, decide_again
-from r3jax.formats.captures import Capture
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import scene_hash
+from r3jax.splatting.model import find_model, newest_name
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.trace.reader import Run
@@ -108,7 +107,7 @@ def _splats(run: Run, name: str | None) -> tuple[GaussianScene, tuple[float, flo
     name = name or newest_name(run.path / "models")
     if name is None:
         return None
-    model = find_model(Capture(run.path, run), name)
+    model = find_model(run.path / "models", run.path, name)
     red, green, blue = model.background.tolist()
     return read_scene(model.path), (red, green, blue)
 

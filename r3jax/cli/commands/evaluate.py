@@ -4,27 +4,27 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.apps.models.folder import find_model
-from r3jax.apps.models.judge import (
-    NETWORKS,
-    JudgeSettings,
-    Judgment,
-    check_judgment_folder,
-    judge,
-    warnings_of,
-    write_judgment,
-)
-from r3jax.apps.models.test_sets import choose_views
 from r3jax.apps.report.report import write_report
 from r3jax.cli.console import Console, Table, Text
 from r3jax.cli.errors import UserError, check_resolution, one_line
 from r3jax.cli.options import EvaluateOptions
 from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages
+from r3jax.evaluation.judge import (
+    NETWORKS,
+    JudgeSettings,
+    Judgment,
+    check_judgment_folder,
+    choose_views,
+    judge,
+    warnings_of,
+    write_judgment,
+)
 from r3jax.evaluation.scores import Summary
 from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.names import parse_topics
+from r3jax.splatting.model import find_model
 
 
 def run_evaluate(options: EvaluateOptions) -> int:
@@ -39,7 +39,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
         if options.worst < 0:
             raise ValueError(f"--worst must not be negative, got {options.worst}")
         capture = open_capture(options.path, options.up, parse_topics(options.topics))
-        model = find_model(capture, options.name, options.model)
+        model = find_model(capture.models, capture.path, options.name, options.model)
         test = choose_views(options.views, capture, model, options.up)
         default = model.path.parent if capture.run is None else capture.path / "report"
         folder = options.out or default

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from r3jax.apps.models.folder import check_free, only_writer, write_model
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
 from r3jax.cli.options import TrainOptions
@@ -10,11 +9,14 @@ from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages, TrainProgress
 from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
+from r3jax.formats.points import write_points
 from r3jax.formats.ros.names import parse_topics
 from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.model import check_free, only_writer, scene_points, write_model
 from r3jax.splatting.training import train
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.views import load_views, split_views
+from r3jax.trace.header import package_versions
 
 
 def run_train(options: TrainOptions) -> int:
@@ -51,7 +53,8 @@ def run_train(options: TrainOptions) -> int:
                     overwrite=options.overwrite,
                     on_progress=progress.on_progress,
                 )
-            write_model(folder, result, options.path, views, split, config)
+            write_points(folder / "points.ply", *scene_points(result.scene))
+            write_model(folder, result, options.path, views, split, config, package_versions())
     except (ValueError, ArithmeticError, OSError, ImportError) as error:
         raise UserError(one_line(error)) from error
     _conclude(console, options, folder, result)

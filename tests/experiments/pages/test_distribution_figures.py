@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.pages.distribution_figures import density, ridge_figure, scatter_figure
-from r3jax.evaluation.statistics import kendall, spearman
+from experiments.rank_statistics import kendall, spearman
 from tests.evaluation.records import benchmark, record
 from tests.experiments.pages.test_benchmark_figures import assert_drawn_inside, legend_of
 

@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.evaluation.areas import area_under, ause, common_range, sparsification
-from tests.mutants import Mutant, assert_caught, each, load
+from experiments.curves import area_under, ause, common_range, sparsification
 
-CHAIN = ("r3jax.evaluation.areas",)
 errors = st.lists(st.floats(-50.0, 50.0).map(lambda x: round(x, 2)), min_size=2, max_size=30)
 
 
@@ -37,19 +35,18 @@ def test_ause_laws(values, random):
     assert moved.relative == pytest.approx(found.relative, abs=1e-6)
 
 
-def law_ause(modules) -> None:
+def test_ause() -> None:
     """By hand: errors 1, 2, 6 in the order predicted best, worst, middle."""
-    m = modules["areas"]
-    found = m.sparsification(np.array([0.9, 0.1, 0.5]), np.array([1.0, 2.0, 6.0]))
+    found = sparsification(np.array([0.9, 0.1, 0.5]), np.array([1.0, 2.0, 6.0]))
     assert found.removed == pytest.approx([0.0, 1 / 3, 2 / 3])
     assert found.curve == pytest.approx([3.0, 3.5, 1.0])
     assert found.oracle == pytest.approx([3.0, 1.5, 1.0])
     assert found.area == pytest.approx(2.0 / 3.0)
     assert found.relative == pytest.approx(2.0 / 3.5)
     # The two views of equal quality leave in both orders: rest 3.5 or 1.5, 2.5 on average.
-    tied = m.sparsification(np.array([0.9, 0.1, 0.1]), np.array([1.0, 2.0, 6.0]))
+    tied = sparsification(np.array([0.9, 0.1, 0.1]), np.array([1.0, 2.0, 6.0]))
     assert tied.curve == pytest.approx([3.0, 2.5, 1.0])
-    assert m.sparsification(np.zeros(3), np.array([1.0, 2.0, 6.0])).relative == pytest.approx(1.0)
+    assert sparsification(np.zeros(3), np.array([1.0, 2.0, 6.0])).relative == pytest.approx(1.0)
 
 
 def test_a_random_order_is_about_one_and_its_interval_says_so():
@@ -62,9 +59,9 @@ def test_a_random_order_is_about_one_and_its_interval_says_so():
     assert gaps == found
 
 
-def law_area(modules) -> None:
+def test_area() -> None:
     """By hand: (10, 20), (20, 24), (50, 27), whole and cut."""
-    area = modules["areas"].area_under
+    area = area_under
     x, y = np.array([10.0, 20.0, 50.0]), np.array([20.0, 24.0, 27.0])
     assert area(x, y) == pytest.approx((10 * 22 + 30 * 25.5) / 40)
     assert area(x, y, start=15.0, end=35.0) == pytest.approx((5 * 23 + 15 * 24.75) / 20)
@@ -115,29 +112,3 @@ def test_mistakes_are_named():
         sparsification(x, np.ones(3))
     with pytest.raises(ValueError, match="finite"):
         sparsification(x, np.array([np.inf, 1.0]))
-
-
-MUTANTS = [
-    Mutant("areas", "np.mean(self.curve - self.oracle)", "np.mean(self.curve)", law_ause),
-    Mutant("areas", "np.mean(self.curve[0] - self.oracle)", "np.mean(self.oracle)", law_ause),
-    Mutant("areas", "by_level[np.sort(level)]", "by_level[np.sort(level)[::-1]]", law_ause),
-    Mutant("areas", "by_level[np.sort(level)]", "error[np.argsort(quality, kind='stable')]",
-           law_ause),
-    Mutant("areas", "np.sort(error)[::-1]", "np.sort(error)", law_ause),
-    Mutant("areas", "np.arange(len(error), 0, -1)", "len(error)", law_ause),
-    Mutant("areas", "/ (high - low)", "/ (x[-1] - x[0])", law_area),
-    Mutant("areas", "(x > low) & (x < high)", "x < low", law_area),
-    Mutant("areas", "x[0] if start is None", "x[0] if True", law_area),
-    Mutant("areas", "x[-1] if end is None", "x[-1] if True", law_area),
-    Mutant("areas", "np.concatenate([[low], inside, [high]])", "np.array([low, high])", law_area),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("law", [law_ause, law_area])
-def test_laws_hold_without_a_fault(law):
-    law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

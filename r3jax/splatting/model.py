@@ -2,7 +2,7 @@
 
 models/NAME/
 scene.ply      the Gaussians
-points.ply     their centers, for programs that show points
+points.ply     their centers, for programs that show points (`r3jax train` writes it)
 history.csv    loss, PSNR and size at every step
 train.json     views, settings, versions; sealed
 checkpoints/   where an interrupted training goes on
@@ -28,16 +28,13 @@ from r3jax.files import (
     own_folder,
     write_atomic,
 )
-from r3jax.formats.captures import Capture
-from r3jax.formats.errors import FormatError
-from r3jax.formats.points import write_points
+from r3jax.splatting.errors import SceneFileError
 from r3jax.splatting.harmonics import C0
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.train import FitResult, History
 from r3jax.splatting.views import Views
-from r3jax.trace.header import package_versions
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import check_type
 from r3jax.validation.files import read_bytes
@@ -84,33 +81,36 @@ class TrainedModel:
         return np.full(3, 1.0 if is_white else 0.0, dtype=np.float32)
 
 
-def find_model(capture: Capture, name: str = "last", path: Path | None = None) -> TrainedModel:
-    """Finds a model of a capture and reads what is known of it.
+def find_model(
+    models: Path, data: Path, name: str = "last", path: Path | None = None
+) -> TrainedModel:
+    """Finds a model of a capture and reads its record.
 
     Args:
-        capture: the capture.
-        name: the model's name among those of the capture.
+        models: folder of the capture's models.
+        data: the capture.
+        name: the model's name among them.
         path: the model's file or folder, if it lies elsewhere.
 
     Raises:
-        FormatError: there is no such model, or its train.json is damaged.
+        SceneFileError: there is no such model, or its train.json is damaged.
     """
-    model = path or capture.models / name / "scene.ply"
+    model = path or models / name / "scene.ply"
     if model.is_dir():
         model = model / "scene.ply"
     if not model.is_file():
-        found = sorted(path.parent.name for path in capture.models.glob("*/scene.ply"))
+        found = sorted(path.parent.name for path in models.glob("*/scene.ply"))
         known = f"there are: {', '.join(found)} (--name)" if found else "there is none yet"
-        raise FormatError(
-            model, f"there is no such model; {known}; `r3jax train {capture.path}` makes one"
+        raise SceneFileError(
+            model, f"there is no such model; {known}; `r3jax train {data}` makes one"
         )
     source = model.parent / "train.json"
     try:
         record = _read_record(source) if source.exists() else {}
     except (ForeignFileError, OSError) as error:
-        raise FormatError(source, f"the file cannot be read ({error})") from error
-    is_inside = capture.models.resolve() in model.resolve().parents
-    is_same = "data" in record and Path(record["data"]).resolve() == capture.path.resolve()
+        raise SceneFileError(source, f"the file cannot be read ({error})") from error
+    is_inside = models.resolve() in model.resolve().parents
+    is_same = "data" in record and Path(record["data"]).resolve() == data.resolve()
     return TrainedModel(model, record, bool(record) and (is_inside or is_same))
 
 
@@ -147,13 +147,13 @@ def check_free(folder: Path, *, replace: bool) -> None:
     """Refuses a folder that holds a model, unless it may change, or something that is no model.
 
     Raises:
-        FormatError: a model.
+        SceneFileError: a model.
         NotOursError: something else.
     """
     check_own(folder, "model", "give another --name")
     present = {path.name for path in folder.iterdir()} if folder.is_dir() else set[str]()
     if present - {"lock", MARKER} and not replace:
-        raise FormatError(
+        raise SceneFileError(
             folder,
             "this holds a model: --resume goes on with it, --overwrite replaces it, "
             "--name NAME makes another",
@@ -165,14 +165,14 @@ def only_writer(folder: Path, *, replace: bool) -> Generator[None]:
     """Makes the folder, and keeps other processes from training this model meanwhile.
 
     Raises:
-        FormatError: another process is training here, or see `check_free`.
+        SceneFileError: another process is training here, or see `check_free`.
         OSError: the folder cannot be made, or a link is in the way.
     """
     own_folder(folder, "model", "give another --name")
     try:
         lock = lock_folder(folder)
     except BlockingIOError:
-        raise FormatError(folder, "another process is training here") from None
+        raise SceneFileError(folder, "another process is training here") from None
     with lock:
         check_free(folder, replace=replace)  # another process may have been faster
         clear_partial(folder)
@@ -186,8 +186,9 @@ def write_model(
     views: Views,
     split: tuple[np.ndarray, np.ndarray],
     config: TrainConfig,
+    packages: dict[str, str],
 ) -> None:
-    """Writes everything but the checkpoints.
+    """Writes the Gaussians, the history and train.json.
 
     Args:
         folder: where to.
@@ -196,12 +197,12 @@ def write_model(
         views: the views trained on.
         split: numbers of the views trained on, and of those held out.
         config: settings of the training.
+        packages: versions of the software.
 
     Raises:
         OSError: the disk is full, not writable, ...
     """
     write_scene(folder / "scene.ply", result.scene)
-    write_points(folder / "points.ply", *scene_points(result.scene))
     history = _history_csv(result.history)
     write_atomic(folder / "history.csv", history)
     training, held_out = split
@@ -212,7 +213,7 @@ def write_model(
         "train_views": training.tolist(),
         "test_views": held_out.tolist(),
         "config": config.as_record(),
-        "packages": package_versions(),
+        "packages": packages,
         "history_sha256": hashlib.sha256(history).hexdigest(),
     }
     # The last: a reader of train.json finds what it speaks of.

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from r3jax.evaluation.contact_sheet import ERROR_SCALE, SheetView, contact_sheet, error_picture
 from r3jax.plots import style
-from r3jax.plots.contact_sheet import ERROR_SCALE, SheetView, contact_sheet, error_picture
 from r3jax.plots.pictures import BEYOND
 from tests.evaluation.test_scores import row
 

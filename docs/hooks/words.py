@@ -1,0 +1,85 @@
+"""Finds words in prose that read translated: `python docs/hooks/words.py`, a part of `make lint`.
+
+Looks at Markdown, at docstrings and comments of Python, and at text given to options. A line that
+ends in `words: ok` is let through.
+"""
+
+import ast
+import io
+import re
+import sys
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+INSTEAD = {
+    r"whoever": "everybody who, any",
+    r"anew": "again",
+    r"so many": "the number of, up to",
+    r"all the same": "anyway, equal",
+    r"(?:goes|go|going|went) on behind": "resume after",
+    r"nobody": "no one, not",
+    r"asked (?:of|for)": "required, target",
+    r"worth (?:a|so|more|less|nothing)": "gains, pays, utility",
+    r"lacks?": "is missing, without, deficit",
+    r"foresees?": "predict",
+    r"its kin": "name them",
+    r"all over the place": "throughout",
+    r"for ever": "forever, without end",
+    r"who chooses": "the policy",
+    r"what carries": "the robot, the platform",
+    r"(?:frames?|captures?|captured|looks?|looking|plans?) on the way": "while moving",
+}
+"""Patterns, and what to write in their place."""
+
+_PATTERN = re.compile(rf"\b(?:{'|'.join(INSTEAD)})\b", re.IGNORECASE)
+_EXCEPTED = "words: ok"
+
+
+def main() -> int:
+    """Prints every finding; 1 if there are any."""
+    found = 0
+    for path in sorted(_files()):
+        for number, line in _prose(path):
+            for match in _PATTERN.finditer(line):
+                found += 1
+                instead = next(v for k, v in INSTEAD.items() if re.fullmatch(k, match[0], re.I))
+                print(f"{path.relative_to(ROOT)}:{number}: {match[0]!r}: say {instead}")
+    return int(found > 0)
+
+
+def _files() -> Iterator[Path]:
+    for folder in ("r3jax", "docs", "examples", "experiments"):
+        for path in (ROOT / folder).rglob("*"):
+            if path.suffix in {".py", ".md"} and "results" not in path.parts[:-1]:
+                yield path
+    yield from (ROOT / "docs" / "results").glob("*.md")
+    yield from ROOT.glob("*.md")
+
+
+def _prose(path: Path) -> Iterator[tuple[int, str]]:
+    text = path.read_text("utf-8")
+    lines = text.splitlines()
+    if path.suffix == ".md":
+        numbers = set(range(1, len(lines) + 1))
+    elif path == Path(__file__):
+        return
+    else:
+        numbers = {
+            token.start[0]
+            for token in tokenize.generate_tokens(io.StringIO(text).readline)
+            if token.type == tokenize.COMMENT
+        }
+        for node in ast.walk(ast.parse(text)):
+            # Docstrings, those of fields too: a string that is a statement by itself.
+            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+                numbers |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    for number in sorted(numbers):
+        if not lines[number - 1].rstrip().endswith(_EXCEPTED):
+            yield number, lines[number - 1]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""Trained models in their folders, and their judgment by test views."""
