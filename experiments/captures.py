@@ -52,7 +52,7 @@ from r3jax.evaluation.comparison import (
 )
 from r3jax.evaluation.statistics import paired_difference
 from r3jax.exploration.config import ClockName
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 
 NAME = "captures"
 

@@ -24,7 +24,7 @@ from experiments.pages.artifacts import (
 from experiments.pages.positions_figure import positions_figure
 from experiments.suite import Options, Records, origin, run_suite
 from r3jax.evaluation.comparison import method_name, methods_of, snapshots_of, with_short_names
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 
 NAME = "degeneracy"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from r3jax.apps.benchmark.cells import Cell, paths_of
 from r3jax.evaluation.comparison import scene_title
 from r3jax.formats.submissions import submission_of_run, write_submission
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 
 
 def keep_flights(

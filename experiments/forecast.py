@@ -39,9 +39,10 @@ from r3jax.apps.forecast.psnr import (
     write_calibration,
 )
 from r3jax.evaluation.comparison import method_name, view_values
-from r3jax.exploration.replay import config_of, states_of
 from r3jax.plots import style
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import states_of
+from r3jax.runs.settings import config_of
 
 NAME = "forecast"
 LEVEL = 0.8

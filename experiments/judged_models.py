@@ -29,6 +29,7 @@ from r3jax.formats.captures import open_capture
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.state import MapState
+from r3jax.runs.reader import read_run
 from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.raycast.raycast import RaycastSimulator
@@ -38,7 +39,6 @@ from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.train import fit
 from r3jax.splatting.views import Views, load_views
-from r3jax.trace.reader import read_run
 
 SCORES = ("psnr", "ssim", "lpips")
 """What is known of each test view."""

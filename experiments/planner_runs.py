@@ -22,12 +22,12 @@ from typing import Any, Literal
 import jax
 
 from r3jax.apps.benchmark.record import machine, source_commit
-from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.clock import WallClock
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.state import LoopState, Mission, Stop, TakenView
+from r3jax.exploration.state import LoopState, Mission, Stop
 from r3jax.exploration.step import start_state, step
+from r3jax.exploration.taken_views import TakenView
 from r3jax.files import write_atomic
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.registry import make_policy, policy_names

@@ -16,15 +16,15 @@ from r3jax.cli import command_line
 from r3jax.cli.console import Console
 from r3jax.cli.main import main
 from r3jax.cli.progress import RunProgress, Stages
-from r3jax.exploration.budget import Budget
+from r3jax.exploration.config import Budget
 from r3jax.interrupts import (
     caught_interrupts,
     check_interrupt,
     deferred_interrupt,
     settle_interrupt,
 )
+from r3jax.runs.reader import read_run
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from r3jax.trace.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore
 

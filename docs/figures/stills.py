@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from r3jax.apps.viewer.blocks import title_of
 from r3jax.apps.viewer.color_maps import SCORES, UNSEEN, paint
 from r3jax.geometry.cameras import Camera, look_at
-from r3jax.trace.reader import Run
+from r3jax.runs.reader import Run
 
 NEAR = 0.05
 """What is closer is not drawn [m]."""

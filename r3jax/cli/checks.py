@@ -27,8 +27,7 @@ from r3jax.cli.options import (
     TrainOptions,
     ViewOptions,
 )
-from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig
+from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig, parse_budget
 from r3jax.files import check_own
 from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.names import parse_topics

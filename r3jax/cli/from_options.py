@@ -5,15 +5,15 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from r3jax.apps.runs.settings import RunSettings, SceneSettings
 from r3jax.cli.checks import DEFAULT_BUDGET, DEFAULT_POLICY, loop_of_options, motion_of_options
 from r3jax.cli.options import ExploreOptions
-from r3jax.exploration.budget import parse_budget
+from r3jax.exploration.config import parse_budget
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policy import Policy
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import Motion
+from r3jax.runs.settings import RunSettings, SceneSettings
 from r3jax.scoring.config import ScoringConfig
 
 

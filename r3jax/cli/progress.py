@@ -16,9 +16,9 @@ from r3jax.cli.console import (
     TimeRemainingColumn,
     progress_bar,
 )
-from r3jax.exploration.budget import Budget
+from r3jax.exploration.config import Budget
+from r3jax.exploration.taken_views import StepRow
 from r3jax.interrupts import check_interrupt
-from r3jax.trace.rows import StepRow
 
 if TYPE_CHECKING:  # training imports what an exploration does not need
     from r3jax.splatting.training.train import Progress

@@ -22,11 +22,11 @@ from r3jax.formats.errors import FormatError
 from r3jax.frame import Frame
 from r3jax.mapping.state import MapState
 from r3jax.plots import style
+from r3jax.runs.header import package_versions
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.model import TrainedModel
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.views import Views, load_views
-from r3jax.trace.header import package_versions
 from r3jax.validation.json_text import sealed
 
 OnProgress = Callable[[str, int], None]

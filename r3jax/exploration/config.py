@@ -1,12 +1,11 @@
-"""Settings of the loop. Plain numbers: they go into run.json as they are."""
+"""Settings of the loop and its budget. Plain numbers: they go into run.json as they are."""
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 from r3jax.mapping.config import MappingConfig
 from r3jax.planning.robot.motion import LEAST_RATE
-from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 
 ClockName = Literal["wall", "model"]
 
@@ -22,9 +21,79 @@ RETIRED_GAZES = {
 LEAST_PIECE = 0.05
 """Frames that are captured on the way lie at least so far apart [m]: the edge of a voxel."""
 
+DEPTH_STEPS_PER_METRE = 5000
+"""Recorded depth is in steps of 0.2 mm (TUM's scale)."""
+
+BEYOND_RANGE = 65535
+"""Recorded depth where nothing lies within the sensor's range (or within 13.1 m)."""
+
 # One step less: the largest stored value means "beyond the range", not a depth.
 LARGEST_DEPTH = (BEYOND_RANGE - 1) / DEPTH_STEPS_PER_METRE
 """What lies farther is recorded as beyond the range [m]."""
+
+Unit = Literal["views", "frames", "seconds", "metres"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long a run may last.
+
+    Views are those that a policy chose, and the one at the start; frames count those captured
+    while moving, too. Without captures they are the same. Seconds are those of the mission clock.
+    """
+
+    unit: Unit
+    amount: float
+
+    def allows(self, *, views: int, frames: int, seconds: float, metres: float) -> bool:
+        """True if a mission of that size lies within the budget."""
+        spent = {"views": views, "frames": frames, "seconds": seconds, "metres": metres}
+        return spent[self.unit] <= self.amount
+
+    def spent_share(self, *, views: int, frames: int, seconds: float, metres: float) -> float:
+        """Share of the budget that such a mission has used, in [0, 1]."""
+        spent = {"views": views, "frames": frames, "seconds": seconds, "metres": metres}
+        # Mapping the last image may exceed the budget: only its arrival has to lie within.
+        return min(1.0, spent[self.unit] / self.amount)
+
+    def __str__(self) -> str:
+        """As `parse_budget` reads it."""
+        # `:g` reads well but keeps six digits: a resumed run must get the very same limit.
+        short = f"{self.amount:g}"
+        return f"{self.unit}:{short if float(short) == self.amount else repr(self.amount)}"
+
+    @property
+    def shown(self) -> str:
+        """As a user writes it."""
+        return as_written(str(self))
+
+
+def as_written(text: str) -> str:
+    """Spells meters in a text as users do, where files spell them otherwise."""
+    return text.replace("metres", "meters")
+
+
+def parse_budget(text: str) -> Budget:
+    """Reads `views:N`, `frames:N`, `seconds:S` or `meters:M`.
+
+    Raises:
+        ValueError: anything else, an amount that is not positive, views or frames not whole.
+    """
+    example = "use views:100, seconds:300 or meters:25; frames:100 counts those on the way as well"
+    unit, separator, amount_text = text.strip().partition(":")
+    if unit == "meters":
+        unit = "metres"  # as recorded runs and submissions spell it
+    if not separator or unit not in get_args(Unit):
+        raise ValueError(f"budget {text!r} is not understood: {example}")
+    try:
+        amount = float(amount_text)
+    except ValueError:
+        raise ValueError(f"budget {text!r}: {amount_text!r} is not a number; {example}") from None
+    if not (math.isfinite(amount) and amount > 0.0):
+        raise ValueError(f"budget {text!r}: the amount must be positive and finite; {example}")
+    if unit in ("views", "frames") and amount != int(amount):
+        raise ValueError(f"budget {text!r}: {unit} are counted in whole numbers; {example}")
+    return Budget(cast(Unit, unit), amount)
 
 
 def check_voxel_size(voxel_size: float, max_range: float) -> None:

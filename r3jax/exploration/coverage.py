@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import ndimage
 
+from r3jax.exploration.taken_views import Coverage
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier_unexplored
 from r3jax.mapping.state import MapState
 from r3jax.scoring.renderability import renderability
-from r3jax.trace.rows import Coverage
 
 _NUM_DRAWN = 1 << 14
 """Probe poses drawn over the scene's box; most of them lie in walls or outside."""

@@ -1,14 +1,85 @@
-"""The loop's own way to a simulator: no image but from where the camera has just arrived.
+"""The loop's access to the world: worlds that can be explored, images from where the camera is.
 
-A policy never gets a simulator. Should one find its way to the loop's all the same, it finds this
-one, whose `render` answers for the pose to which the loop has committed itself, once.
+A policy never gets a simulator. Should one reach the loop's nevertheless, it finds a guard, whose
+`render` answers for the pose to which the loop has committed itself, once.
 """
 
 import numpy as np
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import MAX_CELLS
+from r3jax.planning.robot.limits import begin_at
+from r3jax.planning.robot.motion import Motion
 from r3jax.simulators.base import Simulator
+
+_LEAST_EXTENT = 1.0
+"""Smaller worlds have no place with half a meter free all round [m]."""
+
+_LEAST_HEIGHT = 0.1
+"""Thinner ones are surfaces [m]."""
+
+_LEAST_HOUSE, _LARGEST_HOUSE = 2.0, 500.0
+"""Extents that what is explored usually has [m]."""
+
+
+def first_pose(simulator: Simulator, motion: Motion, cell_size: float) -> np.ndarray:
+    """Finds the pose of the first view, `T_world_camera` [4, 4] float64.
+
+    Args:
+        simulator: the world.
+        motion: of the robot, which must be able to take that view itself.
+        cell_size: edge of a cell of the coarse grid [m].
+
+    Raises:
+        ValueError: a start outside the world's box, or at a height that the robot cannot reach;
+            a world that cannot be explored (see `check_world`).
+    """
+    pose = np.asarray(simulator.start_pose, dtype=np.float64)
+    lower, upper = np.asarray(simulator.bounds, dtype=np.float64)
+    # The grid ends just beyond the box: outside it no cell is there to fly through.
+    if not np.all((pose[:3, 3] >= lower) & (pose[:3, 3] <= upper)):
+        raise ValueError(
+            f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
+            f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
+        )
+    # Before the grid is made: its own refusal names no scale that would mend the mesh.
+    check_world(simulator.bounds, cell_size)
+    return begin_at(motion, pose)
+
+
+def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-size") -> None:
+    """Refuses a world that is too small, too flat or too large to be explored.
+
+    Args:
+        bounds: its box, [2, 3] [m].
+        cell_size: edge of a cell of the coarse grid [m].
+        setting: where the user said so.
+
+    Raises:
+        ValueError: says what is odd, and which scale would mend it.
+    """
+    extent = np.ptp(np.asarray(bounds, np.float64), axis=0)
+    size = f"the world is {' x '.join(f'{length:.6g}' for length in extent)} m large"
+    units = {0.001: "millimeters", 0.01: "centimeters", 1000.0: "kilometers"}
+    hints = [
+        f"; if its mesh is in {unit}, give --scale {scale:g}"
+        for scale, unit in units.items()
+        if _LEAST_HOUSE <= scale * extent.max() <= _LARGEST_HOUSE
+    ]
+    hint = hints[0] if hints else ""
+    # Each check is written so that NaN fails it, too.
+    if not extent.max() >= _LEAST_EXTENT:
+        raise ValueError(f"{size}: too small for a camera with {_LEAST_EXTENT / 2:g} m free{hint}")
+    if not extent.min() >= _LEAST_HEIGHT:
+        raise ValueError(f"{size}: it is flat, there is no space to explore")
+    # The grid has a cell more on every side, as walls lie on the faces of the box.
+    cells = float(np.prod(extent / cell_size + 2.0))
+    if not cells <= MAX_CELLS:
+        raise ValueError(
+            f"{size}: {cells:.2g} cells of {cell_size:g} m, more than {MAX_CELLS:.0e}"
+            f"{hint or f'; give a larger {setting}, or cut the mesh'}"
+        )
 
 
 class OracleReadError(RuntimeError):

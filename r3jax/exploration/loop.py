@@ -4,32 +4,57 @@ A run that is interrupted, or whose disk is full, ends like any other: with the 
 everything recorded before complete. It goes on from there as if nothing had happened.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import jax
 
-from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.clock import make_clock
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.recording import continued, record_end, record_view
-from r3jax.exploration.state import (
-    LoopState,
-    Mission,
-    Stop,
-    StopReason,
-    TakenView,
-    in_words,
-)
-from r3jax.exploration.step import start_state, step
+from r3jax.exploration.state import LoopState, Mission, RecordingStopped, Stop, StopReason, in_words
+from r3jax.exploration.step import relive, start_state, step
+from r3jax.exploration.taken_views import StepRow, TakenView
+from r3jax.frame import Frame
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import LivesOutside, Policy
 from r3jax.simulators.base import Simulator
-from r3jax.trace.errors import RecordingStopped
-from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow
-from r3jax.trace.writer import RunWriter
+
+
+@runtime_checkable
+class Recorder(Protocol):
+    """Writes a run while it is under way: `runs.writer.RunWriter` is one."""
+
+    def record_view(self, view: TakenView, state: LoopState, config: ExplorationConfig) -> None:
+        """Writes one view, and begins to write the state after it.
+
+        Raises:
+            RecordingStopped: it cannot be written; the views before it are complete.
+        """
+        ...
+
+    def record_end(self, state: LoopState, stop: Stop) -> Stop:
+        """Writes the last state and how the run ended; returns the end with what failed in it."""
+        ...
+
+
+@runtime_checkable
+class RecordedViews(Protocol):
+    """The views of a run that was cut off: `runs.reader.Run` has them."""
+
+    @property
+    def rows(self) -> Sequence[StepRow]:
+        """One per view, in order."""
+        ...
+
+    def frame(self, step: int) -> Frame:
+        """The frame of one view, as it entered the map."""
+        ...
+
+    def newest_state(self, start: LoopState) -> LoopState:
+        """The newest stored state that can be used; `start`, the first one, if there is none."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -49,8 +74,8 @@ def explore(
     budget: Budget | str,
     seed: int = 0,
     config: ExplorationConfig | None = None,
-    recorder: RunWriter | None = None,
-    resume: Run | None = None,
+    recorder: Recorder | None = None,
+    resume: RecordedViews | None = None,
     decided_from: int = 0,
     is_enough: Callable[[LoopState], str | None] | None = None,
     on_view: Callable[[TakenView, Planner], None] | None = None,
@@ -114,7 +139,7 @@ def explore(
         # begin again if no checkpoint can be used.
         state = start_state(mission, init_key)
         if resume is not None:
-            state = continued(resume, mission, state, decided_from=decided_from)
+            state = _continued(resume, mission, state, decided_from=decided_from)
             rows = list(resume.rows)
         state, stop = _go(state, mission, rows, recorder, on_view or (lambda view, planner: None))
     finally:
@@ -123,11 +148,33 @@ def explore(
     return Result(state, tuple(rows), stop.reason, stop.message)
 
 
+def _continued(
+    run: RecordedViews, mission: Mission, start: LoopState, *, decided_from: int
+) -> LoopState:
+    """The state after the last recorded view: of the newest stored state, and the views since.
+
+    Rows and frames alone rebuild the state, from the first view if need be; a stored state saves
+    the time. So one that is missing, damaged or of another version costs time, not the run.
+
+    Raises:
+        RunError: a frame that is needed is missing, broken, or not the one that was recorded.
+    """
+    # A stored state has neither the decision that was made while moving, nor the memory of an
+    # external program: all views are processed again.
+    is_stored = not (mission.config.plan_while_moving or isinstance(mission.policy, LivesOutside))
+    state = run.newest_state(start) if is_stored else start
+    for row in run.rows[state.views :]:
+        mission.on_stage("map")
+        decides = row.step >= decided_from
+        state, _ = relive(state, mission, row, run.frame(row.step), decides=decides)
+    return state
+
+
 def _go(
     state: LoopState,
     mission: Mission,
     rows: list[StepRow],
-    recorder: RunWriter | None,
+    recorder: Recorder | None,
     on_view: Callable[[TakenView, Planner], None],
 ) -> tuple[LoopState, Stop]:
     """Steps until something ends the run; adds to `rows`, and records the end."""
@@ -142,7 +189,7 @@ def _go(
                 continue
             if recorder is not None:
                 mission.on_stage("record")
-                record_view(recorder, output, after, mission.config)
+                recorder.record_view(output, after, mission.config)
             # Only once it is recorded: a disk that is full ends the run at what is on it.
             state = after
             rows.append(output.row)
@@ -156,6 +203,7 @@ def _go(
     # The record of a failure ends properly, too; the error itself goes on to the caller.
     except Exception as error:
         if recorder is not None:
-            record_end(recorder, state, Stop(StopReason.FAILED, f"{type(error).__name__}: {error}"))
+            failure = Stop(StopReason.FAILED, f"{type(error).__name__}: {error}")
+            recorder.record_end(state, failure)
         raise
-    return state, stop if recorder is None else record_end(recorder, state, stop)
+    return state, stop if recorder is None else recorder.record_end(state, stop)

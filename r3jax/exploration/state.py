@@ -2,24 +2,23 @@
 
 import enum
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from r3jax.exploration.budget import Budget
 from r3jax.exploration.captures import Leg, Rules
 from r3jax.exploration.clock import Clock
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import Budget, ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.frame import Frame
+from r3jax.exploration.taken_views import StepRow
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Decision, Policy
 from r3jax.planning.robot.motion import motion_of
-from r3jax.trace.rows import StepRow
 
 
 class StopReason(enum.Enum):
@@ -61,6 +60,15 @@ COMPLETE = frozenset(
     )
 )
 """Ends that belong to the result; after any other an exploration is not over."""
+
+
+class RecordingStopped(ValueError):
+    """A run folder refused a write in the middle of a run; everything before it stays readable."""
+
+    def __init__(self, path: Path, reason: str):
+        super().__init__(f"{path}: {reason}")
+        self.path = path
+        self.reason = reason
 
 
 def in_words(rows: Sequence[StepRow]) -> str:
@@ -150,22 +158,6 @@ class LoopState:
     def policy_state(self) -> Any:
         """What the policy remembers."""
         return self.planner.policy_state
-
-
-@dataclass(frozen=True)
-class TakenView:
-    """A view that was taken: what to record beside the state."""
-
-    row: StepRow
-    frame: Frame
-    """In stored form."""
-
-    stages: dict[str, float] = field(default_factory=dict[str, float])
-    """Seconds that the stages really took, those off the mission clock included."""
-
-    decision: Decision | None = None
-    """What sent the camera here, with all that was on offer; None: nothing was decided since the
-    frame before."""
 
 
 @dataclass(frozen=True)

@@ -1,38 +1,32 @@
 """One step of the loop: decide, fly, look, map. On the host, round jitted parts.
 
 A step takes one frame: the view that was chosen, or one on the path to it if the settings ask for
-captures; without them only the frame at the end of a path enters the map. What the simulator and
-the bookkeeping take is not on the mission clock.
+captures; without them only the frame at the end of a path enters the map. The time of the
+simulator and of the bookkeeping is not on the mission clock.
 """
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from r3jax.exploration.captures import (
-    Leg,
-    Rules,
-    aim,
-    begin_leg,
-    observe_on_the_way,
-)
+from r3jax.exploration.captures import Leg, Rules, aim, begin_leg, observe_on_the_way
 from r3jax.exploration.clock import timed
 from r3jax.exploration.coverage import measure_coverage, view_renderability
-from r3jax.exploration.state import (
-    LoopState,
-    Mission,
-    PlannedAhead,
-    Stop,
-    StopReason,
+from r3jax.exploration.guard import first_pose
+from r3jax.exploration.state import LoopState, Mission, PlannedAhead, Stop, StopReason
+from r3jax.exploration.taken_views import (
+    StepRow,
     TakenView,
+    frame_hash,
+    make_choice,
+    stored_form,
 )
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import angle_between
-from r3jax.mapping.occupancy import MAX_CELLS
 from r3jax.planning.planner import (
     Planner,
     decide,
@@ -43,19 +37,7 @@ from r3jax.planning.planner import (
     start,
 )
 from r3jax.planning.policy import Decision, PlanInfo
-from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import motion_of
-from r3jax.trace.images import frame_hash, stored_form
-from r3jax.trace.rows import Choice, Coverage, StepRow, make_choice
-
-_LEAST_EXTENT = 1.0
-"""Smaller worlds have no place with half a meter free all round [m]."""
-
-_LEAST_HEIGHT = 0.1
-"""Thinner ones are surfaces [m]."""
-
-_LEAST_HOUSE, _LARGEST_HOUSE = 2.0, 500.0
-"""Extents that what is explored usually has [m]."""
 
 
 def start_state(
@@ -64,70 +46,24 @@ def start_state(
     """The state before the first view.
 
     Args:
-        mission: what the run is asked for.
+        mission: settings of the run.
         init_key: of the policy's first state.
         other_starts: poses [4, 4] where others start at the same time: space that is free, too.
 
     Raises:
-        ValueError: a start pose outside the world's box, or at a height where what carries the
-            camera cannot be; a world that cannot be explored (see `check_world`).
+        ValueError: see `guard.first_pose`.
     """
     simulator, config = mission.simulator, mission.config
-    pose = np.asarray(simulator.start_pose, dtype=np.float64)
-    lower, upper = np.asarray(simulator.bounds, dtype=np.float64)
-    # The grid ends just beyond the box: outside it no cell is there to fly through.
-    if not np.all((pose[:3, 3] >= lower) & (pose[:3, 3] <= upper)):
-        raise ValueError(
-            f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
-            f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
-        )
-    # Before the grid is made: its own refusal names no scale that would mend the mesh.
-    check_world(simulator.bounds, config.cell_size)
-    # The start must be a view that the robot could take itself.
-    pose = begin_at(motion_of(mission.policy), pose)
+    pose = first_pose(simulator, motion_of(mission.policy), config.cell_size)
     planner = start(
         simulator.camera,
-        np.stack([lower, upper]),
+        np.asarray(simulator.bounds, dtype=np.float64),
         mission.policy,
         starts=[pose, *other_starts],
         config=config,
         key=init_key,
     )
     return LoopState(0, planner, pose)
-
-
-def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-size") -> None:
-    """Refuses a world that is too small, too flat or too large to be explored.
-
-    Args:
-        bounds: its box, [2, 3] [m].
-        cell_size: edge of a cell of the coarse grid [m].
-        setting: where the user said so.
-
-    Raises:
-        ValueError: says what is odd, and which scale would mend it.
-    """
-    extent = np.ptp(np.asarray(bounds, np.float64), axis=0)
-    size = f"the world is {' x '.join(f'{length:.6g}' for length in extent)} m large"
-    units = {0.001: "millimeters", 0.01: "centimeters", 1000.0: "kilometers"}
-    hints = [
-        f"; if its mesh is in {unit}, give --scale {scale:g}"
-        for scale, unit in units.items()
-        if _LEAST_HOUSE <= scale * extent.max() <= _LARGEST_HOUSE
-    ]
-    hint = hints[0] if hints else ""
-    # Each check is written so that NaN fails it, too.
-    if not extent.max() >= _LEAST_EXTENT:
-        raise ValueError(f"{size}: too small for a camera with {_LEAST_EXTENT / 2:g} m free{hint}")
-    if not extent.min() >= _LEAST_HEIGHT:
-        raise ValueError(f"{size}: it is flat, there is no space to explore")
-    # The grid has a cell more on every side, as walls lie on the faces of the box.
-    cells = float(np.prod(extent / cell_size + 2.0))
-    if not cells <= MAX_CELLS:
-        raise ValueError(
-            f"{size}: {cells:.2g} cells of {cell_size:g} m, more than {MAX_CELLS:.0e}"
-            f"{hint or f'; give a larger {setting}, or cut the mesh'}"
-        )
 
 
 def step(
@@ -150,7 +86,8 @@ def step(
     charged = {"exchange": exchange} if exchange else {}
     if state.views == 0:
         # Free of charge: the camera stands there already, and nobody chose the view.
-        return _look(state, mission, _Shot(state.T_world_camera), {}, {"planning": 0.0} | charged)
+        here = state.T_world_camera
+        return _look(state, mission, here, None, {}, {"planning": 0.0} | charged)
     if state.leg is not None:
         return _next_frame(state, mission, state.leg, {}, {"planning": 0.0} | charged)
     # Before deciding: a spent budget must not pay for a decision that cannot be carried out.
@@ -267,7 +204,7 @@ def _next_frame(
     stop = _spent(state, mission, seconds=seconds, metres=leg.length)
     if stop is not None:
         return state, stop
-    return _look(state, mission, _Shot(pose, leg), stages, before)
+    return _look(state, mission, pose, leg, stages, before)
 
 
 def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
@@ -309,59 +246,34 @@ def _good_enough(state: LoopState, mission: Mission) -> Stop | None:
     return None if reason is None else Stop(StopReason.FORECAST, reason)
 
 
-@dataclass(frozen=True)
-class _Shot:
-    """A frame that is to be taken."""
-
-    T_world_camera: np.ndarray
-    """Its pose, [4, 4]."""
-
-    leg: Leg | None = None
-    """The path to it; None: the camera is there."""
-
-    @property
-    def captured(self) -> bool:
-        """True for a frame on the way."""
-        return self.leg is not None and not self.leg.is_last
-
-    @property
-    def decision(self) -> Decision | None:
-        """The decision, with the first frame of its path."""
-        return None if self.leg is None or self.leg.taken > 0 else self.leg.decision
-
-    @property
-    def choice(self) -> Choice | None:
-        """What is recorded of the decision."""
-        if self.leg is None or self.decision is None:
-            return None
-        return make_choice(self.decision, self.leg.info)
-
-
 def _look(
     state: LoopState,
     mission: Mission,
-    shot: _Shot,
+    T_world_camera: np.ndarray,
+    leg: Leg | None,
     stages: dict[str, float],
     before: dict[str, float],
 ) -> tuple[LoopState, TakenView]:
     """Takes a frame, integrates it and measures what is known now.
 
-    `before` holds what is charged for the time until the camera begins to fly [s].
+    Args:
+        state: before the frame.
+        mission: settings of the run.
+        T_world_camera: pose of the frame, [4, 4].
+        leg: the path to it; None: the camera is there.
+        stages: seconds that stages took so far.
+        before: what is charged for the time until the camera begins to fly [s].
     """
+    captured = leg is not None and not leg.is_last
+    # A decision is recorded with the first frame of its path.
+    decided = leg if leg is not None and leg.taken == 0 else None
     mission.on_stage("render")
     begin = time.perf_counter()
-    # Rounded as the trace has it: the image is taken from the very pose that is recorded, so that
-    # whoever has the poses has the images.
-    pose = np.asarray(shot.T_world_camera, dtype=np.float32).astype(np.float64)
-    # Announced first, so that an image that nobody chose is noticed.
-    mission.simulator.commit(state.views, pose)
-    # Rounded as it will be on disk before the map sees it: a replay integrates the same bits.
-    frame = stored_form(mission.simulator.render(pose))
+    frame = _render(mission, state.views, T_world_camera)
     # Read here: what follows is bookkeeping, which the simulator must not be blamed for.
-    rendered = time.perf_counter()
+    stages = stages | {"render": time.perf_counter() - begin}
     # Of the map before the frame: what had been promised of this view.
     arrival = view_renderability(state.map_state, frame.camera, frame.T_world_camera)
-    stages = stages | {"render": rendered - begin}
 
     mission.on_stage("map")
     planner, measured = timed(
@@ -369,14 +281,14 @@ def _look(
         state.planner,
         frame,
         mission.rules,
-        captured=shot.captured,
+        captured=captured,
         repeat_compiled=mission.clock.measures,
     )
     mapping = mission.clock.charge("mapping", measured)
-    length, flight = (0.0, 0.0) if shot.leg is None else (shot.leg.length, shot.leg.flight)
+    length, flight = (0.0, 0.0) if leg is None else (leg.length, leg.flight)
     charged = before | {"mapping": mapping, "flight": flight}
-    state = _arrive(state, planner, frame, length, charged, captured=shot.captured)
-    state = replace(state, leg=None if shot.leg is None else shot.leg.after)
+    state = _arrive(state, planner, frame, length, charged, captured=captured)
+    state = replace(state, leg=None if leg is None else leg.after)
     mission.on_stage("measure")
     begin = time.perf_counter()
     coverage = measure_coverage(
@@ -386,33 +298,33 @@ def _look(
         arrival_renderability=arrival,
         num_probes=mission.config.num_probes,
     )
-    row = _row(state, frame, shot, charged, coverage)
-    stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
-    return state, TakenView(row, frame, stages, shot.decision)
-
-
-def _row(
-    state: LoopState,
-    frame: Frame,
-    shot: _Shot,
-    charged: dict[str, float],
-    coverage: Coverage,
-) -> StepRow:
-    """What the trace says of a frame, given the state after it."""
-    return StepRow(
+    row = StepRow(
         step=state.views - 1,
-        # The frame's float32, not what was asked for: a replay has no other pose.
+        # The frame's float32, not the pose of the decision: a replay has no other pose.
         pose=np.asarray(frame.T_world_camera),
         sha256=frame_hash(frame),
-        choice=shot.choice,
+        choice=make_choice(decided.decision, decided.info) if decided else None,
         seconds=state.seconds,
         metres=state.metres,
         radians=state.radians,
         charged=charged,
         coverage=coverage,
-        captured=shot.captured,
-        hidden=0.0 if shot.leg is None or shot.leg.taken else shot.leg.hidden,
+        captured=captured,
+        hidden=decided.hidden if decided else 0.0,
     )
+    stages = stages | {"map": measured, "measure": time.perf_counter() - begin}
+    return state, TakenView(row, frame, stages, decided.decision if decided else None)
+
+
+def _render(mission: Mission, view: int, T_world_camera: np.ndarray) -> Frame:
+    """Takes the image of a view, in stored form."""
+    # Rounded as the trace has it: the image is taken from the very pose that is recorded, so that
+    # poses alone give the images again.
+    pose = np.asarray(T_world_camera, dtype=np.float32).astype(np.float64)
+    # Announced first, so that an image that nobody chose is noticed.
+    mission.simulator.commit(view, pose)
+    # Rounded as it will be on disk before the map sees it: a replay integrates the same bits.
+    return stored_form(mission.simulator.render(pose))
 
 
 def relive(

@@ -27,7 +27,7 @@ from r3jax.formats.sequences.scannet_sens import is_sens, read_sens
 from r3jax.formats.sequences.seven_scenes import is_seven_scenes, read_seven_scenes
 from r3jax.formats.sequences.tum import is_tum, read_tum
 from r3jax.frame import Frame
-from r3jax.trace.reader import Run, read_run
+from r3jax.runs.reader import Run, read_run
 
 _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ...] = (
     (is_replica_slam, read_replica_slam),

@@ -27,9 +27,10 @@ from r3jax.formats.colmap.model import (
 from r3jax.formats.colmap.text import write_text
 from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import Lens, pinhole_lens
-from r3jax.formats.nerfstudio import transforms_of
+from r3jax.formats.nerfstudio import transforms_of, write_transforms
 from r3jax.formats.points import voxel_points, write_points
-from r3jax.trace.reader import Run
+from r3jax.mapping.state import MapState
+from r3jax.runs.reader import Run
 
 Format = Literal["nerfstudio", "colmap", "colmap-text"]
 
@@ -64,6 +65,18 @@ def export_run(
     with whole_folder(out) as partial:
         _fill(partial, run, kind, (xyz, rgb), on_view)
     return len(xyz)
+
+
+def write_data_set(run: Run, map_state: MapState) -> None:
+    """Writes transforms.json and the points that 3DGS starts from into the run's own folder.
+
+    Raises:
+        OSError: the disk is full, not writable, ...
+    """
+    points = run.path / "exports" / _POINTS
+    make_folder(points.parent)
+    write_points(points, *voxel_points(map_state))
+    write_transforms(run, points.relative_to(run.path).as_posix())
 
 
 def _map_points(run: Run) -> tuple[np.ndarray, np.ndarray]:

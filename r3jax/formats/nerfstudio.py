@@ -24,15 +24,15 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.exploration.config import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
+from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.moved_images import COPIES
 from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
 from r3jax.formats.poses import mend_pose
-from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
-from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow
+from r3jax.runs.reader import Run
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import check_fields, check_type
 from r3jax.validation.files import read_bytes

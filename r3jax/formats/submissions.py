@@ -22,17 +22,18 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.replay import check_decided_alone, config_of
 from r3jax.exploration.state import COMPLETE
+from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.robot.motion import Motion, motion_of_record
-from r3jax.trace.errors import RunError
-from r3jax.trace.paths import paths_to
-from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow, rigid_pose, shortest_floats, table_of
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import Run
+from r3jax.runs.replay import check_decided_alone
+from r3jax.runs.rows import paths_to, rigid_pose, shortest_floats, table_of
+from r3jax.runs.settings import config_of
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import build, check_type
 from r3jax.validation.files import read_bytes
@@ -93,7 +94,7 @@ class SubmittedFrame:
     """True if the frame was captured on the way to a view, and not chosen itself."""
 
     sha256: str | None = None
-    """Hash of the stored pixels (`trace.images.content_hash`); None: nobody knows."""
+    """Hash of the stored pixels (`exploration.taken_views.content_hash`); None: nobody knows."""
 
     @property
     def position(self) -> np.ndarray:

@@ -36,7 +36,7 @@ class ScoringConfig(VisibilityConfig):
     """`box`: 1 inside the seen directions' box, else 2. `one`: always 1."""
 
     delta: str = eqx.field(default="trace", static=True)
-    """`trace`: the paper's Algorithm 2. `pairwise`: its text, 1 - 2 tr(M) / (n - 1)."""
+    """`runs`: the paper's Algorithm 2. `pairwise`: its text, 1 - 2 tr(M) / (n - 1)."""
 
     panorama_bins: int = eqx.field(default=526, static=True)
     """Directions of the panorama; 526 are 10 degrees apart."""

@@ -10,9 +10,9 @@ import r3jax
 from r3jax.cli.commands.benchmark import print_results
 from r3jax.cli.console import Console, Table, TextColumn, progress_bar
 from r3jax.cli.main import main
-from r3jax.trace.writer import RunWriter
+from r3jax.runs.writer import RunWriter
 from tests.evaluation.records import record
-from tests.trace.runs import make_header, make_view
+from tests.runs.runs import make_header, make_view
 
 ODD = "[/x] [abc] [bold]b[/bold] :smile: \x1b[2J\udcff"
 SHOWN = "[/x] [abc] [bold]b[/bold] :smile: \\x1b[2J\\udcff"

@@ -6,7 +6,7 @@ import pytest
 
 from r3jax.apps.forecast.psnr import default_calibration, write_calibration
 from r3jax.cli.main import main
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore, main_without_report
 

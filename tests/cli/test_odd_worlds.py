@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from r3jax.apps.runs.settings import open_run_scene
 from r3jax.cli.main import main
+from r3jax.runs.reader import read_run
+from r3jax.runs.settings import open_run_scene
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
-from r3jax.trace.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from r3jax.cli.main import main
-from r3jax.exploration.replay import rebuild
 from r3jax.mapping.join import grow, merge
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import rebuild
 from tests.box_room import write_room
 from tests.cli.small_runs import explore, main_without_report
 

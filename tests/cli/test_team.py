@@ -9,8 +9,8 @@ import pytest
 from r3jax.cli.main import main
 from r3jax.files import lock_folder
 from r3jax.formats.nerfstudio import read_transforms
+from r3jax.runs.reader import read_run
 from r3jax.simulators.start import APART
-from r3jax.trace.reader import read_run
 from tests.box_room import write_room
 
 VIEWS = 3

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from r3jax.cli.main import main
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore
 

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 from r3jax.apps.report.model_report import read_evaluated_model
-from r3jax.apps.runs.settings import open_run_scene, settings_of_run
 from r3jax.cli.main import main
 from r3jax.exploration import explore
-from r3jax.exploration.recording import state_tables
+from r3jax.runs.reader import read_run
+from r3jax.runs.rows import to_json
+from r3jax.runs.settings import open_run_scene, settings_of_run
+from r3jax.runs.stored_states import state_tables
 from r3jax.splatting.model import find_model
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import empty_scene
@@ -25,8 +27,6 @@ from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.train import scene_extent
 from r3jax.splatting.training.train_step import start_state
 from r3jax.splatting.views import load_views, split_views
-from r3jax.trace.reader import read_run
-from r3jax.trace.rows import to_json
 from tests.box_room import write_room
 from tests.cli import small_runs
 

@@ -20,7 +20,7 @@ import pytest
 
 from r3jax.apps.benchmark.record import read_records
 from r3jax.files import MARKER
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 from tests.box_room import write_room
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ from r3jax.exploration.clock import compilations
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 from tests.apps.benchmark.tiny import CONDITIONS, SETTINGS, make_cells
 from tests.box_room import write_room
 from tests.planning.rooms import center, grid_of, pose_at

@@ -15,10 +15,10 @@ from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
 from r3jax.apps.benchmark.conditions import Conditions
 from r3jax.apps.benchmark.record import read_lines, read_records, write_record, write_records
 from r3jax.planning.registry import policy_names
+from r3jax.runs.writer import RunWriter
 from r3jax.simulators.scenes.registry import open_world
-from r3jax.trace.writer import RunWriter
 from tests.evaluation.records import record
-from tests.trace.runs import make_header, make_view
+from tests.runs.runs import make_header, make_view
 
 SOURCE = Origin("python -m experiments.some", "a machine", "abc")
 ROOT = Path(__file__).parents[2]

@@ -14,11 +14,11 @@ from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.planning.policy import Policy
 from r3jax.planning.registry import make_policy
+from r3jax.runs.header import camera_fields
+from r3jax.runs.writer import RunWriter
 from r3jax.scoring.config import ScoringConfig
-from r3jax.trace.header import camera_fields
-from r3jax.trace.writer import RunWriter
 from tests.exploration.toys import BoxRoom
-from tests.trace.runs import make_header
+from tests.runs.runs import make_header
 
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=4)
 SCORING = ScoringConfig(zbuffer_size=32, panorama_size=32)

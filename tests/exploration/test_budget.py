@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.exploration.budget import Budget, parse_budget
+from r3jax.exploration.config import Budget, parse_budget
 
 
 @given(st.sampled_from(["seconds", "metres"]), st.floats(0.01, 1e6))

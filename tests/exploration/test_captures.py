@@ -9,14 +9,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from r3jax.apps.runs.merge import merge_runs
 from r3jax.exploration import explore
 from r3jax.exploration.captures import Rules, begin_leg, points_along
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.explain_run import explain_run
 from r3jax.exploration.guard import OracleReadError
-from r3jax.exploration.replay import differences, states_of
 from r3jax.exploration.state import StopReason
+from r3jax.exploration.taken_views import stored_form
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate
@@ -24,19 +22,20 @@ from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import MOTIONS, Motion
 from r3jax.planning.turning import direction_of
-from r3jax.trace.header import camera_fields, policy_fields
-from r3jax.trace.images import stored_form
-from r3jax.trace.paths import paths_to
-from r3jax.trace.reader import read_run
-from r3jax.trace.rows import from_json, to_json
-from r3jax.trace.writer import RunWriter
+from r3jax.runs.begin import merge_runs
+from r3jax.runs.explain import explain_run
+from r3jax.runs.header import camera_fields, policy_fields
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import differences, states_of
+from r3jax.runs.rows import from_json, paths_to, to_json
+from r3jax.runs.writer import RunWriter
 from tests.exploration.killed_run import CONFIG, SCORING, small_policy
 from tests.exploration.test_guard import Cheat
 from tests.exploration.test_resume import assert_same_run
 from tests.exploration.toys import BoxRoom, Wander
 from tests.planning.rooms import pose_at
+from tests.runs.runs import make_header, make_view
 from tests.tiers import quick_and_full
-from tests.trace.runs import make_header, make_view
 
 EVERY = 0.2
 AHEAD = replace(CONFIG, capture_every=EVERY, gaze="ahead")

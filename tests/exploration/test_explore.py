@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 
 from r3jax.exploration import clock, explore
-from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import ExplorationConfig, parse_budget
 from r3jax.exploration.state import StopReason
 from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_growing
-from r3jax.trace import checkpoints
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
+from r3jax.runs import stored_states
+from r3jax.runs.reader import read_run
+from r3jax.runs.writer import RunWriter
 from tests.exploration.toys import UPPER, BoxRoom, Wander
-from tests.trace.runs import make_header
+from tests.runs.runs import make_header
 
 CONFIG = ExplorationConfig(
     voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=4, checkpoint_every=3
@@ -226,7 +225,7 @@ def test_a_checkpoint_that_the_disk_refuses_is_told_in_the_last_row(tmp_path, mo
     def full(path, tables):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr(checkpoints, "write_checkpoint", full)
+    monkeypatch.setattr(stored_states, "write_checkpoint", full)
     result = run_in(tmp_path / "run")
     run = read_run(tmp_path / "run")
     assert run.outcome == f"{result.reason.value}: {result.message}"

@@ -26,13 +26,13 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.policy import Policy
 from r3jax.planning.registry import make_policy
+from r3jax.runs.header import camera_fields
+from r3jax.runs.reader import read_run
+from r3jax.runs.writer import RunWriter
 from r3jax.scoring.config import ScoringConfig
-from r3jax.trace.header import camera_fields
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
 from tests.exploration.hall import Hall
 from tests.exploration.killed_run import CONFIG, small_policy
-from tests.trace.runs import make_header
+from tests.runs.runs import make_header
 
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 ALLOCATOR = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "1048576"}

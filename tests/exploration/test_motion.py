@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from r3jax.cli.main import main
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.explain_run import explain_run
 from r3jax.exploration.loop import explore
 from r3jax.exploration.state import StopReason
 from r3jax.geometry.cameras import pose_along
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import MOTIONS, Motion, motion_of_record
-from r3jax.trace.reader import read_run
+from r3jax.runs.explain import explain_run
+from r3jax.runs.reader import read_run
 from tests.cli.small_runs import main_without_report
 from tests.exploration.toys import BoxRoom
 

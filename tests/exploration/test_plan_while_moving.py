@@ -12,10 +12,10 @@ from r3jax.exploration import explore
 from r3jax.planning.decision import prepare_decision
 from r3jax.planning.greedy import RECONSIDERED
 from r3jax.planning.planner import decide, decide_ahead, observe, reconsider
+from r3jax.runs.reader import read_run
+from r3jax.runs.rows import from_json, to_json
 from r3jax.scoring.simulated import imagine_view
 from r3jax.scoring.utility import view_utility
-from r3jax.trace.reader import read_run
-from r3jax.trace.rows import from_json, to_json
 from tests.exploration.killed_run import CONFIG, SCORING, small_policy
 from tests.exploration.test_captures import cut_off, record
 from tests.exploration.test_resume import assert_same_run

@@ -13,18 +13,16 @@ import numpy as np
 import pytest
 
 from r3jax.exploration import explore
-from r3jax.exploration.recording import state_of, state_tables
 from r3jax.exploration.state import StopReason
 from r3jax.files import MARKER
-from r3jax.trace.checkpoints import CheckpointWriter, load_checkpoint
-from r3jax.trace.errors import RunError
-from r3jax.trace.header import camera_fields
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
+from r3jax.runs.header import RunError, camera_fields
+from r3jax.runs.reader import read_run
+from r3jax.runs.stored_states import CheckpointWriter, load_checkpoint, state_of, state_tables
+from r3jax.runs.writer import RunWriter
 from tests.exploration.killed_run import CONFIG, small_policy
 from tests.exploration.toys import BoxRoom, Wander
+from tests.runs.runs import make_header
 from tests.tiers import quick_and_full
-from tests.trace.runs import make_header
 
 VIEWS, CUT = 6, 3
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from r3jax.cli.main import USER_ERROR, main
+from r3jax.exploration.config import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
+from r3jax.exploration.taken_views import frame_hash, stored_form
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.exports import export_run
 from r3jax.formats.nerfstudio import read_transforms
@@ -18,17 +20,15 @@ from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
+from r3jax.runs.header import camera_fields
+from r3jax.runs.reader import read_run
+from r3jax.runs.stored_states import map_tables
+from r3jax.runs.writer import RunWriter
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from r3jax.trace import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
-from r3jax.trace.checkpoints import map_tables
-from r3jax.trace.header import camera_fields
-from r3jax.trace.images import frame_hash, stored_form
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
 from tests.box_room import write_room
 from tests.mutants import Modules, Mutant, assert_caught, each, load
-from tests.trace.runs import make_header, make_view
+from tests.runs.runs import make_header, make_view
 
 CAMERA = Camera(40, 30, 31.3, 30.7, 21.1, 14.2)
 """Nothing about it is symmetric."""

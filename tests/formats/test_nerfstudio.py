@@ -10,10 +10,10 @@ from PIL import Image
 
 from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV, read_transforms, write_transforms
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
+from r3jax.runs.reader import read_run
+from r3jax.runs.writer import RunWriter
 from tests.formats.colmap_models import random_pose, seeds
-from tests.trace.runs import make_header, make_view
+from tests.runs.runs import make_header, make_view
 
 LEVEL = [[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
 """An OpenGL camera at (1, 2, 3) that looks along +y with z up: its -z is the world's +y."""

@@ -11,9 +11,9 @@ from r3jax.formats.points import voxel_points, write_points
 from r3jax.geometry.cameras import invert_pose, project, transform
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
-from tests.trace.runs import make_header, make_view
+from r3jax.runs.reader import read_run
+from r3jax.runs.writer import RunWriter
+from tests.runs.runs import make_header, make_view
 
 
 @pytest.fixture

@@ -28,17 +28,17 @@ from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.mapping import bridge as mapping
 from r3jax.mapping.join import merge
+from r3jax.runs.header import header_to_json
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from r3jax.trace.header import header_to_json
 from tests.fuzz import test_models, test_recordings, test_runs, test_splats
 from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.mutate import mutate
 from tests.fuzz.numbers import NUMBER_TEXTS
 from tests.fuzz.tree import Entry, Files
 from tests.fuzz.worker import Reader
+from tests.runs.runs import make_header
 from tests.simulators.rooms import box_quads, world_of
-from tests.trace.runs import make_header
 
 pytestmark = pytest.mark.full
 

@@ -18,9 +18,9 @@ from r3jax.apps.report.model_report import (
 from r3jax.evaluation.judge import choose_views, mapped_views
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
+from r3jax.runs.header import RunError
 from r3jax.splatting.errors import SceneFileError
 from r3jax.splatting.model import find_model
-from r3jax.trace.errors import RunError
 from tests.fuzz import test_runs
 from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.mutate import mutate

@@ -12,8 +12,8 @@ import pytest
 
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
-from r3jax.trace.checkpoints import CheckpointWriter, load_checkpoint, map_tables, read_checkpoint
-from r3jax.trace.errors import RunError
+from r3jax.runs.header import RunError
+from r3jax.runs.stored_states import CheckpointWriter, load_checkpoint, map_tables, read_checkpoint
 from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files, pick_up, unsealed
 from tests.fuzz.worker import Reader

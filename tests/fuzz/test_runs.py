@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r3jax.exploration.taken_views import to_integers
 from r3jax.geometry.cameras import rigid_error
-from r3jax.trace.errors import RunError
-from r3jax.trace.header import header_to_json
-from r3jax.trace.images import encode_png, to_integers
-from r3jax.trace.reader import read_run
-from r3jax.trace.rows import EndRow, to_json
+from r3jax.runs.header import RunError, header_to_json
+from r3jax.runs.reader import read_run
+from r3jax.runs.rows import EndRow, to_json
+from r3jax.runs.writer import encode_png
 from tests.fuzz.harness import CASES_SLOW
 from tests.fuzz.tree import Files, unsealed
 from tests.fuzz.worker import Reader
-from tests.trace.runs import make_header, make_view
+from tests.runs.runs import make_header, make_view
 
 pytestmark = pytest.mark.full
 

@@ -17,8 +17,8 @@ from r3jax.planning.robot.motion import (
     motion_of,
     motion_of_record,
 )
+from r3jax.runs.header import settings_of
 from r3jax.scoring.config import ScoringConfig
-from r3jax.trace.header import settings_of
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import r3jax
 from r3jax.cli.main import main
 from r3jax.planning import policies, registry
 from r3jax.planning.config import PlannerConfig
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore, main_without_report
 

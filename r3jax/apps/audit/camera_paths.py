@@ -26,7 +26,7 @@ from r3jax.formats.normalization import NAME, read_normalization
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import mend_pose
 from r3jax.geometry.cameras import Camera
-from r3jax.trace.reader import Run
+from r3jax.runs.reader import Run
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import check_fields, check_type
 from r3jax.validation.files import read_bytes

@@ -29,7 +29,7 @@ from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.recordings import Recording
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.trace.reader import Run
+from r3jax.runs.reader import Run
 from r3jax.validation.errors import ForeignFileError
 
 _RADIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")

@@ -15,7 +15,7 @@ from r3jax.apps.benchmark.conditions import Conditions, snapshot_slug
 from r3jax.planning.config import FORMER_SETTINGS
 from r3jax.planning.policies.foreign.commands import COMMAND, words_of
 from r3jax.planning.registry import policy_class
-from r3jax.trace.header import plain_settings, settings_of
+from r3jax.runs.header import plain_settings, settings_of
 
 IDENTITY_VERSION = 1
 """Raised when results of an older version of this package must not be taken over."""

@@ -5,8 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from r3jax.exploration.budget import Budget, parse_budget
-from r3jax.exploration.config import ClockName, ExplorationConfig
+from r3jax.exploration.config import Budget, ClockName, ExplorationConfig, parse_budget
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.policy import Policy
 from r3jax.planning.registry import make_policy

@@ -17,7 +17,7 @@ from r3jax.apps.benchmark.reference_images import (
     save_reference_images,
 )
 from r3jax.evaluation.test_views import ViewSet, load_view_set, render_view_set
-from r3jax.exploration.step import check_world
+from r3jax.exploration.guard import check_world
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.scenes.registry import open_scene
 from r3jax.splatting.views import load_views

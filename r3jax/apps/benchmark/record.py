@@ -14,9 +14,9 @@ from typing import Any
 from r3jax.apps.benchmark.cells import Cell, paths_of
 from r3jax.apps.benchmark.conditions import snapshot_order
 from r3jax.evaluation.scores import METRICS, ViewRow, summarize
+from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic
-from r3jax.trace.header import package_versions, plain_settings
-from r3jax.trace.rows import StepRow
+from r3jax.runs.header import package_versions, plain_settings
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import check_fields
 from r3jax.validation.files import read_bytes

@@ -7,17 +7,16 @@ import numpy as np
 
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.coverage import measure_coverage, view_renderability
+from r3jax.exploration.taken_views import Choice, StepRow, frame_hash, stored_form
 from r3jax.formats.submissions import Submission, SubmittedFrame
 from r3jax.geometry.cameras import angle_between
 from r3jax.mapping.state import empty_map
 from r3jax.planning.planner import add_frame, first_grid
 from r3jax.planning.robot.limits import begin_at
+from r3jax.runs.header import RunHeader
+from r3jax.runs.stored_states import map_tables
+from r3jax.runs.writer import RunWriter
 from r3jax.simulators.base import Simulator
-from r3jax.trace.checkpoints import map_tables
-from r3jax.trace.header import RunHeader
-from r3jax.trace.images import frame_hash, stored_form
-from r3jax.trace.rows import Choice, StepRow
-from r3jax.trace.writer import RunWriter
 
 
 def retake(

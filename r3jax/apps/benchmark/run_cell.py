@@ -33,9 +33,10 @@ from r3jax.apps.benchmark.submitted import load_submission
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.evaluation.maps import map_of
-from r3jax.exploration.budget import parse_budget
+from r3jax.exploration.config import parse_budget
 from r3jax.exploration.loop import explore
 from r3jax.exploration.state import COMPLETE, StopReason
+from r3jax.exploration.taken_views import StepRow
 from r3jax.files import (
     clear_partial,
     lock_folder,
@@ -45,6 +46,9 @@ from r3jax.files import (
     write_atomic,
 )
 from r3jax.formats.submissions import Submission, content_hash
+from r3jax.runs.header import RunError, RunHeader, camera_fields, package_versions, policy_fields
+from r3jax.runs.reader import Run, read_run
+from r3jax.runs.writer import RunWriter
 from r3jax.scoring.renderability import renderability
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
@@ -54,11 +58,6 @@ from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training import train
 from r3jax.splatting.training.checkpoints import remove_checkpoints
 from r3jax.splatting.views import load_views
-from r3jax.trace.errors import RunError
-from r3jax.trace.header import RunHeader, camera_fields, package_versions, policy_fields
-from r3jax.trace.reader import Run, read_run
-from r3jax.trace.rows import StepRow
-from r3jax.trace.writer import RunWriter
 
 OnStage = Callable[[str], None]
 """Told what happens now, in a few words."""

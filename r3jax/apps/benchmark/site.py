@@ -26,9 +26,9 @@ from r3jax.evaluation.comparison import (
 from r3jax.evaluation.scores import METRICS, Metric
 from r3jax.evaluation.statistics import Scores, mean_over_scenes, paired_difference
 from r3jax.files import check_own, make_folder, own_folder, write_atomic
+from r3jax.runs.writer import encode_png
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.render import render
-from r3jax.trace.images import encode_png
 
 PAPER_LEAD = ("ours-pano", "active-gs", "views:300", 2.9, "arXiv 2601.07484")
 """What the paper reports of one method minus another at a budget, mean PSNR [dB], and its source;

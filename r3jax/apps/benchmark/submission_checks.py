@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.exploration.budget import Budget, as_written, parse_budget
 from r3jax.exploration.captures import Rules, allowed_turns, elevations_of
 from r3jax.exploration.clock import model_clock
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import Budget, ExplorationConfig, as_written, parse_budget
 from r3jax.formats.submissions import Submission, SubmittedFrame
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.planning.robot.limits import begin_at

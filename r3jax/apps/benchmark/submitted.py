@@ -10,7 +10,7 @@ from r3jax.apps.benchmark.cells import Cell
 from r3jax.apps.benchmark.conditions import OWN_OF_LOOP, Conditions
 from r3jax.apps.benchmark.plan import Request, prepare_scene
 from r3jax.apps.benchmark.submission_checks import Problem, check_submission
-from r3jax.exploration.step import check_world
+from r3jax.exploration.guard import check_world
 from r3jax.files import make_folder
 from r3jax.formats.submissions import (
     Submission,
@@ -20,9 +20,9 @@ from r3jax.formats.submissions import (
 )
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.robot.motion import MOTIONS
+from r3jax.runs.header import camera_fields
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.scenes.registry import open_scene
-from r3jax.trace.header import camera_fields
 
 FOLDER = "submissions"
 """Folder of a benchmark for the submissions that it judges."""

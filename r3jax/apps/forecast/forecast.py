@@ -27,17 +27,17 @@ from scipy.stats import qmc
 
 from r3jax.apps.forecast.psnr import Calibration, default_calibration, parse_goal, statistic
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.replay import config_of
 from r3jax.exploration.state import LoopState
 from r3jax.geometry.axis_views import LOOKS, poses_at
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.robot.travel import safe_cells
+from r3jax.runs.reader import Run
+from r3jax.runs.settings import config_of
 from r3jax.scoring.batch import score_views
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
-from r3jax.trace.reader import Run
 
 MARGIN = 0.3
 """Least distance of the views to what is occupied [m], as in the benchmark's test sets."""

@@ -10,15 +10,15 @@ from matplotlib.ticker import MaxNLocator
 
 from r3jax.apps.forecast.forecast import Outlook
 from r3jax.apps.report.summary import map_row_bytes, stage_times
-from r3jax.exploration.explain_run import explain_run
+from r3jax.exploration.taken_views import StepRow, unit_of
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture
+from r3jax.runs.explain import explain_run
+from r3jax.runs.reader import Run
+from r3jax.runs.rows import paths_to
 from r3jax.scoring.explain import CAUSES
-from r3jax.trace.paths import paths_to
-from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow, unit_of
 
 _DOT, _CAPTURED_DOT = 26, 8
 """Areas of the marks of views, and of frames that were captured on the way [pt^2]."""

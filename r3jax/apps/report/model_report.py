@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r3jax.plots import style
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import Run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import Run
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import check_fields, check_type
 from r3jax.validation.files import read_bytes

@@ -22,15 +22,15 @@ from r3jax.apps.report.model_report import (
     training_figure,
 )
 from r3jax.apps.report.summary import count_of_views, stage_times, summary
-from r3jax.exploration.replay import states_of
 from r3jax.files import make_folder, own_folder, write_atomic
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.plots import style
 from r3jax.plots.page import render
 from r3jax.plots.pictures import panorama_figure, panorama_picture
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import Run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import Run
+from r3jax.runs.replay import states_of
 
 T = TypeVar("T")
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.exploration.budget import as_written
-from r3jax.trace.reader import Run
+from r3jax.exploration.config import as_written
+from r3jax.runs.reader import Run
 
 STAGES = {
     "plan": "planning",

@@ -8,15 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r3jax.apps.runs.settings import (
-    RunSettings,
-    SceneSettings,
-    new_header,
-    open_run_scene,
-    settings_of_run,
-)
 from r3jax.apps.team.team import Member, TeamResult
-from r3jax.exploration.step import check_world
+from r3jax.exploration.guard import first_pose
 from r3jax.files import (
     check_own,
     clear_partial,
@@ -27,12 +20,18 @@ from r3jax.files import (
 )
 from r3jax.formats.nerfstudio import write_team_transforms, write_transforms
 from r3jax.formats.points import voxel_points, write_points
-from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import motion_of
+from r3jax.runs.reader import Run, read_run
+from r3jax.runs.settings import (
+    RunSettings,
+    SceneSettings,
+    new_header,
+    open_run_scene,
+    settings_of_run,
+)
+from r3jax.runs.writer import RunWriter
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.start import APART, places_beside
-from r3jax.trace.reader import Run, read_run
-from r3jax.trace.writer import RunWriter
 
 
 @dataclass(frozen=True)
@@ -78,10 +77,10 @@ def begin_team(
         ImportError: the scene's simulator is not installed.
     """
     _check_leftovers(folder, len(scenes))
-    placed, simulators = _with_starts(scenes, settings[0].config.cell_size)
+    placed, simulators = _with_starts(scenes)
     members = [Member(s, each.policy) for s, each in zip(simulators, settings, strict=True)]
     for member in members:  # refused before there is a folder
-        begin_at(motion_of(member.policy), member.simulator.start_pose)
+        first_pose(member.simulator, motion_of(member.policy), settings[0].config.cell_size)
     names = [str(number) for number in range(len(scenes))]
     headers = [
         dataclasses.replace(
@@ -145,21 +144,21 @@ def _only_writer(folder: Path, stack: contextlib.ExitStack) -> None:
 
 
 def _with_starts(
-    scenes: Sequence[SceneSettings], cell_size: float
+    scenes: Sequence[SceneSettings],
 ) -> tuple[list[SceneSettings], list[Simulator]]:
     """The scene as each camera sees it; all but the first start beside the first.
 
     Raises:
         ValueError: there is no room.
     """
-    placed, simulators = [scenes[0]], [_opened(scenes[0], cell_size)]
+    placed, simulators = [scenes[0]], [scenes[0].open()]
     places = places_beside(simulators[0].start_pose[:3, 3])
     for scene in scenes[1:]:
         for place in places:
             x, y, z = place.tolist()
             scene = dataclasses.replace(scene, start=(x, y, z))
             try:
-                simulators.append(_opened(scene, cell_size))
+                simulators.append(scene.open())
             except ValueError:
                 continue  # in a wall, or too close to one
             placed.append(scene)
@@ -170,12 +169,6 @@ def _with_starts(
                 f"{simulators[0].start_pose[:3, 3].round(2).tolist()}: give a roomier --start"
             )
     return placed, simulators
-
-
-def _opened(scene: SceneSettings, cell_size: float) -> Simulator:
-    simulator = scene.open()
-    check_world(simulator.bounds, cell_size)
-    return simulator
 
 
 def _check_leftovers(folder: Path, cameras: int) -> None:

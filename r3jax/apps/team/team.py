@@ -13,31 +13,29 @@ it at the first meeting after that. Members that decide at the same time decide 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from r3jax.apps.team.reserved_views import PromisedView, ReservedViews
-from r3jax.apps.team.sharing import Common, Sight, Told, in_order, last_meeting, tell
-from r3jax.exploration.budget import Budget, parse_budget
 from r3jax.exploration.clock import make_clock, timed
-from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.loop import Result
-from r3jax.exploration.recording import record_end, record_view
-from r3jax.exploration.state import LoopState, Mission, Stop, StopReason
+from r3jax.exploration.state import LoopState, Mission, RecordingStopped, Stop, StopReason
 from r3jax.exploration.step import relive, start_state, step
+from r3jax.exploration.taken_views import StepRow
+from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.planner import add_frame, tell_policy
 from r3jax.planning.policy import LivesOutside, Policy
+from r3jax.runs.reader import Run
+from r3jax.runs.writer import RunWriter
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
-from r3jax.trace.errors import RecordingStopped
-from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow
-from r3jax.trace.writer import RunWriter
 
 
 @dataclass(frozen=True)
@@ -86,6 +84,85 @@ class TeamResult:
     def seconds(self) -> float:
         """How long the mission lasted: the longest clock [s]."""
         return max(result.state.seconds for result in self.members)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A frame that a member has taken."""
+
+    seconds: float
+    """Its mission clock when the frame was in its own map [s]."""
+
+    member: int
+
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class Told:
+    """A frame that has become common, and what all know since."""
+
+    sight: Sight
+
+    mapping: float
+    """Seconds that it took to join the common map."""
+
+    voxels: int
+    """Occupied voxels of that map."""
+
+    known_share: float
+    """Known cells over all cells of the scene's box."""
+
+
+@dataclass(frozen=True)
+class Common:
+    """What all have told each other, and what they have not yet."""
+
+    map_state: MapState
+    """Map of the frames that were told."""
+
+    grid: OccupancyGrid
+
+    waiting: tuple[Sight, ...] = ()
+    """Taken and not told yet."""
+
+
+def last_meeting(seconds: float, meet_every: float) -> float:
+    """The clock at the last meeting [s]; 0 for `meet_every`: the radio is always on."""
+    return math.floor(seconds / meet_every) * meet_every if meet_every > 0.0 else seconds
+
+
+def in_order(sights: tuple[Sight, ...]) -> list[Sight]:
+    """By the clock; of two at the same time, the first member's comes first."""
+    return sorted(sights, key=attrgetter("seconds", "member"))
+
+
+def tell(
+    common: Common, until: float, config: ExplorationConfig, *, repeat_compiled: bool
+) -> tuple[Common, list[Told]]:
+    """A meeting: all frames up to a time join the common map.
+
+    Args:
+        common: before.
+        until: mission clock [s]. No frame up to then may be told of later.
+        config: of the maps.
+        repeat_compiled: False where nobody needs the exact time.
+
+    Returns:
+        What is common now, and the frames that have become so, in order.
+    """
+    told: list[Told] = []
+    map_state, grid = common.map_state, common.grid
+    for sight in in_order(common.waiting):
+        if sight.seconds > until:
+            continue
+        (map_state, grid), seconds = timed(
+            add_frame, map_state, grid, sight.frame, config, repeat_compiled=repeat_compiled
+        )
+        known_share = 1.0 - float(np.mean(np.asarray(grid.unexplored)))
+        told.append(Told(sight, seconds, int(map_state.num_occupied), known_share))
+    waiting = tuple(sight for sight in common.waiting if sight.seconds > until)
+    return Common(map_state, grid, waiting), told
 
 
 @dataclass(frozen=True)
@@ -321,7 +398,7 @@ def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Sig
         row, frame = output.row, output.frame
         if me.recorder is not None:
             mission.on_stage("record")
-            record_view(me.recorder, output, after, mission.config)
+            me.recorder.record_view(output, after, mission.config)
     me = replace(me, state=after, rows=(*me.rows, row), owed=0.0)
     return me, Sight(after.seconds, me.number, frame)
 
@@ -341,5 +418,5 @@ def _stop_all(flying: list[_Flying], reason: StopReason, why: str) -> None:
 def _land(me: _Flying, state: LoopState) -> Result:
     """Records how a member ended."""
     assert me.stop is not None
-    stop = me.stop if me.recorder is None else record_end(me.recorder, state, me.stop)
+    stop = me.stop if me.recorder is None else me.recorder.record_end(state, me.stop)
     return Result(state, me.rows, stop.reason, stop.message)

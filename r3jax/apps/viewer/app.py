@@ -19,8 +19,8 @@ from r3jax.apps.viewer.panel import PANEL_WIDTH, Controls, Menu
 from r3jax.apps.viewer.preview import CameraPreview
 from r3jax.apps.viewer.queries import Extras, Query, QueryHandler, Show
 from r3jax.apps.viewer.story import Story
+from r3jax.runs.header import RunError
 from r3jax.scoring.config import ScoringConfig
-from r3jax.trace.errors import RunError
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")

@@ -24,16 +24,16 @@ from r3jax.apps.viewer.color_maps import CAUSE_COLORS, UNSEEN, paint
 from r3jax.apps.viewer.preview import TERMS
 from r3jax.apps.viewer.story import Moment
 from r3jax.exploration.coverage import probe_poses
-from r3jax.exploration.explain_run import Reason
+from r3jax.exploration.taken_views import StepRow
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import INDEX_LIMIT, unpack
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.runs.explain import Reason
+from r3jax.runs.header import RunHeader
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.explain import CAUSES
 from r3jax.scoring.terms import score_voxels
-from r3jax.trace.header import RunHeader
-from r3jax.trace.rows import StepRow
 from r3jax.visibility.depth_buffer import seen_in
 from r3jax.visibility.selection import for_selected
 from r3jax.visibility.views import panorama_view

@@ -16,11 +16,11 @@ from r3jax.apps.viewer.app import App
 from r3jax.apps.viewer.server import url_of
 from r3jax.apps.viewer.story import LiveStory
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.state import TakenView
+from r3jax.exploration.taken_views import TakenView
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.planner import Planner
+from r3jax.runs.reader import Run
 from r3jax.scoring.config import ScoringConfig
-from r3jax.trace.reader import Run
 
 _Item = tuple[TakenView, Planner] | threading.Event | None
 """A view and the planner that has seen it; an event to be set on the way; None: the end."""

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from r3jax.apps.viewer.color_maps import ORDER, paint
+from r3jax.exploration.taken_views import StepRow
 from r3jax.geometry.cameras import Camera
+from r3jax.runs.reader import Run
+from r3jax.runs.rows import paths_to
 from r3jax.splatting.harmonics import C0
 from r3jax.splatting.scene import GaussianScene
-from r3jax.trace.paths import paths_to
-from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow
 
 POINT_BUDGET = 200_000
 """Recorded points that are drawn at most."""

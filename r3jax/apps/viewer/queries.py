@@ -48,12 +48,12 @@ from r3jax.apps.viewer.preview import (
     quick_preview_image,
 )
 from r3jax.apps.viewer.story import Moment, Offer, Story, offer_segments
-from r3jax.exploration.explain_run import Reason
 from r3jax.geometry.cameras import Camera
+from r3jax.runs.explain import Reason
+from r3jax.runs.header import RunError
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import fitted_size
-from r3jax.trace.errors import RunError
 
 _KNOWN_KEPT = 3
 """Moments whose blocks and terms are kept: a slider goes back and forth."""

@@ -8,20 +8,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.apps.runs.settings import scene_of_run, settings_of_run
 from r3jax.apps.viewer.app import App
 from r3jax.apps.viewer.blocks import scoring_of, title_of
 from r3jax.apps.viewer.overlays import recorded_points
 from r3jax.apps.viewer.queries import Extras, Sources, picture_camera
 from r3jax.apps.viewer.server import close_server, open_server, url_of
 from r3jax.apps.viewer.story import Offer, RecordedStory, decide_again
+from r3jax.runs.reader import Run
+from r3jax.runs.settings import scene_of_run, settings_of_run
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import scene_hash
 from r3jax.splatting.model import find_model, newest_name
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene
-from r3jax.trace.reader import Run
 
 
 @dataclass(frozen=True)

@@ -19,23 +19,23 @@ import numpy as np
 
 from r3jax.apps.viewer.color_maps import UTILITY_MAP, paint, spread
 from r3jax.apps.viewer.overlays import frustum_segments
-from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.clock import model_clock
-from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.explain_run import Reason, explain_run
+from r3jax.exploration.config import ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.replay import check_decided_alone, config_of, grid_before
-from r3jax.exploration.state import Mission, TakenView
+from r3jax.exploration.state import Mission
 from r3jax.exploration.step import relive, start_state
+from r3jax.exploration.taken_views import StepRow, TakenView
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.planner import Planner, add_frame
 from r3jax.planning.policy import Decision, Policy
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import Run
-from r3jax.trace.rows import StepRow
+from r3jax.runs.explain import Reason, explain_run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import Run
+from r3jax.runs.replay import check_decided_alone, grid_before
+from r3jax.runs.settings import config_of
 
 
 @dataclass(frozen=True)

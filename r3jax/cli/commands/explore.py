@@ -8,8 +8,6 @@ from typing import Any
 
 from r3jax.apps.forecast.forecast import stopping_rule
 from r3jax.apps.report.report import write_report
-from r3jax.apps.runs.begin import Expedition, begin_run, fork_run, resume_run, write_data_set
-from r3jax.apps.runs.settings import changed_versions, settings_of_run
 from r3jax.cli.checks import default_name
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, check_viser, one_line, resumable, resume_command
@@ -17,14 +15,18 @@ from r3jax.cli.from_options import policy_of_options, run_settings, scene_settin
 from r3jax.cli.options import ExploreOptions
 from r3jax.cli.progress import RunProgress, Stages
 from r3jax.exploration.loop import Result, explore
-from r3jax.exploration.state import StopReason, TakenView, in_words
+from r3jax.exploration.state import StopReason, in_words
+from r3jax.exploration.taken_views import TakenView
+from r3jax.formats.exports import write_data_set
 from r3jax.interrupts import settle_interrupt
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import PolicyError
 from r3jax.planning.robot.motion import motion_of
+from r3jax.runs.begin import Expedition, begin_run, fork_run, resume_run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import Run, read_run
+from r3jax.runs.settings import changed_versions, settings_of_run
 from r3jax.simulators.meshes import assumptions
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import Run, read_run
 
 EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
 """Exit codes of a run that can be gone on with; 0 for all others."""
@@ -173,7 +175,7 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
         with Stages(console) as stages:
             stages.on_progress("writing the data set", 0)
             run = read_run(path)
-            write_data_set(run, result)
+            write_data_set(run, result.state.map_state)
             state = result.state
             page = write_report(run, state.map_state, state.grid, stages.on_progress)
     except (RunError, OSError) as error:

@@ -16,7 +16,7 @@ from r3jax.cli.options import TeamOptions
 from r3jax.cli.progress import RunProgress, Stages
 from r3jax.interrupts import settle_interrupt
 from r3jax.planning.policy import PolicyError
-from r3jax.trace.errors import RunError
+from r3jax.runs.header import RunError
 
 DEFAULT_BUDGET = "seconds:120"
 

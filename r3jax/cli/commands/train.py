@@ -11,12 +11,12 @@ from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.points import write_points
 from r3jax.formats.ros.names import parse_topics
+from r3jax.runs.header import package_versions
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.model import check_free, only_writer, scene_points, write_model
 from r3jax.splatting.training import train
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.views import load_views, split_views
-from r3jax.trace.header import package_versions
 
 
 def run_train(options: TrainOptions) -> int:

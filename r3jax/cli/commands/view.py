@@ -9,10 +9,10 @@ from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, check_viser, one_line
 from r3jax.cli.options import ViewOptions
 from r3jax.cli.progress import Stages
-from r3jax.exploration.replay import config_of
 from r3jax.interrupts import deferred_interrupt, end_process
 from r3jax.network import who_sees
-from r3jax.trace.reader import Run, read_run
+from r3jax.runs.reader import Run, read_run
+from r3jax.runs.settings import config_of
 
 
 def run_view(options: ViewOptions) -> int:

@@ -7,12 +7,12 @@ import numpy as np
 from r3jax.apps.benchmark.retake import retake
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.formats.submissions import SubmittedFrame
-from r3jax.trace.header import camera_fields
-from r3jax.trace.paths import paths_to
-from r3jax.trace.reader import read_run
+from r3jax.runs.header import camera_fields
+from r3jax.runs.reader import read_run
+from r3jax.runs.rows import paths_to
 from tests.exploration.toys import BoxRoom
 from tests.formats.test_submissions import make_submission
-from tests.trace.runs import make_header
+from tests.runs.runs import make_header
 
 PLACES = [(1.2, 1.1), (1.6, 1.3), (1.6, 1.7), (2.0, 1.7), (2.0, 1.1), (1.8, 1.1)]
 CORNERS = {1: (1.6, 1.1), 3: (1.6, 1.9), 4: (2.3, 1.4)}

@@ -14,8 +14,8 @@ from r3jax.apps.benchmark.cells import paths_of, snapshots_left
 from r3jax.apps.benchmark.record import collect, read_records
 from r3jax.apps.benchmark.run_cell import CellError, run_cell, steps_within
 from r3jax.files import own_folder
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import read_run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import read_run
 from r3jax.validation.json_text import unsealed
 from tests.apps.benchmark.tiny import SETTINGS, make_cells
 

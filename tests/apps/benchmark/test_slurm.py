@@ -16,7 +16,7 @@ import pytest
 from r3jax.apps.benchmark.cells import paths_of, snapshots_left
 from r3jax.apps.benchmark.engines.slurm import ended_jobs, read_queue, run_on_cluster
 from r3jax.apps.benchmark.plan import cells_left
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 from tests.apps.benchmark.test_engines import assert_same_records, ends
 from tests.apps.benchmark.tiny import make_cells
 from tests.slurm import cluster

@@ -24,11 +24,9 @@ from r3jax.apps.benchmark.submitted import (
     problems_of,
     stored_submission,
 )
-from r3jax.apps.runs.begin import begin_run
-from r3jax.apps.runs.settings import RunSettings, SceneSettings
-from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig
+from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig, parse_budget
 from r3jax.exploration.loop import explore
+from r3jax.exploration.taken_views import frame_hash, stored_form
 from r3jax.formats.submissions import (
     SubmittedFrame,
     content_hash,
@@ -39,9 +37,10 @@ from r3jax.formats.submissions import (
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import make_motion
-from r3jax.trace.errors import RunError
-from r3jax.trace.images import frame_hash, stored_form
-from r3jax.trace.reader import read_run
+from r3jax.runs.begin import begin_run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import read_run
+from r3jax.runs.settings import RunSettings, SceneSettings
 from tests.apps.benchmark.tiny import CONDITIONS
 from tests.formats.test_submissions import make_submission
 from tests.mutants import Mutant, assert_caught, each

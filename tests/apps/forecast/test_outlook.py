@@ -11,15 +11,15 @@ from r3jax.apps.forecast import forecast as real
 from r3jax.apps.forecast.forecast import Outlook, forecast_map, stopping_rule
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.replay import states_of
 from r3jax.exploration.state import StopReason
-from r3jax.trace.header import camera_fields
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
+from r3jax.runs.header import camera_fields
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import states_of
+from r3jax.runs.writer import RunWriter
 from tests.exploration.killed_run import CONFIG, small_policy
 from tests.exploration.toys import BoxRoom
 from tests.mutants import Modules, Mutant, assert_caught, each, load
-from tests.trace.runs import make_header
+from tests.runs.runs import make_header
 
 CHAIN = ("r3jax.apps.forecast.forecast",)
 

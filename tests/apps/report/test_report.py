@@ -24,20 +24,19 @@ from r3jax.apps.report.report import write_report
 from r3jax.apps.report.summary import map_row_bytes, stage_times, summary
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.explain_run import explain_run
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture, panorama_picture
+from r3jax.runs.explain import explain_run
+from r3jax.runs.header import RunError, camera_fields
+from r3jax.runs.reader import read_run
+from r3jax.runs.writer import RunWriter
 from r3jax.scoring.explain import CAUSES
-from r3jax.trace.errors import RunError
-from r3jax.trace.header import camera_fields
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
 from tests.exploration.toys import BoxRoom, Wander
-from tests.trace.runs import make_flight, make_header, make_view
+from tests.runs.runs import make_flight, make_header, make_view
 
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 13, clock="model", num_probes=4)
 

@@ -21,6 +21,7 @@ from r3jax.apps.team.team import Member, explore_team
 from r3jax.exploration import explore
 from r3jax.exploration.guard import OracleReadError
 from r3jax.exploration.state import StopReason
+from r3jax.exploration.taken_views import stored_form
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.state import empty_map
 from r3jax.planning.planner import add_frame, first_grid
@@ -28,7 +29,6 @@ from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 from r3jax.scoring.batch import score_views
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.simulated import imagine_view
-from r3jax.trace.images import stored_form
 from tests.exploration.killed_run import CONFIG, SCORING, small_policy
 from tests.exploration.test_guard import Cheat
 from tests.exploration.toys import BoxRoom, Wander
@@ -344,7 +344,7 @@ def test_what_is_no_team_is_refused():
         explore_team([Member(room(), Wander()), Member(elsewhere, Wander())], budget="views:2")
 
 
-CHAIN = ("r3jax.apps.team.sharing", "r3jax.apps.team.team")
+CHAIN = ("r3jax.apps.team.team",)
 
 
 def merged(modules: Modules) -> None:
@@ -364,9 +364,9 @@ def own_lots(modules: Modules) -> None:
 
 
 MUTANTS = [
-    Mutant("sharing", 'attrgetter("seconds", "member")', 'attrgetter("member", "seconds")', merged),
-    Mutant("sharing", "if sight.seconds > until:", "if sight.seconds >= until:", merged_in_touch),
-    Mutant("sharing", "math.floor(", "math.ceil(", informed),
+    Mutant("team", 'attrgetter("seconds", "member")', 'attrgetter("member", "seconds")', merged),
+    Mutant("team", "if sight.seconds > until:", "if sight.seconds >= until:", merged_in_touch),
+    Mutant("team", "math.floor(", "math.ceil(", informed),
     Mutant("team", "planner=planner), heard=(), owed", "planner=planner), owed", informed),
     Mutant("team", "if sight.member == me.number:", "if False:", informed),
     Mutant("team", "if sight.member != me.number:", "if False:", informed),

@@ -6,17 +6,16 @@ import shutil
 import pytest
 
 from r3jax.apps.team.team import Member, explore_team
-from r3jax.exploration.replay import check_decided_alone, differences
 from r3jax.exploration.state import StopReason
-from r3jax.trace.errors import RunError
-from r3jax.trace.header import camera_fields, plain_settings
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
+from r3jax.runs.header import RunError, camera_fields, plain_settings
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import check_decided_alone, differences
+from r3jax.runs.writer import RunWriter
 from tests.apps.team.test_team import WIDE, room
 from tests.exploration.killed_run import CONFIG, small_policy
 from tests.exploration.test_resume import assert_same_run
 from tests.exploration.toys import LOWER, UPPER, Wander
-from tests.trace.runs import make_header
+from tests.runs.runs import make_header
 
 pytestmark = pytest.mark.full
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 from tests.box_room import write_room
 from tests.cli.small_runs import explore
 

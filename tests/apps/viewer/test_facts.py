@@ -28,10 +28,10 @@ from r3jax.apps.viewer.facts import (
     stale_html,
     view_html,
 )
-from r3jax.exploration.explain_run import Reason
+from r3jax.exploration.taken_views import Choice, Coverage, StepRow
 from r3jax.plots.style import CAUSE_COLORS
+from r3jax.runs.explain import Reason
 from r3jax.scoring.explain import CAUSES
-from r3jax.trace.rows import Choice, Coverage, StepRow
 
 TOP = {
     "utility": [6560.2, 6100.9, None, 2041.2, 12.0, 11.0],

@@ -8,8 +8,8 @@ from PIL import Image
 
 from r3jax.apps.viewer.blocks import QUANTITIES, cut_height
 from r3jax.apps.viewer.film import HEIGHT, SCENE, WIDTH, export_film
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import read_run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import read_run
 from tests.apps.viewer.conftest import VIEWS
 
 pytestmark = pytest.mark.full

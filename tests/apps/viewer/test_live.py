@@ -8,12 +8,12 @@ import pytest
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 
 import r3jax.apps.viewer.live as live
-from r3jax.apps.runs.settings import open_run_scene, settings_of_run
 from r3jax.apps.viewer.live import open_live
 from r3jax.apps.viewer.server import close_server, open_server
 from r3jax.apps.viewer.story import LiveStory
 from r3jax.exploration.loop import explore
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
+from r3jax.runs.settings import open_run_scene, settings_of_run
 from tests.apps.viewer.conftest import VIEWS
 from tests.box_room import write_room
 from tests.cli.small_runs import explore as explore_by_words

@@ -17,7 +17,7 @@ from r3jax.apps.viewer.overlays import (
 )
 from r3jax.geometry.cameras import Camera, invert_pose, pose_along, project, transform
 from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
-from tests.trace.runs import make_flight
+from tests.runs.runs import make_flight
 
 number = st.floats(-1.0, 1.0).filter(lambda x: abs(x) > 1e-3)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from r3jax.apps.viewer.story import Timeline
-from r3jax.exploration.replay import rebuild
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import read_run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import rebuild
 from tests.apps.viewer.conftest import VIEWS
 
 pytestmark = pytest.mark.full

@@ -25,9 +25,9 @@ from r3jax.planning.planner import decide, observe, start
 from r3jax.planning.policies.foreign.program import network
 from r3jax.planning.policy import LivesOutside, PlansAhead, PolicyError
 from r3jax.planning.registry import make_policy
-from r3jax.trace.header import RunHeader, camera_fields, policy_fields
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
+from r3jax.runs.header import RunHeader, camera_fields, policy_fields
+from r3jax.runs.reader import read_run
+from r3jax.runs.writer import RunWriter
 from tests.exploration.toys import BoxRoom
 from tests.planning.foreign.children import HIGHEST, LOTS, command_of, is_running
 

@@ -13,8 +13,8 @@ from r3jax.formats.captures import Capture, open_capture
 from r3jax.formats.posed_images import PosedImages
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.runs.reader import Run
 from r3jax.splatting.views import Views, load_views, split_views
-from r3jax.trace.reader import Run
 
 
 class PhotosError(ValueError):

@@ -1,23 +1,23 @@
 """What an exploration needs, for a new run or from the header of a recorded one."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.exploration.budget import Budget, parse_budget
-from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.replay import config_of, planner_config_of, policy_key
+from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.planning.config import FORMER_SETTINGS, PlannerConfig
 from r3jax.planning.policy import Policy
-from r3jax.planning.registry import make_policy
+from r3jax.planning.registry import config_class, make_policy
+from r3jax.planning.robot.motion import motion_of_record
+from r3jax.runs.header import RunError, RunHeader, camera_fields, package_versions, policy_fields
+from r3jax.runs.reader import Run
+from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
-from r3jax.trace.errors import RunError
-from r3jax.trace.header import RunHeader, camera_fields, package_versions, policy_fields
-from r3jax.trace.reader import Run
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,56 @@ class RunSettings:
             config = dataclasses.replace(changed.config, until=until)
             changed = dataclasses.replace(changed, config=config)
         return changed
+
+
+def config_of(run: Run) -> ExplorationConfig:
+    """The settings of the loop that a run was made with.
+
+    Raises:
+        RunError: a setting that this version does not know, or cannot work with.
+    """
+    try:
+        # A setting that is not known may have shaped the map: it is refused, not left out.
+        return ExplorationConfig(**run.header.config)
+    except (TypeError, ValueError) as error:
+        raise RunError(run.path / "run.json", f"a setting of the loop: {error}") from None
+
+
+def policy_key(run: Run) -> str:
+    """What `make_policy` knows a run's policy by: its name, or its class if it is a plug-in.
+
+    Raises:
+        KeyError: the header does not say.
+    """
+    policy = run.header.policy
+    return str(policy.get("class") or policy["name"])
+
+
+def _config_class(run: Run) -> type[PlannerConfig]:
+    """The settings of a run's policy; those that all share if the policy is not to be had."""
+    try:
+        return config_class(policy_key(run))
+    except ValueError:  # retired, or of a package that is not installed here
+        return PlannerConfig
+
+
+def planner_config_of(run: Run) -> PlannerConfig:
+    """The settings of the policy that a run was made with.
+
+    Raises:
+        RunError: a setting that this version does not know, or cannot work with.
+    """
+    try:
+        settings = dict(run.header.policy["settings"])
+        scoring = ScoringConfig(**settings.pop("scoring", {}))
+        motion = motion_of_record(settings.pop("motion", None))
+        kind = _config_class(run)
+        # Runs of all policies once recorded settings of one: dropped where they mean nothing.
+        own = {field.name for field in fields(kind)}
+        settings = {k: v for k, v in settings.items() if k in own or k not in FORMER_SETTINGS}
+        return kind(scoring=scoring, motion=motion, **settings)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(run.path / "run.json", f"a setting of the policy: {error}") from None
 
 
 def settings_of_run(run: Run) -> RunSettings:

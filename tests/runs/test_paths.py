@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from r3jax.trace.paths import paths_to, piece_of_path
-from tests.trace.runs import make_flight
+from r3jax.runs.rows import paths_to, piece_of_path
+from tests.runs.runs import make_flight
 
 places = st.integers(2, 4).flatmap(
     lambda num: arrays(np.float64, (num, 3), elements=st.floats(-3.0, 3.0, width=16))

@@ -15,7 +15,6 @@ from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.policy import LivesOutside, Policy
 from r3jax.planning.robot.motion import Motion
-from r3jax.trace.errors import RunError
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import build, check_type
 from r3jax.validation.files import read_bytes
@@ -46,6 +45,15 @@ _PACKAGES = (
     "equinox",
     "orbax-checkpoint",
 )
+
+
+class RunError(ValueError):
+    """A run folder that cannot be read or written; names the file and the reason."""
+
+    def __init__(self, path: Path, reason: str):
+        super().__init__(f"{path}: {reason}")
+        self.path = path
+        self.reason = reason
 
 
 @dataclass(frozen=True)

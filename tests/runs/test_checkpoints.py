@@ -11,9 +11,15 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
-from r3jax.trace.arrays import fill, named_arrays
-from r3jax.trace.checkpoints import KEPT, CheckpointWriter, checkpoint_steps, load_checkpoint
-from r3jax.trace.errors import RunError
+from r3jax.runs.header import RunError
+from r3jax.runs.stored_states import (
+    KEPT,
+    CheckpointWriter,
+    checkpoint_steps,
+    fill,
+    load_checkpoint,
+    named_arrays,
+)
 
 TABLES = {
     "loop": {"seconds": np.asarray(1 / 3), "views": np.asarray(7), "is_lost": np.asarray(True)},
@@ -228,7 +234,7 @@ def test_a_really_full_disk_is_reported(tmp_path):
     """On a file system of 1 MB, where a user may mount one."""
     program = (
         "import sys, numpy as np\nfrom pathlib import Path\n"
-        "from r3jax.trace.checkpoints import CheckpointWriter\n"
+        "from r3jax.runs.stored_states import CheckpointWriter\n"
         "noise = np.random.default_rng(0).integers(0, 256, 500_000, np.uint8)\n"
         "writer = CheckpointWriter(Path(sys.argv[1]))\n"
         "try:\n    writer.save(0, {'map': {f'noise{i}': noise + i for i in range(8)}}, wait=True)\n"

@@ -13,14 +13,15 @@ import jax
 import numpy as np
 import pytest
 
+from r3jax.exploration.state import RecordingStopped
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
-from r3jax.trace.checkpoints import map_tables
-from r3jax.trace.errors import RecordingStopped, RunError
-from r3jax.trace.reader import read_run
-from r3jax.trace.rows import from_json, to_json
-from r3jax.trace.writer import RunWriter
-from tests.trace.runs import make_header, make_view
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import read_run
+from r3jax.runs.rows import from_json, to_json
+from r3jax.runs.stored_states import map_tables
+from r3jax.runs.writer import RunWriter
+from tests.runs.runs import make_header, make_view
 
 
 def write_run(path, views=3, end=True, **kwargs):

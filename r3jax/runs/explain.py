@@ -14,20 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.exploration.captures import scoring_on_the_way
-from r3jax.exploration.replay import (
-    check_decided_alone,
-    config_of,
-    is_decided_apart,
-    planner_config_of,
-    states_of,
-)
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
 from r3jax.planning.decision import explain_path, initial_state
 from r3jax.planning.turning import count_look
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import Run
+from r3jax.runs.replay import check_decided_alone, is_decided_apart, states_of
+from r3jax.runs.settings import config_of, planner_config_of
 from r3jax.scoring.explain import Explanation
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import Run
 
 
 @dataclass(frozen=True)

@@ -1,129 +1,21 @@
-"""The rows of trace.jsonl: one per view, and one that says how the run ended."""
+"""The rows of trace.jsonl, one per view and one that says how the run ended, and their path.
+
+Shape symbols: K, L waypoints.
+"""
 
 import dataclasses
 import json
-import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from r3jax.exploration.taken_views import Choice, Coverage, StepRow
 from r3jax.geometry.cameras import rigid_error
-from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import build
 from r3jax.validation.json_text import parse_json, sealed, unsealed
-
-TOP_CANDIDATES = 10
-"""Candidates of a decision that a row keeps, the best ones by total utility."""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The decision that led to a view."""
-
-    pose: np.ndarray
-    """Chosen `T_world_camera`, [4, 4]."""
-
-    score: float
-    """Its utility."""
-
-    waypoints: np.ndarray
-    """Path of the camera center [m], [K, 3]."""
-
-    length: float
-    """Length of that path [m]."""
-
-    num_candidates: int
-    """Poses that were drawn."""
-
-    num_reachable: int
-    """Poses that a safe path leads to."""
-
-    top: dict[str, list[float | None]] = field(default_factory=dict[str, list[float | None]])
-    """Utilities of the best candidates, best first; None where one has no finite value."""
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """What the map and the grid know after a view. Not on the mission clock."""
-
-    voxels: int
-    """Occupied voxels of the map."""
-
-    map_bytes: int
-    """Memory of the map's rows, empty ones included [bytes]."""
-
-    dropped: int
-    """Observations lost so far because the table was full and might not grow."""
-
-    known_cells: int
-    """Coarse cells known to be free or occupied."""
-
-    known_share: float
-    """Known cells over all cells of the scene's box. The insides of walls and of furniture and
-    what lies outside can never be seen, so it stays below 1."""
-
-    frontier_cells: int
-    """Unexplored cells that share a face with a free one: what is left to see."""
-
-    mean_renderability: float
-    """Mean renderability of a fixed sequence of probe views inside known free space."""
-
-    arrival_renderability: float
-    """Renderability of this very view just before it was integrated: how much it repeated."""
-
-
-@dataclass(frozen=True)
-class StepRow:
-    """One view: where, why, at what cost, and what is known since."""
-
-    step: int
-    """Number of the view, from 0; names its images."""
-
-    pose: np.ndarray
-    """`T_world_camera`, [4, 4] float32."""
-
-    sha256: str
-    """Hash of the stored pixels."""
-
-    choice: Choice | None
-    """How the view was chosen; None for the start pose. Where frames are captured on the way, the
-    decision stands in the first row of its path: what comes before a row is what was known when it
-    was made."""
-
-    seconds: float
-    """Mission clock after the view: planning, mapping and flight [s]."""
-
-    metres: float
-    """Path flown so far [m]."""
-
-    radians: float
-    """Angle turned so far, along the shortest rotations [rad]."""
-
-    charged: dict[str, float]
-    """What this view added to the mission clock: `planning`, `mapping`, `flight`, `gaze` where it
-    was captured on the way, and `exchange` where others told what they had seen [s]."""
-
-    coverage: Coverage
-
-    captured: bool = False
-    """True if the frame was captured on the way to a view, and not chosen itself."""
-
-    hidden: float = 0.0
-    """Planning of this row's decision that the flight before it hid: not on the clock [s]."""
-
-    @property
-    def begins_run(self) -> bool:
-        """True if the camera did not fly to the view: a run begins, be it within a merged one."""
-        flown = self.choice is not None or self.captured or self.charged.get("flight", 0.0) > 0.0
-        return not flown
-
-
-def unit_of(rows: Iterable[StepRow]) -> str:
-    """Names what rows count: views, or frames where some were captured on the way."""
-    return "frames" if any(row.captured for row in rows) else "views"
 
 
 @dataclass(frozen=True)
@@ -131,39 +23,13 @@ class EndRow:
     """How the run ended."""
 
     outcome: str
-    """`budget`, `no-reachable-candidate`, `interrupted`, ...: `exploration.loop.StopReason`."""
+    """`budget`, `no-reachable-candidate`, `interrupted`, ...: `exploration.state.StopReason`."""
 
     message: str
     """The same in a sentence."""
 
     views: int
     """Views recorded."""
-
-
-def make_choice(decision: Decision, info: PlanInfo) -> Choice:
-    """What the trace keeps of a decision."""
-    total = np.asarray(decision.utilities.get("total", np.zeros(0)), dtype=np.float64)
-    # Unreachable candidates have no utility; stable, so that equal ones keep the order of drawing.
-    best = np.argsort(-np.where(np.isfinite(total), total, -np.inf), kind="stable")
-    best = best[:TOP_CANDIDATES]
-    top = {
-        name: [finite_or_none(value) for value in np.asarray(values)[best]]
-        for name, values in decision.utilities.items()
-    }
-    return Choice(
-        pose=np.asarray(decision.T_world_camera, dtype=np.float32),
-        score=float(decision.score),
-        waypoints=np.asarray(decision.waypoints, dtype=np.float32),
-        length=float(decision.length),
-        num_candidates=info.num_candidates,
-        num_reachable=info.num_reachable,
-        top=top,
-    )
-
-
-def finite_or_none(value: float) -> float | None:
-    """JSON knows neither inf nor NaN."""
-    return float(value) if math.isfinite(value) else None
 
 
 def to_json(row: StepRow | EndRow) -> str:
@@ -267,3 +133,41 @@ def _plain_dict(items: list[tuple[str, Any]]) -> dict[str, Any]:
         name: shortest_floats(value) if isinstance(value, np.ndarray) else value
         for name, value in items
     }
+
+
+def paths_to(rows: Iterable[StepRow]) -> Iterator[np.ndarray | None]:
+    """Follows the path of the camera, row by row.
+
+    Args:
+        rows: of a trace, from the first one on.
+
+    Yields:
+        Waypoints from the row before to this one, [K, 3] float64 [m]; None where nothing was flown:
+        at the start, and where another run of a merged one begins.
+    """
+    before: StepRow | None = None
+    waypoints, begin = np.zeros((0, 3)), 0.0
+    for row in rows:
+        if before is None or row.begins_run:
+            waypoints = np.zeros((0, 3))
+            yield None
+        else:
+            if row.choice is not None:  # where frames are captured it stands in the first one's row
+                waypoints, begin = row.choice.waypoints.astype(np.float64), before.metres
+            piece = piece_of_path(waypoints, before.metres - begin, row.metres - begin)
+            # Exactly from frame to frame: lengths along the path are rounded.
+            piece[0], piece[-1] = before.pose[:3, 3], row.pose[:3, 3]
+            yield piece
+        before = row
+
+
+def piece_of_path(waypoints: np.ndarray, begin: float, end: float) -> np.ndarray:
+    """Cuts the piece between two lengths [m] out of a path over waypoints [K, 3], [L, 3] [m]."""
+    if len(waypoints) < 2:
+        return np.zeros((2, 3))
+    steps = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    done = np.concatenate([[0.0], np.cumsum(steps)])
+    # Bends at the very ends of the piece are its ends.
+    between = (done > begin + 1e-4) & (done < end - 1e-4)
+    at = np.concatenate([[begin], done[between], [end]])
+    return np.stack([np.interp(at, done, waypoints[:, axis]) for axis in range(3)], axis=1)

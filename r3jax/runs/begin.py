@@ -1,6 +1,6 @@
-"""Runs begun, gone on with, and forked: everything that `explore` is called with."""
+"""Runs begun, resumed, forked and merged."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -8,27 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.apps.runs.settings import (
+from r3jax.exploration.guard import first_pose
+from r3jax.exploration.taken_views import StepRow, unit_of
+from r3jax.mapping.state import MapState
+from r3jax.planning.robot.motion import motion_of
+from r3jax.runs.header import RunError, RunHeader, package_versions, policy_fields
+from r3jax.runs.reader import Run, read_run
+from r3jax.runs.replay import check_alike, is_decided_apart, parts_of, rebuild
+from r3jax.runs.rows import piece_of_path
+from r3jax.runs.settings import (
     RunSettings,
     SceneSettings,
     new_header,
     open_run_scene,
     settings_of_run,
 )
-from r3jax.exploration.loop import Result
-from r3jax.exploration.replay import is_decided_apart
-from r3jax.exploration.step import check_world
-from r3jax.files import make_folder
-from r3jax.formats.nerfstudio import write_transforms
-from r3jax.formats.points import voxel_points, write_points
-from r3jax.planning.robot.limits import begin_at
-from r3jax.planning.robot.motion import motion_of
+from r3jax.runs.stored_states import map_tables
+from r3jax.runs.writer import RunWriter
 from r3jax.simulators.base import Simulator
-from r3jax.trace.header import package_versions, policy_fields
-from r3jax.trace.paths import piece_of_path
-from r3jax.trace.reader import Run, read_run
-from r3jax.trace.rows import StepRow, unit_of
-from r3jax.trace.writer import RunWriter
 
 
 @dataclass(frozen=True)
@@ -57,8 +54,8 @@ def begin_run(
         ImportError: its simulator is not installed.
     """
     simulator = scene.open()
-    check_world(simulator.bounds, settings.config.cell_size)  # refused before there is a folder
-    begin_at(motion_of(settings.policy), simulator.start_pose)
+    # Refused before there is a folder.
+    first_pose(simulator, motion_of(settings.policy), settings.config.cell_size)
     header = new_header(settings, scene, simulator)
     recorder = RunWriter(path, header, overwrite=overwrite)
     return Expedition(settings, simulator, recorder, scene.seed)
@@ -178,13 +175,83 @@ def _decided_from(run: Run) -> int:
     return int((run.header.parent or {}).get("decided_from", 0))
 
 
-def write_data_set(run: Run, result: Result) -> None:
-    """Writes transforms.json and the points that 3DGS starts from into the run folder.
+def merge_runs(
+    runs: list[Run],
+    out: Path,
+    *,
+    overwrite: bool = False,
+    on_frame: Callable[[], None] = lambda: None,
+) -> MapState:
+    """Writes a run that holds the views of several, one run after the other.
+
+    The rows of a later run are numbered on, and its totals (clock, path, angle) added to those
+    before; what a row says of the map is of that run's own map. The stored map and grid have
+    seen all.
+
+    Args:
+        runs: of one scene, mapped on the same terms, with the same camera.
+        out: folder of the merged run.
+        overwrite: replace the run that is there.
+        on_frame: called after every frame that has entered the map.
+
+    Returns:
+        The map.
 
     Raises:
-        OSError: the disk is full, not writable, ...
+        RunError: the runs do not fit together, cannot be read, or `out` cannot be written.
     """
-    points = run.path / "exports" / "points.ply"
-    make_folder(points.parent)
-    write_points(points, *voxel_points(result.state.map_state))
-    write_transforms(run, points.relative_to(run.path).as_posix())
+    _check_apart(runs)
+    for run in runs[1:]:
+        check_alike(runs[0], run)
+        if run.header.camera != runs[0].header.camera:
+            raise RunError(
+                run.path,
+                f"its camera is not that of {runs[0].path}, and a run has one: {run.header.camera} "
+                f"instead of {runs[0].header.camera}",
+            )
+    map_state, grid = rebuild(runs, on_frame=on_frame)
+    with RunWriter(out, _header(runs), overwrite=overwrite) as writer:
+        last: StepRow | None = None
+        for run in runs:
+            before = last
+            for row in run.rows:
+                last = _behind(row, before)
+                writer.adopt(last, run, row.step)
+        writer.checkpoint(writer.views - 1, map_tables(map_state, grid), wait=True)
+        writer.finish("merged", f"the views of {' and '.join(str(run.path) for run in runs)}")
+    return map_state
+
+
+def _check_apart(runs: list[Run]) -> None:
+    """Refuses views that would count twice.
+
+    Raises:
+        RunError: a run is given twice, under whatever path.
+    """
+    for number, run in enumerate(runs):
+        if any(run.path.samefile(other.path) for other in runs[:number]):
+            raise RunError(run.path, "a run is not merged with itself: give two different runs")
+
+
+def _header(runs: list[Run]) -> RunHeader:
+    views = [views for run in runs for views in parts_of(run)]
+    unit = unit_of(row for run in runs for row in run.rows)
+    return replace(
+        runs[0].header,
+        budget=f"{unit}:{sum(views)}",
+        packages=package_versions(),
+        parent={"merged": [str(run.path) for run in runs], "merged_views": views},
+    )
+
+
+def _behind(row: StepRow, before: StepRow | None) -> StepRow:
+    """A row of a later run, numbered on behind the last row of the runs before."""
+    if before is None:
+        return row
+    return replace(
+        row,
+        step=before.step + 1 + row.step,
+        seconds=before.seconds + row.seconds,
+        metres=before.metres + row.metres,
+        radians=before.radians + row.radians,
+    )

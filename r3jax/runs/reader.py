@@ -7,18 +7,25 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.exploration.state import LoopState
+from r3jax.exploration.taken_views import StepRow, content_hash, from_integers
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.trace.checkpoints import checkpoint_steps, load_checkpoint, read_checkpoint
-from r3jax.trace.errors import RunError
-from r3jax.trace.header import RunHeader, read_header
-from r3jax.trace.images import content_hash, from_integers, read_png
-from r3jax.trace.rows import EndRow, StepRow, from_json
+from r3jax.runs.header import RunError, RunHeader, read_header
+from r3jax.runs.rows import EndRow, from_json
+from r3jax.runs.stored_states import (
+    belongs_to,
+    checkpoint_steps,
+    load_checkpoint,
+    read_checkpoint,
+    state_of,
+)
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.fields import check_type
 from r3jax.validation.files import read_bytes
+from r3jax.validation.images import image_pixels
 from r3jax.validation.json_text import parse_json, unsealed
 
 _MAX_BYTES = 256 << 20
@@ -105,6 +112,26 @@ class Run:
         """
         return load_checkpoint(self.path / "checkpoints", step)
 
+    def newest_state(self, start: LoopState) -> LoopState:
+        """The newest stored state of the loop that can be used; the start if there is none.
+
+        Args:
+            start: the state before the first view; everything but the arrays is taken from it.
+        """
+        # Newest first: every view after a checkpoint costs one more mapping and decision.
+        for step in reversed(self.checkpoint_steps()):
+            # The trace was cut before it: its map holds views that the run no longer has. Or a
+            # path is under way: it is decided again, from where it begins.
+            if step >= len(self.rows) or self.rows[step].captured:
+                continue
+            try:
+                state = state_of(self.load_checkpoint(step), start)
+            except ValueError:
+                continue  # an older one, or the frames, will do
+            if belongs_to(state, self.rows[step]):
+                return state
+        return start
+
 
 def read_run(path: Path | str) -> Run:
     """Reads a run folder; a run that was cut off reads up to its last complete row.
@@ -132,6 +159,24 @@ def read_run(path: Path | str) -> Run:
         else:
             rows.append(row)
     return Run(path, header, tuple(rows), end, _read_timings(path / "timings.jsonl"))
+
+
+def read_png(path: Path, width: int, height: int, *, is_depth: bool) -> np.ndarray:
+    """Reads a stored image, [H, W, 3] uint8 or [H, W] uint16.
+
+    Raises:
+        RunError: the file is missing, broken, of another size or of another kind.
+    """
+    kind, modes = ("16-bit depth", ("I;16", "I")) if is_depth else ("8-bit RGB", ("RGB",))
+    try:
+        pixels = image_pixels(path, ["PNG"], (width, height), modes, f"expected {kind}")
+    except FileNotFoundError:
+        raise RunError(path, "the image is missing") from None
+    except OSError as error:
+        raise RunError(path, f"the image cannot be read ({error.strerror})") from None
+    except ForeignFileError as error:
+        raise RunError(path, str(error)) from None
+    return pixels.astype(np.uint16) if is_depth else pixels
 
 
 def complete_lines(path: Path) -> list[str]:

@@ -11,23 +11,23 @@ import pytest
 import r3jax
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.exploration.explain_run import explain_run
-from r3jax.exploration.replay import planner_config_of, rebuild, states_of
 from r3jax.frame import Frame
 from r3jax.planning.registry import make_policy
-from r3jax.trace.errors import RunError
-from r3jax.trace.header import camera_fields, plain_settings
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
+from r3jax.runs.explain import explain_run
+from r3jax.runs.header import RunError, camera_fields, plain_settings
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import rebuild, states_of
+from r3jax.runs.settings import planner_config_of
+from r3jax.runs.writer import RunWriter
 from tests.exploration.toys import UPPER, BoxRoom
 from tests.mutants import Modules, Mutant, assert_caught, each, load
-from tests.trace.runs import make_header
+from tests.runs.runs import make_header
 
 pytestmark = pytest.mark.full
 
 VIEWS = 10
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=1)
-CHAIN = ("r3jax.planning.decision", "r3jax.exploration.explain_run")
+CHAIN = ("r3jax.planning.decision", "r3jax.runs.explain")
 
 
 class GlassRoom(BoxRoom):
@@ -67,7 +67,7 @@ def states(run):
 
 def law_of_the_trace(modules: Modules, run, states) -> None:
     """The unexplored cells and the sum of 1 - R are those that the trace says were weighed."""
-    reasons = list(modules["explain_run"].explain_run(run, states))
+    reasons = list(modules["explain"].explain_run(run, states))
     assert len(reasons) == VIEWS
     assert reasons[0] is None
     for row, reason in zip(run.rows[1:], reasons[1:], strict=True):
@@ -83,11 +83,11 @@ def test_reasons_are_the_utilities_of_the_trace(run, states):
 
 
 MUTANTS = [
-    Mutant("explain_run", "memory = memory or initial_state(",
+    Mutant("explain", "memory = memory or initial_state(",
            "memory = initial_state(", law_of_the_trace),
     Mutant("decision", "explain_view(map_state, scoring_grid,", "explain_view(map_state, grid,",
            law_of_the_trace),
-    Mutant("explain_run", "map_state, grid, pose, choice.pose", "map_state, grid, pose, pose",
+    Mutant("explain", "map_state, grid, pose, choice.pose", "map_state, grid, pose, pose",
            law_of_the_trace),
 ]  # fmt: skip
 

@@ -14,15 +14,6 @@ What is read back is checked: rows and run.json end with a seal, the SHA-256 of 
 row has the hash of its view's pixels; `sha256.json` in a checkpoint has those of its files, the
 header of a model that of its numbers. What an earlier version wrote without is read unchecked.
 
-`trace.jsonl` holds nothing that depends on the machine unless the mission clock does: under
+`runs.jsonl` holds nothing that depends on the machine unless the mission clock does: under
 the model clock two equal runs write equal bytes.
 """
-
-DEPTH_STEPS_PER_METRE = 5000
-"""Depth is stored in steps of 0.2 mm (TUM's scale)."""
-
-NO_MEASUREMENT = 0
-"""Stored depth where the sensor measured nothing."""
-
-BEYOND_RANGE = 65535
-"""Stored depth where nothing lies within the sensor's range (or within 13.1 m)."""

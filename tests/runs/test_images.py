@@ -7,18 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from r3jax.exploration.config import BEYOND_RANGE
+from r3jax.exploration.taken_views import content_hash, from_integers, stored_form, to_integers
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.trace import BEYOND_RANGE
-from r3jax.trace.errors import RunError
-from r3jax.trace.images import (
-    content_hash,
-    encode_png,
-    from_integers,
-    read_png,
-    stored_form,
-    to_integers,
-)
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import read_png
+from r3jax.runs.writer import encode_png
 
 CAMERA = Camera.from_fov(6, 4)
 SIZE = (4, 6)

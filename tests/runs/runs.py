@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.exploration.captures import points_along
+from r3jax.exploration.taken_views import Choice, Coverage, StepRow, frame_hash, stored_form
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.trace.header import RunHeader, camera_fields
-from r3jax.trace.images import frame_hash, stored_form
-from r3jax.trace.rows import Choice, Coverage, StepRow
+from r3jax.runs.header import RunHeader, camera_fields
 
 CAMERA = Camera.from_fov(8, 6, 70.0)
 

@@ -9,9 +9,11 @@ import contextlib
 import json
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,14 +25,26 @@ from r3jax.checkpoints import (
     read_arrays,
     write_checkpoint,
 )
+from r3jax.exploration.state import LoopState
+from r3jax.exploration.taken_views import StepRow
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.trace.errors import RunError
+from r3jax.runs.header import RunError
 from r3jax.validation.errors import ForeignFileError
 
 # Not one: if the newest is damaged, an older one still saves most of the mapping.
 KEPT = 3
 """Older checkpoints are deleted."""
+
+
+_APART = ("planner", "leg", "planned")
+
+_LOOP = tuple(field.name for field in fields(LoopState) if field.name not in _APART)
+"""Fields of the state in the table `loop`; what the planner holds has tables of its own, and what
+is under way is decided again."""
+
+_LATER = {"captured": np.asarray(0)}
+"""Fields that came after the first checkpoints, as they were then."""
 
 
 class CheckpointWriter:
@@ -171,7 +185,103 @@ def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
 
 def map_tables(map_state: MapState, grid: OccupancyGrid) -> dict[str, dict[str, np.ndarray]]:
     """The tables `map` and `grid` of a checkpoint."""
-    from r3jax.trace.arrays import named_arrays
-
     num_bins = {"num_bins": np.asarray(map_state.num_bins)}
     return {"map": named_arrays(map_state) | num_bins, "grid": named_arrays(grid)}
+
+
+def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
+    """The state as a checkpoint holds it."""
+    tables = map_tables(state.map_state, state.grid)
+    tables["policy"] = named_arrays(state.policy_state)
+    return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in _LOOP}}
+
+
+def state_of(tables: Tables, like: LoopState) -> LoopState:
+    """Inverse of `state_tables`.
+
+    Args:
+        tables: of a checkpoint.
+        like: a state of the same run, such as its first: what is not an array is taken from it.
+
+    Raises:
+        ValueError: a table or an array is missing or of another kind.
+    """
+    # Not `policy`: a policy that remembers nothing has no such table.
+    missing = sorted({"map", "grid", "loop"} - set(tables))
+    if missing:
+        raise ValueError(f"the checkpoint lacks {', '.join(missing)}")
+    arrays = dict(tables["map"])
+    # No array of the map, so `fill` would not notice: with other bins the visited bits of a row
+    # stand for other directions.
+    if int(arrays.pop("num_bins", -1)) != like.map_state.num_bins:
+        raise ValueError("the checkpoint's map has other direction bins than the run")
+    # Through `fill`, so that totals come back as plain numbers and are summed as before.
+    rest = {name: getattr(like, name) for name in _LOOP}
+    planner = replace(
+        like.planner,
+        map_state=fill(like.map_state, arrays),
+        grid=fill(like.grid, tables["grid"]),
+        policy_state=fill(like.policy_state, tables.get("policy", {})),
+    )
+    return LoopState(planner=planner, **fill(rest, _LATER | dict(tables["loop"])))
+
+
+def belongs_to(state: LoopState, row: StepRow) -> bool:
+    """Whether a stored state is that after the view of a row of the trace."""
+    # Exact: JSON and checkpoints hold every float as it is, so any difference is a mismatch.
+    return (
+        state.views == row.step + 1
+        and np.array_equal(np.asarray(state.T_world_camera, np.float32), row.pose)
+        and (state.seconds, state.metres) == (row.seconds, row.metres)
+    )
+
+
+def named_arrays(tree: Any) -> dict[str, np.ndarray]:
+    """Every leaf of a tree by its path in it, such as `memory.of_stage.0.left`."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {_name(path): np.asarray(leaf) for path, leaf in leaves}
+
+
+def fill(template: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """A tree built like `template` whose leaves are `arrays`: inverse of `named_arrays`.
+
+    Shapes may differ from the template's, as tables grow; types may not.
+
+    Args:
+        template: gives the structure, all that is not an array, and the type of each leaf.
+        arrays: by path.
+
+    Raises:
+        ValueError: a leaf is missing, of another type, or there is one too many.
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(template)
+    names = [_name(path) for path, _ in leaves]
+    # One array too many means another version of the policy: its memory would be half understood.
+    if set(names) != set(arrays):
+        odd = sorted(set(names) ^ set(arrays))
+        raise ValueError(f"these arrays are missing or of no use: {', '.join(odd)}")
+    filled = [
+        _like(leaf, arrays[name], name) for name, (_, leaf) in zip(names, leaves, strict=True)
+    ]
+    return jax.tree.unflatten(structure, filled)
+
+
+def _name(path: tuple[Any, ...]) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".") or "value"
+
+
+def _like(leaf: Any, array: np.ndarray, name: str) -> Any:
+    """The array as the kind of thing that the leaf is: a device array, NumPy, or a number."""
+    wanted = np.asarray(leaf)
+    # Sizes may differ, as tables double; a type or an axis may not, as compiled code rests on them.
+    if array.dtype != wanted.dtype or array.ndim != wanted.ndim:
+        raise ValueError(
+            f"{name} is {array.dtype} with {array.ndim} axes, expected {wanted.dtype} with "
+            f"{wanted.ndim}"
+        )
+    if isinstance(leaf, jax.Array):
+        return jnp.asarray(array)
+    if isinstance(leaf, np.ndarray | np.generic):
+        return array
+    # A Python number: as an array it would be traced where the loop wants a plain value.
+    return type(leaf)(array.item())

@@ -1,0 +1,219 @@
+"""Views that were taken: the stored form of a frame, and the row that is recorded of it.
+
+The map integrates what is recorded: the loop rounds a frame to its stored form (8-bit color,
+16-bit depth) *before* it enters the map, so that a map rebuilt from the files is the same map,
+bit for bit.
+
+Shape symbols: H, W image size; K waypoints.
+"""
+
+import hashlib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.exploration.config import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.planning.policy import Decision, PlanInfo
+
+TOP_CANDIDATES = 10
+"""Candidates of a decision that a row keeps, the best ones by total utility."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The decision that led to a view."""
+
+    pose: np.ndarray
+    """Chosen `T_world_camera`, [4, 4]."""
+
+    score: float
+    """Its utility."""
+
+    waypoints: np.ndarray
+    """Path of the camera center [m], [K, 3]."""
+
+    length: float
+    """Length of that path [m]."""
+
+    num_candidates: int
+    """Poses that were drawn."""
+
+    num_reachable: int
+    """Poses that a safe path leads to."""
+
+    top: dict[str, list[float | None]] = field(default_factory=dict[str, list[float | None]])
+    """Utilities of the best candidates, best first; None where one has no finite value."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the map and the grid know after a view. Not on the mission clock."""
+
+    voxels: int
+    """Occupied voxels of the map."""
+
+    map_bytes: int
+    """Memory of the map's rows, empty ones included [bytes]."""
+
+    dropped: int
+    """Observations lost so far because the table was full and might not grow."""
+
+    known_cells: int
+    """Coarse cells known to be free or occupied."""
+
+    known_share: float
+    """Known cells over all cells of the scene's box. The insides of walls and of furniture and
+    what lies outside can never be seen, so it stays below 1."""
+
+    frontier_cells: int
+    """Unexplored cells that share a face with a free one: what is left to see."""
+
+    mean_renderability: float
+    """Mean renderability of a fixed sequence of probe views inside known free space."""
+
+    arrival_renderability: float
+    """Renderability of this very view just before it was integrated: how much it repeated."""
+
+
+@dataclass(frozen=True)
+class StepRow:
+    """One view: where, why, at what cost, and what is known since."""
+
+    step: int
+    """Number of the view, from 0; names its images."""
+
+    pose: np.ndarray
+    """`T_world_camera`, [4, 4] float32."""
+
+    sha256: str
+    """Hash of the stored pixels."""
+
+    choice: Choice | None
+    """How the view was chosen; None for the start pose. Where frames are captured on the way, the
+    decision stands in the first row of its path: what comes before a row is what was known when it
+    was made."""
+
+    seconds: float
+    """Mission clock after the view: planning, mapping and flight [s]."""
+
+    metres: float
+    """Path flown so far [m]."""
+
+    radians: float
+    """Angle turned so far, along the shortest rotations [rad]."""
+
+    charged: dict[str, float]
+    """What this view added to the mission clock: `planning`, `mapping`, `flight`, `gaze` where it
+    was captured on the way, and `exchange` where others told what they had seen [s]."""
+
+    coverage: Coverage
+
+    captured: bool = False
+    """True if the frame was captured on the way to a view, and not chosen itself."""
+
+    hidden: float = 0.0
+    """Planning of this row's decision that the flight before it hid: not on the clock [s]."""
+
+    @property
+    def begins_run(self) -> bool:
+        """True if the camera did not fly to the view: a run begins, be it within a merged one."""
+        flown = self.choice is not None or self.captured or self.charged.get("flight", 0.0) > 0.0
+        return not flown
+
+
+def unit_of(rows: Iterable[StepRow]) -> str:
+    """Names what rows count: views, or frames where some were captured on the way."""
+    return "frames" if any(row.captured for row in rows) else "views"
+
+
+@dataclass(frozen=True)
+class TakenView:
+    """A view that was taken: what to record beside the state."""
+
+    row: StepRow
+    frame: Frame
+    """In stored form."""
+
+    stages: dict[str, float] = field(default_factory=dict[str, float])
+    """Seconds that the stages really took, those off the mission clock included."""
+
+    decision: Decision | None = None
+    """What sent the camera here, with all that was on offer; None: nothing was decided since the
+    frame before."""
+
+
+def make_choice(decision: Decision, info: PlanInfo) -> Choice:
+    """What the trace keeps of a decision."""
+    total = np.asarray(decision.utilities.get("total", np.zeros(0)), dtype=np.float64)
+    # Unreachable candidates have no utility; stable, so that equal ones keep the order of drawing.
+    best = np.argsort(-np.where(np.isfinite(total), total, -np.inf), kind="stable")
+    best = best[:TOP_CANDIDATES]
+    top = {
+        name: [finite_or_none(value) for value in np.asarray(values)[best]]
+        for name, values in decision.utilities.items()
+    }
+    return Choice(
+        pose=np.asarray(decision.T_world_camera, dtype=np.float32),
+        score=float(decision.score),
+        waypoints=np.asarray(decision.waypoints, dtype=np.float32),
+        length=float(decision.length),
+        num_candidates=info.num_candidates,
+        num_reachable=info.num_reachable,
+        top=top,
+    )
+
+
+def finite_or_none(value: float) -> float | None:
+    """JSON knows neither inf nor NaN."""
+    return float(value) if math.isfinite(value) else None
+
+
+def to_integers(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Color [H, W, 3] uint8 and depth [H, W] uint16 in steps of 0.2 mm."""
+    rgb = np.rint(np.asarray(frame.rgb) * np.float32(255.0)).astype(np.uint8)
+    depth = np.asarray(frame.depth)
+    # inf times a number is inf, and its integer is undefined: it gets its own value below.
+    finite = np.where(np.isfinite(depth), depth, 0.0)
+    # In float64 the product is exact; float32 would round it once more, before `rint` does.
+    steps = np.rint(finite.astype(np.float64) * DEPTH_STEPS_PER_METRE)
+    # A surface closer than half a step is still a surface, not a missing measurement.
+    steps = np.where((finite > 0.0) & (steps < 1.0), 1.0, steps)
+    steps = np.where(np.isinf(depth), BEYOND_RANGE, np.minimum(steps, BEYOND_RANGE))
+    return rgb, steps.astype(np.uint16)
+
+
+def from_integers(
+    rgb: np.ndarray, depth: np.ndarray, T_world_camera: np.ndarray, camera: Camera
+) -> Frame:
+    """The frame that stored images stand for: inverse of `to_integers`."""
+    metres = depth.astype(np.float32) / np.float32(DEPTH_STEPS_PER_METRE)
+    return Frame(
+        rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
+        depth=jnp.asarray(np.where(depth == BEYOND_RANGE, np.float32(np.inf), metres)),
+        T_world_camera=jnp.asarray(T_world_camera, dtype=jnp.float32),
+        camera=camera,
+    )
+
+
+def stored_form(frame: Frame) -> Frame:
+    """The frame as it will be read back: rounded to 8-bit color and 0.2 mm of depth."""
+    rgb, depth = to_integers(frame)
+    return from_integers(rgb, depth, np.asarray(frame.T_world_camera), frame.camera)
+
+
+def content_hash(rgb: np.ndarray, depth: np.ndarray) -> str:
+    """SHA-256 over the stored pixels; it does not depend on the PNG compressor."""
+    digest = hashlib.sha256(np.ascontiguousarray(rgb).tobytes())
+    # Little-endian by name: the hash must be the same on every machine.
+    digest.update(np.ascontiguousarray(depth).astype("<u2").tobytes())
+    return digest.hexdigest()
+
+
+def frame_hash(frame: Frame) -> str:
+    """`content_hash` of a frame."""
+    return content_hash(*to_integers(frame))
