@@ -33,7 +33,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 import r3jax
 from r3jax.apps.audit.live.guide_page import open_guide
-from r3jax.formats.depth_images import resample_depth
+from r3jax.formats.depth import resample_depth
 from r3jax.formats.points import voxel_points
 from r3jax.formats.ros.messages import depth_of, frame_of, lens_of, rgb_of, stamp_of
 from r3jax.formats.ros.transforms import TransformTree

@@ -30,7 +30,7 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.state import MapState
 from r3jax.runs.reader import read_run
-from r3jax.simulators.depth_noise import NoisySimulator
+from r3jax.simulators.base import NoisySimulator
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import open_world

@@ -26,10 +26,8 @@ import numpy as np
 from r3jax import files
 from r3jax.files import is_link, remove, remove_own, sync_folder, whole_folder, write_atomic
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_type
-from r3jax.validation.files import check_tree, read_bytes
-from r3jax.validation.json_text import parse_json
-from r3jax.validation.names import check_relative
+from r3jax.validation.files import check_relative, check_tree, read_bytes
+from r3jax.validation.json_text import check_type, parse_json
 
 Tables = Mapping[str, Mapping[str, np.ndarray]]
 """Named arrays, by table."""

@@ -30,7 +30,7 @@ from r3jax.cli.options import (
 from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig, parse_budget
 from r3jax.files import check_own
 from r3jax.formats.errors import check_capture
-from r3jax.formats.ros.names import parse_topics
+from r3jax.formats.ros.bags import parse_topics
 from r3jax.planning.policies import check_policy
 from r3jax.planning.policies.foreign.commands import short_name
 from r3jax.planning.robot.motion import Motion, make_motion

@@ -28,7 +28,7 @@ from r3jax.cli.options import (
 )
 from r3jax.cli.options.parsing import number_rules, options_of, parser_class
 from r3jax.kernels.native.ahead import cache_folder, compile_ahead
-from r3jax.validation.choices import did_you_mean
+from r3jax.validation.errors import did_you_mean
 
 COMMANDS = {
     "demo": DemoOptions,

@@ -24,11 +24,9 @@ from r3jax.files import make_folder, write_atomic
 from r3jax.frame import Frame
 from r3jax.geometry.axis_views import LOOKS, poses_at
 from r3jax.geometry.cameras import Camera
-from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_fields
+from r3jax.validation.errors import ForeignFileError, VersionError, check_version
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import parse_json
-from r3jax.validation.versions import VersionError, check_version
+from r3jax.validation.json_text import check_fields, parse_json
 
 SPACING = (1.0, 1.0, 0.75)
 """Replica-Dense's lattice [m]."""

@@ -15,15 +15,17 @@ from r3jax.formats.phones.polycam import is_polycam, read_polycam
 from r3jax.formats.phones.record3d import is_record3d, read_record3d
 from r3jax.formats.phones.stray_scanner import is_stray_scanner, read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
-from r3jax.formats.recordings import Recording, is_recording, read_recording
+from r3jax.formats.recordings import is_recording, read_recording
 from r3jax.formats.ros.bag_reader import read_bag
-from r3jax.formats.ros.bags import is_bag
-from r3jax.formats.ros.names import Topics
-from r3jax.formats.ros.rtabmap_database import is_rtabmap_database, read_rtabmap_database
-from r3jax.formats.ros.rtabmap_export import is_rtabmap_export, read_rtabmap_export
+from r3jax.formats.ros.bags import Topics, is_bag
+from r3jax.formats.ros.rtabmap import (
+    is_rtabmap_database,
+    is_rtabmap_export,
+    read_rtabmap_database,
+    read_rtabmap_export,
+)
 from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
-from r3jax.formats.sequences.scannet import is_scannet, read_scannet
-from r3jax.formats.sequences.scannet_sens import is_sens, read_sens
+from r3jax.formats.sequences.scannet import is_scannet, is_sens, read_scannet, read_sens
 from r3jax.formats.sequences.seven_scenes import is_seven_scenes, read_seven_scenes
 from r3jax.formats.sequences.tum import is_tum, read_tum
 from r3jax.frame import Frame
@@ -70,7 +72,7 @@ class Capture:
     """Posed images on disk; with depth, unless they are posed images without."""
 
     path: Path
-    source: Run | Recording | PosedImages
+    source: Run | PosedImages
 
     @property
     def run(self) -> Run | None:

@@ -8,6 +8,8 @@ a pinhole; distortion is kept as data and never applied.
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from r3jax.geometry.cameras import Camera
 from r3jax.validation.errors import ForeignFileError
 
@@ -144,6 +146,18 @@ class Lens:
     def camera(self) -> Camera:
         """The pinhole camera of the same focal lengths, whatever the distortion."""
         return Camera(self.width, self.height, *self.intrinsics)
+
+
+def matrix_lens(K: np.ndarray, size: tuple[int, int], offset: float = 0.5) -> Lens:
+    """The PINHOLE of a matrix of intrinsics, [3, 3] or larger.
+
+    Args:
+        K: the matrix.
+        size: width and height [px].
+        offset: added to the principal point: 0.5 where pixel centers lie at whole numbers.
+    """
+    params = (K[0, 0], K[1, 1], K[0, 2] + offset, K[1, 2] + offset)
+    return Lens("PINHOLE", *size, tuple(float(value) for value in params))
 
 
 def pinhole_lens(camera: Camera) -> Lens:

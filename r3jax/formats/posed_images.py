@@ -3,12 +3,17 @@
 Poses and points stay in the capture's own coordinates: nothing is turned, centered or scaled. A
 COLMAP model without known positions is not in meters, and its world may be upside down.
 
+Images may lie elsewhere than a capture's file says: programs that train splats keep the originals
+in `input` and smaller copies in `images_2`, `images_4` and `images_8`; others leave them beside the
+model.
+
 Shape symbols: n images; m points; t observations.
 """
 
 import dataclasses
+import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +21,13 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.formats.depth_files import stored_depth
-from r3jax.formats.depth_images import resample_depth
+from r3jax.formats.depth import MILLIMETERS, DepthUnit, resample_depth, stored_depth
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.frame import Frame
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import read_bytes
-from r3jax.validation.images import image_size, masked_pixels
+from r3jax.validation.images import first_size, image_size, masked_pixels
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 """What Pillow may try."""
@@ -61,34 +65,6 @@ class SparsePoints:
 
 
 @dataclass(frozen=True)
-class DepthUnit:
-    """What the numbers in a depth image mean; 0 is no measurement."""
-
-    metres_per_step: float = 0.001
-    """Units of the capture per step of whole numbers."""
-
-    beyond_range: int | None = None
-    """Stored where nothing lies within the sensor's range; None: there is no such number."""
-
-    invalid: int | None = None
-    """Stored, beside 0, where there is no measurement; None: there is no such number."""
-
-    metres_per_unit: float = 1.0
-    """Units of the capture per 1.0 where the numbers are floats."""
-
-    def depth(self, steps: np.ndarray) -> np.ndarray:
-        """z-depth [h, w] float32 of stored numbers; 0 no measurement, inf beyond the range."""
-        if steps.dtype.kind == "f":
-            return (steps * self.metres_per_unit).astype(np.float32)
-        depth = (steps.astype(np.float64) * self.metres_per_step).astype(np.float32)
-        if self.invalid is not None:
-            depth = np.where(steps == self.invalid, np.float32(0.0), depth)
-        if self.beyond_range is None:
-            return depth
-        return np.where(steps == self.beyond_range, np.float32(np.inf), depth)
-
-
-@dataclass(frozen=True)
 class Pixels:
     """Reads the pixels of a capture that is no folder of plain images: an archive, a video."""
 
@@ -118,7 +94,7 @@ class PosedImages:
     depth_paths: tuple[Path | None, ...]
     """One per image; None where there is no depth image."""
 
-    depth_unit: DepthUnit = DepthUnit()
+    depth_unit: DepthUnit = MILLIMETERS
     """Meaning of the numbers in all depth images."""
 
     points: SparsePoints | None = None
@@ -235,7 +211,6 @@ class PosedImages:
             return self.pixels.rgb(index), None
         path, lens = self.image_paths[index], self.lenses[index]
         with naming(path):
-            image_size(path, IMAGE_FORMATS)  # refuses what would not fit into memory
             return masked_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
 
     def depth(self, index: int) -> np.ndarray | None:
@@ -249,7 +224,11 @@ class PosedImages:
         path = self.depth_paths[index]
         if path is None:
             return None
-        stored = self.pixels.depth(index) if self.pixels else _read_depth(path, self.depth_unit)
+        if self.pixels is not None:
+            stored = self.pixels.depth(index)
+        else:
+            with naming(path):
+                stored = self.depth_unit.depth(stored_depth(read_bytes(path, _MAX_DEPTH)))
         own = None if self.depth_lenses is None else self.depth_lenses[index]
         return resample_depth(stored, self.lenses[index], own)
 
@@ -271,7 +250,78 @@ def _fitted(lens: Lens, images: list[Path]) -> Lens:
     return lens.resized(*size) if lens.has_shape(*size) else lens
 
 
-def _read_depth(path: Path, unit: DepthUnit) -> np.ndarray:
-    """z-depth [h, w] float32; 0 no measurement, inf beyond the range."""
-    with naming(path):
-        return unit.depth(stored_depth(read_bytes(path, _MAX_DEPTH)))
+COPIES = ("_2", "_4", "_8")
+"""What the names of folders of smaller copies end with."""
+
+FOLDERS = ("images", "input", *(f"images{copy}" for copy in COPIES), ".")
+"""Where images lie, beside a model or above it."""
+
+
+def find_images(places: Iterable[Path], names: Mapping[str, Lens]) -> Path | None:
+    """Finds the folder that holds most of the images; None: none of them is anywhere.
+
+    Args:
+        places: folders that hold it, under one of the usual names; the first goes first.
+        names: of the images, and the lens of each. Images of another shape than their lenses' were
+            undistorted since, and go last.
+    """
+    best, most = None, (False, 0)
+    for folder in (place / name for place in places for name in FOLDERS):
+        # os.path: a name of a foreign file may be longer than a file's can be.
+        there = [name for name in names if os.path.isfile(folder / name)]
+        if there and (found := (_fits(folder, there, names), len(there))) > most:
+            best, most = folder, found
+    return best
+
+
+def _fits(folder: Path, there: list[str], names: Mapping[str, Lens]) -> bool:
+    """True if the first image that can be opened has the shape of its lens."""
+    with suppress(ForeignFileError, OSError):
+        size = first_size((folder / name for name in there), IMAGE_FORMATS)
+        return names[there[0]].has_shape(*size)
+    return False
+
+
+def pair_images(
+    path: Path, images: Mapping[str, Path], depths: Mapping[str, Path], num_poses: int
+) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Pairs images with depth images by the names of their frames, which are in order.
+
+    Of a frame whose image was deleted the depth image says that there was one, and the other way
+    round: the pose is still known, and what is missing is noticed when it is read.
+
+    Args:
+        path: the capture, for messages.
+        images: images by the names of their frames.
+        depths: depth images by the names of their frames.
+        num_poses: frames that have a pose.
+
+    Raises:
+        FormatError: there are more or fewer frames than poses.
+    """
+    names = sorted({*images, *depths})
+    if len(names) != num_poses:
+        counts = f"{len(images)} images, {len(depths)} depth images, {num_poses} poses"
+        odd = next((name for name in images if name not in depths), None)
+        beside = "" if odd is None else f", and no depth image of {images[odd].name}"
+        raise FormatError(path, f"the numbers must be equal, found {counts}{beside}")
+
+    def in_order(files: Mapping[str, Path]) -> tuple[Path, ...]:
+        known, like = next(iter(files.items()))
+        gone = lambda name: like.with_name(like.name.replace(known, name))
+        return tuple(files.get(name) or gone(name) for name in names)
+
+    return in_order(images), in_order(depths)
+
+
+def left_out(count: int, total: int, frames: str = "frames") -> str | None:
+    """A sentence on frames that are left out; None where there are none.
+
+    Args:
+        count: of those that are left out.
+        total: how many there are.
+        frames: what they are called.
+    """
+    if not count:
+        return None
+    return f"{count} of {total} {frames} lack an image, depth or a pose and are left out."

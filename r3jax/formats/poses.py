@@ -1,4 +1,4 @@
-"""Poses from files, and the tables of numbers in text that most recordings keep them in.
+"""Poses from files: matrices, quaternions, and tables of numbers in text that hold them.
 
 What rounding did to a rotation is mended, anything worse is refused.
 """
@@ -8,10 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.geometry.cameras import rigid_error
+from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import plain_text, read_bytes
+
+UP_Y, UP_Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+"""Verticals of worlds: phones have y up, robots and most data sets z."""
 
 MAX_DRIFT = 0.02
 """Rotations off by at most this (text with few digits, long chains of products) are mended."""
@@ -53,16 +58,20 @@ def mend_pose(path: Path, which: str, pose: np.ndarray) -> np.ndarray:
     return pose
 
 
-def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+def read_lines(path: Path, data: bytes | None = None) -> Iterator[tuple[int, list[str]]]:
     """The words of every line that has any, and its number from 1; comments start with #.
 
     A heading that lost its # ("timestamp filename") is no line either.
+
+    Args:
+        path: the file.
+        data: what it holds, where it lies in an archive.
 
     Raises:
         FormatError: missing, not a regular file, or far too large.
     """
     with naming(path):
-        data = plain_text(read_bytes(path, _MAX_TEXT))
+        data = plain_text(read_bytes(path, _MAX_TEXT) if data is None else data)
     for number, raw in enumerate(io.BytesIO(data), start=1):
         words = raw.decode("utf-8", errors="replace").partition("#")[0].split()
         if words and words[0].lower() != "timestamp":
@@ -83,13 +92,104 @@ def to_floats(path: Path, number: int, words: list[str], columns: int) -> list[f
         raise FormatError(path, f"line {number}: {error!s:.200}") from None
 
 
-def read_numbers(path: Path, columns: int) -> np.ndarray:
-    """A table of numbers, [n, columns] float64, n >= 1.
+def read_numbers(path: Path, columns: int, data: bytes | None = None) -> np.ndarray:
+    """A table of numbers, [n, columns] float64, n >= 1; `data` as in `read_lines`.
 
     Raises:
         FormatError: the file is missing, holds no numbers, or a line has another number of them.
     """
-    rows = [to_floats(path, number, words, columns) for number, words in read_lines(path)]
+    lines = read_lines(path, data)
+    rows = [to_floats(path, number, words, columns) for number, words in lines]
     if not rows:
         raise FormatError(path, "the file holds no numbers")
     return np.asarray(rows)
+
+
+def read_matrix(path: Path, rows: int, columns: int, data: bytes | None = None) -> np.ndarray:
+    """A matrix of this shape, float64; `data` as in `read_lines`.
+
+    Raises:
+        FormatError: the file is missing, or holds something else.
+    """
+    matrix = read_numbers(path, columns, data)
+    if len(matrix) != rows:
+        raise FormatError(path, f"expected a {rows}x{columns} matrix, got {len(matrix)} lines")
+    return matrix
+
+
+def read_poses(path: Path) -> np.ndarray:
+    """Camera-to-world matrices [n, 4, 4], one a line, 16 numbers row by row.
+
+    Raises:
+        FormatError: the file is missing or damaged, or a pose is not finite or not rigid.
+    """
+    rows = read_numbers(path, columns=16).reshape(-1, 4, 4)
+    return np.stack(
+        [mend_pose(path, f"pose {i} (line {i + 1})", pose) for i, pose in enumerate(rows)]
+    )
+
+
+def up_of_poses(poses: np.ndarray) -> np.ndarray | None:
+    """The vertical of a data set whose world has z up, [3].
+
+    None where the first pose is the identity: then another program wrote it in this layout, whose
+    world is the first camera.
+    """
+    return None if np.allclose(poses[0], np.eye(4), atol=1e-6) else UP_Z
+
+
+def nearest(times: np.ndarray, others: np.ndarray, max_gap: float) -> np.ndarray:
+    """For each time the index of the nearest other time; -1 where it is too far away.
+
+    Args:
+        times: [n] [s], in any order.
+        others: [m] [s], in any order, m >= 1.
+        max_gap: the largest difference [s].
+    """
+    order = np.argsort(others, kind="stable")
+    ordered = others[order]
+    right = np.searchsorted(ordered, times).clip(0, len(others) - 1)
+    left = (right - 1).clip(0)
+    is_left = np.abs(ordered[left] - times) <= np.abs(ordered[right] - times)
+    best = np.where(is_left, left, right)
+    return np.where(np.abs(ordered[best] - times) <= max_gap, order[best], -1)
+
+
+def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+    """The rotation matrix [3, 3] of a quaternion w x y z [4]; rounding of its length is mended.
+
+    Raises:
+        ForeignFileError: not finite, or not of unit length.
+    """
+    length = float(np.sqrt(np.sum(np.square(quaternion))))
+    if not abs(length - 1.0) <= MAX_DRIFT:  # NaN makes the comparison false
+        raise ForeignFileError(f"the rotation is no unit quaternion, its length is {length:g}")
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+
+
+def quaternion_of(R: np.ndarray) -> np.ndarray:
+    """The quaternion w x y z [4] of a rotation matrix [3, 3], with w >= 0."""
+    return Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
+
+
+def quaternion_pose(source: Path, which: str, position: np.ndarray, xyzw: np.ndarray) -> np.ndarray:
+    """Makes the matrix [4, 4] float64 of a position [3] and a unit quaternion x y z w [4].
+
+    Args:
+        source: the file that the pose is from, for the message.
+        which: the pose's name in that file, for the message.
+        position: of the camera.
+        xyzw: rotation from the camera to the world.
+
+    Raises:
+        FormatError: not finite, too far away, or no unit quaternion.
+    """
+    pose = np.eye(4)
+    pose[:3, 3] = position
+    if not np.abs(pose[:3, 3]).max() <= MAX_DISTANCE:  # NaN makes the comparison false
+        raise FormatError(source, f"{which}: the position is {pose[:3, 3].tolist()}")
+    try:
+        pose[:3, :3] = rotation_of(np.roll(np.asarray(xyzw, np.float64), 1))
+    except ForeignFileError as error:
+        raise FormatError(source, f"{which}: {error}") from None
+    return pose

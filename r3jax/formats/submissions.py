@@ -34,11 +34,9 @@ from r3jax.runs.reader import Run
 from r3jax.runs.replay import check_decided_alone
 from r3jax.runs.rows import paths_to, rigid_pose, shortest_floats, table_of
 from r3jax.runs.settings import config_of
-from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import build, check_type
+from r3jax.validation.errors import ForeignFileError, check_version
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import parse_json
-from r3jax.validation.versions import check_version
+from r3jax.validation.json_text import build, check_type, parse_json
 
 FORMAT = "r3jax-submission"
 """What the first line says it is."""

@@ -15,13 +15,10 @@ from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.policy import LivesOutside, Policy
 from r3jax.planning.robot.motion import Motion
-from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import build, check_type
-from r3jax.validation.files import read_bytes
+from r3jax.validation.errors import ForeignFileError, VersionError, check_version
+from r3jax.validation.files import check_relative, read_bytes
 from r3jax.validation.images import MAX_PIXELS
-from r3jax.validation.json_text import parse_json, sealed, unsealed
-from r3jax.validation.names import check_relative
-from r3jax.validation.versions import VersionError, check_version
+from r3jax.validation.json_text import build, check_type, parse_json, sealed, unsealed
 
 FORMAT = "r3jax-run"
 """What run.json says it is."""

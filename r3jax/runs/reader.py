@@ -23,10 +23,9 @@ from r3jax.runs.stored_states import (
     state_of,
 )
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_type
 from r3jax.validation.files import read_bytes
 from r3jax.validation.images import image_pixels
-from r3jax.validation.json_text import parse_json, unsealed
+from r3jax.validation.json_text import check_type, parse_json, unsealed
 
 _MAX_BYTES = 256 << 20
 """A trace has some kilobytes a view."""

@@ -14,8 +14,7 @@ import numpy as np
 from r3jax.exploration.taken_views import Choice, Coverage, StepRow
 from r3jax.geometry.cameras import rigid_error
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import build
-from r3jax.validation.json_text import parse_json, sealed, unsealed
+from r3jax.validation.json_text import build, parse_json, sealed, unsealed
 
 
 @dataclass(frozen=True)

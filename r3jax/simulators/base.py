@@ -1,7 +1,13 @@
-"""What the loop may know of a world: a camera, a box, a start, and images from where it is."""
+"""What the loop may know of a world: a camera, a box, a start, and images from where it is.
 
+`NoisySimulator` makes the depth of another simulator as uncertain as a real sensor's.
+"""
+
+import hashlib
 from typing import Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from r3jax.frame import Frame
@@ -33,3 +39,73 @@ class Simulator(Protocol):
     def render(self, T_world_camera: np.ndarray) -> Frame:
         """The RGB-D frame at a pose. The same pose gives the same frame, noise included."""
         ...
+
+
+class NoisySimulator:
+    """Adds depth noise N(0, (sigma d)^2) to another simulator's frames.
+
+    That is the sensor of Active-GS (Jin et al., RA-L 2025), with sigma = 0.01. The noise is a
+    pure function of the seed and the pose: a frame that is rendered again is the same frame.
+    """
+
+    def __init__(
+        self, simulator: Simulator, relative_sigma: float | int = 0.01, seed: int = 0
+    ) -> None:
+        """Wraps `simulator`.
+
+        Args:
+            simulator: renders the frames without noise.
+            relative_sigma: standard deviation of the depth as a share of the depth.
+            seed: of the noise, 0 or more.
+
+        Raises:
+            ValueError: a share outside [0, 0.2], or a negative seed.
+        """
+        if not 0.0 <= relative_sigma <= 0.2:
+            raise ValueError(
+                f"relative_sigma is a share of the depth and must lie in [0, 0.2], "
+                f"got {relative_sigma}"
+            )
+        if seed < 0:
+            raise ValueError(f"seed must be 0 or more, got {seed}")
+        self.simulator = simulator
+        self._sigma = relative_sigma
+        self._seed = seed
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of every frame."""
+        return self.simulator.camera
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Axis-aligned box of the world, [2, 3] [m]."""
+        return self.simulator.bounds
+
+    @property
+    def start_pose(self) -> np.ndarray:
+        """`T_world_camera` at the start, [4, 4]."""
+        return self.simulator.start_pose
+
+    def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
+        """The frame at a pose, with noise on its depth; 0 and inf keep their meaning."""
+        frame = self.simulator.render(np.asarray(T_world_camera))
+        depth = np.asarray(frame.depth)
+        noise = self._generator(frame).standard_normal(depth.shape, dtype=np.float32)
+        # Cut at 4.5 sigma: a rare outlier must not turn a depth negative.
+        factor = 1.0 + np.float32(self._sigma) * np.clip(noise, -4.5, 4.5)
+        is_measured = (depth > 0.0) & np.isfinite(depth)
+        noisy = np.where(is_measured, depth * factor, depth)
+        return Frame(
+            rgb=frame.rgb,
+            depth=jnp.asarray(noisy),
+            T_world_camera=frame.T_world_camera,
+            camera=frame.camera,
+            far=True,
+        )
+
+    def _generator(self, frame: Frame) -> np.random.Generator:
+        """Random numbers that depend on the seed and the frame's pose only."""
+        pose = np.asarray(frame.T_world_camera, dtype=np.float32) + np.float32(0.0)  # no -0
+        digest = hashlib.sha256(pose.tobytes()).digest()
+        return np.random.default_rng([self._seed, *np.frombuffer(digest, dtype=np.uint32)])

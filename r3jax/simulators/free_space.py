@@ -21,9 +21,8 @@ from scipy.spatial import KDTree
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.simulators.base import Simulator
+from r3jax.simulators.base import NoisySimulator, Simulator
 from r3jax.simulators.clearance import SurfaceDistance, cut_triangles, point_triangle
-from r3jax.simulators.depth_noise import NoisySimulator
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.raycast.rays import TriangleScene
 

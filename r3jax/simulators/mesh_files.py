@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_type
 from r3jax.validation.files import check_regular
-from r3jax.validation.json_text import parse_json
+from r3jax.validation.json_text import check_type, parse_json
 
 _MAX_JSON = 256 << 20
 """Larger trees are cut off, and refused as such [bytes]."""

@@ -35,11 +35,9 @@ from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.train import FitResult, History
 from r3jax.splatting.views import Views
-from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_type
+from r3jax.validation.errors import ForeignFileError, check_version
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import parse_json, sealed, unsealed
-from r3jax.validation.versions import check_version
+from r3jax.validation.json_text import check_type, parse_json, sealed, unsealed
 
 RECORD_FORMAT = 1
 """Format version of train.json."""

@@ -42,12 +42,7 @@ def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
         OSError: missing, or not permitted.
     """
     with _opened(path, formats) as image:
-        width, height = image.size
-    if width * height > MAX_PIXELS:
-        raise ForeignFileError(
-            f"the image is {width} x {height}: more than {MAX_PIXELS} pixels are not read"
-        )
-    return width, height
+        return image.size
 
 
 def first_size(paths: Iterable[Path], formats: Sequence[str]) -> tuple[int, int]:
@@ -68,7 +63,7 @@ def first_size(paths: Iterable[Path], formats: Sequence[str]) -> tuple[int, int]
 def image_pixels(
     path: Path | bytes,
     formats: Sequence[str],
-    size: tuple[int, int],
+    size: tuple[int, int] | None = None,
     modes: Sequence[str] = (),
     wanted: str = "",
 ) -> np.ndarray:
@@ -77,7 +72,7 @@ def image_pixels(
     Args:
         path: the file, or what it holds.
         formats: those that Pillow may try, such as "PNG".
-        size: width and height that it must have [px].
+        size: width and height that it must have [px]; None: any.
         modes: Pillow's modes that it may have; none: any, and it becomes RGB.
         wanted: what to say of an image that has another mode.
 
@@ -85,7 +80,7 @@ def image_pixels(
         [H, W, 3] uint8 where no modes are given (see `masked_pixels`), else whatever the mode is.
 
     Raises:
-        ForeignFileError: not an image of these formats, broken, of another size or mode.
+        ForeignFileError: not an image of these formats, broken, too large, of another size or mode.
         OSError: missing, or not permitted.
     """
     with _opened(path, formats) as image:
@@ -151,8 +146,8 @@ def masked_pixels(
         Colors [H, W, 3] uint8, and True for the pixels that are there, [H, W]; None: all are.
 
     Raises:
-        ForeignFileError: not an image of these formats, broken, of another size, or of numbers
-            that do not say what white is.
+        ForeignFileError: not an image of these formats, broken, too large, of another size, or of
+            numbers that do not say what white is.
         OSError: missing, or not permitted.
     """
     with _opened(path, formats) as image:
@@ -160,8 +155,8 @@ def masked_pixels(
         return _colors(image)
 
 
-def _check_size(image: Any, size: tuple[int, int]) -> None:
-    if image.size != size:
+def _check_size(image: Any, size: tuple[int, int] | None) -> None:
+    if size is not None and image.size != size:
         raise ForeignFileError(_other_size(image, size))
 
 
@@ -201,6 +196,12 @@ def _opened(path: Path | bytes, formats: Sequence[str]) -> Generator[Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(source, formats=tuple(formats)) as image:
+                width, height = image.size
+                if width * height > MAX_PIXELS:  # before a pixel is unpacked
+                    raise ForeignFileError(
+                        f"the image is {width} x {height}: more than {MAX_PIXELS} pixels are not "
+                        "read"
+                    )
                 yield image
     except (FileNotFoundError, ForeignFileError):
         raise

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from r3jax.formats.colmap.model import quaternion_of
 from r3jax.formats.lenses import Lens
+from r3jax.formats.poses import quaternion_of
 from tests.apps.audit.room import SIZE, color_of, round_poses
 from tests.formats.sequences import encoded
 

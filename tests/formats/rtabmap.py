@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.formats.colmap.model import quaternion_of
+from r3jax.formats.poses import quaternion_of
 from tests.formats.bags import T_BASE_LINK, T_LINK_OPTICAL, camera_poses, rvl
 from tests.formats.phones import LENS, depth_steps, room_poses, view
 from tests.formats.sequences import encoded

@@ -6,7 +6,7 @@ import json
 import numpy as np
 from PIL import Image
 
-from r3jax.formats.colmap.model import quaternion_of
+from r3jax.formats.poses import quaternion_of
 from tests.formats.colmap_models import random_pose
 
 WIDTH, HEIGHT, NUM = 10, 8, 3

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from r3jax.formats.captures import open_capture
-from r3jax.formats.depth_files import stored_depth
+from r3jax.formats.depth import stored_depth
 from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.validation.errors import ForeignFileError

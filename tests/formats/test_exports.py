@@ -12,10 +12,10 @@ from r3jax.cli.main import USER_ERROR, main
 from r3jax.exploration.config import BEYOND_RANGE, DEPTH_STEPS_PER_METRE
 from r3jax.exploration.taken_views import frame_hash, stored_form
 from r3jax.formats.colmap.reader import read_colmap
+from r3jax.formats.depth import DepthUnit
 from r3jax.formats.exports import export_run
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.formats.points import read_points
-from r3jax.formats.posed_images import DepthUnit
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
@@ -27,7 +27,6 @@ from r3jax.runs.writer import RunWriter
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from tests.box_room import write_room
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.runs.runs import make_header, make_view
 
 CAMERA = Camera(40, 30, 31.3, 30.7, 21.1, 14.2)
@@ -203,65 +202,3 @@ def test_a_run_without_a_map_has_no_points(run, tmp_path):
     assert "ply_file_path" not in content
     assert export_run(read_run(copy), tmp_path / "model", "colmap") == 0
     assert len(read_colmap(tmp_path / "model")) == 3
-
-
-CHAIN = (
-    "r3jax.formats.lenses",
-    "r3jax.formats.posed_images",
-    "r3jax.formats.moved_images",
-    "r3jax.formats.nerfstudio",
-    "r3jax.formats.colmap.model",
-    "r3jax.formats.colmap.binary",
-    "r3jax.formats.colmap.text",
-    "r3jax.formats.exports",
-    "r3jax.formats.colmap.reader",
-)
-_STAGE: dict[str, object] = {}
-
-
-@pytest.fixture
-def stage(run, simulator, tmp_path):
-    """What the law needs beside the modules."""
-    _STAGE.update(run=run, simulator=simulator, folder=tmp_path)
-    yield
-    _STAGE.clear()
-
-
-def pixels_law(modules: Modules) -> None:
-    """The writers under test write for the true readers, the readers under test read the true."""
-    run, simulator, folder = (_STAGE[name] for name in ("run", "simulator", "folder"))
-    model = modules["exports"].model_of(run, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    (folder / "sparse").mkdir()
-    modules["binary"].write_binary(folder / "sparse", model)
-    (folder / "transforms.json").write_text(json.dumps(modules["nerfstudio"].transforms_of(run)))
-    export_run(run, folder / "true", "nerfstudio")
-    export_run(run, folder / "true model", "colmap")
-    first = simulator.render(run.rows[0].pose)
-    for images in (
-        read_colmap(folder / "sparse"),
-        read_transforms(folder),
-        modules["reader"].read_colmap(folder / "true model"),
-        modules["nerfstudio"].read_transforms(folder / "true"),
-    ):
-        assert_same_pixels(render_again(simulator, images, 0), first)
-
-
-MUTANTS = [
-    Mutant("nerfstudio", "np.diag([1.0, -1.0, -1.0, 1.0])", "np.eye(4)", pixels_law),
-    Mutant("nerfstudio", "[1.0, -1.0, -1.0, 1.0]", "[-1.0, -1.0, 1.0, 1.0]", pixels_law),
-    Mutant("nerfstudio", "matrix @ OPENGL_FROM_OPENCV", "OPENGL_FROM_OPENCV @ matrix", pixels_law),
-    Mutant("nerfstudio", "found[0], found[-1]", "found[-1], found[0]", pixels_law),
-    Mutant("model", "pose[:3, :3] = R.T", "pose[:3, :3] = R", pixels_law),
-    Mutant("exports", "colmap_pose(pose)", "colmap_pose(np.linalg.inv(pose))", pixels_law),
-    Mutant("lenses", "camera.fx, camera.fy,", "camera.fy, camera.fx,", pixels_law),
-    Mutant("lenses", "camera.cx, camera.cy)", "camera.cx - 0.5, camera.cy - 0.5)", pixels_law),
-]
-
-
-def test_the_law_holds_of_the_original(stage):
-    pixels_law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_wrong_axes_show_in_the_pixels(stage, mutant):
-    assert_caught(CHAIN, mutant)

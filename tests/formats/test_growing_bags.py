@@ -1,6 +1,5 @@
 """Bags that are being recorded: cut anywhere, they show what is whole, and the rest as it comes."""
 
-import struct
 from contextlib import suppress
 from itertools import pairwise
 
@@ -9,18 +8,15 @@ import pytest
 
 from r3jax.formats.errors import FormatError
 from r3jax.formats.ros.bag_reader import read_bag
-from r3jax.formats.ros.growing.bag import FollowedBag, growing_files, key_frames
-from r3jax.formats.ros.growing.mcap import McapFollower
-from r3jax.formats.ros.growing.rosbag1 import Rosbag1Follower
-from r3jax.formats.ros.unpack import MAX_CHUNK, unpack_chunk
+from r3jax.formats.ros.bags import MAX_CHUNK, unpack_chunk
+from r3jax.formats.ros.growing import FollowedBag, McapFollower, growing_files, key_frames
 from r3jax.validation.errors import ForeignFileError
 from tests.formats.bags import Robot, camera_poses, moved, write_bag
 from tests.formats.phones import NUM
 
 
-def bag_file(tmp_path, kind, pose="tf"):
-    path = write_bag(tmp_path / ("whole.bag" if kind == "bag" else "whole"), Robot(pose=pose), kind)
-    return path if kind == "bag" else next(path.glob("*.mcap"))
+def bag_file(tmp_path, pose="tf"):
+    return next(write_bag(tmp_path / "whole", Robot(pose=pose)).glob("*.mcap"))
 
 
 def names(images):
@@ -29,16 +25,13 @@ def names(images):
 
 def followed(path):
     files = growing_files(path)
-    return FollowedBag(path, files), files
+    return FollowedBag(path), files
 
 
-@pytest.mark.parametrize("kind", ["mcap", "bag"])
-def test_a_bag_without_its_end_shows_the_same(tmp_path, kind):
-    whole = bag_file(tmp_path, kind)
-    cut = tmp_path / ("cut.bag.active" if kind == "bag" else "cut.mcap")
-    content = whole.read_bytes()
-    summary = 4 if kind == "bag" else 600
-    cut.write_bytes(content[: len(content) - summary])
+def test_a_bag_without_its_end_shows_the_same(tmp_path):
+    whole = bag_file(tmp_path)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:-600])  # the summary
     bag, files = followed(cut)
     images, expected = bag.images(files), read_bag(whole)
     assert names(images) == names(expected)
@@ -48,13 +41,12 @@ def test_a_bag_without_its_end_shows_the_same(tmp_path, kind):
         np.testing.assert_array_equal(images.depth(index), expected.depth(index))
 
 
-@pytest.mark.parametrize("kind", ["mcap", "bag"])
 @pytest.mark.parametrize("pose", ["tf", "odometry"])
-def test_a_bag_that_grows_byte_by_byte_only_gains_frames(tmp_path, kind, pose, monkeypatch):
-    monkeypatch.setattr("r3jax.formats.ros.growing.bag._SETTLE", 0)
-    whole = bag_file(tmp_path, kind, pose)
+def test_a_bag_that_grows_byte_by_byte_only_gains_frames(tmp_path, pose, monkeypatch):
+    monkeypatch.setattr("r3jax.formats.ros.growing._SETTLE", 0)
+    whole = bag_file(tmp_path, pose)
     content = whole.read_bytes()
-    growing = tmp_path / ("growing.bag" if kind == "bag" else "growing.mcap")
+    growing = tmp_path / "growing.mcap"
     growing.touch()
     bag, files = followed(growing)
     seen: list[list[str]] = []
@@ -73,7 +65,7 @@ def test_a_bag_that_grows_byte_by_byte_only_gains_frames(tmp_path, kind, pose, m
 
 
 def test_a_folder_that_is_recorded_gets_more_parts(tmp_path):
-    whole = bag_file(tmp_path, "mcap")
+    whole = bag_file(tmp_path)
     path = tmp_path / "drive"
     path.mkdir()
     assert growing_files(path) == []
@@ -95,25 +87,12 @@ def test_sqlite_is_refused_until_the_bag_is_finished(tmp_path):
         growing_files(path)
 
 
-def test_a_bag_of_ros_1_is_found_by_the_name_that_it_will_have(tmp_path):
+def test_a_bag_of_ros_1_is_refused_until_it_is_closed(tmp_path):
     active = tmp_path / "drive.bag.active"
     active.touch()
-    assert growing_files(tmp_path / "drive.bag") == growing_files(tmp_path) == [active]
-
-
-def test_a_chunk_whose_size_is_not_written_yet_is_waited_for(tmp_path):
-    content = bag_file(tmp_path, "bag").read_bytes()
-    path = tmp_path / "growing.bag"
-    path.write_bytes(content)
-    follower = Rosbag1Follower(path)
-    notes = follower.advance()
-    chunk = notes[0].chunk
-    open_chunk = content[: chunk - 4] + struct.pack("<I", 0) + content[chunk:]
-    path.write_bytes(open_chunk)
-    follower = Rosbag1Follower(path)
-    assert follower.advance() == []
-    path.write_bytes(content)
-    assert [note.time for note in follower.advance()] == [note.time for note in notes]
+    for path in (active, tmp_path / "drive.bag", tmp_path):
+        with pytest.raises(FormatError, match=rf"{path}.*until the recorder has closed it"):
+            growing_files(path)
 
 
 def test_frames_are_half_a_second_apart_and_moved():
@@ -129,12 +108,10 @@ def test_frames_are_half_a_second_apart_and_moved():
     assert key_frames(stamps, poses, -1).tolist() == []
 
 
-@pytest.mark.parametrize("kind", ["mcap", "bag"])
-def test_other_files_are_refused(tmp_path, kind):
-    path = tmp_path / f"none.{kind}"
-    path.write_bytes(bytes(100))
-    with pytest.raises(ForeignFileError, match="this is no"):
-        (McapFollower if kind == "mcap" else Rosbag1Follower)(path).advance()
+def test_other_files_are_refused(tmp_path):
+    (tmp_path / "none.mcap").write_bytes(bytes(100))
+    with pytest.raises(ForeignFileError, match="no MCAP"):
+        McapFollower(tmp_path / "none.mcap").advance()
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
@@ -159,10 +136,10 @@ def test_a_chunk_that_says_less_than_it_holds_is_refused(compression):
 
 def test_a_bomb_in_a_bag_is_refused(tmp_path, monkeypatch):
     path = write_bag(tmp_path / "whole")
-    monkeypatch.setattr("r3jax.formats.ros.unpack.MAX_CHUNK", 1000)
+    monkeypatch.setattr("r3jax.formats.ros.bags.MAX_CHUNK", 1000)
     with pytest.raises(FormatError, match="is more than 1000 and not read"):
         read_bag(path)
-    monkeypatch.setattr("r3jax.formats.ros.growing.bag._SETTLE", 0)
+    monkeypatch.setattr("r3jax.formats.ros.growing._SETTLE", 0)
     bag, files = followed(path)
     with pytest.raises(FormatError, match="is more than 1000 and not read"):
         bag.images(files)

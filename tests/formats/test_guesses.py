@@ -8,7 +8,7 @@ import pytest
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError, check_capture
 from tests.formats import phones, sequences
-from tests.fuzz.containers import zipped
+from tests.fuzz.mutations import zipped
 from tests.fuzz.tree import lay_out
 
 FOLDERS = {

@@ -152,12 +152,6 @@ def test_an_applied_scale_is_undone_where_depth_tells_the_units(folder):
     assert "scaled by 0.5 (applied_scale): that is undone" in images.remark
 
 
-def test_exported_poses_without_cameras_say_what_to_give(folder):
-    (folder / "transforms.json").write_text("[]")
-    with pytest.raises(FormatError, match=r"as `ns-export cameras` writes it.* give the"):
-        read_transforms(folder)
-
-
 def test_depth_is_in_millimeters_unless_the_file_says_otherwise(folder):
     steps = np.arange(20, dtype=np.uint16).reshape(4, 5)  # half the image's size
     Image.fromarray(steps).save(folder / "depth.png")
@@ -188,53 +182,3 @@ def test_what_is_missing_is_named_when_it_is_read(folder):
     assert len(read_transforms(folder)) == 2
     with pytest.raises(FormatError, match=r"b\.png: the file is missing"):
         images.frame(0)
-
-
-MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-
-DAMAGES = {
-    "no frames": ({"frames": None}, "`transforms` lacks frames"),
-    "empty": ({"frames": []}, "lists no frames"),
-    "no path": ({"0.file_path": None}, r"`frames\[0\]` lacks file_path"),
-    "number": ({"0.file_path": 7}, r"`frames\[0\]\.file_path` must be str"),
-    "upwards": ({"1.file_path": "../../x"}, "leads out of the folder"),
-    "absolute": ({"1.file_path": "/etc/passwd"}, "absolute path"),
-    "depth": ({"0.depth_file_path": "../x.png"}, "leads out of the folder"),
-    "points": ({"ply_file_path": "/x.ply"}, "absolute path"),
-    "no pose": ({"1.transform_matrix": None}, r"`frames\[1\]` lacks transform_matrix"),
-    "2x4": ({"1.transform_matrix": LEVEL[:2]}, "must be a 3x4 or a 4x4 matrix"),
-    "ragged": ({"1.transform_matrix": [[1], [2, 3], []]}, "must be a 3x4 or a 4x4 matrix"),
-    "text": ({"1.transform_matrix": "x"}, "must be list"),
-    "mirror": ({"1.transform_matrix": MIRRORED}, r"frames\[1\]\.transform_matrix: .* mirrors"),
-    "scale": ({"1.transform_matrix": [[2, 0, 0, 0], *LEVEL[1:]]}, "not rigid"),
-    "far": ({"1.transform_matrix": [[1, 0, 0, 1e30], *LEVEL[1:]]}, "the position is"),
-    "no focal": ({"fl_x": None, "fl_y": None}, r"frames\[0\]: there is no focal length"),
-    "negative": ({"fl_y": -1.0}, "no camera has the focal lengths"),
-    "angle": ({"fl_x": None, "camera_angle_x": 4.0}, "no angle of view"),
-    "model": ({"camera_model": "EQUIRECTANGULAR"}, "'EQUIRECTANGULAR' is not known"),
-    "half a pixel": ({"w": 10.5}, "`w` must be a whole number"),
-    "k4": ({"k4": 0.1}, "k4 belongs to a fisheye"),
-    "unit": ({"depth_unit_scale_factor": 0}, "makes no sense"),
-    "applied scale": ({"applied_scale": 0.0}, "the applied_scale 0 makes no sense"),
-    "applied": ({"applied_transform": [[1.0]]}, "`applied_transform` must be a 3x4"),
-    "no size": (
-        {"w": None, "0.file_path": "gone", "1.file_path": "gone too"},
-        "gone: the file is missing, and its size",
-    ),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_file_is_named(folder, damage):
-    changes, message = DAMAGES[damage]
-    with pytest.raises(FormatError, match=message) as caught:
-        read_transforms(written(folder, **changes))
-    assert str(folder) in str(caught.value)
-
-
-def test_a_file_that_is_not_there_is_named(folder):
-    with pytest.raises(FormatError, match=r"transforms\.json: the file is missing"):
-        read_transforms(folder)
-    (folder / "transforms.json").write_text('{"frames": NaN}')
-    with pytest.raises(FormatError, match="NaN is no number"):
-        read_transforms(folder / "transforms.json")

@@ -11,16 +11,14 @@ from r3jax.apps.audit.source import source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
 from r3jax.formats.phones import archives
-from r3jax.formats.phones.arkit_scenes import read_arkit_scenes
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
 from r3jax.formats.phones.record3d import read_record3d
-from r3jax.formats.phones.stray_scanner import read_stray_scanner
-from r3jax.formats.phones.videos import Video
+from r3jax.formats.phones.stray_scanner import Video, read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
 from tests.apps.audit.room import SIZE, color_of
 from tests.formats import phones
 from tests.formats.phones import FACTOR, NUM, Y_UP_FROM_Z_UP, rays_of
-from tests.fuzz.containers import zipped
+from tests.fuzz.mutations import zipped
 from tests.fuzz.tree import lay_out
 
 JPEG = 12.0
@@ -120,87 +118,6 @@ def test_other_folders_are_no_polycam(tmp_path):
         assert not is_polycam(tmp_path / name)
 
 
-def damaged(name, change):
-    """Files with one changed by a function of its JSON or bytes; None takes it away."""
-
-    def changed(files):
-        files = dict(files)
-        if change is None:
-            files = {other: data for other, data in files.items() if name not in other}
-        else:
-            names = [other for other in files if name in other]
-            assert names
-            files[names[0]] = change(files[names[0]])
-        return files
-
-    return changed
-
-
-def with_fields(**fields):
-    return lambda data: json.dumps({**json.loads(data), **fields}).encode()
-
-
-def without_field(name):
-    return lambda data: json.dumps(
-        {k: v for k, v in json.loads(data).items() if k != name}
-    ).encode()
-
-
-POLYCAM = {
-    "depth": (
-        damaged("keyframes/depth", None),
-        "looks like a Polycam export without keyframes/depth: .* ns-process-data images",
-    ),
-    "cameras": (damaged("cameras/", None), "without keyframes/cameras: export raw data"),
-    "field": (
-        damaged("corrected_cameras", without_field("fx")), r"1600000\.json: `camera` lacks fx",
-    ),
-    "pose": (damaged("corrected_cameras", with_fields(t_00=7.0)), r"1600000\.json: the pose"),
-    "size": (damaged("corrected_cameras", with_fields(width=-1)), r"image is -1 x 36 pixels"),
-    "word": (damaged("corrected_cameras", with_fields(fx="x")), r"`camera.fx` must be float"),
-    "not json": (damaged("corrected_cameras", lambda data: data[:40]), "this is not JSON"),
-}  # fmt: skip
-PIXELS = {
-    "image": (
-        damaged("corrected_images", lambda data: data[:50]),
-        r"1600000\.jpg: the image cannot",
-    ),
-    "other size": (
-        damaged("corrected_cameras", with_fields(width=50)),
-        r"1600000\.jpg: the image has 48 x 36 pixels, but .* 50 x 36",
-    ),
-    "colored depth": (
-        damaged("keyframes/depth", lambda data: phones.encoded(np.zeros((12, 16, 3), np.uint8))),
-        r"depth/1600000\.png: depth must be a PNG or TIFF of 16 bits",
-    ),
-    "confidence": (
-        damaged("keyframes/confidence", lambda data: phones.encoded(np.zeros((3, 4), np.uint8))),
-        r"confidence/1600000\.png: the confidence has 4 x 3 pixels, its depth image 16 x 12",
-    ),
-}
-
-
-@pytest.mark.parametrize("damage", POLYCAM)
-@pytest.mark.parametrize("is_zip", [False, True])
-def test_damaged_polycam_is_named(tmp_path, damage, is_zip):
-    break_it, message = POLYCAM[damage]
-    files = break_it(phones.polycam())
-    lay_out(tmp_path / "scan", files)
-    path = write_zip(tmp_path / "scan.zip", files) if is_zip else tmp_path / "scan"
-    with pytest.raises(FormatError, match=message) as found:
-        open_capture(path)
-    assert str(path) in str(found.value)
-
-
-@pytest.mark.parametrize("damage", PIXELS)
-def test_damaged_pixels_of_polycam_are_named(tmp_path, damage):
-    break_it, message = PIXELS[damage]
-    lay_out(tmp_path / "scan", break_it(phones.polycam()))
-    images = read_polycam(tmp_path / "scan")
-    with pytest.raises(FormatError, match=message):
-        images.frame(0)
-
-
 def test_an_archive_that_was_cut_off_says_so(tmp_path):
     path = tmp_path / "scan.zip"
     path.write_bytes(zipped(phones.polycam())[:-100])
@@ -290,52 +207,6 @@ def test_record3d_of_earlier_versions_has_one_camera_and_no_size_of_depth(tmp_pa
     assert depth.shape == (640, 480)
     assert (np.asarray(depth[:2]) == 1.0).all()
     assert (np.asarray(depth[3:]) == 2.0).all()
-
-
-def with_lzfse(array):
-    import lzfse
-
-    return lambda data: lzfse.compress(array.tobytes())
-
-
-RECORD3D = {
-    "depth": (damaged(".depth", None), "looks like a recording of Record3D without depth"),
-    "poses": (damaged("metadata", with_fields(poses=[[0, 0, 0, 1, 0, 0]])), "1 poses must have 7"),
-    "fewer": (damaged("metadata", with_fields(poses=[[0, 0, 0, 1, 0, 0, 0]])), "intrinsics, 4"),
-    "no pose": (damaged("metadata", with_fields(poses=[])), "the 0 poses"),
-    "quaternion": (
-        damaged("metadata", with_fields(poses=[[0, 0, 0, 2, 0, 0, 0]] * 4)),
-        "metadata: pose 0: the rotation is no unit quaternion",
-    ),
-    "K": (damaged("metadata", with_fields(K=[1.0])), "`K` must have 9 numbers"),
-    "size": (damaged("metadata", with_fields(dw=1 << 20)), "cannot have 1048576 x 12 pixels"),
-    "field": (damaged("metadata", without_field("w")), "`metadata` lacks w"),
-}
-
-
-@pytest.mark.parametrize("damage", RECORD3D)
-def test_damaged_record3d_is_named(tmp_path, damage):
-    break_it, message = RECORD3D[damage]
-    path = write_zip(tmp_path / "scan.r3d", break_it(phones.record3d()))
-    with pytest.raises(FormatError, match=message) as found:
-        open_capture(path)
-    assert str(path) in str(found.value)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda data: data[:30], r"0\.depth: it unpacks to .* bytes, not 768: is it damaged"),
-        (lambda data: b"bvx1" + data[4:], r"0\.depth: it unpacks to 0 bytes, not 768"),
-        (with_lzfse(np.ones((12, 15), np.float32)), "it unpacks to 720 bytes, not 768"),
-        (with_lzfse(np.zeros(1 << 20, np.uint8)), "it unpacks to more than 768 bytes, not 768"),
-    ],
-)
-def test_damaged_depth_of_record3d_is_named(tmp_path, change, message):
-    lay_out(tmp_path, damaged("0.depth", change)(phones.record3d()))
-    images = read_record3d(tmp_path)
-    with pytest.raises(FormatError, match=message):
-        images.frame(0)
 
 
 def test_record3d_without_lzfse_names_the_extra(tmp_path, monkeypatch):
@@ -434,33 +305,6 @@ def test_frames_of_a_video_come_by_number_in_any_order(tmp_path):
             video.frame(number)
 
 
-def lines(change):
-    return lambda data: "\n".join(change(data.decode().splitlines())).encode()
-
-
-STRAY = {
-    "depth": (damaged("depth/", None), "looks like a recording of Stray Scanner without depth/"),
-    "odometry": (damaged("odometry", None), "Stray Scanner without odometry.csv: copy the whole"),
-    "columns": (
-        damaged("odometry", lambda data: data.replace(b"qw", b"q")), r"odometry\.csv: .*columns qw",
-    ),
-    "no rows": (damaged("odometry", lines(lambda rows: rows[:1])), "it lists no frames"),
-    "row": (damaged("odometry", lines(lambda rows: [*rows, "1, 2"])), "row 5 has 2 fields"),
-    "word": (damaged("odometry", lambda d: d.replace(b"000001", b"x")), "row 2: `frame`"),
-    "frame": (damaged("odometry", lambda d: d.replace(b"000003", b"-3")), "-3 is no number"),
-    "video": (damaged("rgb.mp4", lambda data: data[:100]), r"rgb\.mp4: the video cannot be read"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("damage", STRAY)
-def test_damaged_stray_scanner_is_named(tmp_path, damage):
-    break_it, message = STRAY[damage]
-    lay_out(tmp_path, break_it(phones.stray_scanner()))
-    with pytest.raises(FormatError, match=message) as found:
-        open_capture(tmp_path)
-    assert str(tmp_path) in str(found.value)
-
-
 def test_poses_after_the_end_of_a_video_are_left_out(tmp_path):
     files = phones.stray_scanner()
     shorter = [phones.view(pose, phones.VIDEO)[0] for pose in phones.room_poses()[:3]]
@@ -493,24 +337,3 @@ def test_arkit_scenes_shows_the_room(tmp_path):
     np.testing.assert_array_equal(images.up, [0, 0, 1])
     assert [lens.params[0] for lens in images.lenses] == [34.0, 35.0, 36.0, 37.0]
     assert (images.depth(0).reshape(12, FACTOR, 16, FACTOR)[:, :, -2:] == 0).all()
-
-
-ARKIT_SCENES = {
-    "depth": (damaged("lowres_depth", None), "looks like a video of ARKitScenes without images"),
-    "cameras": (damaged("pincam", None), "download its assets lowres_wide, lowres_depth"),
-    "camera": (damaged("1.628.pincam", lambda data: b"256 192 1"), r"pincam: every line must have"),
-    "huge": (damaged("1.628.pincam", lambda data: b"1e300 1 1 1 1 1"), "image is 0 x 1 pixels"),
-    "columns": (damaged("traj", lambda data: data[:-20]), r"wide\.traj: every line must have 7"),
-    "word": (damaged("traj", lambda data: b"a b c d e f g"), "a word that is no number"),
-    "lost": (damaged("traj", lambda data: b"6791 nan 0 0 0 0 0"), "not finite"),
-    "other time": (damaged("traj", lambda data: b"7 0 0 0 0 0 0"), "without images that have"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("damage", ARKIT_SCENES)
-def test_damaged_arkit_scenes_is_named(tmp_path, damage):
-    break_it, message = ARKIT_SCENES[damage]
-    lay_out(tmp_path, break_it(phones.arkit_scenes()))
-    with pytest.raises(FormatError, match=message) as found:
-        read_arkit_scenes(tmp_path)
-    assert str(tmp_path) in str(found.value)

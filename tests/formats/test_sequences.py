@@ -1,7 +1,6 @@
 """Replica-SLAM, TUM and 7-Scenes: pixels, meters, poses and intrinsics as their pages say."""
 
 import io
-import json
 
 import numpy as np
 import pytest
@@ -136,65 +135,6 @@ def test_the_nearest_in_time_is_taken_unless_it_is_too_far(asked, others, gap):
             assert least > gap
         else:
             assert distance[i, j] == least <= gap
-
-
-def cut(name, at):
-    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:at])
-
-
-def put(name, text):
-    return lambda folder: (folder / name).write_text(text)
-
-
-def remove(name):
-    return lambda folder: (folder / name).unlink()
-
-
-DAMAGES = {
-    "replica_slam": {
-        "no pose": (put("traj.txt", ""), r"traj\.txt: the file holds no numbers"),
-        "cut": (cut("traj.txt", 500), r"traj\.txt: line \d has \d+ numbers, not 16"),
-        "fewer": (
-            lambda f: [remove(f"results/{name}000001.{end}")(f)
-                       for name, end in (("frame", "jpg"), ("depth", "png"))],
-            "2 images, 2 depth images, 3 poses",
-        ),
-        "no camera": (remove("cam_params.json"), r"cam_params\.json: the file is missing"),
-        "camera": (put("cam_params.json", '{"camera": {"w": 1}}'), "`camera` lacks cx"),
-        "scale": (
-            lambda f: put("cam_params.json", json.dumps({"camera": dict(
-                w=10, h=8, fx=1, fy=1, cx=1, cy=1, scale=0)}))(f), "scale 0 makes no sense",
-        ),
-    },
-    "tum": {
-        "leads out": (put("rgb.txt", "100.0 ../x.png\n"), r"rgb\.txt: line 1: .*leads out"),
-        "no list": (put("depth.txt", "# nothing\n"), r"depth\.txt: the file lists no pictures"),
-        "word": (put("depth.txt", "now x.png\n"), r"depth\.txt: line 1: could not"),
-        "not finite": (put("depth.txt", "inf x.png\n"), "timestamps that are not finite"),
-        "columns": (put("rgb.txt", "100.0\n"), "line 1 is not a timestamp and a path"),
-        "other time": (put("groundtruth.txt", "7 0 0 0 0 0 0 1\n"), "no image has a depth image"),
-        "quaternion": (
-            put("groundtruth.txt", "100 0 0 0 0 0 0 2\n"), r"pose at 100\.0000 s: .*no unit",
-        ),
-        "far": (put("groundtruth.txt", "100 1e13 0 0 0 0 0 1\n"), "the position is"),
-    },
-    "seven_scenes": {
-        "no pose": (remove("frame-000001.pose.txt"), r"000001\.pose\.txt: the file is missing"),
-        "short": (put("frame-000001.pose.txt", "1 0 0 0\n"), "expected a 4x4 matrix, got 1 lines"),
-        "lost": (
-            put("frame-000000.pose.txt", "\n".join(["nan nan nan nan"] * 4)), "not finite",
-        ),
-    },
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("kind", "damage"), [(k, d) for k in DAMAGES for d in DAMAGES[k]])
-def test_a_damaged_sequence_is_named(tmp_path, kind, damage):
-    break_it, message = DAMAGES[kind][damage]
-    lay_out(tmp_path / kind, getattr(sequences, kind)())
-    break_it(tmp_path / kind)
-    with pytest.raises(FormatError, match=message):
-        READERS[kind][1](tmp_path / kind)
 
 
 @pytest.mark.parametrize("kind", ["replica_slam", "tum"])

@@ -10,9 +10,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-CASES_SLOW = 2000
-"""Cases of every reader behind the marker `slow`."""
-
 _HANG = 10.0
 """A case that takes longer hangs [s]."""
 
@@ -33,9 +30,10 @@ class Harness:
         self._log = scratch / "stderr.txt"
         self._process: subprocess.Popen[bytes] | None = None
         self._warm: set[str] = set()
+        self._cases = 0
 
-    def check(self, module: str, count: int) -> None:
-        """Runs the seeds and the first `count` cases of a reader.
+    def check(self, name: str, count: int | None = None) -> None:
+        """Runs the seeds and the first `count` cases of a reader; None: as many as it names.
 
         Raises:
             AssertionError: a case crashed, hung, or ended in anything but the reader's own
@@ -43,51 +41,53 @@ class Harness:
         """
         failures: list[str] = []
         verdicts: Counter[str] = Counter()
-        for number in range(count):
-            if module not in self._warm:
-                self._warm_up(module)
-            answer = self._ask(module, number, _HANG)
+        number = 0
+        while count is None or number < count:
+            count = self._warm_up(name, count)
+            answer = self._ask("READERS", name, number, _HANG)
             verdicts[answer["verdict"]] += 1
             if answer["verdict"] == "failed":
                 failures.append(f"case {number} ({answer['what']}): {answer['why']}")
+            number += 1
         listed = "\n\n".join(failures[:_SHOWN])
-        assert not failures, f"{len(failures)} of {count} cases of {module} failed:\n{listed}"
-        assert verdicts["read"], f"no case of {module} was harmless: is the seed read at all?"
-        assert verdicts["refused"], f"no case of {module} was refused"
+        assert not failures, f"{len(failures)} of {count} cases of {name} failed:\n{listed}"
+        assert verdicts["read"], f"no case of {name} was harmless: is the seed read at all?"
+        assert verdicts["refused"], f"no case of {name} was refused"
 
-    def check_crafted(self, reader: str, warm: str | None = None) -> None:
-        """Runs the seeds of a reader as the cases: ones that were made by hand.
-
-        Args:
-            reader: the cases.
-            warm: a reader that imports and compiles the same, and is run before them.
+    def check_all(self, table: str, name: str) -> None:
+        """Runs all cases of a reader that were made by hand, or its bombs.
 
         Raises:
             AssertionError: as for `check`.
         """
         number, seeds, failures = 0, 1, []
         while number < seeds:
-            if warm is not None and warm not in self._warm:
-                self._warm_up(warm)
-            answer = self._ask(reader, -1 - number, _HANG)
+            self._warm_up(name)
+            answer = self._ask(table, name, -1 - number, _HANG)
             if answer["verdict"] == "failed":
                 failures.append(f"case {number}: {answer['why']}")
             number, seeds = number + 1, answer.get("seeds", seeds)
         assert not failures, "\n\n".join(failures)
 
-    def _warm_up(self, module: str) -> None:
-        """The seeds must read; it also imports and compiles what the reader needs."""
-        number, seeds = 0, 1
-        while number < seeds:
-            answer = self._ask(module, -1 - number, _START)
-            assert answer["verdict"] == "read", f"seed {number} of {module}: {answer['why']}"
-            number, seeds = number + 1, answer["seeds"]
-        self._warm.add(module)
+    def _warm_up(self, name: str, count: int | None = None) -> int:
+        """The seeds must read; it also imports and compiles what the reader needs.
 
-    def _ask(self, module: str, number: int, patience: float) -> dict[str, Any]:
+        Returns:
+            `count`, or how many cases the reader names.
+        """
+        number, seeds = 0, 1
+        while name not in self._warm and number < seeds:
+            answer = self._ask("READERS", name, -1 - number, _START)
+            assert answer["verdict"] == "read", f"seed {number} of {name}: {answer['why']}"
+            number, seeds = number + 1, answer["seeds"]
+            self._cases = answer["cases"]
+        self._warm.add(name)
+        return self._cases if count is None else count
+
+    def _ask(self, table: str, name: str, number: int, patience: float) -> dict[str, Any]:
         """What became of one case."""
         process = self._process or self._start()
-        question = json.dumps({"reader": module, "case": number}).encode() + b"\n"
+        question = json.dumps({"table": table, "reader": name, "case": number}).encode() + b"\n"
         assert process.stdin is not None
         try:
             process.stdin.write(question)

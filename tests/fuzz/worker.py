@@ -1,8 +1,9 @@
 """The process that reads hostile files: `python -m tests.fuzz.worker FOLDER`.
 
-For every line that it is sent, {"reader": "module:attribute", "case": number}, it answers two
+For every line that it is sent, {"table": "READERS", "reader": name, "case": number}, it answers two
 lines of JSON: what the case is, once it lies on the disk, and what became of it. Number -1 is the
-first seed itself, -2 the second. What kills this process kills nothing else.
+first seed itself, -2 the second. The table "BOMBS" holds the seeds of every reader as bombs. What
+kills this process kills nothing else.
 """
 
 import contextlib
@@ -20,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from tests.fuzz.mutate import mutate
+from tests.fuzz.mutations import bombs_of, mutate
 from tests.fuzz.tree import Files, lay_out
 
 MEMORY = 1 << 30
-"""What one case may add at most [bytes]."""
+"""What one case may add at most [bytes]; a bomb that asks for more address space fails at once."""
 
 _LONGEST_MESSAGE = 2000
 """A message that quotes half the file helps nobody [characters]."""
@@ -49,8 +50,8 @@ class Reader:
     make: Callable[[np.random.Generator, Files], tuple[Files, str]] = mutate
     """Makes a case from a seed."""
 
-    ceiling: int | None = None
-    """Address space that a case may add; asking for more fails at once [bytes]."""
+    cases: int = 150
+    """Of those that are made by chance, in the normal suite."""
 
 
 class Guard:
@@ -93,10 +94,22 @@ def _caches() -> tuple[str, ...]:
     return (*found, str(Path(__file__).resolve().parents[2] / "r3jax"))
 
 
-def make_case(module: str, reader: Reader, seeds: list[Files], number: int) -> tuple[Files, str]:
+def make_case(name: str, reader: Reader, seeds: list[Files], number: int) -> tuple[Files, str]:
     """Case `number` of a reader: always the same."""
-    rng = np.random.default_rng([zlib.crc32(module.encode()), number])
+    rng = np.random.default_rng([zlib.crc32(name.encode()), number])
     return reader.make(rng, seeds[number % len(seeds)])
+
+
+def find_reader(table: str, name: str) -> tuple[Reader, list[Files]]:
+    """A reader of a table, and its seeds."""
+    readers = importlib.import_module("tests.fuzz.readers")
+    if table != "BOMBS":
+        reader: Reader = getattr(readers, table)[name]
+        return reader, reader.seeds()
+    reader = readers.READERS[name]
+    if name == "mesh":
+        return reader, importlib.import_module("tests.fuzz.meshes").bombs()
+    return reader, [case for seed in reader.seeds() for case in bombs_of(seed)]
 
 
 def run_case(reader: Reader, folder: Path, guard: Guard) -> tuple[str, str]:
@@ -158,7 +171,7 @@ def _limit_memory() -> None:
 
 @contextlib.contextmanager
 def _under(ceiling: int | None) -> Iterator[None]:
-    """Lets the process grow by so much and no further."""
+    """Lets the process grow by so much and no further [bytes]."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     if ceiling is not None:
         resource.setrlimit(resource.RLIMIT_AS, (_mapped() + ceiling, hard))
@@ -176,27 +189,26 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print is no answer
     guard = Guard(scratch / "case")
-    known: dict[str, tuple[Reader, list[Files]]] = {}
+    known: dict[tuple[str, str], tuple[Reader, list[Files]]] = {}
     folder = scratch / "case"
     folder.mkdir(exist_ok=True)
     os.chdir(scratch)
     for line in sys.stdin:
         asked = json.loads(line)
-        module, number = asked["reader"], asked["case"]
-        if module not in known:
-            name, _, attribute = module.partition(":")
-            reader: Reader = getattr(importlib.import_module(name), attribute or "READER")
-            known[module] = reader, reader.seeds()
-        reader, seeds = known[module]
+        key, number = (asked["table"], asked["reader"]), asked["case"]
+        if key not in known:
+            known[key] = find_reader(*key)
+        reader, seeds = known[key]
         if number < 0:
             files, what = seeds[-1 - number], "the seed itself"
         else:
-            files, what = make_case(module, reader, seeds, number)
+            files, what = make_case(key[1], reader, seeds, number)
         lay_out(folder, files)
         if number >= 0 and resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
             _limit_memory()
-        print(json.dumps({"what": what, "seeds": len(seeds)}), file=answers, flush=True)
-        with _under(reader.ceiling):
+        told = {"what": what, "seeds": len(seeds), "cases": reader.cases}
+        print(json.dumps(told), file=answers, flush=True)
+        with _under(MEMORY if key[0] == "BOMBS" else None):
             verdict, why = run_case(reader, folder, guard)
         print(json.dumps({"verdict": verdict, "why": why}), file=answers, flush=True)
 

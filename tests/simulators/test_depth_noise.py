@@ -6,8 +6,7 @@ import pytest
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.simulators.base import Simulator
-from r3jax.simulators.depth_noise import NoisySimulator
+from r3jax.simulators.base import NoisySimulator, Simulator
 
 CAMERA = Camera.from_fov(200, 100, 60.0)
 

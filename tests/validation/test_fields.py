@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import build, check_fields, check_type
+from r3jax.validation.json_text import build, check_fields, check_type
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.names import below
+from r3jax.validation.files import below
 
 
 @pytest.mark.parametrize("name", ["a.png", "a/b c.png", "./a.png", "a//b.png", "..a", "a..", "ü"])

@@ -1,6 +1,6 @@
 import pytest
 
-from r3jax.validation.versions import VersionError, check_version
+from r3jax.validation.errors import VersionError, check_version
 
 
 def test_the_versions_between_are_read():

@@ -21,16 +21,13 @@ from r3jax.files import write_atomic
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens
-from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
-from r3jax.formats.normalization import NAME, read_normalization
+from r3jax.formats.nerfstudio import NAME, OPENGL_FROM_OPENCV, read_normalization
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import mend_pose
 from r3jax.geometry.cameras import Camera
-from r3jax.runs.reader import Run
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_fields, check_type
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import parse_json, sealed, unsealed
+from r3jax.validation.json_text import check_fields, check_type, parse_json, sealed, unsealed
 
 _MAX_BYTES = 256 << 20
 """A pose takes some hundred bytes."""
@@ -203,10 +200,7 @@ def path_of(path: Path, capture: object = None) -> CameraPath:
     source = open_capture(path, "z").source
     if isinstance(source, PosedImages):
         return CameraPath(source.poses, source.lenses)
-    if isinstance(source, Run):
-        if not source.rows:
-            raise FormatError(path, "the run has no views yet: there is no path to judge")
-        poses = np.stack([row.pose for row in source.rows]).astype(np.float64)
-    else:
-        poses = source.poses
+    if not source.rows:
+        raise FormatError(path, "the run has no views yet: there is no path to judge")
+    poses = np.stack([row.pose for row in source.rows]).astype(np.float64)
     return CameraPath(poses, (pinhole_lens(source.camera),) * len(poses))

@@ -26,7 +26,6 @@ from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens
 from r3jax.formats.points import read_points
 from r3jax.formats.posed_images import PosedImages
-from r3jax.formats.recordings import Recording
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.runs.reader import Run
@@ -298,7 +297,7 @@ class Source:
         )
 
 
-def source_of(capture: Run | Recording | PosedImages, name: str) -> Source:
+def source_of(capture: Run | PosedImages, name: str) -> Source:
     """Any capture, to be audited.
 
     Args:
@@ -313,17 +312,10 @@ def source_of(capture: Run | Recording | PosedImages, name: str) -> Source:
         raise FormatError(capture.path, "there are no views to audit")
     if isinstance(capture, PosedImages):
         return _of_images(capture, name)
-    if isinstance(capture, Run):
-        poses = np.stack([row.pose for row in capture.rows]).astype(np.float64)
-        labels = tuple(f"view {row.step + 1}" for row in capture.rows)
-        up = np.array([0.0, 0.0, 1.0])
-        camera = capture.camera
-    else:
-        poses, labels, up = capture.poses, tuple(p.name for p in capture.image_paths), None
-        camera = capture.camera
-        # Only its pixels are read: in coordinates of UTM a frame would lose those of its pose.
-        capture = dataclasses.replace(capture, poses=np.tile(np.eye(4), (len(poses), 1, 1)))
-    lens = pinhole_lens(camera)
+    poses = np.stack([row.pose for row in capture.rows]).astype(np.float64)
+    labels = tuple(f"view {row.step + 1}" for row in capture.rows)
+    up = np.array([0.0, 0.0, 1.0])
+    lens = pinhole_lens(capture.camera)
     stride = _stride([lens])
     table = sampling_table(lens, stride)
 

@@ -17,11 +17,9 @@ from r3jax.evaluation.scores import METRICS, ViewRow, summarize
 from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic
 from r3jax.runs.header import package_versions, plain_settings
-from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_fields
+from r3jax.validation.errors import ForeignFileError, VersionError, check_version
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import parse_json, sealed, unsealed
-from r3jax.validation.versions import VersionError, check_version
+from r3jax.validation.json_text import check_fields, parse_json, sealed, unsealed
 
 FORMAT = 1
 """Format version of a record."""

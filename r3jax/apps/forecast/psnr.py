@@ -27,11 +27,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from r3jax.files import write_atomic
-from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_fields
+from r3jax.validation.errors import ForeignFileError, check_version
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import parse_json
-from r3jax.validation.versions import check_version
+from r3jax.validation.json_text import check_fields, parse_json
 
 MEAN = "mean"
 """Name of the statistic that is not a percentile; those are `p10`, `p50`, ..."""

@@ -14,9 +14,8 @@ from r3jax.plots import style
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_fields, check_type
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import parse_json, unsealed
+from r3jax.validation.json_text import check_fields, check_type, parse_json, unsealed
 
 _TITLES = {
     "psnr": ("PSNR [dB]", 2),

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r3jax.exploration.config import check_voxel_size
-from r3jax.formats.recordings import Recording
+from r3jax.formats.posed_images import PosedImages
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
 from r3jax.plots import style
@@ -35,7 +35,7 @@ class FrameReport:
 
 
 def follow_recording(
-    recording: Recording, *, voxel_size: float = 0.05, max_range: float = 5.0
+    recording: PosedImages, *, voxel_size: float = 0.05, max_range: float = 5.0
 ) -> Iterator[tuple[FrameReport, MapState]]:
     """Integrates a recording and says of each frame how well it was known before.
 
@@ -65,7 +65,7 @@ def follow_recording(
         yield FrameReport(index, before, voxels - known, voxels, metres), state
 
 
-def revisit_figure(recording: Recording, reports: list[FrameReport]) -> Figure:
+def revisit_figure(recording: PosedImages, reports: list[FrameReport]) -> Figure:
     """Renderability before integration along the recording, and the path from above."""
     figure = style.new_figure(11.0, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.7, 1.0])

@@ -34,7 +34,7 @@ from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic
 from r3jax.formats.errors import FormatError
 from r3jax.plots import style
 from r3jax.runs.reader import Run
-from r3jax.validation.packages import why_not_imported
+from r3jax.validation.errors import why_not_imported
 
 ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "mpeg4")
 """Tried in this order: H.264 by three programs, and what every FFmpeg has."""

@@ -22,7 +22,7 @@ from r3jax.cli.options.parsing import given_words
 from r3jax.cli.progress import Stages
 from r3jax.files import check_own, own_folder
 from r3jax.formats.captures import open_capture
-from r3jax.formats.ros.names import parse_topics
+from r3jax.formats.ros.bags import parse_topics
 from r3jax.interrupts import settle_interrupt
 from r3jax.network import who_sees
 

@@ -23,7 +23,7 @@ from r3jax.evaluation.judge import (
 from r3jax.evaluation.scores import Summary
 from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
-from r3jax.formats.ros.names import parse_topics
+from r3jax.formats.ros.bags import parse_topics
 from r3jax.splatting.model import find_model
 
 

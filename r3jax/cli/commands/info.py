@@ -91,7 +91,7 @@ def _show_recording(console: Console, options: InfoOptions, path: Path) -> None:
     if options.plot is not None:
         check_replaceable(options.plot, PNG_MARK)
     recording = read_recording(path, options.up)
-    camera = recording.camera
+    camera = recording.lenses[0].camera
     console.print(
         f"{len(recording)} frames of {camera.width}x{camera.height} px; renderability of each "
         "frame before it is mapped:",

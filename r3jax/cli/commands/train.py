@@ -10,7 +10,7 @@ from r3jax.cli.progress import Stages, TrainProgress
 from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.points import write_points
-from r3jax.formats.ros.names import parse_topics
+from r3jax.formats.ros.bags import parse_topics
 from r3jax.runs.header import package_versions
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.model import check_free, only_writer, scene_points, write_model

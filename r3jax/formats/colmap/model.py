@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from r3jax.formats.lenses import Lens
-from r3jax.formats.poses import MAX_DISTANCE, MAX_DRIFT
+from r3jax.formats.poses import MAX_DISTANCE, quaternion_of, rotation_of
 from r3jax.validation.errors import ForeignFileError
 
 NO_POINT = -1
@@ -100,44 +100,6 @@ def points_without_tracks(xyz: np.ndarray, rgb: np.ndarray) -> ColmapPoints:
         track_images=none,
         track_keypoints=none,
     )
-
-
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """The rotation matrix [3, 3] of a quaternion w x y z [4]; rounding of its length is mended.
-
-    Raises:
-        ForeignFileError: not finite, or not of unit length.
-    """
-    length = float(np.sqrt(np.sum(np.square(quaternion))))
-    if not abs(length - 1.0) <= MAX_DRIFT:  # NaN makes the comparison false
-        raise ForeignFileError(f"the rotation is no unit quaternion, its length is {length:g}")
-    w, x, y, z = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def quaternion_of(R: np.ndarray) -> np.ndarray:
-    """The quaternion w x y z [4] of a rotation matrix [3, 3], with w >= 0.
-
-    Bar-Itzhack (2000): the eigenvector of the largest eigenvalue of a symmetric 4x4 matrix. It is
-    exact for rotations, stable for all angles, and of the nearest one where R has rounding.
-    """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = R.astype(np.float64).reshape(-1)
-    K = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    quaternion = np.linalg.eigh(K)[1][:, -1]
-    return -quaternion if quaternion[0] < 0.0 else quaternion
 
 
 def pose_of(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -11,10 +11,9 @@ from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints, p
 from r3jax.formats.colmap.text import read_text
 from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import Lens
-from r3jax.formats.moved_images import find_images
-from r3jax.formats.posed_images import PosedImages, SparsePoints
+from r3jax.formats.posed_images import PosedImages, SparsePoints, find_images
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.names import below, check_relative
+from r3jax.validation.files import below, check_relative
 
 _MODEL_FOLDERS = (
     *(".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap"),

@@ -1,18 +1,21 @@
-"""A folder, or a zip archive of one: phone apps hand on both, and both are read alike.
+"""Captures of phone apps: a folder, or a zip archive of one, whose frames become posed images.
 
-Nothing is unpacked onto the disk. An archive may hold its files under one folder at its top.
+Apps hand on both, and both are read alike. Nothing is unpacked onto the disk. An archive may hold
+its files under one folder at its top.
 """
 
 import zipfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from r3jax.formats.depth_files import DEPTH_MODES, stored_depth
+from r3jax.formats.depth import DEPTH_MODES, MILLIMETERS, keep_confident, stored_depth
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.posed_images import IMAGE_FORMATS
+from r3jax.formats.lenses import Lens
+from r3jax.formats.posed_images import IMAGE_FORMATS, Pixels, PosedImages, left_out
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import check_regular, read_bytes
 from r3jax.validation.images import image_pixels, image_size
@@ -102,7 +105,6 @@ class Archive:
         """
         data = self.read(name, _MAX_IMAGE)
         with naming(self.where(name)):
-            image_size(data, IMAGE_FORMATS)  # refuses what would not fit into memory
             return image_pixels(data, IMAGE_FORMATS, size)
 
     def size(self, name: str) -> tuple[int, int]:
@@ -133,8 +135,7 @@ class Archive:
         """
         data, wanted = self.read(name, _MAX_IMAGE), "confidence must be a gray image"
         with naming(self.where(name)):
-            size = image_size(data, IMAGE_FORMATS)
-            return image_pixels(data, IMAGE_FORMATS, size, _CONFIDENCE_MODES, wanted)
+            return image_pixels(data, IMAGE_FORMATS, None, _CONFIDENCE_MODES, wanted)
 
 
 def _unpack(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
@@ -220,3 +221,100 @@ def is_there(path: Path, *marks: str) -> bool:
         return find_archive(path, *marks) is not None
     except FormatError:
         return False
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame: names of its files in the archive, and what was read of it."""
+
+    image: str
+    depth: str
+    confidence: str
+    """Need not exist: then all depth counts."""
+
+    lens: Lens
+    """Lens of the color image."""
+
+    pose: np.ndarray
+    """`T_world_camera`, [4, 4]: OpenCV axes."""
+
+
+def complete_shots(
+    archive: Archive, shots: Sequence[Shot], total: int, advice: str, *, images: bool = True
+) -> tuple[list[Shot], str | None]:
+    """Leaves out the frames that lack their depth image or image.
+
+    Args:
+        archive: that holds them.
+        shots: those that have a pose and a camera.
+        total: how many frames the app lists.
+        advice: what to do where no frame is left, a part of a sentence.
+        images: False where the images are no files of the archive.
+
+    Returns:
+        The others, and a remark on how many are left out.
+
+    Raises:
+        FormatError: none is left.
+    """
+    kept = [
+        shot
+        for shot in shots
+        if archive.has(shot.depth) and (not images or archive.has(shot.image))
+    ]
+    if not kept:
+        raise FormatError(archive.path, advice)
+    return kept, left_out(total - len(kept), total)
+
+
+def confident_depth(archive: Archive, shot: Shot, best: int) -> np.ndarray:
+    """Reads a depth image in millimeters, [h, w] float32 [m], where the sensor was sure.
+
+    Raises:
+        FormatError: a file is missing or damaged, or the sizes differ.
+    """
+    depth = MILLIMETERS.depth(archive.depth_steps(shot.depth))
+    if not archive.has(shot.confidence):
+        return depth
+    levels = archive.confidence(shot.confidence)
+    with naming(archive.where(shot.confidence)):
+        return keep_confident(depth, levels, best)
+
+
+def posed_images(
+    archive: Archive,
+    shots: Sequence[Shot],
+    *,
+    depth: Callable[[Shot], np.ndarray],
+    rgb: Callable[[Shot], np.ndarray] | None = None,
+    up: np.ndarray | None,
+    remark: str | None,
+    path: Path | None = None,
+) -> PosedImages:
+    """Joins frames to posed images.
+
+    Args:
+        archive: that holds their files.
+        shots: at least one.
+        depth: reads the depth of a frame, [h, w] float32.
+        rgb: reads the colors of a frame, [H, W, 3] uint8; None: from its image in the archive.
+        up: the vertical of their world, [3]; None: not known.
+        remark: what is left out.
+        path: what the capture is called in messages; None: as the archive.
+    """
+    chosen = list(shots)
+
+    def from_archive(shot: Shot) -> np.ndarray:
+        return archive.rgb(shot.image, (shot.lens.width, shot.lens.height))
+
+    read = rgb or from_archive
+    return PosedImages(
+        path=path or archive.path,
+        image_paths=tuple(archive.where(shot.image) for shot in chosen),
+        lenses=tuple(shot.lens for shot in chosen),
+        poses=np.stack([shot.pose for shot in chosen]),
+        depth_paths=tuple(archive.where(shot.depth) for shot in chosen),
+        pixels=Pixels(lambda index: read(chosen[index]), lambda index: depth(chosen[index])),
+        up=up,
+        remark=remark,
+    )

@@ -15,16 +15,22 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
-from r3jax.formats.phones.archives import Archive, find_archive, is_there
-from r3jax.formats.phones.shots import UP_Z, Shot, complete_shots, confident_depth, posed_images
+from r3jax.formats.phones.archives import (
+    Archive,
+    Shot,
+    complete_shots,
+    confident_depth,
+    find_archive,
+    is_there,
+    posed_images,
+)
 from r3jax.formats.posed_images import PosedImages
-from r3jax.formats.poses import mend_pose
-from r3jax.formats.sequences.tum import nearest
+from r3jax.formats.poses import UP_Z, mend_pose, nearest, read_numbers
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.files import plain_text
 
 _BEST = 2
 _TRAJECTORY, _CAMERAS = "lowres_wide.traj", "lowres_wide_intrinsics"
@@ -79,7 +85,7 @@ def read_arkit_scenes(path: Path | str) -> PosedImages:
 def _shot(archive: Archive, name: str, camera: str, pose: np.ndarray) -> Shot:
     source = f"{_CAMERAS}/{camera}.pincam"
     with naming(archive.where(source)):
-        numbers = _numbers(archive.read(source), 6)[0]
+        numbers = read_numbers(archive.where(source), 6, archive.read(source))[0]
         width, height = (int(value) if abs(value) < 1e6 else 0 for value in numbers[:2])
         lens = Lens("PINHOLE", width, height, tuple(float(value) for value in numbers[2:]))
     files = (f"{folder}/{name}.png" for folder in ("lowres_wide", "lowres_depth", "confidence"))
@@ -88,33 +94,13 @@ def _shot(archive: Archive, name: str, camera: str, pose: np.ndarray) -> Shot:
 
 def _trajectory(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
     """Times [n] and poses `T_world_camera` [n, 4, 4]."""
-    table = _numbers(archive.read(_TRAJECTORY), 7)
+    table = read_numbers(archive.where(_TRAJECTORY), 7, archive.read(_TRAJECTORY))
     if not np.all(np.isfinite(table)) or np.abs(table).max() > 1e12:
         raise ForeignFileError("there are numbers that are not finite or far too large")
+    turns = Rotation.from_rotvec(-table[:, 1:4])
     poses = np.tile(np.eye(4), (len(table), 1, 1))
-    for pose, row in zip(poses, table, strict=True):
-        R = _rotation(row[1:4])
-        pose[:3, :3], pose[:3, 3] = R.T, -R.T @ row[4:7]
+    poses[:, :3, :3], poses[:, :3, 3] = turns.as_matrix(), -turns.apply(table[:, 4:7])
     return table[:, 0], poses
-
-
-def _rotation(axis_angle: np.ndarray) -> np.ndarray:
-    """Rodrigues' rotation [3, 3] of an axis times an angle [3]."""
-    angle = float(np.linalg.norm(axis_angle))
-    x, y, z = axis_angle / max(angle, 1e-12)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
-
-
-def _numbers(data: bytes, columns: int) -> np.ndarray:
-    """A table of numbers, [n, columns], n >= 1."""
-    rows = [line.split() for line in plain_text(data).splitlines() if line.strip()]
-    if not rows or {len(row) for row in rows} != {columns}:
-        raise ForeignFileError(f"every line must have {columns} numbers")
-    try:
-        return np.array([[float(word) for word in row] for row in rows])
-    except ValueError as error:
-        raise ForeignFileError(f"there is a word that is no number ({error!s:.100})") from None
 
 
 def _time(name: str) -> float:

@@ -18,11 +18,18 @@ import numpy as np
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
-from r3jax.formats.phones.archives import Archive, find_archive, is_there
-from r3jax.formats.phones.shots import UP_Y, Shot, complete_shots, confident_depth, posed_images
+from r3jax.formats.phones.archives import (
+    Archive,
+    Shot,
+    complete_shots,
+    confident_depth,
+    find_archive,
+    is_there,
+    posed_images,
+)
 from r3jax.formats.posed_images import PosedImages
-from r3jax.formats.poses import mend_pose
-from r3jax.validation.fields import check_fields
+from r3jax.formats.poses import UP_Y, mend_pose
+from r3jax.validation.json_text import check_fields
 
 _BEST = 255
 _FARTHEST = 5.0

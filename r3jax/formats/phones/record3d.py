@@ -14,24 +14,30 @@ Where the first pose is no rotation, the app has made the first camera the world
 is not known then. Else the world is ARKit's, y up.
 """
 
+import ctypes
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from r3jax.formats.depth_files import check_exr, stored_depth
-from r3jax.formats.depth_images import keep_confident
+from r3jax.formats.depth import MILLIMETERS, check_exr, keep_confident, stored_depth
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
-from r3jax.formats.phones.archives import Archive, find_archive, is_there
-from r3jax.formats.phones.lzfse_streams import load_decoder, unpack_lzfse
-from r3jax.formats.phones.shots import MILLIMETERS, UP_Y, Shot, complete_shots, posed_images
+from r3jax.formats.phones.archives import (
+    Archive,
+    Shot,
+    complete_shots,
+    find_archive,
+    is_there,
+    posed_images,
+)
 from r3jax.formats.posed_images import PosedImages
-from r3jax.formats.quaternion_poses import quaternion_pose
-from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_fields, check_type
+from r3jax.formats.poses import UP_Y, quaternion_pose
+from r3jax.validation.errors import ForeignFileError, why_not_imported
+from r3jax.validation.json_text import check_fields, check_type
 
 _BEST = 2
 _DEPTH_SIZES = ((256, 192), (640, 480))
@@ -172,3 +178,50 @@ def _turned(count: int, lens: Lens) -> tuple[int, int]:
     """Rows and columns of so many values, turned as the image is."""
     longer, shorter = next(size for size in _DEPTH_SIZES if count == size[0] * size[1])
     return (longer, shorter) if lens.height > lens.width else (shorter, longer)
+
+
+def load_decoder(path: Path) -> Any:
+    """Loads `lzfse_decode_buffer` of the reference implementation.
+
+    Args:
+        path: the capture that needs it, for the message.
+
+    Raises:
+        FormatError: the package is not installed, or was built without it.
+    """
+    try:
+        import lzfse
+
+        decoder = ctypes.CDLL(lzfse.__file__).lzfse_decode_buffer
+    except ImportError as error:
+        what_for = "the depth of Record3D is unpacked by"
+        reason = why_not_imported(error, "lzfse", what_for, "phones")
+        raise FormatError(path, reason) from None
+    except (AttributeError, OSError) as error:
+        reason = f"the package lzfse does not hold its decoder ({error!s:.200}): another version?"
+        raise FormatError(path, reason) from None
+    size, pointer = ctypes.c_size_t, ctypes.c_char_p
+    decoder.argtypes = [pointer, size, pointer, size, ctypes.c_void_p]
+    decoder.restype = size
+    return decoder
+
+
+def unpack_lzfse(decoder: Any, data: bytes, lengths: Collection[int]) -> bytes:
+    """Unpacks a stream.
+
+    Args:
+        decoder: of `load_decoder`.
+        data: the stream.
+        lengths: numbers of bytes that it may hold.
+
+    Raises:
+        ForeignFileError: damaged, or of another length.
+    """
+    room = max(lengths) + 1
+    buffer = ctypes.create_string_buffer(room)
+    length = decoder(buffer, room, data, len(data), None)
+    if length not in lengths:
+        wanted = " or ".join(str(one) for one in sorted(lengths))
+        what = f"more than {room - 1}" if length == room else str(length)
+        raise ForeignFileError(f"it unpacks to {what} bytes, not {wanted}: is it damaged?")
+    return buffer.raw[:length]

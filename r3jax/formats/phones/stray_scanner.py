@@ -12,20 +12,31 @@ Columns are found by their names, and an empty field is not known.
 (https://github.com/StrayRobots/scanner)
 """
 
+import io
 import math
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
-from r3jax.formats.phones.archives import Archive, find_archive, is_there
-from r3jax.formats.phones.shots import UP_Y, Shot, complete_shots, confident_depth, posed_images
-from r3jax.formats.phones.videos import Video
+from r3jax.formats.phones.archives import (
+    Archive,
+    Shot,
+    complete_shots,
+    confident_depth,
+    find_archive,
+    is_there,
+    posed_images,
+)
 from r3jax.formats.posed_images import PosedImages
-from r3jax.formats.quaternion_poses import quaternion_pose
-from r3jax.validation.errors import ForeignFileError
+from r3jax.formats.poses import UP_Y, quaternion_pose, read_matrix
+from r3jax.validation.errors import ForeignFileError, why_not_imported
 from r3jax.validation.files import check_regular, plain_text
+from r3jax.validation.images import MAX_PIXELS
 
 _BEST = 2
 _POSE = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -33,6 +44,85 @@ _INTRINSICS = ("fx", "fy", "cx", "cy")
 _VIDEO = "rgb.mp4"
 _MAX_VIDEO = 4 << 30
 """Size of a video in an archive, which is read as a whole [bytes]."""
+
+
+_AHEAD = 90
+"""Frames so close before the next one asked for are decoded rather than jumped over."""
+
+
+class Video:
+    """A video that is asked for its frames one by one, best in order."""
+
+    def __init__(self, path: Path, source: Path | bytes):
+        """Opens it and counts its frames without decoding them.
+
+        Args:
+            path: its name, for messages.
+            source: the file, or what it holds.
+
+        Raises:
+            FormatError: PyAV is not installed, or this is no video.
+        """
+        self._path = path
+        self._av = _load_av(path)
+        opened = io.BytesIO(source) if isinstance(source, bytes) else str(source)
+        try:
+            self._container: Any = self._av.open(opened)
+            self._stream: Any = self._container.streams.video[0]
+            self.size: tuple[int, int] = self._stream.width, self._stream.height
+            times = [packet.pts for packet in self._container.demux(self._stream)]
+        except Exception as error:  # whatever FFmpeg says of what is no video
+            raise FormatError(path, f"the video cannot be read ({error!s:.200})") from None
+        if not 0 < self.size[0] * self.size[1] <= MAX_PIXELS:
+            raise FormatError(path, f"the video has {self.size[0]} x {self.size[1]} pixels")
+        self._times = sorted(time for time in times if time is not None)
+        self._next, self._frames = len(self._times), iter(())
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._times)
+
+    def frame(self, number: int) -> np.ndarray:
+        """Decodes a frame, [H, W, 3] uint8.
+
+        Raises:
+            FormatError: there is none of this number, or the video is damaged.
+        """
+        if not 0 <= number < len(self._times):
+            raise FormatError(
+                self._path, f"the video has {len(self)} frames, none of number {number}"
+            )
+        if not self._next <= number < self._next + _AHEAD:
+            self._frames = self._from(number)
+        try:
+            for frame in self._frames:
+                if frame.pts is not None and frame.pts >= self._times[number]:
+                    self._next = number + 1
+                    return self._pixels(frame)
+        except FormatError:
+            raise
+        except Exception as error:
+            raise FormatError(self._path, f"frame {number} is damaged ({error!s:.200})") from None
+        raise FormatError(self._path, f"the video ends before frame {number}")
+
+    def _from(self, number: int) -> Iterator[Any]:
+        """Frames from the key frame before a frame on."""
+        self._container.seek(self._times[number], stream=self._stream)
+        yield from self._container.decode(self._stream)
+
+    def _pixels(self, frame: Any) -> np.ndarray:
+        if (frame.width, frame.height) != self.size:
+            raise FormatError(self._path, f"a frame has {frame.width} x {frame.height} pixels")
+        return frame.to_ndarray(format="rgb24")
+
+
+def _load_av(path: Path) -> ModuleType:
+    try:
+        import av
+    except ImportError as error:
+        reason = why_not_imported(error, "av", "videos are decoded by PyAV,", "phones")
+        raise FormatError(path, reason) from None
+    return av
 
 
 def is_stray_scanner(path: Path) -> bool:
@@ -144,14 +234,6 @@ def _number(word: str, which: str) -> float:
 
 def _camera_matrix(archive: Archive) -> np.ndarray:
     """fx, fy, cx, cy of all frames, [4]."""
-    source = archive.where("camera_matrix.csv")
-    text = plain_text(archive.read("camera_matrix.csv")).decode(errors="replace")
-    with naming(source):
-        try:
-            lines = filter(str.strip, text.splitlines())  # the app writes blanks after commas
-            K = np.array([[float(word) for word in line.split(",")] for line in lines])
-        except ValueError as error:
-            raise ForeignFileError(f"this is no matrix ({error!s:.200})") from None
-        if K.shape != (3, 3):
-            raise ForeignFileError("expected a 3x3 matrix")
+    name = "camera_matrix.csv"
+    K = read_matrix(archive.where(name), 3, 3, archive.read(name).replace(b",", b" "))
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])

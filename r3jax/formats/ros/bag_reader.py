@@ -14,26 +14,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from r3jax.formats.depth_images import register_depth
+from r3jax.formats.depth import register_depth
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
-from r3jax.formats.phones.shots import UP_Z
-from r3jax.formats.posed_images import Pixels, PosedImages
-from r3jax.formats.poses import mend_pose
-from r3jax.formats.ros.bag_poses import PoseTopic, add_transforms, find_chain, find_pose_topic
-from r3jax.formats.ros.bags import AnyBag, Bag, Stamped, find_bag
+from r3jax.formats.posed_images import Pixels, PosedImages, left_out
+from r3jax.formats.poses import UP_Z, mend_pose, nearest
+from r3jax.formats.ros.bags import AnyBag, Bag, Stamped, Topics, find_bag
 from r3jax.formats.ros.messages import depth_of, frame_of, lens_of, rgb_of, stamp_of
-from r3jax.formats.ros.names import Topics
 from r3jax.formats.ros.topics import (
     TF,
     ImageTopic,
+    PoseTopic,
+    add_transforms,
     check_topics,
+    find_chain,
     find_images,
     find_info,
+    find_pose_topic,
     not_parsed,
 )
 from r3jax.formats.ros.transforms import TransformTree
-from r3jax.formats.sequences.tum import nearest
 from r3jax.validation.errors import ForeignFileError
 
 _MAX_GAP = 0.02
@@ -163,7 +163,7 @@ class BagReading:
             bag, tree, (self._color, self._depth), self._lens, self._topics.depth_info
         )
         gone = 0 if choose is not None else total - len(color)
-        lost = f" {gone} of {total} frames lack depth or a pose and are left out." if gone else ""
+        lost = left_out(gone, total)
         return PosedImages(
             path=self._path,
             image_paths=tuple(color.name(bag, i) for i in range(len(color))),
@@ -178,7 +178,7 @@ class BagReading:
             up=UP_Z if chain[-1] in _WORLDS else None,
             remark=f"Color is {color.topic}, depth {depth.topic}, poses are those of {chain[0]} in "
             f"{chain[-1]} by {source}{not_parsed(bag)}."
-            f"{camera.remark}{lost}",
+            f"{camera.remark}{'' if lost is None else f' {lost}'}",
         )
 
     def _choose_pose(self, frame: str) -> None:

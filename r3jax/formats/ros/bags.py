@@ -1,23 +1,27 @@
 """Bags of ROS 1 and ROS 2, opened by `rosbags`: topics, and messages by topic and time.
 
 A bag is a file of ROS 1 (.bag), of ROS 2 (.mcap or .db3), or the folder that `ros2 bag record`
-writes (metadata.yaml). Whatever `rosbags` says of a damaged one becomes one kind of error.
+writes (metadata.yaml). Whatever `rosbags` says of a damaged one becomes one kind of error, and a
+chunk is never unpacked to more than it says.
 """
 
+import bz2
+import dataclasses
 import io
 import os
+import sys
 import weakref
 from collections.abc import Collection, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.ros.unpack import unpack_chunk
 from r3jax.validation.database import check_database
+from r3jax.validation.errors import ForeignFileError, why_not_imported
 from r3jax.validation.files import check_regular
-from r3jax.validation.packages import why_not_imported
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Files of ROS 1, and of ROS 2's two storages."""
@@ -290,3 +294,100 @@ def _limit_chunks() -> None:
     with suppress(AttributeError):
         for name in reader.decompressors:
             reader.decompressors[name] = lambda data, name=name: unpack_chunk(data, name)
+
+
+MAX_CHUNK = 256 << 20
+"""Recorders begin another chunk after about a megabyte; some users let them wait longer [bytes]."""
+
+
+def unpack_chunk(data: bytes, compression: str, size: int | None = None) -> bytes:
+    """Unpacks a chunk.
+
+    Args:
+        data: as it is stored.
+        compression: lz4, zstd or bz2; nothing or none: it is not packed.
+        size: what it must come to [bytes]; None: not known.
+
+    Raises:
+        ForeignFileError: another compression, damaged, of another size, or too large.
+    """
+    most = MAX_CHUNK if size is None else size
+    if most > MAX_CHUNK:
+        raise ForeignFileError(f"a chunk of {size} bytes is more than {MAX_CHUNK} and not read")
+    found = data if compression in ("", "none") else _unpacked(data, compression, most + 1)
+    if len(found) > most or size not in (None, len(found)):
+        raise ForeignFileError(f"a chunk holds more or less than the {most} bytes it may hold")
+    return found
+
+
+def _unpacked(data: bytes, compression: str, most: int) -> bytes:
+    """At most so many bytes of it."""
+    decompressor = _decompressor(compression)
+    try:
+        return decompressor.decompress(data, max_length=most)
+    except Exception as error:  # each decompressor has its own
+        raise ForeignFileError(f"a chunk cannot be unpacked ({error!s:.200})") from None
+
+
+def _decompressor(compression: str) -> Any:
+    if compression == "bz2":
+        return bz2.BZ2Decompressor()
+    if compression == "lz4":
+        from lz4.frame import LZ4FrameDecompressor
+
+        return LZ4FrameDecompressor()
+    if compression == "zstd":
+        if sys.version_info >= (3, 14):
+            from compression import zstd
+        else:
+            from backports import zstd
+        return zstd.ZstdDecompressor()
+    raise ForeignFileError(f"chunks packed by {compression[:20]!r} are not read")
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Names of topics and frames; None is guessed."""
+
+    color: str | None = None
+    """Color images."""
+
+    depth: str | None = None
+    """Depth images."""
+
+    info: str | None = None
+    """Camera of the color images."""
+
+    depth_info: str | None = None
+    """Camera of the depth images."""
+
+    pose: str | None = None
+    """Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped in place of tf."""
+
+    frame: str | None = None
+    """Frame that the poses of `pose` are of; by default the message's child_frame_id, else the
+    optical frame of the camera."""
+
+    world: str | None = None
+    """Frame of tf that poses are given in; by default the root, such as map."""
+
+
+def parse_topics(text: str | None) -> Topics | None:
+    """Reads names such as "color=/camera/color/image_raw,pose=/odom"; None stays None.
+
+    Raises:
+        ValueError: a word that is no such pair, or another key.
+    """
+    if text is None:
+        return None
+    known = [field.name for field in dataclasses.fields(Topics)]
+    found: dict[str, str] = {}
+    for word in filter(None, (word.strip() for word in text.split(","))):
+        key, _, name = (part.strip() for part in word.partition("="))
+        if key not in known or not name:
+            raise ValueError(
+                f"topics are named like color=/camera/color/image_raw,pose=/odom with "
+                f"{', '.join(known)}; got {word!r}"
+            )
+        found[key] = name
+    return Topics(**found)

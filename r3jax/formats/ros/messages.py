@@ -2,6 +2,11 @@
 
 The functions take any object with a message's fields: of rclpy, of rospy, or of a bag.
 
+RVL (Wilson 2017) compresses depth images without loss, in ROS and in RTAB-Map: a stream of nibbles,
+the highest of each 32-bit little-endian word first, three bits of a number, lowest first, and one
+that says whether it goes on. The numbers are runs by turns: how many pixels are zero, how many are
+not, and of those the zigzag-coded differences to the pixel before.
+
 Shape symbols: H, W image size; h, w size of a depth image.
 """
 
@@ -11,12 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.formats.depth_files import DEPTH_MODES
-from r3jax.formats.lenses import Lens
+from r3jax.formats.depth import DEPTH_MODES
+from r3jax.formats.lenses import Lens, matrix_lens
 from r3jax.formats.posed_images import IMAGE_FORMATS
-from r3jax.formats.ros.rvl import unpack_rvl
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.images import MAX_PIXELS, image_pixels, image_size
+from r3jax.validation.images import MAX_PIXELS, image_pixels
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -119,7 +123,7 @@ def rgb_of(message: Any) -> np.ndarray:
     encoding = encoding_of(message)
     if not hasattr(message, "encoding"):
         data = bytes(message.data)
-        rgb = image_pixels(data, IMAGE_FORMATS, image_size(data, IMAGE_FORMATS))
+        rgb = image_pixels(data, IMAGE_FORMATS)
         # A raw sensor's pixels may be packed as they are, in one channel.
         return _from_bayer(rgb[..., 0], _BAYER[encoding]) if encoding in _BAYER else rgb
     if encoding in _GRAY:
@@ -233,7 +237,7 @@ def _unpacked(data: bytes, stored: str, is_meters: bool) -> np.ndarray:
         steps = unpack_rvl(data)
     else:
         wanted = "depth must be a 16-bit PNG"
-        steps = image_pixels(data, ("PNG",), image_size(data, ("PNG",)), DEPTH_MODES, wanted)
+        steps = image_pixels(data, ("PNG",), None, DEPTH_MODES, wanted)
     if not is_meters:
         return clean_depth(0.001 * steps.astype(np.float64))
     if inverse is None:
@@ -281,8 +285,7 @@ def rectified_lens(matrix: np.ndarray, size: tuple[int, int]) -> Lens:
             "the camera_info was never filled in, its matrix is zero: calibrate the camera "
             "(camera_calibration), or name another topic by --topics info=TOPIC"
         )
-    values = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
-    return Lens("PINHOLE", *size, tuple(float(value) for value in values))
+    return matrix_lens(K, size)
 
 
 def _distortion(name: str, coefficients: np.ndarray) -> tuple[str, tuple[float, ...]]:
@@ -297,3 +300,69 @@ def _distortion(name: str, coefficients: np.ndarray) -> tuple[str, tuple[float, 
     if model == "OPENCV" and found[4:].any():  # k3 of plumb_bob
         model, count = "FULL_OPENCV", 8
     return model, (*found[:count], *(0.0,) * max(0, count - len(found)))
+
+
+_SIZE = struct.Struct("<II")
+"""Columns and rows, before the stream."""
+
+_LONGEST = 8
+"""Nibbles of a number: 24 bits are more than any run or difference takes."""
+
+
+def unpack_rvl(data: bytes) -> np.ndarray:
+    """Unpacks a depth image, [h, w] uint16.
+
+    Args:
+        data: its size and the stream.
+
+    Raises:
+        ForeignFileError: cut off or damaged, or an image that is too large.
+    """
+    if len(data) < _SIZE.size:
+        raise ForeignFileError("a depth image is cut off")
+    width, height = _SIZE.unpack_from(data)
+    total = width * height
+    if not 0 < total <= MAX_PIXELS:
+        raise ForeignFileError(f"a depth image has {width} x {height} pixels")
+    numbers = _numbers(data[_SIZE.size :])
+    zigzag, is_measured = _runs(numbers, total)
+    deltas = (zigzag >> 1) ^ -(zigzag & 1)
+    values = np.cumsum(deltas)
+    if len(values) and not (values.min() >= 0 and values.max() <= 0xFFFF):
+        raise ForeignFileError("a depth image is damaged")
+    depth = np.zeros(total, np.uint16)
+    depth[is_measured] = values
+    return depth.reshape(height, width)
+
+
+def _numbers(stream: bytes) -> np.ndarray:
+    """All numbers of a stream, [k] int64."""
+    words = np.frombuffer(stream[: len(stream) // 4 * 4], "<u4")
+    nibbles = (words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32)) & 15
+    nibbles = nibbles.ravel().astype(np.int64)
+    ends = np.flatnonzero(nibbles < 8)
+    if not len(ends):
+        raise ForeignFileError("a depth image is damaged")
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    if (ends - starts).max() >= _LONGEST:
+        raise ForeignFileError("a depth image is damaged")
+    place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
+    return np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << (3 * place), starts)
+
+
+def _runs(numbers: np.ndarray, total: int) -> tuple[np.ndarray, np.ndarray]:
+    """Differences of the pixels that are measured, and which pixels those are [total]."""
+    is_measured = np.zeros(total, bool)
+    deltas: list[np.ndarray] = []
+    at, pixel = 0, 0
+    while pixel < total:
+        if at + 1 >= len(numbers):
+            raise ForeignFileError("a depth image is cut off")
+        zeros, others = int(numbers[at]), int(numbers[at + 1])
+        begin, end = pixel + zeros, pixel + zeros + others
+        if end > total or at + 2 + others > len(numbers):
+            raise ForeignFileError("a depth image is damaged")
+        is_measured[begin:end] = True
+        deltas.append(numbers[at + 2 : at + 2 + others])
+        at, pixel = at + 2 + others, end
+    return np.concatenate(deltas), is_measured

@@ -12,18 +12,14 @@ that others write in this layout.
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from r3jax.formats.depth import DepthUnit
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
-from r3jax.formats.posed_images import DepthUnit, PosedImages
-from r3jax.formats.poses import mend_pose, read_numbers
-from r3jax.formats.recordings import pair_images
-from r3jax.formats.sequences.scannet import UP
+from r3jax.formats.posed_images import PosedImages, pair_images
+from r3jax.formats.poses import read_poses, up_of_poses
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_fields
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import parse_json
+from r3jax.validation.json_text import check_fields, parse_json
 
 _MAX_JSON = 1 << 20
 """A camera takes some hundred bytes."""
@@ -48,13 +44,9 @@ def read_replica_slam(path: Path | str) -> PosedImages:
     """
     path = Path(path)
     found, measured = (_numbered(path / "results", start) for start in ("frame", "depth"))
-    source = path / "traj.txt"
-    poses = read_numbers(source, columns=16).reshape(-1, 4, 4)
+    poses = read_poses(path / "traj.txt")
     images, depths = pair_images(path, found, measured, len(poses))
     lens, unit = _camera(path)
-    poses = np.stack(
-        [mend_pose(source, f"pose {i} (line {i + 1})", pose) for i, pose in enumerate(poses)]
-    )
     return PosedImages(
         path=path,
         image_paths=images,
@@ -62,7 +54,7 @@ def read_replica_slam(path: Path | str) -> PosedImages:
         poses=poses,
         depth_paths=depths,
         depth_unit=unit,
-        up=None if np.allclose(poses[0], np.eye(4), atol=1e-6) else UP,
+        up=up_of_poses(poses),
     )
 
 

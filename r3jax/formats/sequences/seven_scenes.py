@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from r3jax.formats.depth import DepthUnit
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.lenses import Lens
-from r3jax.formats.posed_images import DepthUnit, PosedImages
-from r3jax.formats.poses import mend_pose, read_numbers
+from r3jax.formats.lenses import Lens, matrix_lens
+from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.poses import mend_pose, read_matrix
 
 _LENS = Lens("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0))
 _UNIT = DepthUnit(0.001, invalid=65535)
@@ -71,16 +72,10 @@ def _lens(path: Path) -> Lens:
     source = next((file for file in found if file.exists()), None)
     if source is None:
         return _LENS
-    K = read_numbers(source, columns=3)
-    if K.shape != (3, 3):
-        raise FormatError(source, f"expected a 3x3 matrix, got {len(K)} lines")
+    K = read_matrix(source, 3, 3)
     with naming(source):
-        params = tuple(float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-        return Lens("PINHOLE", _LENS.width, _LENS.height, params)
+        return matrix_lens(K, (_LENS.width, _LENS.height), offset=0.0)
 
 
 def _pose(source: Path) -> np.ndarray:
-    matrix = read_numbers(source, columns=4)
-    if matrix.shape != (4, 4):
-        raise FormatError(source, f"expected a 4x4 matrix, got {len(matrix)} lines")
-    return mend_pose(source, "the pose", matrix)
+    return mend_pose(source, "the pose", read_matrix(source, 4, 4))

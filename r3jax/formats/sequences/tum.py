@@ -18,23 +18,30 @@ from pathlib import Path
 
 import numpy as np
 
+from r3jax.formats.depth import DepthUnit
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.lenses import Lens
-from r3jax.formats.posed_images import IMAGE_FORMATS, DepthUnit, PosedImages
-from r3jax.formats.poses import read_lines, read_numbers, to_floats
-from r3jax.formats.quaternion_poses import quaternion_pose
-from r3jax.formats.sequences.scannet import UP
+from r3jax.formats.lenses import Lens, matrix_lens
+from r3jax.formats.posed_images import IMAGE_FORMATS, PosedImages
+from r3jax.formats.poses import (
+    nearest,
+    quaternion_pose,
+    read_lines,
+    read_matrix,
+    read_numbers,
+    to_floats,
+    up_of_poses,
+)
 from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.files import below
 from r3jax.validation.images import first_size
-from r3jax.validation.names import below
 
 _MAX_GAP = 0.02
 """Images and poses farther apart than this do not belong together [s]."""
 
 _UNIT = DepthUnit(1.0 / 5000.0)
 _SIZE = (640, 480)
-_DEFAULT = (525.0, 525.0, 319.5, 239.5)
-"""fx, fy, cx, cy of the benchmark's sensors [px]; pixel centers lie at whole numbers."""
+_DEFAULT = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
+"""Intrinsics of the benchmark's sensors [px]; pixel centers lie at whole numbers."""
 
 
 def is_tum(path: Path) -> bool:
@@ -60,40 +67,24 @@ def read_tum(path: Path | str) -> PosedImages:
     table = read_numbers(source, columns=8)
     if not np.all(np.isfinite(table)):
         raise FormatError(source, "there are numbers that are not finite")
-    depth_at, pose_at = nearest(image_times, depth_times), nearest(image_times, table[:, 0])
+    depth_at = nearest(image_times, depth_times, _MAX_GAP)
+    pose_at = nearest(image_times, table[:, 0], _MAX_GAP)
     chosen = np.flatnonzero((depth_at >= 0) & (pose_at >= 0))
     if not len(chosen):
         raise FormatError(
             path, f"no image has a depth image and a pose within {_MAX_GAP:g} s of it"
         )
-    poses = [_pose(source, table[pose_at[i]]) for i in chosen]
+    poses = np.stack([_pose(source, table[pose_at[i]]) for i in chosen])
     lens = _lens(path, [images[i] for i in chosen])
     return PosedImages(
         path=path,
         image_paths=tuple(images[i] for i in chosen),
         lenses=(lens,) * len(chosen),
-        poses=np.stack(poses),
+        poses=poses,
         depth_paths=tuple(depths[depth_at[i]] for i in chosen),
         depth_unit=_UNIT,
-        up=None if np.allclose(poses[0], np.eye(4), atol=1e-6) else UP,
+        up=up_of_poses(poses),
     )
-
-
-def nearest(times: np.ndarray, others: np.ndarray, max_gap: float = _MAX_GAP) -> np.ndarray:
-    """For each time the index of the nearest other time; -1 where it is too far away.
-
-    Args:
-        times: [n] [s], in any order.
-        others: [m] [s], in any order, m >= 1.
-        max_gap: the largest difference [s].
-    """
-    order = np.argsort(others, kind="stable")
-    ordered = others[order]
-    right = np.searchsorted(ordered, times).clip(0, len(others) - 1)
-    left = (right - 1).clip(0)
-    is_left = np.abs(ordered[left] - times) <= np.abs(ordered[right] - times)
-    best = np.where(is_left, left, right)
-    return np.where(np.abs(ordered[best] - times) <= max_gap, order[best], -1)
 
 
 def _pictures(folder: Path, name: str) -> tuple[np.ndarray, list[Path]]:
@@ -125,18 +116,12 @@ def _lens(path: Path, images: Sequence[Path]) -> Lens:
     with naming(images[0]):
         width, height = first_size(images, IMAGE_FORMATS)
     source = path / "K.txt"
-    if source.exists():
-        K = read_numbers(source, columns=3)
-        if K.shape != (3, 3):
-            raise FormatError(source, "expected a 3x3 matrix")
-        fx, fy, cx, cy = (float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    elif (width, height) == _SIZE:
-        fx, fy, cx, cy = _DEFAULT
-    else:
+    if not source.exists() and (width, height) != _SIZE:
         raise FormatError(
             source,
             f"the file is missing, and the images are {width}x{height}, not the benchmark's "
             f"{_SIZE[0]}x{_SIZE[1]}: give their 3x3 intrinsics in it",
         )
+    K = read_matrix(source, 3, 3) if source.exists() else _DEFAULT
     with naming(source):
-        return Lens("PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5))
+        return matrix_lens(K, (width, height))

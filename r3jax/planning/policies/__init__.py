@@ -11,7 +11,7 @@ import re
 from importlib.metadata import entry_points
 
 from r3jax.planning.policies.foreign.commands import COMMAND, words_of
-from r3jax.validation.choices import did_you_mean
+from r3jax.validation.errors import did_you_mean
 
 GROUP = "r3jax.policies"
 """Entry points by which other packages offer policies: `name = "package.module:Class"`."""

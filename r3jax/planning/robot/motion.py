@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
-from r3jax.validation.choices import did_you_mean
+from r3jax.validation.errors import did_you_mean
 
 UNLIMITED = (-math.inf, math.inf)
 """Heights of a robot that may be at any [m]."""

@@ -36,8 +36,11 @@ import numpy as np
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.simulators.habitat.habitat_poses import agent_from_pose, horizontal_fov_deg, rotation_of
-from r3jax.simulators.habitat.habitat_stage import read_stage
+from r3jax.simulators.habitat.stage import (
+    agent_from_pose,
+    horizontal_fov_deg,
+    read_stage,
+)
 from r3jax.simulators.meshes import load_world, world_from_file
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 
@@ -177,10 +180,10 @@ class HabitatSimulator:
     def _observe(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bytes [H, W, 3] and depth without limit [H, W] at a pose [4, 4]."""
         try:
-            position, wxyz = agent_from_pose(T, self._habitat_from_world)
+            position, rotation = agent_from_pose(T, self._habitat_from_world)
         except ValueError as error:
             raise ValueError(f"cannot render: {error}") from None
-        return self._habitat.observe(position, rotation_of(wxyz))
+        return self._habitat.observe(position, rotation.as_matrix())
 
     def _check_same_world(self, pose: np.ndarray) -> None:
         """Refuses a Habitat that shows something else than the mesh file has from `pose` [4, 4]."""

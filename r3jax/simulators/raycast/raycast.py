@@ -157,7 +157,7 @@ class RaycastSimulator:
         problem = rigid_error(T)
         if problem is not None:
             raise ValueError(f"cannot render: {problem}")
-        from r3jax.simulators.raycast.directions import turned  # not before: it needs Numba
+        from r3jax.simulators.raycast.shading import turned  # not before: it needs Numba
 
         height, width = self._camera.height, self._camera.width
         directions = turned(self._pixels, T[:3, :3].astype(np.float32))
@@ -274,7 +274,7 @@ class RaycastSimulator:
             directions: their rays, row by row [H * W, 3].
             T: `T_world_camera`.
         """
-        from r3jax.simulators.raycast.directions import average, find_edges, inside
+        from r3jax.simulators.raycast.shading import average, find_edges, inside
 
         is_edge = np.zeros(face.shape, dtype=bool)
         find_edges(image, face, is_edge)

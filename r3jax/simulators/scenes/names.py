@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from r3jax.simulators.scenes import procedural, replica
-from r3jax.validation.choices import did_you_mean
+from r3jax.validation.errors import did_you_mean
 
 OUTSIDE = {
     "mesh": ("the mesh file", "a file, as in mesh:house.glb"),

@@ -7,10 +7,9 @@ import numpy as np
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.native.ahead import compile_ahead
 from r3jax.kernels.native.platform import is_cpu_only, missing_for_machine_code
-from r3jax.simulators.base import Simulator
-from r3jax.simulators.depth_noise import NoisySimulator
+from r3jax.simulators.base import NoisySimulator, Simulator
 from r3jax.simulators.habitat.habitat import HabitatSimulator
-from r3jax.simulators.habitat.habitat_stage import read_stage
+from r3jax.simulators.habitat.stage import read_stage
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes import procedural, replica

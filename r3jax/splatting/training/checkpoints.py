@@ -25,10 +25,9 @@ from r3jax.splatting.errors import CheckpointError
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.train_step import TrainState
 from r3jax.splatting.views import Views
-from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.errors import ForeignFileError, check_version
 from r3jax.validation.files import read_bytes
 from r3jax.validation.json_text import parse_json
-from r3jax.validation.versions import check_version
 
 KEPT = 2
 """Older checkpoints are deleted."""

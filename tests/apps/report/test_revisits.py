@@ -23,7 +23,7 @@ def share_seen_before(recording) -> np.ndarray:
     """Per frame, the share of its measured pixels whose voxel an earlier frame has touched."""
     seen = np.zeros(0, dtype=np.int64)
     shares = []
-    camera = recording.camera
+    camera = recording.lenses[0].camera
     u = (np.arange(camera.width) + 0.5 - float(camera.cx)) / float(camera.fx)
     v = (np.arange(camera.height) + 0.5 - float(camera.cy)) / float(camera.fy)
     rays = np.stack([*np.meshgrid(u, v), np.ones((camera.height, camera.width))], axis=-1)

@@ -19,7 +19,7 @@ _POINTS = np.random.default_rng(3).normal(0.0, 2.0, (NUM_POINTS, 3))
 
 
 def _extrinsics(pose: np.ndarray) -> list[float]:
-    from r3jax.formats.colmap.model import quaternion_of
+    from r3jax.formats.poses import quaternion_of
 
     inverse = np.linalg.inv(pose)
     return [*quaternion_of(inverse[:3, :3]), *inverse[:3, 3]]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from r3jax.formats.colmap.model import quaternion_of
+from r3jax.formats.poses import quaternion_of
 from tests.formats.colmap_models import random_pose
 from tests.formats.sequences import encoded
 

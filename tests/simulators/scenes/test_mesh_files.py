@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from r3jax.simulators.meshes import load_world
+from r3jax.simulators.meshes import assumptions, load_world
 
 CORNERS = np.array([[0.0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -217,65 +217,30 @@ def test_the_texture_transform_extension_moves_texture_coordinates(tmp_path):
     np.testing.assert_allclose(load_world(path).face_uv, expected, atol=1e-5)
 
 
-def test_a_missing_file(tmp_path):
-    with pytest.raises(ValueError, match=r"no such mesh file: .*nothing\.glb"):
-        load_world(tmp_path / "nothing.glb")
+BAD = {
+    "nothing.glb": (None, ""),
+    **dict.fromkeys(("a.glb", "a.ply", "a.obj", "a.off"), (b"\x00\x01this is no mesh\xff" * 9, "")),
+    "empty.ply": (b"", ""),
+    "none.obj": (b"# nothing\n", ""),
+    "infinite.ply": (
+        QUADS.replace("1 1 0 0 0 255", "nan 1 0 0 0 255") + "4 0 1 2 3\n4 1 4 5 2\n", "1 of 6 ",
+    ),
+    "flat.ply": (QUADS + "3 0 1 4\n3 0 0 1\n", "zero area"),
+    "beyond.ply": (QUADS + "3 0 1 2\n3 0 1 9\n", ""),
+    "points.ply": (trimesh.PointCloud(CORNERS).export(file_type="ply"), "4 points"),
+    "points.glb": (trimesh.PointCloud(CORNERS).export(file_type="glb"), "4 points"),
+    "city.ply": (trimesh.Trimesh(CORNERS * 1e6, FACES).export(file_type="ply"), "meters"),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["a.glb", "a.ply", "a.obj", "a.xyz123"])
-def test_a_file_that_is_no_mesh(tmp_path, name):
-    path = tmp_path / name
-    path.write_bytes(b"\x00\x01this is no mesh\xff" * 9)
-    with pytest.raises(ValueError, match=name):
-        load_world(path)
-
-
-def test_an_empty_file(tmp_path):
-    path = tmp_path / "empty.ply"
-    path.write_bytes(b"")
-    with pytest.raises(ValueError, match=r"empty\.ply"):
-        load_world(path)
-
-
-def test_an_empty_mesh(tmp_path):
-    path = tmp_path / "none.obj"
-    path.write_text("# nothing\n")
-    with pytest.raises(ValueError, match=r"none\.obj.*empty mesh|cannot read.*none\.obj"):
-        load_world(path)
-
-
-@pytest.mark.parametrize("name", ["points.ply", "points.glb"])
-def test_a_mesh_without_faces(tmp_path, name):
-    path = saved(tmp_path, trimesh.PointCloud(CORNERS), name)
-    with pytest.raises(ValueError, match=r"4 points but no faces.*reconstruct"):
-        load_world(path)
-
-
-def test_vertices_that_are_not_finite(tmp_path):
-    path = tmp_path / "a.ply"
-    path.write_text(QUADS.replace("1 1 0 0 0 255", "nan 1 0 0 0 255") + "4 0 1 2 3\n4 1 4 5 2\n")
-    with pytest.raises(ValueError, match=r"a\.ply: 1 of 6 vertices are not finite"):
-        load_world(path)
-
-
-def test_faces_without_area(tmp_path):
-    path = tmp_path / "a.ply"
-    path.write_text(QUADS + "3 0 1 4\n3 0 0 1\n")
-    with pytest.raises(ValueError, match="zero area"):
-        load_world(path)
-
-
-def test_a_world_in_millimeters_of_a_city(tmp_path):
-    path = saved(tmp_path, trimesh.Trimesh(CORNERS * 1e6, FACES, process=False), "a.ply")
-    with pytest.raises(ValueError, match="unit is meters"):
-        load_world(path)
-
-
-def test_a_face_that_names_no_vertex(tmp_path):
-    path = tmp_path / "a.ply"
-    path.write_text(QUADS + "3 0 1 2\n3 0 1 9\n")
-    with pytest.raises(ValueError, match=r"a\.ply"):
-        load_world(path)
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_mesh_is_named(tmp_path, name):
+    data, fact = BAD[name]
+    if data is not None:
+        (tmp_path / name).write_bytes(data.encode() if isinstance(data, str) else data)
+    with pytest.raises(ValueError, match=fact) as found:
+        load_world(tmp_path / name)
+    assert name in str(found.value)
 
 
 def test_up_must_be_an_axis(tmp_path):
@@ -312,3 +277,56 @@ def test_claims_of_a_glb_that_it_does_not_keep(tmp_path, edit, reason):
     path = glb_with(saved(tmp_path, plain(), "a.glb"), edit)
     with pytest.raises(ValueError, match=rf"a\.glb: .*{reason}"):
         load_world(path)
+
+
+@pytest.mark.parametrize("name", ["EXT_meshopt_compression", "KHR_mesh_quantization"])
+def test_meshes_packed_by_an_extension_are_named(tmp_path, name):
+    corners = np.array([[0, 0, 0, 0], [32767, 0, 0, 0], [0, 32767, 0, 0]], np.int16)
+    view = {"buffer": 0, "byteLength": 24, "byteStride": 8}
+    if "meshopt" in name:
+        view |= {"buffer": 1, "extensions": {name: {"buffer": 0, "byteLength": 24, "count": 3}}}
+    tree = {
+        "asset": {"version": "2.0"}, "extensionsUsed": [name], "extensionsRequired": [name],
+        "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5122, "normalized": True, "count": 3,
+                       "type": "VEC3"}],
+        "bufferViews": [view], "buffers": [{"byteLength": 24}, {"byteLength": 24}],
+    }  # fmt: skip
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text
+    body += struct.pack("<I4s", 24, b"BIN\0") + corners.tobytes()
+    path = tmp_path / "room.glb"
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    with pytest.raises(ValueError, match=rf"room\.glb.*{name}.*export"):
+        load_world(path)
+
+
+def test_a_splat_is_no_mesh(tmp_path):
+    path = tmp_path / "point_cloud.ply"
+    path.write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\n"
+        b"property float y\nproperty float z\nproperty float f_dc_0\nend_header\n" + bytes(16)
+    )
+    with pytest.raises(ValueError, match=r"point_cloud\.ply is a Gaussian splat.*mesh"):
+        load_world(path)
+
+
+def test_a_pointer_of_git_lfs_is_no_mesh(tmp_path):
+    path = tmp_path / "room.glb"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n")
+    with pytest.raises(ValueError, match="git lfs pull"):
+        load_world(path)
+
+
+def test_what_is_assumed_of_a_mesh_is_said(tmp_path):
+    box = trimesh.creation.box(extents=[4.0, 3.0, 2.5])
+    box.export(tmp_path / "gray.stl")
+    size, colors = assumptions(load_world(tmp_path / "gray.stl"))
+    assert "4 x 3 x 2.5 m" in size
+    assert "--scale" in size
+    assert "no colors" in colors
+    box.visual.vertex_colors = np.random.default_rng(0).integers(0, 255, (8, 4))
+    box.export(tmp_path / "colored.ply")
+    assert len(assumptions(load_world(tmp_path / "colored.ply"))) == 1

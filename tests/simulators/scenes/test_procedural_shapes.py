@@ -5,7 +5,7 @@ import pytest
 
 from r3jax.simulators.scenes.procedural import shapes
 from r3jax.simulators.scenes.procedural.materials import patterns, textures
-from r3jax.simulators.scenes.procedural.materials.random_fields import cloud
+from r3jax.simulators.scenes.procedural.materials.textures import cloud
 from r3jax.simulators.scenes.procedural.model import Finish, Model
 from r3jax.simulators.world import Material
 

@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from r3jax.geometry.cameras import Camera
-from r3jax.simulators.base import Simulator
-from r3jax.simulators.depth_noise import NoisySimulator
+from r3jax.simulators.base import NoisySimulator, Simulator
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.scenes import registry
 

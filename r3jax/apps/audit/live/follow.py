@@ -22,7 +22,7 @@ from r3jax.apps.audit.live.growing import Arrival, GrowingCapture
 from r3jax.apps.audit.live.guide_page import GuidePage
 from r3jax.apps.audit.source import Source
 from r3jax.apps.audit.vertical import Normals, block_normals, estimated_up
-from r3jax.formats.ros.names import Topics
+from r3jax.formats.ros.bags import Topics
 from r3jax.frame import Frame
 from r3jax.mapping.config import MappingConfig
 from r3jax.planning.growth import GrowthAhead

@@ -23,8 +23,8 @@ import numpy as np
 from r3jax.apps.audit.source import Picture, Source, source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.recordings import is_recording
-from r3jax.formats.ros.growing.bag import FollowedBag, growing_files
-from r3jax.formats.ros.names import Topics
+from r3jax.formats.ros.bags import Topics
+from r3jax.formats.ros.growing import FollowedBag, growing_files
 from r3jax.geometry.cameras import angle_between
 
 _IMAGES = (".png", ".jpg")
@@ -203,7 +203,7 @@ class GrowingCapture:
         self._when = time.monotonic()
         files = growing_files(self._path)
         if files and self._bag is None:
-            self._bag = FollowedBag(self._path, files, self._topics)
+            self._bag = FollowedBag(self._path, self._topics)
         try:
             source = self._opened(files)
         except (ValueError, OSError) as error:  # half of it is written; or it is none

@@ -39,7 +39,7 @@ from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PolicyErr
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.travel import Travel
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_type
+from r3jax.validation.json_text import check_type
 
 PROTOCOL = 1
 """Version of the messages."""

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.fields import check_type
-from r3jax.validation.json_text import parse_json
+from r3jax.validation.json_text import check_type, parse_json
 
 PREFIX = struct.Struct("<II")
 """Lengths of header and arrays."""

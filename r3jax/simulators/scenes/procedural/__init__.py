@@ -11,7 +11,7 @@ radius passes. World: z up, meters; one room's floor has a corner at the origin.
 import importlib
 
 from r3jax.simulators.world import World
-from r3jax.validation.choices import did_you_mean
+from r3jax.validation.errors import did_you_mean
 
 _SCENES = {
     "flat": "flat",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.materials.random_fields import Real
+from r3jax.simulators.scenes.procedural.materials.textures import Real
 from r3jax.simulators.scenes.procedural.model import Finish, Model
 from r3jax.simulators.scenes.procedural.shapes import Shape, box, combine, grid, quad
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.simulators.scenes.procedural.materials.random_fields import Real
+from r3jax.simulators.scenes.procedural.materials.textures import Real
 
 _UNIT_QUAD = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], dtype=np.float64)
 

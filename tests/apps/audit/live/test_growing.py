@@ -182,7 +182,7 @@ def test_a_line_counts_once_it_has_an_end(tmp_path):
 
 
 def test_a_bag_that_is_recorded_comes_in_by_and_by(tmp_path, monkeypatch):
-    monkeypatch.setattr("r3jax.formats.ros.growing.bag._SETTLE", 0)
+    monkeypatch.setattr("r3jax.formats.ros.growing._SETTLE", 0)
     content = next(write_bag(tmp_path / "whole").glob("*.mcap")).read_bytes()
     path = tmp_path / "drive"
     capture = GrowingCapture(path, tmp_path / "scratch")

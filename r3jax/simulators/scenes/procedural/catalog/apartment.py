@@ -1,11 +1,10 @@
 """The apartment: two bedrooms, a living room, a kitchen and a bathroom along a hall."""
 
-from r3jax.simulators.scenes.procedural.assemble import assemble
-from r3jax.simulators.scenes.procedural.catalog.palettes import BERBER, NORDIC, PERSIAN
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
 from r3jax.simulators.scenes.procedural.furniture import decor, kitchen, objects, seating, storage
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.model import Model
+from r3jax.simulators.scenes.procedural.materials.finishes import BERBER, NORDIC, PERSIAN
+from r3jax.simulators.scenes.procedural.model import Model, assemble
 from r3jax.simulators.world import World
 
 SUMMARY = "two-bedroom apartment with living room, kitchen, bathroom and hall, 90 m2"

@@ -1,11 +1,10 @@
 """The classroom: rows of desks before a blackboard, a cloakroom and a science store."""
 
-from r3jax.simulators.scenes.procedural.assemble import assemble
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
 from r3jax.simulators.scenes.procedural.furniture import decor, kitchen, objects, storage, workplace
 from r3jax.simulators.scenes.procedural.furniture.seating import bench
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.model import Model
+from r3jax.simulators.scenes.procedural.model import Model, assemble
 from r3jax.simulators.world import World
 
 SUMMARY = "classroom with a blackboard, a cloakroom and a store, 80 m2"

@@ -1,11 +1,10 @@
 """The corridor: a long passage with three offices, an archive and a lounge along it."""
 
-from r3jax.simulators.scenes.procedural.assemble import assemble
-from r3jax.simulators.scenes.procedural.catalog.palettes import BERBER, NORDIC, PERSIAN
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
 from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.model import Model
+from r3jax.simulators.scenes.procedural.materials.finishes import BERBER, NORDIC, PERSIAN
+from r3jax.simulators.scenes.procedural.model import Model, assemble
 from r3jax.simulators.world import World
 
 SUMMARY = "corridor with three offices, an archive and a lounge, 118 m2"

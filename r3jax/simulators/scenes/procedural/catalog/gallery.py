@@ -1,11 +1,10 @@
 """The gallery: three halls with pictures, sculptures, benches and a large mirror."""
 
-from r3jax.simulators.scenes.procedural.assemble import assemble
-from r3jax.simulators.scenes.procedural.catalog.palettes import CHIPS, PERSIAN
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
 from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.model import Model
+from r3jax.simulators.scenes.procedural.materials.finishes import CHIPS, PERSIAN
+from r3jax.simulators.scenes.procedural.model import Model, assemble
 from r3jax.simulators.world import World
 
 SUMMARY = "gallery of three halls with pictures, sculptures and a wall mirror, 88 m2"

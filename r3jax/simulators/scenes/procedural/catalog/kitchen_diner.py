@@ -1,11 +1,10 @@
 """The kitchen-diner: a family kitchen with an island, a dining corner and a pantry."""
 
-from r3jax.simulators.scenes.procedural.assemble import assemble
-from r3jax.simulators.scenes.procedural.catalog.palettes import CHIPS, NORDIC
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
 from r3jax.simulators.scenes.procedural.furniture import decor, kitchen, objects, seating, storage
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.model import Model
+from r3jax.simulators.scenes.procedural.materials.finishes import CHIPS, NORDIC
+from r3jax.simulators.scenes.procedural.model import Model, assemble
 from r3jax.simulators.world import World
 
 SUMMARY = "kitchen-diner with an island, marble worktops and a pantry, 32 m2"

@@ -1,11 +1,10 @@
 """The library: a reading hall with shelves, a study and a foyer."""
 
-from r3jax.simulators.scenes.procedural.assemble import assemble
-from r3jax.simulators.scenes.procedural.catalog.palettes import NORDIC, PERSIAN
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
 from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.model import Model
+from r3jax.simulators.scenes.procedural.materials.finishes import NORDIC, PERSIAN
+from r3jax.simulators.scenes.procedural.model import Model, assemble
 from r3jax.simulators.world import World
 
 SUMMARY = "library with a reading hall, a study and a foyer, 98 m2"

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from r3jax.simulators.scenes.procedural.assemble import assemble
-from r3jax.simulators.scenes.procedural.catalog.palettes import BERBER, PERSIAN
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
 from r3jax.simulators.scenes.procedural.furniture import (
     decor,
@@ -14,7 +12,8 @@ from r3jax.simulators.scenes.procedural.furniture import (
     workplace,
 )
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.model import Model
+from r3jax.simulators.scenes.procedural.materials.finishes import BERBER, PERSIAN
+from r3jax.simulators.scenes.procedural.model import Model, assemble
 from r3jax.simulators.scenes.procedural.shapes import box, cylinder, tube
 from r3jax.simulators.world import World
 

@@ -1,7 +1,5 @@
 """The office: desk islands, a meeting room behind glass, a break room and a copy room."""
 
-from r3jax.simulators.scenes.procedural.assemble import assemble
-from r3jax.simulators.scenes.procedural.catalog.palettes import NORDIC
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
 from r3jax.simulators.scenes.procedural.furniture import (
     decor,
@@ -12,7 +10,8 @@ from r3jax.simulators.scenes.procedural.furniture import (
     workplace,
 )
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.model import Model
+from r3jax.simulators.scenes.procedural.materials.finishes import NORDIC
+from r3jax.simulators.scenes.procedural.model import Model, assemble
 from r3jax.simulators.world import World
 
 SUMMARY = "open-plan office with glass partitions, meeting room, break room and copy room, 88 m2"

@@ -6,8 +6,7 @@ Wall pieces have their back on y = 0 and z measured from the floor.
 import numpy as np
 
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.materials.random_fields import Real
-from r3jax.simulators.scenes.procedural.materials.textures import Color
+from r3jax.simulators.scenes.procedural.materials.textures import Color, Real
 from r3jax.simulators.scenes.procedural.model import Finish, Model
 from r3jax.simulators.scenes.procedural.shapes import (
     box,

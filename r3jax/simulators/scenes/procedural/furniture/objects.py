@@ -6,8 +6,8 @@ Origin at the middle of the foot unless a function says otherwise.
 import numpy as np
 
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.materials.random_fields import Real
-from r3jax.simulators.scenes.procedural.materials.screens import SPINES
+from r3jax.simulators.scenes.procedural.materials.artwork import SPINES
+from r3jax.simulators.scenes.procedural.materials.textures import Real
 from r3jax.simulators.scenes.procedural.model import Model
 from r3jax.simulators.scenes.procedural.shapes import (
     Shape,

@@ -4,7 +4,7 @@ import numpy as np
 
 from r3jax.simulators.scenes.procedural.furniture import objects
 from r3jax.simulators.scenes.procedural.materials import finishes as f
-from r3jax.simulators.scenes.procedural.materials.random_fields import Real
+from r3jax.simulators.scenes.procedural.materials.textures import Real
 from r3jax.simulators.scenes.procedural.model import Finish, Model
 from r3jax.simulators.scenes.procedural.shapes import (
     box,

@@ -7,9 +7,8 @@ import functools
 
 import numpy as np
 
-from r3jax.simulators.scenes.procedural.materials import artwork, patterns, screens, textures
-from r3jax.simulators.scenes.procedural.materials.random_fields import Real
-from r3jax.simulators.scenes.procedural.materials.textures import Color
+from r3jax.simulators.scenes.procedural.materials import artwork, patterns, textures
+from r3jax.simulators.scenes.procedural.materials.textures import Color, Real
 from r3jax.simulators.scenes.procedural.model import Finish
 from r3jax.simulators.world import Material
 
@@ -247,7 +246,7 @@ def picture(kind: str, seed: int, wide: bool = False) -> Finish:
 def screen(seed: int) -> Finish:
     """A computer screen that is on."""
     material = Material(
-        screens.desktop(seed), emission=0.85, specular=0.3, shininess=80.0, mirror=0.05
+        artwork.desktop(seed), emission=0.85, specular=0.3, shininess=80.0, mirror=0.05
     )
     return Finish(material)
 
@@ -255,29 +254,54 @@ def screen(seed: int) -> Finish:
 @functools.cache
 def board(kind: str, seed: int) -> Finish:
     """A "white" or "black" writing board, written on."""
-    texture = screens.whiteboard(seed) if kind == "white" else screens.blackboard(seed)
+    texture = artwork.whiteboard(seed) if kind == "white" else artwork.blackboard(seed)
     return _flat(texture, gloss=0.5 if kind == "white" else 0.1)
 
 
 @functools.cache
 def spines(seed: int) -> Finish:
     """The atlas of book spines."""
-    return _flat(screens.book_spines(seed), gloss=0.12)
+    return _flat(artwork.book_spines(seed), gloss=0.12)
 
 
 @functools.cache
 def package(seed: int) -> Finish:
     """The print on a carton, tin or jar."""
-    return _flat(screens.package(seed), gloss=0.25)
+    return _flat(artwork.package(seed), gloss=0.25)
 
 
 @functools.cache
 def clock_face(seed: int) -> Finish:
     """A clock's dial."""
-    return _flat(screens.clock(seed))
+    return _flat(artwork.clock(seed))
 
 
 @functools.cache
 def keyboard() -> Finish:
     """A keyboard's keys."""
-    return _flat(screens.keyboard())
+    return _flat(artwork.keyboard())
+
+
+PERSIAN = (
+    (0.52, 0.13, 0.13),
+    (0.16, 0.2, 0.36),
+    (0.86, 0.76, 0.56),
+    (0.36, 0.24, 0.2),
+    (0.7, 0.48, 0.3),
+)
+NORDIC = (
+    (0.87, 0.84, 0.77),
+    (0.3, 0.38, 0.45),
+    (0.75, 0.5, 0.36),
+    (0.56, 0.6, 0.55),
+    (0.2, 0.22, 0.26),
+)
+BERBER = (
+    (0.9, 0.87, 0.8),
+    (0.25, 0.22, 0.2),
+    (0.8, 0.62, 0.4),
+    (0.62, 0.35, 0.25),
+    (0.45, 0.5, 0.42),
+)
+LEAFY = ((0.42, 0.53, 0.42), (0.56, 0.64, 0.5), (0.8, 0.55, 0.46))
+CHIPS = ((0.6, 0.3, 0.22), (0.3, 0.35, 0.36), (0.92, 0.9, 0.86), (0.72, 0.6, 0.4))

@@ -8,14 +8,15 @@ import functools
 import numpy as np
 from PIL import Image, ImageDraw
 
-from r3jax.simulators.scenes.procedural.materials.random_fields import (
+from r3jax.simulators.scenes.procedural.materials.textures import (
+    Color,
+    Ink,
     Real,
     blend,
     cloud,
     smoothstep,
     texels,
 )
-from r3jax.simulators.scenes.procedural.materials.textures import Color, Ink
 
 
 def _rgb(color: Color) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""Reads a database of RTAB-Map (SQLite), as its apps and its node for ROS save a map.
+"""Reads maps of RTAB-Map: its database (SQLite), and what it exports.
+
+A database, as its apps and its node for ROS save it:
 
     Node.pose           12 float32: 3x4 matrix of the robot in the map, z up [m]
     Data.image          JPEG or PNG
@@ -10,32 +12,46 @@
     Admin.opt_ids       ids and poses of the optimized graph, by zlib, with 12 bytes behind it;
     Admin.opt_poses     where they are there, they go before Node.pose, and other nodes are left out
 
+An export, `rtabmap-export --images_id --poses_camera --poses_format 11 X.db`:
+
+    X_camera_poses.txt    lines "stamp x y z qx qy qz qw id", camera to map, OpenCV axes, z up [m]
+    X_rgb/<id>.jpg        8-bit RGB
+    X_depth/<id>.png      uint16, millimeters, of the same or fewer pixels
+    X_calib/<id>.yaml     camera as OpenCV writes it; pixel centers at whole numbers
+
+Images are rectified: RTAB-Map takes the projection matrix, where there is one, and no distortion.
 (https://github.com/introlab/rtabmap: DatabaseSchema.sql, Compression.cpp, CameraModel.cpp)
 """
 
+import re
 import sqlite3
 import struct
 import zlib
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from r3jax.formats.depth_files import DEPTH_MODES
-from r3jax.formats.depth_images import keep_confident
+from r3jax.formats.depth import DEPTH_MODES, keep_confident
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens
-from r3jax.formats.phones.shots import UP_Z
-from r3jax.formats.posed_images import IMAGE_FORMATS, Pixels, PosedImages
-from r3jax.formats.poses import mend_pose
-from r3jax.formats.ros.messages import clean_depth, rectified_lens
-from r3jax.formats.ros.rtabmap_export import COMMAND
-from r3jax.formats.ros.rvl import unpack_rvl
+from r3jax.formats.phones.archives import (
+    Archive,
+    Shot,
+    complete_shots,
+    confident_depth,
+    posed_images,
+)
+from r3jax.formats.posed_images import IMAGE_FORMATS, Pixels, PosedImages, left_out
+from r3jax.formats.poses import UP_Z, mend_pose, quaternion_pose, read_numbers
+from r3jax.formats.ros.messages import clean_depth, rectified_lens, unpack_rvl
 from r3jax.validation.database import check_database, query_database
 from r3jax.validation.errors import ForeignFileError
-from r3jax.validation.images import MAX_PIXELS, image_pixels, image_size
+from r3jax.validation.files import plain_text
+from r3jax.validation.images import MAX_PIXELS, image_pixels
 
 _HEADER = 11
 _RVL = b"DEPTHRVL"
@@ -102,7 +118,7 @@ def read_rtabmap_database(path: Path | str) -> PosedImages:
         )
     gone = total - len(nodes)
     which = "odometry's: the graph was never optimized" if optimized is None else "optimized"
-    lost = f" {gone} of {total} images lack depth or a pose and are left out." if gone else ""
+    lost = left_out(gone, total, "images")
     return PosedImages(
         path=path,
         image_paths=tuple(path / "image" / str(node.id) for node in nodes),
@@ -114,7 +130,7 @@ def read_rtabmap_database(path: Path | str) -> PosedImages:
             lambda index: _depth(path, nodes[index], has_confidence=has_confidence),
         ),
         up=UP_Z,
-        remark=f"Poses are {which}.{lost}",
+        remark=f"Poses are {which}.{'' if lost is None else f' {lost}'}",
     )
 
 
@@ -235,7 +251,6 @@ def _blob(path: Path, column: str, node: _Node) -> bytes:
 def _rgb(path: Path, node: _Node) -> np.ndarray:
     with naming(path / "image" / str(node.id)):
         data = _blob(path, "image", node)
-        image_size(data, IMAGE_FORMATS)  # refuses what would not fit into memory
         return image_pixels(data, IMAGE_FORMATS, (node.lens.width, node.lens.height))
 
 
@@ -255,7 +270,7 @@ def _confidence(data: bytes) -> np.ndarray:
     """Confidence [h, w] uint8: a PNG, or rows by zlib with their number, length and type behind."""
     if data.startswith(_PNG):
         wanted = "confidence must be an 8-bit PNG"
-        return image_pixels(data, ("PNG",), image_size(data, ("PNG",)), ("L",), wanted)
+        return image_pixels(data, ("PNG",), None, ("L",), wanted)
     rows, columns, kind = struct.unpack("<3i", data[-12:].rjust(12, b"\0"))
     if rows <= 0 or columns <= 0 or kind != 0 or rows * columns > MAX_PIXELS:
         raise ForeignFileError("its confidence is damaged")
@@ -272,10 +287,94 @@ def _all_depth(data: bytes) -> np.ndarray:
     """z-depth [h, w] float32 as it is stored."""
     if data.startswith(_RVL):
         return clean_depth(0.001 * unpack_rvl(data[len(_RVL) :]).astype(np.float64))
-    size = image_size(data, ("PNG",))
     wanted = "depth must be a PNG of 16 bits or of four channels"
-    pixels = image_pixels(data, ("PNG",), size, (*DEPTH_MODES, "RGBA"), wanted)
+    pixels = image_pixels(data, ("PNG",), None, (*DEPTH_MODES, "RGBA"), wanted)
     if pixels.ndim == 2:
         return clean_depth(0.001 * pixels.astype(np.float64))
     stored = np.ascontiguousarray(pixels[..., [2, 1, 0, 3]])  # OpenCV's order
     return clean_depth(stored.view("<f4")[..., 0])
+
+
+COMMAND = "rtabmap-export --images_id --poses_camera --poses_format 11 {}"
+"""What a user runs on a database."""
+
+_POSES = "_camera_poses.txt"
+
+
+def is_rtabmap_export(path: Path) -> bool:
+    """True if the folder looks like an export of RTAB-Map."""
+    return _name(path) is not None
+
+
+def _name(path: Path) -> str | None:
+    """What the names of all files begin with."""
+    found = [one.name.removesuffix(_POSES) for one in path.glob(f"*{_POSES}")]
+    found = [name for name in found if (path / f"{name}_rgb").is_dir()]
+    return found[0] if len(found) == 1 else None
+
+
+def read_rtabmap_export(path: Path | str) -> PosedImages:
+    """Opens an export and checks everything but the pixels.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        FormatError: poses or cameras that are missing or damaged; no image with depth.
+    """
+    path = Path(path)
+    name = _name(path)
+    if name is None:
+        raise FormatError(path, f"there is no file *{_POSES} with a folder *_rgb in it")
+    source = path / f"{name}{_POSES}"
+    archive = Archive(path)
+    rows = read_numbers(source, columns=9)
+    shots = [_shot(archive, source, name, row) for row in rows]
+    advice = (
+        "this looks like an export of RTAB-Map without images and depth that are named by their "
+        f"ids: {COMMAND.format('DATABASE')}"
+    )
+    kept, remark = complete_shots(archive, [shot for shot in shots if shot], len(rows), advice)
+    read = partial(confident_depth, archive, best=0)
+    return posed_images(archive, kept, depth=read, up=UP_Z, remark=remark)
+
+
+def _shot(archive: Archive, source: Path, name: str, row: np.ndarray) -> Shot | None:
+    """One frame of a row [9]; None where it has no image or camera."""
+    number = int(row[8]) if np.isfinite(row[8]) and abs(row[8]) < 1e15 else -1
+    image, calibration = f"{name}_rgb/{number}.jpg", f"{name}_calib/{number}.yaml"
+    if not archive.has(image) or not archive.has(calibration):
+        return None
+    with naming(archive.where(calibration)):
+        text = plain_text(archive.read(calibration)).decode(errors="replace")
+        lens = _lens(text, archive.size(image))
+    return Shot(
+        image=image,
+        depth=f"{name}_depth/{number}.png",
+        confidence="",
+        lens=lens,
+        pose=quaternion_pose(source, f"the pose of image {number}", row[1:4], row[4:8]),
+    )
+
+
+def _lens(text: str, size: tuple[int, int]) -> Lens:
+    """The camera in a YAML of OpenCV, for an image of this width and height."""
+    matrix = _matrix(text, "projection_matrix", 12)
+    matrix = _matrix(text, "camera_matrix", 9) if matrix is None else matrix
+    if matrix is None:
+        raise ForeignFileError("there is no camera_matrix in it")
+    return rectified_lens(matrix, size)
+
+
+def _matrix(text: str, name: str, count: int) -> np.ndarray | None:
+    """The numbers of a matrix; None where it is not there."""
+    found = re.search(rf"{name}:[^\[\]]{{0,200}}data:\s*\[([^\[\]]{{0,2000}})\]", text)
+    if found is None:
+        return None
+    try:
+        numbers = np.array([float(word) for word in found[1].split(",")])
+    except ValueError:
+        raise ForeignFileError(f"{name} holds a word that is no number") from None
+    if len(numbers) != count:
+        raise ForeignFileError(f"{name} must have {count} numbers, got {len(numbers)}")
+    return numbers

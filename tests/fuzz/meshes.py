@@ -1,31 +1,23 @@
-"""Damaged scenes: GLB, glTF with its buffers and textures, PLY, OBJ with its materials.
+"""Scenes to be damaged: GLB, glTF with its buffers and textures, PLY, OBJ with its materials."""
 
-All 2,000 cases: `pytest -m slow tests/fuzz/test_meshes.py`.
-"""
-
+import base64
 import io
-from collections.abc import Callable
+import json
+import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import trimesh
 from PIL import Image
 
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import open_world
-from tests.fuzz.containers import zipped
-from tests.fuzz.harness import CASES_SLOW
+from tests.fuzz.mutations import zipped
 from tests.fuzz.tree import Fifo, Files
-from tests.fuzz.worker import Reader
 from tests.simulators.rooms import box_quads, world_of
-
-pytestmark = pytest.mark.full
-
-CASES = 150
-"""In the normal suite."""
 
 NAMES = ("scene.glb", "scene.gltf", "scene.ply", "scene.obj", "scene.stl", "scene.off", "scene.zip")
 
@@ -110,19 +102,6 @@ def read(folder: Path) -> None:
     assert not np.isnan(frame.depth).any()
 
 
-READER = Reader(seeds, read, (ValueError,))
-
-
-def test_damaged_meshes_are_refused_or_read(harness):
-    harness.check(__name__, CASES)
-
-
-@pytest.mark.slow
-def test_many_damaged_meshes(harness):
-    """`pytest -m slow tests/fuzz/test_meshes.py`."""
-    harness.check(__name__, CASES_SLOW)
-
-
 def edited(edit: Callable[[dict[str, Any]], None]) -> bytes:
     """A GLB whose scene graph was edited."""
     return trimesh.exchange.gltf.export_glb(room(textured=True).scene(), tree_postprocessor=edit)
@@ -158,26 +137,93 @@ GRAPHS = (in_a_circle, doubling, deep, repeating, unfinished)
 NAMES_ELSEWHERE = ("../outside/secret", "/dev/zero", "pipe", "nothing.png", "../../../etc/passwd")
 
 
-def crafted() -> dict[str, Files]:
+def crafted() -> list[Files]:
     """Cases that chance does not find."""
-    cases: dict[str, Files] = {edit.__name__: {"scene.glb": edited(edit)} for edit in GRAPHS}
+    cases: list[Files] = [{"scene.glb": edited(edit)} for edit in GRAPHS]
     obj = next(files for files in seeds() if "scene.obj" in files and len(files) > 1)
     material = next(name for name in obj if name.endswith(".mtl"))
     for name in NAMES_ELSEWHERE:
-        cases[f"texture {name}"] = obj | {
-            material: b"newmtl m\nmap_Kd " + name.encode() + b"\n",
-            "pipe": Fifo(),
-        }
+        cases.append(obj | {material: b"newmtl m\nmap_Kd " + name.encode() + b"\n", "pipe": Fifo()})
     counts = b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n"
     fields = b"".join(b"property float %c\n" % axis for axis in b"xyz")
     lists = b"element face 4000000000\nproperty list uint int vertex_indices\nend_header\n"
-    cases["counts"] = {"scene.ply": counts + fields + lists + bytes(64)}
-    cases["archive"] = {"scene.zip": zipped({"scene.ply": seeds()[3]["scene.ply"]})}
+    cases.append({"scene.ply": counts + fields + lists + bytes(64)})
+    cases.append({"scene.zip": zipped({"scene.ply": seeds()[3]["scene.ply"]})})
     return cases
 
 
-CRAFTED = Reader(lambda: list(crafted().values()), read, (ValueError,))
+def glb(tree: dict[str, Any], stored: bytes = b"") -> bytes:
+    """A GLB of a tree and one buffer."""
+    text = json.dumps({"asset": {"version": "2.0"}, **tree}).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text
+    if stored:
+        stored += bytes(-len(stored) % 4)
+        body += struct.pack("<I4s", len(stored), b"BIN\0") + stored
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
-def test_crafted_meshes_are_refused_or_read(harness):
-    harness.check_crafted(f"{__name__}:CRAFTED")
+def one_mesh(accessors: list[dict[str, Any]], primitives: int = 1, nodes: int = 1) -> dict:
+    """The tree of a mesh with one position for each primitive."""
+    return {
+        "accessors": accessors,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}] * primitives}],
+        "nodes": [{"mesh": 0}] * nodes,
+        "scenes": [{"nodes": list(range(nodes))}],
+    }
+
+
+def points(count: int, **fields: Any) -> dict[str, Any]:
+    return {"componentType": 5126, "type": "VEC3", "count": count, **fields}
+
+
+def bombs() -> list[Files]:
+    """Small files that would unpack to gigabytes."""
+    return [{f"scene.{kind}": data} for kind, data in _bombs()]
+
+
+def _bombs() -> Iterator[tuple[str, bytes]]:
+    """Files that repeat what they store, or claim what they do not."""
+    rng = np.random.default_rng(0)
+    million = rng.normal(size=(29_997, 9)).astype("<f4").tobytes()[:1_079_892]
+    count, size = len(million) // 36 * 3, len(million)
+    buffer: dict[str, Any] = {"buffers": [{"byteLength": size}]}
+    view = {"buffer": 0, "byteLength": size}
+    one = {**buffer, "bufferViews": [view]}
+    named = points(count, bufferView=0)
+    yield "glb", glb(one_mesh([points(30_000_000)]) | {"bufferViews": []})
+    yield "glb", glb(one_mesh([points(1 << 40)]) | one, million)
+    yield "glb", glb(one_mesh([points(1 << 40, bufferView=0)]) | one, million)
+    yield "glb", glb(one_mesh([named], primitives=200) | one, million)
+    yield "glb", glb(one_mesh([named], primitives=30_000) | one, million)
+    yield "glb", glb(one_mesh([named], nodes=2_000) | one, million)
+    yield "glb", glb(one_mesh([named] * 3_000) | one, million)
+    yield "glb", glb(one_mesh([named]) | buffer | {"bufferViews": [view] * 3_000}, million)
+    dense = {**buffer, "bufferViews": [view | {"byteStride": 1}]}
+    yield "glb", glb(one_mesh([points(size - 64, bufferView=0, type="MAT4")] * 20) | dense, million)
+    indexed = one_mesh([points(3, bufferView=0), {**named, "type": "SCALAR", "count": size}])
+    indexed["accessors"][1] |= {"componentType": 5121}
+    indexed["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 5}]
+    yield "glb", glb(indexed | one, bytes(size))
+    sparse = {"count": 1, "indices": {"bufferView": 0}, "values": {"bufferView": 0}}
+    yield "glb", glb(one_mesh([points(1 << 30, sparse=sparse)]) | one, million)
+    yield "glb", glb(one_mesh([points(3, bufferView=0)], primitives=33_000) | one, million)
+    uri = "data:application/octet-stream;base64," + base64.b64encode(million).decode()
+    inline = {"buffers": [{"byteLength": size, "uri": uri}], "bufferViews": [view] * 3_000}
+    yield "gltf", json.dumps({**one_mesh([named]), **inline}).encode()
+    itself = {"buffers": [{"byteLength": size, "uri": "scene.gltf"}] * 2_000}
+    padding = {"extras": "x" * size}
+    yield (
+        "gltf",
+        json.dumps({**one_mesh([named]), "bufferViews": [view], **itself, **padding}).encode(),
+    )
+    corners = b"".join(b"v %d %d 0\n" % (i % 100, i // 100) for i in range(30_000))
+    groups = b"".join(b"usemtl m%d\nf 1 2 %d\n" % (i, i + 3) for i in range(200))
+    yield "obj", corners + groups
+    yield "obj", corners + b"f" + b"".join(b" %d" % (i + 1) for i in range(30_000)) + b"\n"
+    text = b"ply\nformat ascii 1.0\nelement vertex 3000000000\nproperty float x\nproperty float y\n"
+    faces = b"element face 3000000000\nproperty list uchar int vertex_indices\nend_header\n"
+    yield "ply", text + b"property float z\n" + faces + b"0 0 0\n" * 300_000
+    yield "off", b"OFF\n3000000000 3000000000 0\n" + b"0 0 0\n" * 300_000
+    yield "stl", bytes(80) + struct.pack("<I", 0xFFFFFFFF) + bytes(1_000_000)
+    yield "stl", b"solid a\n" + b"vertex 0 0 0\n" * 150_000 + b"endsolid a\n"

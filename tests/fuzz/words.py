@@ -2,8 +2,6 @@
 
 The work itself (exploring, mapping, training, evaluating, planning a benchmark) is left out: a case
 ends where it would begin. What was asked is refused with one line and exit code 2, or makes sense.
-
-All 2,000 cases: `pytest -m slow tests/fuzz/test_cli.py`.
 """
 
 import contextlib
@@ -17,33 +15,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from r3jax.apps.report import revisits
-from r3jax.cli import command_line, kernels
+from r3jax.cli import command_line
 from r3jax.cli.commands import audit, benchmark, explore, replay, train
 from r3jax.cli.main import main
 from r3jax.evaluation import judge
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.mapping import bridge as mapping
+from r3jax.kernels.native.ahead import compile_ahead
 from r3jax.mapping.join import merge
 from r3jax.runs.header import header_to_json
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from tests.fuzz import test_models, test_recordings, test_runs, test_splats
-from tests.fuzz.harness import CASES_SLOW
-from tests.fuzz.mutate import mutate
-from tests.fuzz.numbers import NUMBER_TEXTS
+from tests.fuzz.mutations import NUMBER_TEXTS, mutate
 from tests.fuzz.tree import Entry, Files
-from tests.fuzz.worker import Reader
 from tests.runs.runs import make_header
 from tests.simulators.rooms import box_quads, world_of
-
-pytestmark = pytest.mark.full
-
-CASES = 60
-"""In the normal suite."""
 
 COMMANDS = (
     ("info",),
@@ -106,19 +95,21 @@ class Begun(Exception):
     """The words make sense: the work would begin."""
 
 
-def seeds() -> list[Files]:
+def seeds(run: Files, splats: Files, recording: Files) -> list[Files]:
+    """Every command with a run that holds a model, a recording, and a scene."""
+    compile_ahead()  # once in a process, and not by the command under test
     # Numba unpickles its own machine code, which the guard would lay at a command's door.
     for name in (mapping.ADD, mapping.LOOK, mapping.MARK):
         mapping.register(name)
     walls = world_of(box_quads((-2, -2, -1.5), (2, 2, 1.5), inward=True))
     _ = RaycastSimulator(walls, Camera.from_fov(6, 4, 90.0)).start_pose
     files: dict[str, Entry] = {}
-    for name, data in (test_runs.seeds()[0] | test_models.seeds()[0]).items():
+    for name, data in run.items():
         files[f"run/{name}"] = data
-    files["run/models/last/scene.ply"] = test_splats.seeds()[0]["scene.ply"]
+    files["run/models/last/scene.ply"] = splats["scene.ply"]
     scene = {"name": "mesh:room.obj", "up": None, "noise": 0.0, "max_range": 5.0, "start": None}
     policy = {"name": "random", "settings": {}}
-    for name, data in test_recordings.seeds()[0].items():
+    for name, data in recording.items():
         files[f"recording/{name}"] = data
     corners = "".join(f"v {x} {y} {z}\n" for z in (0, 3) for y in (0, 4) for x in (0, 4))
     quads = ((1, 3, 4, 2), (5, 6, 8, 7), (1, 2, 6, 5), (3, 7, 8, 4), (1, 5, 7, 3), (2, 4, 8, 6))
@@ -192,7 +183,6 @@ def with_work_left_out() -> None:
     def begin(*_: Any, **__: Any) -> Any:
         raise Begun
 
-    kernels.COMMANDS = ()
     audit.audit = begin
     explore.explore = begin
     train.train.fit = begin
@@ -202,19 +192,6 @@ def with_work_left_out() -> None:
     replay.differences = begin
     judge.map_of = begin
     revisits.follow_recording = begin
-
-
-READER = Reader(seeds, read, (Refused,), names_file=False, make=make)
-
-
-def test_odd_words_are_refused_or_make_sense(harness):
-    harness.check(__name__, CASES)
-
-
-@pytest.mark.slow
-def test_many_odd_words(harness):
-    """`pytest -m slow tests/fuzz/test_cli.py`."""
-    harness.check(__name__, CASES_SLOW)
 
 
 VALUES = {
@@ -245,9 +222,8 @@ VALUES = {
 BEGINNINGS = (COMMANDS[5], COMMANDS[8], COMMANDS[10], COMMANDS[12])
 
 
-def crafted() -> list[Files]:
+def crafted(whole: Files) -> list[Files]:
     """Each value with the first command that has the option: all read it by the same rule."""
-    (whole, *_) = seeds()
     cases: list[Files] = []
     tried: set[str] = set()
     for words in BEGINNINGS:
@@ -258,10 +234,3 @@ def crafted() -> list[Files]:
                 asked = [*words, option, *(value.split() if option == "--start" else [value])]
                 cases.append(dict(whole) | {"words.json": json.dumps(asked).encode()})
     return cases
-
-
-CRAFTED = Reader(crafted, read, (Refused,), names_file=False)
-
-
-def test_values_without_sense_are_refused(harness):
-    harness.check_crafted(f"{__name__}:CRAFTED")
