@@ -3,6 +3,7 @@
 import copy
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +11,7 @@ from PIL import Image
 
 from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV, read_transforms, write_transforms
+from r3jax.geometry.cameras import invert_pose, project, transform
 from r3jax.runs.reader import read_run
 from r3jax.runs.writer import RunWriter
 from tests.formats.colmap_models import random_pose, seeds
@@ -56,11 +58,15 @@ def written(folder, **changes):
     return folder
 
 
-def test_a_run_comes_back_exactly(tmp_path):
-    with RunWriter(tmp_path / "run", make_header()) as writer:
+def recorded(folder):
+    with RunWriter(folder / "run", make_header()) as writer:
         for step in range(3):
             writer.add(*make_view(step))
-    run = read_run(tmp_path / "run")
+    return read_run(folder / "run")
+
+
+def test_a_run_comes_back_exactly(tmp_path):
+    run = recorded(tmp_path)
     images = read_transforms(write_transforms(run, "exports/points.ply"))
     assert images.image_paths == tuple(run.image_path(row.step) for row in run.rows)
     assert images.points_path == run.path / "exports/points.ply"
@@ -72,6 +78,24 @@ def test_a_run_comes_back_exactly(tmp_path):
         measured = np.isfinite(ours.depth)
         np.testing.assert_array_equal(np.isfinite(theirs.depth), measured)
         np.testing.assert_allclose(theirs.depth[measured], ours.depth[measured], rtol=2e-7)
+
+
+def test_an_opengl_camera_sees_the_same_pixels(tmp_path):
+    run = recorded(tmp_path)
+    content = json.loads(write_transforms(run).read_text())
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-3.0, 3.0, (50, 3)).astype(np.float32)
+    for row, frame in zip(run.rows, content["frames"], strict=True):
+        ours, depth = project(
+            run.camera, transform(invert_pose(jnp.asarray(row.pose)), jnp.asarray(points))
+        )
+        world_from_gl = np.asarray(frame["transform_matrix"])
+        x, y, z = ((points - world_from_gl[:3, 3]) @ world_from_gl[:3, :3]).T
+        u = content["fl_x"] * x / -z + content["cx"]
+        v = content["fl_y"] * -y / -z + content["cy"]
+        front = np.asarray(depth) > 0.1
+        assert front.any()
+        np.testing.assert_allclose(np.stack([u, v], 1)[front], ours[front], rtol=1e-3, atol=1e-2)
 
 
 @given(seed=seeds)

@@ -84,3 +84,8 @@ def test_a_binary_file_that_is_cut_off_is_refused(tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FormatError, match=r"p\.ply: the file is missing"):
         read_points(tmp_path / "p.ply")
+
+
+def test_points_and_colors_must_fit(tmp_path):
+    with pytest.raises(ValueError, match=r"both be \[n, 3\]"):
+        write_points(tmp_path / "p.ply", np.zeros((2, 3)), np.zeros((3, 3), np.uint8))

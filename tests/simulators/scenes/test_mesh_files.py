@@ -238,9 +238,8 @@ def test_what_is_no_mesh_is_named(tmp_path, name):
     data, fact = BAD[name]
     if data is not None:
         (tmp_path / name).write_bytes(data.encode() if isinstance(data, str) else data)
-    with pytest.raises(ValueError, match=fact) as found:
+    with pytest.raises(ValueError, match=f"{name}.*{fact}"):
         load_world(tmp_path / name)
-    assert name in str(found.value)
 
 
 def test_up_must_be_an_axis(tmp_path):

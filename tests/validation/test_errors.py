@@ -1,3 +1,5 @@
+"""A format version that is not read is refused, with the r3jax that reads it."""
+
 import pytest
 
 from r3jax.validation.errors import VersionError, check_version
