@@ -1,6 +1,6 @@
 """The comparison that several tables and figures share: cells of the benchmark in three sizes."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -12,7 +12,6 @@ from r3jax.apps.benchmark.engines.local import Event, run_in_processes
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
 from r3jax.apps.benchmark.record import collect, read_lines, read_records, write_record
-from r3jax.evaluation.comparison import method_name, methods_of, scenes_of
 from r3jax.planning.registry import policy_names
 from r3jax.simulators.scenes.registry import scene_names
 
@@ -164,18 +163,6 @@ def run_requests(
     take_over(options.kept, root, cells)
     run_cells(cells, root, engine=options.engine, jobs=options.jobs)
     return root, cells, read_records(root, cells)
-
-
-def by_method_and_scene(records: Records, items: Sequence[T]) -> Iterator[tuple[str, str, list[T]]]:
-    """What belongs to the records of each method in each scene, one item per record."""
-    for method in methods_of(records):
-        for scene in scenes_of(records):
-            mine = [
-                item
-                for record, item in zip(records, items, strict=True)
-                if (method_name(record), record["scene"]) == (method, scene)
-            ]
-            yield method, scene, mine
 
 
 def run_cells(cells: Sequence[Cell], root: Path, *, engine: str = "local", jobs: int = 1) -> None:

@@ -10,7 +10,7 @@ voxel (`scoring.difficulty`) and D = 1 - R, a pixel is expected to be off by
 L the mean square of the map's colors: what is not rendered is as wrong as it is bright. No
 coefficient is negative: the error never falls with difficulty, nor rises with R. The mean of e over
 a view is its expected squared error, and so its PSNR; with other coefficients it is 1 - SSIM. They
-were fitted on trained models by `python -m experiments.expected_error`.
+were fitted on trained models (`docs/results/expected-error.md`).
 
 Shape symbols: N rows of the map; h w size of the depth buffer; T terms; p pixels.
 """

@@ -2,14 +2,12 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
+from experiments import seen_pixels
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.splatting.views import PosedImage
-from tests.mutants import Mutant, assert_caught, each, load
 
-CHAIN = ("experiments.seen_pixels",)
 SIZE = 24
 CAMERA = Camera.from_fov(SIZE, SIZE, 90.0)
 WALL = 2.0  # x of the wall [m]
@@ -29,22 +27,21 @@ def view(pose, depth):
     return PosedImage(jnp.full((SIZE, SIZE, 3), 0.5), depth, pose, CAMERA)
 
 
-def asked(modules):
-    m = modules["seen_pixels"]
+def asked():
 
     def seen(test, frames, max_range=5.0):
         limits = jnp.float32(max_range), jnp.float32(0.05)
-        return np.asarray(m.seen_pixels(test, m.recorded(frames), *limits))
+        return np.asarray(seen_pixels.seen_pixels(test, seen_pixels.recorded(frames), *limits))
 
     return seen
 
 
-def law_wall(modules) -> None:
+def test_wall() -> None:
     """Seen is what a frame has looked at.
 
     The frame stands 1 m to the left: it sees the wall's points with y in [-1, 3].
     """
-    seen = asked(modules)
+    seen = asked()
     test = view(look((0.0, 0.0, 0.0)), WALL)
     frames = [frame(look((0.0, 1.0, 0.0)), WALL)]
     y = -WALL * (np.arange(SIZE) + 0.5 - SIZE / 2) / (SIZE / 2)  # the image's x points to -y
@@ -57,9 +54,9 @@ def law_wall(modules) -> None:
     assert not seen(behind, [frame(look((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), WALL)]).any()
 
 
-def law_hidden(modules) -> None:
+def test_hidden() -> None:
     """What stands before the wall hides it; the sensor's noise does not."""
-    seen = asked(modules)
+    seen = asked()
     test = view(look((0.0, 0.0, 0.0)), WALL)
     for depth, expected in ((WALL - 0.2, False), (WALL - 0.04, True), (WALL + 0.3, True)):
         assert np.all(seen(test, [frame(look((0.0, 0.0, 0.0)), depth)]) == expected)
@@ -71,9 +68,9 @@ def law_hidden(modules) -> None:
     np.testing.assert_array_equal(seen(test, [frame(look((0.0, 0.0, 0.0)), depth)]), expected)
 
 
-def law_holes(modules) -> None:
+def test_holes() -> None:
     """Without a depth, here or there, or beyond the range, nothing is seen."""
-    seen = asked(modules)
+    seen = asked()
     here = look((0.0, 0.0, 0.0))
     holes = np.full((SIZE, SIZE), WALL)
     holes[:, :5], holes[:, 5:9] = 0.0, np.inf
@@ -88,7 +85,7 @@ def law_holes(modules) -> None:
 
 
 def test_any_poses_against_float64():
-    seen = asked(load(CHAIN))
+    seen = asked()
     rng = np.random.default_rng(0)
     frames = [
         frame(look(rng.uniform(-1, 1, 3), rng.normal(size=3)), rng.uniform(0.5, 4, (SIZE, SIZE)))
@@ -119,26 +116,3 @@ def test_any_poses_against_float64():
     assert 0.1 < expected.mean() < 0.9
     assert doubtful.mean() < 0.1
     np.testing.assert_array_equal(seen(test, frames)[~doubtful], expected[~doubtful])
-
-
-MUTANTS = [
-    Mutant("seen_pixels", "(ahead <= measured + tolerance)", "(measured > -1.0)", law_hidden),
-    Mutant("seen_pixels", "(measured > 0.0) &", "", law_holes),
-    Mutant("seen_pixels", "measured + tolerance", "measured", law_hidden),
-    Mutant("seen_pixels", "_limit(f.depth), 0.0)", "f.depth, 0.0)", law_hidden),
-    Mutant("seen_pixels", "seen | (inside", "(inside", law_wall),
-    Mutant("seen_pixels", "(ahead > 1e-3) & (column >= 0.0)", "(column >= 0.0)", law_wall),
-    Mutant("seen_pixels", "invert_pose(f.T_world_camera)", "f.T_world_camera", law_wall),
-    Mutant("seen_pixels", "<= max_range * max_range", "<= 100.0 * max_range", law_holes),
-    Mutant("seen_pixels", "known & seen", "seen", law_holes),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("law", [law_wall, law_hidden, law_holes])
-def test_laws_hold_without_a_fault(law):
-    law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
