@@ -50,10 +50,10 @@ test-workqueue: setup
 
 # What `test-all` adds to `test`.
 test-added: setup
-	$(PYTEST) -m "full and not (mutant or slow)"
+	$(PYTEST) -m "full and not slow"
 
 mutants: setup
-	$(PYTEST) -m mutant
+	$(BIN)/python -m tests.mutants
 
 stress: setup
 	$(PYTEST) -m slow

@@ -86,7 +86,7 @@ def steps_of(options: Options, timings: Path) -> list[Step]:
     smoke = ("--size", "smoke", "--work", str(options.out / NAME), "--out", str(options.out / NAME))
     return [
         # One process: several would share the memory of one GPU.
-        Step("tests", (*pytest, "-m", "not (mutant or slow)", *options.tests)),
+        Step("tests", (*pytest, "-m", "not slow", *options.tests)),
         Step(
             "benchmarks",
             (*pytest, "tests/benchmarks", "--jaxtyping-packages=", "--benchmark-enable",

@@ -80,7 +80,7 @@ def is_measured(config: pytest.Config) -> bool:
 def pytest_configure(config):
     """Compiles quickly, unless it is measured how long things take: then all benchmarks run."""
     if is_measured(config):
-        config.option.markexpr = "not (mutant or slow)"
+        config.option.markexpr = "not slow"
     flags = os.environ.get("XLA_FLAGS", "")
     is_known = jax.__version_info__[:2] == (0, 10)
     # Once, though each test process inherits them: a program is found again by its flags' text.

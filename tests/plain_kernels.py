@@ -1,11 +1,33 @@
-"""Kernels for CPUs as plain Python, for tests that plant faults in them: nothing is compiled."""
+"""Kernels for CPUs as plain Python, held to the formulas: nothing is compiled."""
 
 import contextlib
+import importlib.util
 import sys
 from collections.abc import Generator
+from pathlib import Path
 from types import ModuleType
+from unittest import mock
 
 import numpy as np
+
+Modules = dict[str, ModuleType]
+"""Loaded modules by the last part of their names."""
+
+
+def load(chain: tuple[str, ...]) -> Modules:
+    """Loads modules a second time, in this order, each of which sees the earlier ones."""
+    loaded: Modules = {}
+    with mock.patch.dict(sys.modules):
+        for name in chain:
+            spec = importlib.util.find_spec(name)
+            if spec is None or spec.origin is None:
+                raise LookupError(f"no source for module {name!r}")
+            module = ModuleType(name)
+            module.__file__ = spec.origin
+            sys.modules[name] = loaded[name.rpartition(".")[2]] = module
+            source = Path(spec.origin).read_text(encoding="utf-8")
+            exec(compile(source, spec.origin, "exec"), module.__dict__)
+    return loaded
 
 
 @contextlib.contextmanager

@@ -5,17 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r3jax.baselines.active_gs import confidence
 from r3jax.baselines.active_gs.confidence import aligned, glance, no_sightings, see
 from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.seen import rows_in_view
 from r3jax.planning.registry import make_policy
 from tests.baselines.test_active_gs_confidence import RANGE, frames, maps
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 pytestmark = pytest.mark.full
 
-CHAIN = ("r3jax.baselines.active_gs.confidence",)
 REACH = jnp.float32(RANGE)
 
 
@@ -29,11 +28,11 @@ def history():
     return steps[1:]
 
 
-def law_glance(modules: Modules) -> None:
+def test_glances_are_what_a_loop_says() -> None:
     numbers = []
     in_float64 = lambda x: np.asarray(x, dtype=np.float64)
     for frame, state, before, touched in history():
-        after = modules["confidence"].glance(before, touched, state, frame, REACH)
+        after = confidence.glance(before, touched, state, frame, REACH)
         seen = np.asarray(rows_in_view(state, frame, REACH))
         is_touched = np.asarray(touched.views) > np.asarray(before.views)
         known = np.asarray(touched.views) > 0
@@ -61,10 +60,6 @@ def law_glance(modules: Modules) -> None:
     assert sum(numbers) > 10
 
 
-def test_glances_are_what_a_loop_says():
-    law_glance(load(CHAIN))
-
-
 def test_a_look_may_raise_confidence_but_never_the_cosines_of_what_is_hidden():
     frame, state, before, touched = history()[-1]
     after = glance(before, touched, state, frame, REACH)
@@ -88,16 +83,3 @@ def test_the_policy_takes_note_of_pixels_and_glances():
         expected = glance(before, touched, known, frame, REACH)
     jax.tree.map(np.testing.assert_array_equal, state.memory, expected)
     assert float(expected.views.sum()) > float(history()[-1][3].views.sum()) + 10
-
-
-MUTANTS = [
-    Mutant("confidence", "(touched.views == before.views)", "True", law_glance),
-    Mutant("confidence", "rows_in_view(state, frame, max_range) & ", "", law_glance),
-    Mutant("confidence", "1.0 - distance / max_range", "1.0", law_glance),
-    Mutant("confidence", "touched.normal * direction", "-touched.normal * direction", law_glance),
-]
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

@@ -16,10 +16,8 @@ from r3jax.geometry.cameras import look_at
 from r3jax.splatting import harmonics
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.render import render
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
-CHAIN = ("r3jax.baselines.fisher",)
 COUNT = 50
 BEHIND = (0.2, 0.5, 0.1)
 CONFIG = RasterConfig(max_intersections=1 << 12)
@@ -64,7 +62,7 @@ def dense_information(scene, camera, pose, *, quirk: bool):
     return {n: np.asarray(s * q) for n, s, q in zip(PARTS, slopes, squares, strict=True)}
 
 
-def information_is_dense(modules: Modules) -> None:
+def test_information_is_the_sum_of_squared_dense_jacobians() -> None:
     scene, camera, pose = a_case()
     with pytest.MonkeyPatch.context() as patch:
         # Forward mode cannot pass a gradient that is written out.
@@ -72,16 +70,12 @@ def information_is_dense(modules: Modules) -> None:
         expected = {q: dense_information(scene, camera, pose, quirk=q) for q in (False, True)}
     for quirk in (False, True):
         form = Form(quirk=quirk, background=BEHIND)
-        found, overflow = modules["fisher"].information(CONFIG, scene, camera, pose, form)
+        found, overflow = fisher.information(CONFIG, scene, camera, pose, form)
         assert int(overflow) == 0
         assert not np.asarray(found.quats).any()
         for name in PARTS:
             a, b = np.asarray(getattr(found, name)), expected[quirk][name]
             assert np.all(np.abs(a - b) <= 1e-3 * np.abs(b) + 1e-5 * b.max()), name
-
-
-def test_information_is_the_sum_of_squared_dense_jacobians():
-    information_is_dense({"fisher": fisher})
 
 
 def test_opacities_of_one_say_nothing_and_disturb_nothing():
@@ -101,17 +95,17 @@ def numbers(*values):
     return replace(blank, means=jnp.asarray([values], jnp.float32))
 
 
-def gains_by_hand(modules: Modules) -> None:
+def gains_by_hand() -> None:
     """H_v = 3, 1, 0 where H = 1, 0, 5 is known, with lambda = 0.5."""
     found, known = numbers(3.0, 1.0, 0.0), numbers(1.0, 0.0, 5.0)
-    gain = modules["fisher"].gain
+    gain = fisher.gain
     assert float(gain(found, known, Form(damping=0.5))) == pytest.approx(3.0 / 1.5 + 1.0 / 0.5)
     d_opt = gain(found, known, Form(criterion="d-opt", damping=0.5))
     assert float(d_opt) == pytest.approx(np.log(3.0) + np.log(3.0), rel=1e-5)
 
 
 def test_gains_worked_out_by_hand():
-    gains_by_hand({"fisher": fisher})
+    gains_by_hand()
     assert Form().damping == 1e-6  # the authors' lambda
     # What was never seen counts a million times what was.
     assert float(fisher.gain(numbers(1, 0, 0), numbers(0, 0, 0), Form())) == pytest.approx(1e6)
@@ -139,14 +133,13 @@ def a_pool(num: int = 7):
     return np.stack([np.asarray(look_at(place, np.zeros(3))) for place in places])
 
 
-def batches_are_greedy(modules: Modules) -> None:
+def test_batches_are_those_of_brute_force() -> None:
     """By brute force: all H of all views at hand, ratios and sums in NumPy."""
-    module = modules["fisher"]
     scene, camera, pool = random_cloud(4, 20, 0), view(16, 16)[0], a_pool()
     form = Form(quirk=False)
     table = []
     for pose in pool:
-        found, _ = module.information(CONFIG, scene, camera, jnp.asarray(pose), form)
+        found, _ = fisher.information(CONFIG, scene, camera, jnp.asarray(pose), form)
         table.append(np.concatenate([np.ravel(x) for x in jax.tree.leaves(found)]))
     table = np.asarray(table, np.float64)
     known, expected = 3.0 * table[3] + table[0], []
@@ -155,11 +148,7 @@ def batches_are_greedy(modules: Modules) -> None:
         ratio[expected] = -np.inf
         expected.append(int(np.argmax(ratio)))
         known = known + table[expected[-1]]
-    assert module.greedy_batch(scene, camera, pool, pool[[3, 3, 3, 0]], 7, form) == expected
-
-
-def test_batches_are_those_of_brute_force():
-    batches_are_greedy({"fisher": fisher})
+    assert fisher.greedy_batch(scene, camera, pool, pool[[3, 3, 3, 0]], 7, form) == expected
 
 
 def test_a_larger_batch_begins_with_the_smaller_one_and_repeats_nothing():
@@ -183,31 +172,3 @@ def test_known_information_is_a_sum_over_views():
     found = scores(scene, camera, pool[:1], singles[0], Form())
     shown = sum(int((np.asarray(x) > 0).sum()) for x in jax.tree.leaves(singles[0]))
     assert 0.0 < found[0] < shown
-
-
-MUTANTS = [
-    Mutant("fisher", "divide(squares.log_scales, jnp.exp(scene.log_scales))", "squares.log_scales",
-           information_is_dense),
-    Mutant("fisher", "opacity * (1.0 - opacity))", "opacity)", information_is_dense),
-    Mutant("fisher", "jnp.zeros_like(squares.quats)", "squares.quats", information_is_dense),
-    Mutant("fisher", "if form.quirk else squares", "", information_is_dense),
-    Mutant("fisher", "new / (old + form.damping)", "new / (old + new + form.damping)",
-           gains_by_hand),
-    Mutant("fisher", "jnp.log1p(share)", "jnp.log(share + 1e-9)", gains_by_hand),
-    Mutant("fisher", "known = jax.tree.map(jnp.add, known, more)", "pass", batches_are_greedy),
-    Mutant("fisher", "found[chosen] = -np.inf", "pass", batches_are_greedy),
-    Mutant("fisher", "known, chosen = known_information(scene, camera, trained, form), list[int]()",
-           "known, chosen = known_information(scene, camera, trained[:1], form), list[int]()",
-           batches_are_greedy),
-]  # fmt: skip
-
-
-@pytest.mark.mutant
-@pytest.mark.parametrize("law", [information_is_dense, gains_by_hand, batches_are_greedy])
-def test_the_laws_hold(law):
-    law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_faults_are_noticed(mutant):
-    assert_caught(CHAIN, mutant)

@@ -36,11 +36,9 @@ from r3jax.splatting.projection import rotation_rows
 from r3jax.splatting.render import render
 from r3jax.splatting.training.optimizer import empty_moments
 from tests.exploration.toys import BoxRoom
-from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.splatting.clouds import random_cloud
 from tests.tiers import quick_and_full
 
-CHAIN = ("r3jax.baselines.births",)
 KEY = jax.random.key(5)
 
 
@@ -209,7 +207,7 @@ def test_what_no_key_frame_sees_any_more_is_pruned():
     np.testing.assert_array_equal(kept, np.asarray(means)[expected])
 
 
-def births_by_hand(modules: Modules) -> None:
+def test_births_by_hand() -> None:
     """Each of the three reasons just beyond its threshold, and just short of it."""
     rgb, depth = np.full((1, 6, 3), 0.5, np.float32), np.full((1, 6), 2.0, np.float32)
     # The mean of the three channels: one that is off by 0.7 is not enough.
@@ -217,11 +215,11 @@ def births_by_hand(modules: Modules) -> None:
     color[0, 5, 0] += 0.7
     distance = np.array([[2.0, 2.0, 2.0, 2.0, 2.11, 2.09]])
     alpha = np.array([[1.0, 1.0, 0.49, 0.51, 1.0, 1.0]])
-    found = modules["births"].is_wrong(rgb, depth, (color, distance, alpha), DISCS)
+    found = births.is_wrong(rgb, depth, (color, distance, alpha), DISCS)
     assert found.tolist() == [[True, False, True, False, True, False]]
 
 
-def discs_lie_on_their_wall(modules: Modules) -> None:
+def test_discs_lie_on_their_wall() -> None:
     """A slanted wall: Gaussians on its pixels' points, their third axes along its normal."""
     camera = Camera.from_fov(24, 20, 70.0)
     pose = np.asarray(pose_along(jnp.array([1.0, 2.0, 0.5]), jnp.array([1.0, 0.1, 0.0])))
@@ -236,7 +234,7 @@ def discs_lie_on_their_wall(modules: Modules) -> None:
     nothing = np.zeros((20, 24, 3)), np.zeros((20, 24)), np.zeros((20, 24))
     settings = replace(DISCS, spacing=1e-3)
     rng = np.random.default_rng(0)
-    born = modules["births"].born_in(rgb, depth, pose, camera, nothing, settings, rng)
+    born = births.born_in(rgb, depth, pose, camera, nothing, settings, rng)
     assert len(born.means) == 20 * 24 - 1
     np.testing.assert_allclose(born.means @ normal, height, atol=1e-4)
     rotation = rotation_rows(jnp.asarray(born.quats))
@@ -251,24 +249,16 @@ def discs_lie_on_their_wall(modules: Modules) -> None:
     np.testing.assert_allclose(np.exp(born.log_scales[0]), [0.01, 0.01, 1e-5], rtol=1e-4)
 
 
-def rows_move_whole(modules: Modules) -> None:
+def test_rows_move_whole() -> None:
     scene = random_cloud(1, 6, 0)
     marks = jnp.arange(12.0).reshape(6, 2) + 1.0
     keep = np.array([False, True, True, False, True, False])
-    kept, moved = modules["births"].kept_rows((scene, marks), keep)
+    kept, moved = births.kept_rows((scene, marks), keep)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         a, b = np.asarray(getattr(kept, name)), np.asarray(getattr(scene, name))
         np.testing.assert_array_equal(a[:3], b[keep])
     np.testing.assert_array_equal(moved, [[3, 4], [5, 6], [9, 10], [0, 0], [0, 0], [0, 0]])
     assert np.asarray(kept.is_alive).tolist() == [True] * 3 + [False] * 3
-
-
-LAWS = [births_by_hand, discs_lie_on_their_wall, rows_move_whole]
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_births_and_rows_are_right(law):
-    law({"births": births})
 
 
 def test_a_map_grows_by_unused_rows():
@@ -309,28 +299,3 @@ def test_values_are_composited_by_their_weights():
     pose = scene.frames.T_world_camera[0]
     seen = show(colored(scene.scene, jnp.full(scene.scene.capacity, 0.25)), scene.camera, pose)
     np.testing.assert_allclose(seen.rgb[..., 0], 0.25 * np.asarray(seen.alpha), atol=1e-5)
-
-
-MUTANTS = [
-    Mutant("births", "(error > settings.birth_color)", "(error > 1.1 * settings.birth_color)",
-           births_by_hand),
-    Mutant("births", "np.mean((color - rgb) ** 2, axis=-1)", "np.max((color - rgb) ** 2, axis=-1)",
-           births_by_hand),
-    Mutant("births", "depth - distance < -settings.birth_depth * depth",
-           "distance - depth < -settings.birth_depth * depth", births_by_hand),
-    Mutant("births", "alpha < settings.birth_opacity", "alpha < 0.4", births_by_hand),
-    Mutant("births", "turned_to(normals[chosen] @ pose[:3, :3].T)", "turned_to(normals[chosen])",
-           discs_lie_on_their_wall),
-    Mutant("births", "pose[:3, :3].T + pose[:3, 3]", "pose[:3, :3].T", discs_lie_on_their_wall),
-    Mutant("births", "np.stack([1.0 + z, -y, x,", "np.stack([1.0 + z, y, x,",
-           discs_lie_on_their_wall),
-    Mutant("births", "(np.arange(camera.width) + 0.5", "(np.arange(camera.width) + 1.0",
-           discs_lie_on_their_wall),
-    Mutant("births", "array[num:] = 0", "pass", rows_move_whole),
-    Mutant("births", "scene.opacity_logits[num:] = DEAD_LOGIT", "pass", rows_move_whole),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_faults_are_noticed(mutant):
-    assert_caught(CHAIN, mutant)

@@ -4,16 +4,13 @@ import functools
 
 import jax
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.baselines.active_gamer import pool
 from r3jax.planning.robot.travel import plan_travel
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import CELL, center, grid_of, two_rooms
 
-CHAIN = ("r3jax.baselines.active_gamer.pool",)
 NUM = 30
 SHAPE = (25, 14, 10)
 
@@ -28,9 +25,9 @@ def rooms_travel(num_known: int = 25):
     return travel_in(two_rooms()[0] & (np.arange(25) < num_known)[:, None, None])
 
 
-def law_columns(modules: Modules) -> None:
+def test_columns() -> None:
     """1 m apart from 0.5 m on: cells 2, 7, 12, ... of 0.2 m; 0.5 m apart from 0.25 m on."""
-    coarse, fine = modules["pool"].STAGES
+    coarse, fine = pool.STAGES
     columns = coarse.columns(SHAPE, CELL)
     assert sorted(set(columns[:, 0])) == [2, 7, 12, 17, 22]
     assert sorted(set(columns[:, 1])) == [2, 7, 12]
@@ -42,13 +39,13 @@ def law_columns(modules: Modules) -> None:
     assert (fine.heights, fine.num_directions) == ((1.0, 2.5), 15)
 
 
-def law_places(modules: Modules) -> None:
+def test_places() -> None:
     """By hand: free layers 1..8, so the floor is under layer 1 and stops are layers 2..7.
 
     Their centers lie 0.3, 0.5, ..., 1.3 m above the floor. 1.75 m takes layer 7 (0.45 m below
     it); 1.0 m takes layer 5 (0.9 m: as near as 1.1 m, and lower); 2.5 m is too far from all.
     """
-    coarse, fine = modules["pool"].STAGES
+    coarse, fine = pool.STAGES
     travel = rooms_travel()
     cells, there = coarse.places(travel)
     stops = {(2, 7), (7, 2), (7, 7), (17, 2), (17, 7), (22, 2), (22, 7), (2, 2), (12, 7)}
@@ -63,9 +60,9 @@ def law_places(modules: Modules) -> None:
     assert set(cells[there, 2].tolist()) == {5}
 
 
-def law_floor(modules: Modules) -> None:
+def test_floor() -> None:
     """100 cells of layer 3 and 100 of layer 6; one cell below is an outlier, ten are a floor."""
-    floor_layer = modules["pool"].floor_layer
+    floor_layer = pool.floor_layer
     free = np.zeros((10, 10, 8), bool)
     assert floor_layer(free) == 0
     free[:, :, [3, 6]] = True
@@ -76,17 +73,16 @@ def law_floor(modules: Modules) -> None:
     assert floor_layer(free) == 1
 
 
-def law_levels_share_no_cell(modules: Modules) -> None:
+def test_levels_share_no_cell() -> None:
     """Stops are 0.3, 0.5, ... m high: without a border both levels would take the first."""
-    stage = modules["pool"].LatticeStage(0.5, (0.3, 0.35), 3)
+    stage = pool.LatticeStage(0.5, (0.3, 0.35), 3)
     cells, there = stage.places(rooms_travel())
     assert there.sum() > 50
     assert len(np.unique(cells[there], axis=0)) == there.sum()
 
 
-def history(modules: Modules, seed: int, num_rounds: int):
+def history(seed: int, num_rounds: int):
     """Rounds of drawing and dismissing while more and more of the flat becomes known."""
-    pool = modules["pool"]
     rng = np.random.default_rng(seed)
     pools = pool.empty_pools(SHAPE, CELL)
     for _ in range(num_rounds):
@@ -106,10 +102,10 @@ def history(modules: Modules, seed: int, num_rounds: int):
         pools = pool.Pools(tuple(of_stage), pools.num_ended)
 
 
-def law_history(modules: Modules, seed: int = 5, num_rounds: int = 25) -> None:
+def law_history(seed: int = 5, num_rounds: int = 25) -> None:
     """Who left never returns; no candidate twice; all stand where the robot may stop."""
     gone, stage = set(), 0
-    for draw, gain, best, travel, pools in history(modules, seed, num_rounds):
+    for draw, gain, best, travel, pools in history(seed, num_rounds):
         names = [
             (draw.stage, int(p), int(d)) for p, d in zip(draw.place, draw.direction, strict=True)
         ]
@@ -131,9 +127,9 @@ def law_history(modules: Modules, seed: int = 5, num_rounds: int = 25) -> None:
     assert gone
 
 
-def law_order(modules: Modules) -> None:
+def test_order() -> None:
     """Never scored: nearest first. Then the remembered gains decide, whatever the distance."""
-    pool, travel = modules["pool"], rooms_travel()
+    travel = rooms_travel()
     pools, draw = pool.draw_candidates(pool.empty_pools(SHAPE, CELL), travel, 12)
     first = pools.of_stage[0]
     cells, there = pool.STAGES[0].places(travel)
@@ -159,9 +155,9 @@ def law_order(modules: Modules) -> None:
     np.testing.assert_allclose(np.asarray(after.gain)[draw.place, draw.direction], seen, rtol=1e-6)
 
 
-def law_stages(modules: Modules) -> None:
+def test_stages() -> None:
     """Stage 0 until its pool is spent, for good; what cannot be reached waits meanwhile."""
-    pool, free = modules["pool"], two_rooms()[0]
+    free = two_rooms()[0]
     first_room = free & (np.arange(25) < 13)[:, None, None]
     pools, draw = pool.draw_candidates(pool.empty_pools(SHAPE, CELL), travel_in(first_room), NUM)
     assert draw.stage == 0
@@ -195,55 +191,12 @@ def law_stages(modules: Modules) -> None:
     assert int(pools.num_ended) == 2
 
 
-LAWS = [
-    law_columns,
-    law_places,
-    law_floor,
-    law_levels_share_no_cell,
-    law_history,
-    law_order,
-    law_stages,
-]
-
-
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
-def test_law(law):
-    law(load(CHAIN))
-
-
 @given(seed=st.integers(0, 1000))
 def test_no_candidate_returns(seed):
-    law_history({"pool": pool}, seed, num_rounds=6)
+    law_history(seed, num_rounds=6)
 
 
 def test_the_pool_is_a_pytree_of_arrays():
     leaves = jax.tree.leaves(pool.empty_pools(SHAPE, CELL))
     assert all(isinstance(leaf, jax.Array) for leaf in leaves)
     assert {leaf.shape for leaf in leaves} == {(15, 5), (120, 15), ()}
-
-
-MUTANTS = [
-    Mutant("pool", "np.arange(0.5 * self.spacing", "np.arange(0.0 * self.spacing", law_columns),
-    Mutant("pool", "points / cell_size + 1e-3", "points / cell_size + 0.5", law_columns),
-    Mutant("pool", "+ 0.5 - layer_of_floor)", "+ 0.5)", law_places),
-    Mutant("pool", "& (gap <= _SLACK + 1e-6)", "", law_places),
-    Mutant("pool", "travel.goals & travel.safe)[", "travel.free)[", law_places),
-    Mutant("pool", "gaps.argmin(axis=1)", "gaps.argmax(axis=1)", law_places),
-    Mutant("pool", "_BELOW_FLOOR = 0.02", "_BELOW_FLOOR = 0.0", law_floor),
-    Mutant("pool", "(height >= low) & (height < high) & ", "", law_levels_share_no_cell),
-    Mutant("pool", "left[draw.place, draw.direction] |=", "left[draw.place, 0] |=", law_history),
-    Mutant("pool", "is_done[best] = True", "pass", law_history),
-    Mutant("pool", "pool.entered & ~pool.left", "pool.entered", law_history),
-    Mutant("pool", "~pool.left) & has_place[:, None]", "~pool.left)", law_history),
-    Mutant("pool", "(distance, -remembered)", "(-remembered, distance)", law_order),
-    Mutant("pool", "(distance, -remembered)", "(-distance, -remembered)", law_order),
-    Mutant("pool", "LEAST_GAIN = 0.005", "LEAST_GAIN = 0.004", law_order),
-    Mutant("pool", "remembered[draw.place, draw.direction] = gain", "pass", law_order),
-    Mutant("pool", "num_ended += 1", "pass", law_stages),
-    Mutant("pool", "range(num_ended, len(STAGES))", "range(len(STAGES))", law_stages),
-]
-
-
-@each(MUTANTS)
-def test_a_fault_is_noticed(mutant):
-    assert_caught(CHAIN, mutant)

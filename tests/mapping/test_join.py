@@ -12,7 +12,6 @@ from r3jax.mapping.join import Statistics, grow, merge
 from r3jax.mapping.seen import bin_words
 from r3jax.mapping.state import MapState, empty_map
 from tests.mapping.reference import Row, assert_same_rows, read_map
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 CAPACITY, NUM, VOXEL_SIZE = 16, 6, 0.0625  # one shape: one compile
 BINS = (0, 1, 31, 32, 33, 63)  # few, so that batches share them; both words
@@ -146,20 +145,12 @@ def test_bins_and_resolution_only_grow(chosen, last):
         assert later[voxel].count >= row.count
 
 
-def test_full_map_keeps_its_rows_and_counts_what_it_drops():
-    law_full_map({"join": real})
-
-
 def test_growing_in_time_drops_nothing():
     full = map_of([FULL[0]], capacity=8)
     larger = grow(full, 16)
     state = join(larger, FULL[1].statistics())
     assert int(state.dropped) == 0
     assert_same_rows(read_map(state), expected_rows(FULL[:2]))
-
-
-def test_drops_of_both_maps_add_up():
-    law_merged_drops({"join": real})
 
 
 @pytest.mark.parametrize("num_bins", [1, 31, 32, 33, 64, 100])
@@ -184,27 +175,25 @@ def test_bad_capacities_are_refused():
         grow(empty_map(16), 24)
 
 
-# Laws of fixed examples, for the mutants ---------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 FULL = [Batch(seed, num_voxels=20, padding=0.0) for seed in (0, 1, 2)]
 
 
-def law_joins(modules: Modules) -> None:
-    module = modules["join"]
+def test_joins() -> None:
     batches = [Batch(seed, num_voxels=7) for seed in range(4)]
-    state = map_of(batches, jax.jit(module.join), module.Statistics)
+    state = map_of(batches, jax.jit(real.join), real.Statistics)
     assert_same_rows(read_map(state), expected_rows(batches))
 
 
-def law_full_map(modules: Modules) -> None:
+def test_full_map_keeps_its_rows_and_counts_what_it_drops() -> None:
     """8 rows for 13 voxels: what is in stays in, each loss is counted once and for good."""
-    module = modules["join"]
-    join, dropped = jax.jit(module.join), 0
+    join, dropped = jax.jit(real.join), 0
     state = empty_map(8, VOXEL_SIZE)
     kept: dict = {}
     for batch in FULL:
         before = set(read_map(state))
-        state = join(state, batch.statistics(module.Statistics))
+        state = join(state, batch.statistics(real.Statistics))
         rows = read_map(state)
         assert before <= set(rows)
         dropped += sum(voxel not in rows for voxel in batch.voxels)
@@ -214,57 +203,19 @@ def law_full_map(modules: Modules) -> None:
     assert dropped > 0
 
 
-def law_merge(modules: Modules) -> None:
-    """The module is a copy of its own: its chunks may be made smaller than the map."""
-    module = modules["join"]
-    vars(module)["CHUNK"] = 4
+def test_maps_of_many_chunks_merge_and_grow(monkeypatch) -> None:
+    monkeypatch.setattr(real, "CHUNK", 4)
     batches = [Batch(seed, num_voxels=7) for seed in range(4)]
     a, b = map_of(batches[:2]), map_of(batches[2:])
-    assert_same_rows(read_map(module.merge(a, b)), expected_rows(batches))
-    assert_same_rows(read_map(module.grow(a, 64)), expected_rows(batches[:2]))
+    assert_same_rows(read_map(real.merge(a, b)), expected_rows(batches))
+    assert_same_rows(read_map(real.grow(a, 64)), expected_rows(batches[:2]))
 
 
-def law_merged_drops(modules: Modules) -> None:
+def test_drops_of_both_maps_add_up() -> None:
     a, b = map_of(FULL, capacity=8), map_of(FULL[:2], capacity=8)
     lost = len(set(read_map(b)) - set(read_map(a)))
-    merged = modules["join"].merge(a, b)
+    merged = real.merge(a, b)
     assert int(merged.dropped) == int(a.dropped) + int(b.dropped) + lost
-    assert int(modules["join"].grow(a, 16).dropped) == int(a.dropped) > 0
-    unchanged = modules["join"].merge(a, empty_map(8, VOXEL_SIZE))
+    assert int(real.grow(a, 16).dropped) == int(a.dropped) > 0
+    unchanged = real.merge(a, empty_map(8, VOXEL_SIZE))
     assert int(unchanged.dropped) == int(a.dropped)
-
-
-CHAIN = ("r3jax.mapping.join",)
-MUTANTS = [
-    Mutant("join", "weight = n_b / jnp.maximum(n, 1.0)",
-           "weight = 1.0 / jnp.maximum(n, 1.0)", law_joins),
-    Mutant("join", "weight = n_b / jnp.maximum(n, 1.0)",
-           "weight = n_b / jnp.maximum(n_a, 1.0)", law_joins),
-    Mutant("join", " + jnp.sum(d * d, axis=0) * n_a * weight", "", law_joins),
-    Mutant("join", "jnp.sum(d * d, axis=0) * n_a * weight",
-           "jnp.sum(d * d, axis=0) * weight", law_joins),
-    Mutant("join", "m2_a + m2_b +", "m2_a +", law_joins),
-    Mutant("join", "d = mean_b - mean_a", "d = mean_a - mean_b", law_joins),
-    Mutant("join", "at(state.visited) | new.visited", "new.visited", law_joins),
-    Mutant("join", "at(state.visited) | new.visited", "at(state.visited) ^ new.visited", law_joins),
-    Mutant("join", "jnp.maximum(at(state.resolution), new.resolution)",
-           "new.resolution", law_joins),
-    Mutant("join", "is_lost = new.valid & (row", "is_lost = (row", law_merged_drops),
-    Mutant("join", "dropped=state.dropped + jnp.sum", "dropped=jnp.sum", law_full_map),
-    Mutant("join", "find_or_insert(state.key, new.key, new.valid)",
-           "find_or_insert(state.key, new.key, new.valid | True)", law_joins),
-    Mutant("join", "state.dropped + other.dropped", "state.dropped", law_merged_drops),
-    Mutant("join", "valid=rows(other.occupied)", "valid=rows(other.count > 3.0)", law_merge),
-    Mutant("join", "other.capacity // size, join_chunk", "1, join_chunk", law_merge),
-]  # fmt: skip
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    for law in (law_joins, law_full_map, law_merge, law_merged_drops):
-        law(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

@@ -10,7 +10,6 @@ from r3jax.mapping.join import grow
 from r3jax.mapping.lookup import lookup
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_points
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.strategies import NUM_POINTS, VOXEL_SIZE, Sighting, sightings
 
 CAPACITY = 64
@@ -68,10 +67,6 @@ def fixed_sighting() -> Sighting:
     )
 
 
-def test_points_that_are_not_finite_are_in_no_voxel():
-    law_not_finite({"lookup": real})
-
-
 def test_an_empty_map_has_no_rows():
     nothing = lookup(empty_map(CAPACITY, VOXEL_SIZE), jnp.asarray(fixed_sighting().points))
     np.testing.assert_array_equal(nothing, CAPACITY)
@@ -86,43 +81,20 @@ def test_points_of_any_leading_shape():
     np.testing.assert_array_equal(jax.vmap(lookup, in_axes=(None, 0))(state, points), rows)
 
 
-# Laws of fixed examples, for the mutants ---------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 
-def law_rows(modules: Modules) -> None:
+def test_rows() -> None:
     seen = fixed_sighting()
     swapped = np.concatenate([seen.points[:, [1, 0, 2]], seen.points[:, [0, 2, 1]]])
-    assert_found(modules["lookup"].lookup, map_of(seen), seen, seen.points)
-    assert_found(modules["lookup"].lookup, map_of(seen), seen, swapped)
+    assert_found(real.lookup, map_of(seen), seen, seen.points)
+    assert_found(real.lookup, map_of(seen), seen, swapped)
 
 
-def law_not_finite(modules: Modules) -> None:
+def test_points_that_are_not_finite_are_in_no_voxel() -> None:
     """Voxel 0 is in the map: what is not finite must not be taken for the origin."""
     state = map_of(fixed_sighting())
     bad = np.full((NUM_POINTS, 3), 0.5 * VOXEL_SIZE, np.float32)
     bad[:, 0] = np.resize([np.nan, np.inf, -np.inf], NUM_POINTS)
     bad[::2, 1:] = np.nan
-    np.testing.assert_array_equal(modules["lookup"].lookup(state, jnp.asarray(bad)), CAPACITY)
-
-
-CHAIN = ("r3jax.mapping.lookup",)
-MUTANTS = [
-    Mutant("lookup", "pack(index[:, 0], index[:, 1], index[:, 2])",
-           "pack(index[:, 1], index[:, 0], index[:, 2])", law_rows),
-    Mutant("lookup", "pack(index[:, 0], index[:, 1], index[:, 2])",
-           "pack(index[:, 0], index[:, 1], index[:, 1])", law_rows),
-    Mutant("lookup", "jnp.all(jnp.isfinite", "jnp.any(jnp.isfinite", law_not_finite),
-    Mutant("lookup", "jnp.stack([low, high]), is_finite)",
-           "jnp.stack([low, high]), is_finite | True)", law_not_finite),
-]  # fmt: skip
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    law_rows(modules)
-    law_not_finite(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
+    np.testing.assert_array_equal(real.lookup(state, jnp.asarray(bad)), CAPACITY)

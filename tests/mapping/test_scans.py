@@ -15,7 +15,6 @@ from r3jax.mapping.state import MapState
 from r3jax.mapping.update import integrate_points
 from tests.mapping.reference import ReferenceMap, assert_same_rows, read_map
 from tests.mapping.sighted import NUM_BINS, new_map, random_sighting
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.strategies import NUM_POINTS, VOXEL_SIZE, Sighting, sightings
 
 PADDED = 32
@@ -185,7 +184,7 @@ def test_bad_scan_is_named(changes, words):
         integrate_points(new_map(), **(good | changes))
 
 
-# Laws of fixed examples, for the mutants ---------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 EXAMPLES = [
     moving(random_sighting(seed), np.random.default_rng(seed).integers(-64, 64, (NUM_POINTS, 3)))
@@ -193,47 +192,22 @@ EXAMPLES = [
 ]
 
 
-def law_scans(modules: Modules) -> None:
+def test_scans_of_many_chunks(monkeypatch) -> None:
     """With chunks smaller than a scan, so that leaders and their positions stay together."""
-    module = modules["update"]
-    vars(module)["CHUNK"] = 4
+    monkeypatch.setattr(real, "CHUNK", 4)
     reference = reference_of(EXAMPLES)
     assert reference.clearance > 1e-5
-    assert_same_rows(read_map(map_of(EXAMPLES, module.integrate_points)), reference.rows())
+    assert_same_rows(read_map(map_of(EXAMPLES, real.integrate_points)), reference.rows())
 
 
-def law_unknown_position(modules: Modules) -> None:
+def test_unknown_position() -> None:
     """Under jit a point whose sensor position is not known takes no part."""
     scan = EXAMPLES[0]
     positions = scan.positions.copy()
     positions[::3] = np.nan
     known = np.isfinite(positions).all(axis=1)
-    add = jax.jit(modules["update"].integrate_points)
+    add = jax.jit(real.integrate_points)
     state = add(new_map(), *scan[:2], positions, scan.focal)
     reference = reference_of([Scan(*(array[known] for array in scan[:3]), scan.focal)])
     assert reference.clearance > 1e-5
     assert_same_rows(read_map(state), reference.rows())
-
-
-CHAIN = ("r3jax.mapping.associate", "r3jax.mapping.update")
-MUTANTS = [
-    Mutant("associate", "at[groups.leader].add(values", "at[groups.leader].max(values", law_scans),
-    Mutant("associate", "sums / jnp.maximum(groups.rgb_sum[:, 3:], 1.0)", "sums", law_scans),
-    Mutant("update", "camera_position[index].T", "camera_position[:index.shape[0]].T", law_scans),
-    Mutant("update", "camera_position = group_means(groups, camera_position)", "pass", law_scans),
-    Mutant("update", "valid = valid & jnp.all(jnp.isfinite(points_world), axis=1)",
-           "valid = jnp.all(jnp.isfinite(points_world), axis=1)", law_scans),
-    Mutant("update", "valid = valid & jnp.all(jnp.isfinite(camera_position), axis=1)",
-           "pass", law_unknown_position),
-]  # fmt: skip
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    law_scans(modules)
-    law_unknown_position(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

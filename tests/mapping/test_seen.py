@@ -12,7 +12,6 @@ from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping import seen as real
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate, integrate_growing, integrate_points
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.tiers import quick_and_full
 
 WIDTH, HEIGHT, CAPACITY, VOXEL = 24, 18, 2048, 0.05  # one shape: one compile
@@ -67,7 +66,9 @@ def seen_by_hand(state: MapState, frame: Frame) -> tuple[np.ndarray, np.ndarray]
         i, j = int(v), int(u)
         around = depth[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
         limit = around.max() + VOXEL
-        unsure[row] |= abs(z - limit) < 1e-3 or depth[i, j] == 0  # holes: `law_holes`
+        unsure[row] |= (
+            abs(z - limit) < 1e-3 or depth[i, j] == 0
+        )  # holes: `test_behind_glass_a_voxel_is_seen_unless_another_hides_it`
         seen[row] = z <= limit
     return seen, unsure
 
@@ -83,8 +84,8 @@ def has_bin(state: MapState, bins: np.ndarray) -> np.ndarray:
     return (words[bins // 32, np.arange(CAPACITY)] >> (bins % 32).astype(np.uint32)) & 1 == 1
 
 
-def law_seen(modules: Modules) -> None:
-    update = jax.jit(modules["seen"].mark_seen)
+def law_seen() -> None:
+    update = jax.jit(real.mark_seen)
     for seed in range(3):
         before, frame = cloud_map(seed), frame_of(seed)
         after = update(before, frame, REACH)
@@ -107,7 +108,7 @@ def law_seen(modules: Modules) -> None:
 
 
 def test_what_is_seen_is_what_a_loop_says():
-    law_seen({"seen": real})
+    law_seen()
 
 
 def test_marking_twice_changes_nothing():
@@ -116,7 +117,7 @@ def test_marking_twice_changes_nothing():
     jax.tree.map(np.testing.assert_array_equal, once, twice)
 
 
-def law_holes(modules: Modules) -> None:
+def test_behind_glass_a_voxel_is_seen_unless_another_hides_it() -> None:
     """Without a measurement, a wall is seen where no other wall hides it, and nothing is new."""
     across, up = np.arange(-0.6, 0.61, 0.04), np.arange(-0.4, 0.41, 0.04)
     y, z = (a.ravel() for a in np.meshgrid(across, up))
@@ -137,7 +138,7 @@ def law_holes(modules: Modules) -> None:
     depth[12] = 9.0  # one row of measurements says nothing of the holes beside it
     frame = Frame(rgb=np.zeros((HEIGHT, WIDTH, 3), np.float32), depth=depth,
                   T_world_camera=pose, camera=CAMERA)  # fmt: skip
-    after = jax.jit(modules["seen"].mark_seen)(before, frame, REACH)
+    after = jax.jit(real.mark_seen)(before, frame, REACH)
     is_seen = has_bin(after, bins_by_hand(before, frame)) & occupied
     is_far, is_left = centers[0] > 2.0, centers[1] < 0.0
     high, low = (centers[2] * s > 0.06 * centers[0] for s in (1.0, -1.0))  # off the border row
@@ -154,10 +155,6 @@ def law_holes(modules: Modules) -> None:
         assert np.mean(is_seen[rows]) == float(expected), (expected, rows.sum())
     assert not is_seen[occupied & is_left & ~is_far].any()
     np.testing.assert_array_equal(after.count, before.count)
-
-
-def test_behind_glass_a_voxel_is_seen_unless_another_hides_it():
-    law_holes({"seen": real})
 
 
 @pytest.mark.parametrize("allow_growth", quick_and_full([True, False], [False]))
@@ -184,27 +181,3 @@ def test_look_lets_edges_in_if_told():
     np.testing.assert_array_equal(after.count, plain.count)
     filtered = integrate(empty_map(after.capacity, VOXEL), frame, REACH)
     assert int(filtered.num_occupied) < int(after.num_occupied)
-
-
-CHAIN = ("r3jax.mapping.seen",)
-MUTANTS = [
-    Mutant("seen", "z <= measured + state.voxel_size", "z <= measured", law_seen),
-    Mutant("seen", "jnp.where(frame.depth > 0.0, farthest, 0.0)", "farthest", law_holes),
-    Mutant("seen", "(is_hole & hidden_by_none)", "is_hole", law_holes),
-    Mutant("seen", "(is_in & is_shown) | (is_hole", "(is_in & is_shown) & (is_hole", law_holes),
-    Mutant("seen", "[pixel] == 0.0", "[pixel] >= 0.0", law_holes),
-    Mutant("seen", "visited[:, index] | words", "words", law_seen),
-    Mutant("seen", "(u < camera.width)", "(u < camera.height)", law_seen),
-    Mutant("seen", "<= max_range * max_range", "< jnp.inf", law_seen),
-    Mutant("seen", "jax.lax.max, (3, 3)", "jax.lax.max, (1, 1)", law_seen),
-]
-
-
-@pytest.mark.mutant
-def test_law_holds_without_a_fault():
-    law_seen(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

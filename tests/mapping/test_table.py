@@ -10,7 +10,6 @@ from hypothesis.extra import numpy as hnp
 from r3jax.geometry.voxels import EMPTY_WORD
 from r3jax.mapping import table as real
 from r3jax.mapping.table import hash_key
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 CAPACITY, NUM_KEYS = 32, 12  # one shape: one compile
 
@@ -108,11 +107,7 @@ def test_voxels_of_a_plane_spread_over_the_table():
     assert 0.8 < per_slot.var() / per_slot.mean() < 1.2  # Poisson: 1
 
 
-def test_full_table_keeps_its_keys_and_reports_the_rest():
-    law_full_table({"table": real})
-
-
-# Laws of fixed examples, for the mutants ---------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 
 def fixed_batches() -> list[tuple[np.ndarray, np.ndarray]]:
@@ -124,13 +119,13 @@ def fixed_batches() -> list[tuple[np.ndarray, np.ndarray]]:
     return batch_list
 
 
-def law_dictionary(modules: Modules) -> None:
-    insert = jax.jit(modules["table"].find_or_insert)
+def test_dictionary() -> None:
+    insert = jax.jit(real.find_or_insert)
     assert_holds(*insert_all(empty_table(), fixed_batches(), insert))
 
 
-def law_full_table(modules: Modules) -> None:
-    insert = jax.jit(modules["table"].find_or_insert)
+def test_full_table_keeps_its_keys_and_reports_the_rest() -> None:
+    insert = jax.jit(real.find_or_insert)
     number = np.arange(NUM_KEYS)
     keys = [np.stack([number + NUM_KEYS * i, number]) for i in range(4)]
     valid = np.ones(NUM_KEYS, dtype=bool)
@@ -141,30 +136,3 @@ def law_full_table(modules: Modules) -> None:
     np.testing.assert_array_equal(again, table)
     expected = [rows.get(tuple(key), CAPACITY) for key in keys[0].T.tolist()]
     np.testing.assert_array_equal(found, expected)
-
-
-CHAIN = ("r3jax.mapping.table",)
-MUTANTS = [
-    Mutant("table", "(low == keys[0]) & (high == keys[1])", "(low == keys[0])", law_dictionary),
-    Mutant("table", "(low == keys[0]) & (high == keys[1])", "(high == keys[1])", law_dictionary),
-    Mutant("table", "is_won = bids & (owner[slot] == item)", "is_won = bids", law_dictionary),
-    Mutant("table", "jnp.where(is_empty, -1, num_items)", "jnp.full(capacity, -1)", law_dictionary),
-    Mutant("table", "jnp.where(is_new, claimed, found)", "claimed", law_dictionary),
-    Mutant("table", "is_new = valid & (", "is_new = (", law_dictionary),
-    Mutant("table", "start = (jnp.zeros((), jnp.int32), absent, valid)",
-           "start = (jnp.ones((), jnp.int32), absent, valid)", law_dictionary),
-    Mutant("table", "probe * (probe + 1) // 2", "probe * 2", law_full_table),
-    Mutant("table", "MAX_PROBES = 192", "MAX_PROBES = 3", law_full_table),
-    Mutant("table", "& ~is_found & ~is_empty", "& is_found", law_full_table),
-]  # fmt: skip
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    law_dictionary(modules)
-    law_full_table(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

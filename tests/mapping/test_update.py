@@ -21,7 +21,6 @@ from tests.mapping.sighted import (
     random_sighting,
     reference_of,
 )
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.strategies import NUM_POINTS, VOXEL_SIZE, sightings
 
 sequences = st.lists(sightings(), min_size=1, max_size=4)
@@ -120,10 +119,6 @@ def test_long_sequences_keep_their_precision():
         np.testing.assert_allclose(rows[voxel].m2, row.m2, rtol=1e-2)
 
 
-def test_points_that_are_not_finite_are_padding_under_jit():
-    law_padding({"update": real})
-
-
 def test_no_points_change_nothing():
     state = map_of([random_sighting(0)])
     nothing = np.zeros((0, 3), np.float32)
@@ -210,23 +205,21 @@ def test_bad_input_is_named(changes, words):
         integrate_points(state, **(GOOD | changes))
 
 
-# Laws of fixed examples, for the mutants ---------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 SEEN = [random_sighting(seed) for seed in range(10, 14)]
 
 
-def law_points(modules: Modules) -> None:
-    """The module is a copy of its own: its chunks may be made smaller than a frame."""
-    module = modules["update"]
-    vars(module)["CHUNK"] = 4
+def test_points_of_many_chunks(monkeypatch) -> None:
+    monkeypatch.setattr(real, "CHUNK", 4)
     reference = reference_of(SEEN)
     assert reference.clearance > 1e-6
-    assert_same_rows(read_map(map_of(SEEN, module.integrate_points)), reference.rows())
+    assert_same_rows(read_map(map_of(SEEN, real.integrate_points)), reference.rows())
 
 
-def law_padding(modules: Modules) -> None:
+def test_points_that_are_not_finite_are_padding_under_jit() -> None:
     """Points without a measurement, and whatever color they have, take no part."""
-    add = jax.jit(modules["update"].integrate_points)
+    add = jax.jit(real.integrate_points)
     sighting = SEEN[0]
     bad = np.resize(np.array([np.nan, 0.0, np.inf, -np.inf, 0.0], np.float32), (10, 3))
     padded = sighting._replace(
@@ -234,38 +227,3 @@ def law_padding(modules: Modules) -> None:
         rgb=np.concatenate([np.ones((5, 3)), sighting.rgb, np.zeros((5, 3))], dtype=np.float32),
     )
     assert_identical_rows(add(new_map(), *padded), map_of([sighting]))
-
-
-CHAIN = ("r3jax.mapping.seen", "r3jax.mapping.update")
-MUTANTS = [
-    Mutant("seen", "position[:, None]) - center", "position[:, None]) + center", law_points),
-    Mutant("seen", "position[:, None]) - center",
-           "position[:, None]) - center + 0.5 * state.voxel_size", law_points),
-    Mutant("seen", "nearest_bin(offset / distance[None, :], state.num_bins)",
-           "nearest_bin(offset / distance[None, :], 32)", law_points),
-    Mutant("update", "count=valid.astype(jnp.float32)",
-           "count=2.0 * valid.astype(jnp.float32)", law_points),
-    Mutant("update", "m2=jnp.zeros(valid.shape, dtype=jnp.float32)",
-           "m2=0.01 * valid.astype(jnp.float32)", law_points),
-    Mutant("seen", ", focal / distance", ", 1.0 / distance", law_points),
-    Mutant("seen", ", focal / distance", ", focal * distance", law_points),
-    Mutant("update", "sums[:3] / jnp.maximum(sums[3:], 1.0)", "sums[:3] / 2.0", law_points),
-    Mutant("update", "leaders, chunk * size, size", "leaders, 2 * chunk * size, size", law_points),
-    Mutant("update", "(num_voxels + (size - 1)) // size", "1", law_points),
-    Mutant("update", "valid = index < num", "valid = index <= num", law_points),
-    Mutant("update", "jnp.all(jnp.isfinite(points_world)",
-           "jnp.any(jnp.isfinite(points_world)", law_padding),
-    Mutant("update", "groups = group_by_voxel(points.T, rgb, valid,",
-           "groups = group_by_voxel(points.T, rgb, valid | True,", law_padding),
-]  # fmt: skip
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    law_points(modules)
-    law_padding(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

@@ -19,7 +19,6 @@ from r3jax.mapping.state import MapState
 from r3jax.mapping.update import integrate, integrate_points
 from tests.mapping.reference import ReferenceMap, assert_same_rows, read_map
 from tests.mapping.sighted import NUM_BINS, assert_identical_rows, new_map
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.strategies import VOXEL_SIZE
 
 HEIGHT, WIDTH, CAPACITY = 12, 16, 512  # one shape: one compile
@@ -96,18 +95,6 @@ def is_edge(frame: Frame) -> np.ndarray:
 
 
 FRAMES = [frame_of(scene_depth(i), turn, seed=i) for i, turn in enumerate(TURNS)]
-
-
-def test_map_holds_the_statistics_of_all_frames():
-    law_frames({"update": real})
-
-
-def test_edges_take_no_part_unless_they_are_let_in():
-    law_edges({"update": real})
-
-
-def test_range_ends_at_z_depth_and_includes_its_end():
-    law_range({"update": real})
 
 
 def test_frame_equals_its_points():
@@ -193,67 +180,34 @@ def test_bad_range_is_named(max_range):
         integrate(new_map(CAPACITY), FRAMES[0], max_range)
 
 
-# Laws of fixed examples, for the mutants ---------------------------------------------------------
+# Laws of fixed examples ---------------------------------------------------------------------------
 
 
-def law_frames(modules: Modules) -> None:
+def test_map_holds_the_statistics_of_all_frames() -> None:
     """All that was measured, edges and all; nothing else."""
     measured = [is_measured(frame) for frame in FRAMES]
     reference = reference_of(FRAMES, measured)
     assert reference.clearance > 1e-6
-    state = map_of(FRAMES, pixels_of(modules["update"]), drop_edges=False)
+    state = map_of(FRAMES, pixels_of(real), drop_edges=False)
     assert_same_rows(read_map(state), reference.rows())
 
 
-def law_edges(modules: Modules) -> None:
+def test_edges_take_no_part_unless_they_are_let_in() -> None:
     frame = FRAMES[0]
     measured = is_measured(frame)
     edges = is_edge(frame)
     assert 0.1 < edges.mean() < 0.7
     inside = reference_of([frame], [measured & ~edges]).rows()
     assert len(inside) < len(reference_of([frame], [measured]).rows())
-    assert_same_rows(read_map(map_of([frame], pixels_of(modules["update"]))), inside)
+    assert_same_rows(read_map(map_of([frame], pixels_of(real))), inside)
 
 
-def law_range(modules: Modules) -> None:
+def test_range_ends_at_z_depth_and_includes_its_end() -> None:
     """1.5 m is the depth of the nearest surface, whatever the length of its rays."""
     near = [np.asarray(frame.depth) == 1.5 for frame in FRAMES]
     options = {"max_range": 1.5, "drop_edges": False}
-    state = map_of(FRAMES, pixels_of(modules["update"]), **options)
+    state = map_of(FRAMES, pixels_of(real), **options)
     assert_same_rows(read_map(state), reference_of(FRAMES, near).rows())
-
-
-CHAIN = ("r3jax.mapping.associate", "r3jax.mapping.update")
-MUTANTS = [
-    Mutant("update", "(depth > 0.0) &", "(depth >= 0.0) &", law_frames),
-    Mutant("update", "jnp.isfinite(depth) &", "", law_frames),
-    Mutant("update", "& (depth <= max_range)", "", law_range),
-    Mutant("update", "(depth <= max_range)", "(depth < max_range)", law_range),
-    Mutant("update", "is_measured & ~edge_pixels(", "is_measured & edge_pixels(", law_edges),
-    Mutant("update", "is_measured & ~edge_pixels(", "is_measured | edge_pixels(", law_edges),
-    Mutant("associate", "T[i, 1] * y + T[i, 2] * depth", "T[i, 1] * y", law_frames),
-    Mutant("associate", "jnp.float32) + 0.5 - camera.cx",
-           "jnp.float32) - camera.cx", law_frames),
-    Mutant("associate", "v[:, None] * depth", "v[:, None]", law_frames),
-    Mutant("update", "        drop_edges,\n", "        ~drop_edges,\n", law_frames),
-    Mutant("update", "valid.reshape(-1)", "valid.T.reshape(-1)", law_frames),
-    Mutant("update", "groups, frame.position, frame.camera.focal",
-           "groups, frame.position, frame.camera.fx", law_frames),
-    Mutant("update", "groups, frame.position, frame.camera.focal",
-           "groups, frame.T_world_camera[3, :3], frame.camera.focal", law_frames),
-]  # fmt: skip
-
-
-@pytest.mark.mutant
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    for law in (law_frames, law_edges, law_range):
-        law(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
 
 
 def test_a_camera_whose_surroundings_have_no_voxel_index_is_refused():

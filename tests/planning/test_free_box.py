@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from r3jax.planning.refinement import refine as real
 from r3jax.planning.robot.travel import Travel, plan_travel
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of
 
 SHAPE = (9, 8, 7)
@@ -26,11 +25,11 @@ def cluttered(seed: int) -> tuple[Travel, np.ndarray]:
     return travel, center(*(cells[rng.integers(len(cells))] + rng.uniform(-0.45, 0.45, 3)))
 
 
-def law_free(modules: Modules, seed: int = 0) -> None:
+def law_free(seed: int = 0) -> None:
     """Every cell that the box reaches into is a stop; it holds the place and ends in reach."""
     travel, place = cluttered(seed)
     radius = float(np.random.default_rng(seed).uniform(0.05, 0.7))
-    low, high = modules["refine"].free_box(travel, place, radius)
+    low, high = real.free_box(travel, place, radius)
     assert np.all(low <= place)
     assert np.all(place <= high)
     assert np.all(np.maximum(place - low, high - place) <= radius + 1e-9)
@@ -48,16 +47,16 @@ def law_free(modules: Modules, seed: int = 0) -> None:
 
 @given(seeds)
 def test_a_box_is_free(seed):
-    law_free({"refine": real}, seed)
+    law_free(seed)
 
 
-def law_large(modules: Modules, seed: int = 0) -> None:
+def law_large(seed: int = 0) -> None:
     """No layer of cells beside the box is free as a whole, unless it is out of reach."""
     travel, place = cluttered(seed)
     if not travel.safe[travel.cell_of(place)]:
         return
     radius = 0.5
-    low, high = modules["refine"].free_box(travel, place, radius)
+    low, high = real.free_box(travel, place, radius)
     first, last = (np.floor((corner - ORIGIN) / CELL).astype(int) for corner in (low, high))
     stops = travel.safe & travel.reachable
     for axis, (end, step) in itertools.product(range(3), ((first, -1), (last, 1))):
@@ -71,7 +70,7 @@ def law_large(modules: Modules, seed: int = 0) -> None:
 
 @given(seeds)
 def test_a_box_is_as_large_as_it_may_be(seed):
-    law_large({"refine": real}, seed)
+    law_large(seed)
 
 
 def test_in_the_open_a_box_ends_at_the_radius():
@@ -91,46 +90,10 @@ def test_where_the_margin_is_not_kept_nothing_moves():
     np.testing.assert_array_equal(high, place)
 
 
-def law_heights(modules: Modules) -> None:
+def test_a_carrier_keeps_its_heights() -> None:
     heights = (float(center(7, 7, 7)[2] - 0.02), float(center(7, 7, 7)[2] + 0.03))
     open_space = grid_of(np.ones((15, 15, 15), bool))
     travel = plan_travel(open_space, center(7, 7, 7), heights=heights)
-    low, high = modules["refine"].free_box(travel, center(7, 7, 7), 0.4)
+    low, high = real.free_box(travel, center(7, 7, 7), 0.4)
     assert heights[0] <= low[2] <= high[2] <= heights[1]
     np.testing.assert_allclose((high - low)[:2], 0.8)
-
-
-def test_a_carrier_keeps_its_heights():
-    law_heights({"refine": real})
-
-
-CHAIN = ("r3jax.planning.refinement.refine",)
-
-
-def over_seeds(law):
-    """The law on worlds that differ: a fault shows in some of them."""
-    return lambda modules: [law(modules, seed) for seed in range(40)]
-
-
-MUTANTS = [
-    Mutant("refine", ".all():", ".any():", over_seeds(law_free)),
-    Mutant("refine", "travel.safe & travel.reachable", "travel.free", over_seeds(law_free)),
-    Mutant("refine", "reach = JITTER * ", "reach = 0.5 * ", over_seeds(law_free)),
-    Mutant("refine", "np.maximum(low, position - radius)", "low", over_seeds(law_free)),
-    Mutant("refine", "np.minimum(low, position), ", "low, ", over_seeds(law_free)),
-    Mutant("refine", "range(3), ((first", "range(2), ((first", over_seeds(law_large)),
-    Mutant("refine", "((first, -1), (last, 1))", "((last, 1),)", over_seeds(law_large)),
-    Mutant("refine", "                grows = True\n", "", over_seeds(law_large)),
-    Mutant("refine", "*travel.heights)", "-9.0, 9.0)", law_heights),
-]
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    for mutant in MUTANTS:
-        mutant.law(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

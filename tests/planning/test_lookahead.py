@@ -18,7 +18,6 @@ from r3jax.planning.robot.travel import plan_travel
 from r3jax.scoring.batch import cache_positions_near, score_positions
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama import panorama
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.known_hall import CAMERA, CONFIG, SCORING, after_view, for_scoring
 from tests.planning.rooms import candidates_of, center, grid_of, two_rooms
 
@@ -64,10 +63,10 @@ def all_paths(problem: real.BeamProblem, horizon: int) -> dict[tuple[int, ...], 
     return rates
 
 
-def law_paths(modules: Modules) -> None:
+def law_paths() -> None:
     """With room for all of them, the search finds the best path of three views."""
     problem = outlook_of(WIDE)
-    found = modules["lookahead"].search(problem)
+    found = real.search(problem)
     rates = all_paths(problem, 3)
     best = max(rates, key=lambda path: rates[path])
     assert found[0].places == best
@@ -79,7 +78,7 @@ def law_paths(modules: Modules) -> None:
 
 @pytest.mark.full
 def test_a_beam_with_room_for_all_finds_the_best_path():
-    law_paths({"lookahead": real})
+    law_paths()
 
 
 @pytest.mark.full
@@ -95,10 +94,10 @@ def test_a_narrow_beam_keeps_its_promise():
     assert found[0].rate >= 0.9 * max(rates.values())
 
 
-def law_one_view(modules: Modules) -> None:
+def law_one_view() -> None:
     """A horizon of one is the next-best view, by gain over time."""
     problem = outlook_of(dataclasses.replace(WIDE, horizon=1), view_seconds=0.3)
-    found = modules["lookahead"].search(problem)
+    found = real.search(problem)
     rate = problem.utility / (0.3 + problem.lengths)
     assert found[0].places == (int(np.argmax(rate)),)
     assert found[0].rate == pytest.approx(rate.max())
@@ -106,10 +105,10 @@ def law_one_view(modules: Modules) -> None:
 
 @pytest.mark.full
 def test_a_horizon_of_one_is_the_next_best_view():
-    law_one_view({"lookahead": real})
+    law_one_view()
 
 
-def law_motion(modules: Modules) -> None:
+def law_motion() -> None:
     """A slow level camera: the seconds of every path by hand, and no view that it cannot take."""
     motion = Motion(elevations=(0.0, 0.0), speed=0.2, turn_rate=45.0)
     start = poses_along(PLACES[:1], np.array([[0.0, 1.0, 0.0]]))[0]
@@ -118,7 +117,7 @@ def law_motion(modules: Modules) -> None:
     problem = dataclasses.replace(
         flying, views=limits.project_to_feasible(flying.views), limits=limits
     )
-    found = modules["lookahead"].search(problem)
+    found = real.search(problem)
     assert len(found) > 10
     for path in found:
         seconds, here, place = 0.0, start, None
@@ -134,25 +133,21 @@ def law_motion(modules: Modules) -> None:
 
 @pytest.mark.full
 def test_a_carrier_takes_its_time():
-    law_motion({"lookahead": real})
+    law_motion()
 
 
-def law_apart(modules: Modules) -> None:
+def test_choices_lie_apart() -> None:
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[1, 0, 3] = 0.1  # as good as the first
     poses[2, 0, 3] = 0.75
     poses[3, :3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # turned by 90 degrees
-    apart = modules["lookahead"]._apart
+    apart = real._apart
     views = candidates_of(poses)
     assert apart([1, 0, 2, 3], views, (), 4) == [1, 3]
     assert apart([0, 1, 2, 3], views, (), 4) == [0, 2, 3]
     assert apart([0, 1, 2, 3], views, (), 2) == [0, 2]
     third = views.position[2], views.direction[2]
     assert apart([0, 1, 2, 3], views, (third,), 4) == [0, 3]
-
-
-def test_choices_lie_apart():
-    law_apart({"lookahead": real})
 
 
 @pytest.mark.full
@@ -188,34 +183,3 @@ def test_ways_between_rooms_lead_through_the_door():
     between = real.lengths_between(travel, ends)
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.8)
     assert between[0, 1] > 1.6
-
-
-CHAIN = ("r3jax.scoring.simulated", "r3jax.planning.policies.ahead.lookahead")
-_TAKEN = "path.directions[-1][None]"
-_SECONDS = "seconds=path.seconds + float(cost[i])"
-_FIRST = "cost = config.view_seconds + ways"
-MUTANTS = [
-    Mutant("lookahead", _TAKEN, "path.directions[0][None]", law_paths),
-    Mutant("lookahead", "problem.between[last]", "problem.lengths", law_paths),
-    Mutant("lookahead", _SECONDS, "seconds=float(cost[i])", law_paths),
-    Mutant("lookahead", "return sum(self.gains) /", "return self.gains[-1] /", law_paths),
-    Mutant("lookahead", _FIRST, "cost = ways", law_one_view),
-    Mutant("lookahead", " + turning[k]", "", law_motion),
-    Mutant("lookahead", "turned = limits.project_to_feasible(turned)", "pass", law_motion),
-    Mutant("lookahead", "ways / problem.speed", "ways", law_motion),
-    Mutant("lookahead", "< _TURNED", "> _TURNED", law_apart),
-    Mutant("lookahead", "for other in taken:", "for other in ():", law_apart),
-    Mutant("lookahead", "return is_far |", "return is_far &", law_apart),
-]
-
-
-@pytest.mark.mutant
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    for law in (law_paths, law_one_view, law_motion, law_apart):
-        law(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

@@ -9,33 +9,16 @@ import pytest
 from r3jax.baselines.active_gamer import pool
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import empty_map
-from r3jax.planning import decision, greedy
+from r3jax.planning import decision
 from r3jax.planning.candidates import Candidates, candidates_along, poses_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policies import frontier, random, renderability
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import MOTIONS, Motion
 from r3jax.planning.robot.travel import plan_travel
-from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, center, grid_of, pose_at, two_rooms
 from tests.planning.test_motions_of_policies import CAMERA, CONSTRAINED, assert_obeys, turns
 
-CHAIN = (
-    "r3jax.planning.decision",
-    "r3jax.planning.greedy",
-    "r3jax.baselines.active_gamer.pool",
-    "r3jax.planning.policies.renderability",
-    "r3jax.planning.policies.random",
-    "r3jax.planning.policies.frontier",
-)
-REAL: Modules = {
-    "decision": decision,
-    "greedy": greedy,
-    "pool": pool,
-    "renderability": renderability,
-    "random": random,
-    "frontier": frontier,
-}
 NUM = 12
 KEY = jax.random.key(2)
 LATTICE = fibonacci_lattice(526)
@@ -57,7 +40,7 @@ def decide(policy):
     return policy.decide(state, empty_map(64), GRID, level_start(), key=KEY)[0]
 
 
-def law_what_is_scored_is_what_is_taken(modules: Modules) -> None:
+def test_what_is_scored_is_what_is_taken() -> None:
     """The scorer sees the candidates as the carrier would take them."""
     for name in CONSTRAINED:
         seen = []
@@ -67,12 +50,12 @@ def law_what_is_scored_is_what_is_taken(modules: Modules) -> None:
             zeros = np.zeros(len(poses))
             return SimpleNamespace(exploration=zeros, rendering=zeros, total=zeros + 1.0)
 
-        answer = decide(modules["renderability"].Ours(config_of(name), score))
+        answer = decide(renderability.Ours(config_of(name), score))
         np.testing.assert_allclose(seen[0], answer.candidates, atol=1e-6)
         assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
 
 
-def law_a_policy_that_turns_is_held(modules: Modules) -> None:
+def test_a_policy_that_turns_is_held() -> None:
     """A panorama that answers with a direction off the limits is brought back within them."""
     for name in CONSTRAINED:
         allowed_axes = []
@@ -82,7 +65,7 @@ def law_a_policy_that_turns_is_held(modules: Modules) -> None:
             axes = LATTICE[allowed.argmax(axis=1)]  # the highest that is allowed
             return SimpleNamespace(best_direction=axes, best_score=np.ones(NUM))
 
-        answer = decide(modules["renderability"].OursPano(config_of(name), score))
+        answer = decide(renderability.OursPano(config_of(name), score))
         assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
         limits = Limits(MOTIONS[name], level_start())
         expected = limits.allowed_axes(answer.candidates[:, :3, 3], len(LATTICE))
@@ -90,10 +73,10 @@ def law_a_policy_that_turns_is_held(modules: Modules) -> None:
         assert not expected.all()
 
 
-def law_turns_cost(modules: Modules) -> None:
+def test_turns_cost() -> None:
     """Path and seconds of every candidate by hand: the way is a straight line here."""
     config = config_of("gimbal")
-    answer = decide(modules["random"].Random(config))
+    answer = decide(random.Random(config))
     poses, motion = answer.candidates, config.motion
     straight = np.linalg.norm(poses[:, :3, 3] - level_start()[:3, 3], axis=1)
     meters = motion.speed * turns(level_start(), poses) / motion.turn_rate
@@ -101,27 +84,27 @@ def law_turns_cost(modules: Modules) -> None:
     chosen = int(np.argmax(answer.utilities["total"]))
     assert answer.seconds == pytest.approx((straight + meters)[chosen] / motion.speed, abs=0.002)
     assert np.ptp(meters) > 0.5
-    free = decide(modules["random"].Random(PlannerConfig(num_candidates=NUM, num_frontier=4)))
+    free = decide(random.Random(PlannerConfig(num_candidates=NUM, num_frontier=4)))
     assert free.seconds is None
 
 
-def law_heights_count_from_the_first_view(modules: Modules) -> None:
+def test_heights_count_from_the_first_view() -> None:
     """Not from the latest one: a hand that has come up does not come up from there again."""
     config, first = config_of("handheld"), level_start()
-    state = modules["decision"].initial_state(CAMERA, GRID, motion=config.motion)
+    state = decision.initial_state(CAMERA, GRID, motion=config.motion)
     higher = first.copy()
     higher[2, 3] += 0.1
     for pose in (first, higher):
         args = state, empty_map(64), GRID, pose, config
-        state, travel, _ = modules["decision"].prepare_decision(*args)
+        state, travel, _ = decision.prepare_decision(*args)
         low, high = first[2, 3] - 0.6, first[2, 3] + 0.4
         np.testing.assert_allclose(travel.heights, (low, high), atol=1e-6)
-    assert modules["decision"].initial_state(CAMERA, GRID).start_height is None
-    walker = modules["random"].Random(config).init(CAMERA, GRID, key=KEY)
+    assert decision.initial_state(CAMERA, GRID).start_height is None
+    walker = random.Random(config).init(CAMERA, GRID, key=KEY)
     assert walker.start_height is not None
 
 
-def law_frontier_shows_its_target(modules: Modules) -> None:
+def test_frontier_shows_its_target() -> None:
     """A level camera never walks to a target that it would look over."""
     free, _ = two_rooms()
     start = level_start()
@@ -130,24 +113,24 @@ def law_frontier_shows_its_target(modules: Modules) -> None:
     targets = np.zeros_like(free)
     targets[8, 3:10, 1:9] = True
     limits = Limits(Motion(heights=(0.0, 0.0), elevations=(0.0, 0.0)), start, height)
-    places, aims = modules["frontier"].nearest_views(travel, targets, 200, limits, key=KEY)
+    places, aims = frontier.nearest_views(travel, targets, 200, limits, key=KEY)
     assert len(places) > 10
     shown = (aims - places) / np.linalg.norm(aims - places, axis=1, keepdims=True)
     assert np.hypot(shown[:, 0], shown[:, 1]).min() >= 0.9
     assert np.all(places[:, 2] == start[2, 3])
-    anything, _ = modules["frontier"].nearest_views(travel, targets, 200, key=KEY)
+    anything, _ = frontier.nearest_views(travel, targets, 200, key=KEY)
     assert len(anything) > len(places)
 
 
-def law_pool_waits_for_turns(modules: Modules) -> None:
+def test_pool_waits_for_turns() -> None:
     """A hand takes of the pool what it can turn to on the way: its azimuth is never changed."""
     start, shape = level_start(), (25, 14, 10)
     travel = plan_travel(GRID, start[:3, 3])
     limits = Limits(MOTIONS["handheld"], start, travel.heights)
-    pools = modules["pool"].empty_pools(shape, CELL)
+    pools = pool.empty_pools(shape, CELL)
     # Stage 1 needs stage 0 to be over.
-    _, every = modules["pool"].draw_candidates(pools, travel, 500)
-    _, some = modules["pool"].draw_candidates(pools, travel, 500, limits)
+    _, every = pool.draw_candidates(pools, travel, 500)
+    _, some = pool.draw_candidates(pools, travel, 500, limits)
     assert 0 < some.candidates.num_valid < every.candidates.num_valid
     assert not _is_cut_short(limits, some.candidates).any()
     left_out = np.array(sorted(_views(every.candidates) - _views(some.candidates)))
@@ -167,58 +150,11 @@ def _is_cut_short(limits: Limits, candidates: Candidates) -> np.ndarray:
     return gap.max(axis=1) > 1e-4
 
 
-def law_low_robots_have_candidates(modules: Modules) -> None:
+def test_low_robots_have_candidates() -> None:
     """A robot below the levels of the lattice has its candidates at its own height."""
     start = pose_at(center(5, 6, 2))
     height = (float(start[2, 3]), float(start[2, 3]))
     travel = plan_travel(GRID, start[:3, 3], heights=height)
-    _, found = modules["pool"].draw_candidates(
-        modules["pool"].empty_pools((25, 14, 10), CELL), travel, 500
-    )
+    _, found = pool.draw_candidates(pool.empty_pools((25, 14, 10), CELL), travel, 500)
     assert found is not None
     assert np.all(found.candidates.position[:, 2] == start[2, 3])
-
-
-LAWS = [
-    law_what_is_scored_is_what_is_taken,
-    law_a_policy_that_turns_is_held,
-    law_turns_cost,
-    law_heights_count_from_the_first_view,
-    law_frontier_shows_its_target,
-    law_pool_waits_for_turns,
-    law_low_robots_have_candidates,
-]
-
-
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
-def test_law(law):
-    law(REAL)
-
-
-MUTANTS = [
-    Mutant("greedy", "limits.project_to_feasible(drawn.candidates)", "drawn.candidates", LAWS[0]),
-    Mutant(
-        "greedy", "            candidates = limits.project_to_feasible(candidates)\n", "", LAWS[1]
-    ),
-    Mutant("greedy", "pose, travel.heights)", "pose)", LAWS[0]),
-    Mutant("greedy", "limits.path_costs(lengths, candidates.direction)", "lengths", law_turns_cost),
-    Mutant("greedy", "memory, self.config.motion)", "memory)", LAWS[3]),
-    Mutant(
-        "decision",
-        "seconds=limits.seconds(length, candidates.direction[best])",
-        "seconds=None",
-        LAWS[2],
-    ),
-    Mutant("decision", "is None or not np.isnan(start)", "is None", LAWS[3]),
-    Mutant("decision", "state.trail, heights, motion.body)", "state.trail)", LAWS[3]),
-    Mutant("frontier", "_may_look(limits, place, aim) and ", "", law_frontier_shows_its_target),
-    Mutant("frontier", "travel.stops(stops)", "travel.centers(stops)", LAWS[4]),
-    Mutant("pool", "has_place[:, None] & can_turn", "has_place[:, None]", law_pool_waits_for_turns),
-    Mutant("pool", "np.clip(level, lowest, highest)", "level", law_low_robots_have_candidates),
-    Mutant("pool", "travel.stops(cells[place])", "travel.centers(cells[place])", LAWS[6]),
-]
-
-
-@each(MUTANTS)
-def test_a_fault_is_noticed(mutant):
-    assert_caught(CHAIN, mutant)

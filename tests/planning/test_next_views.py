@@ -16,7 +16,6 @@ from r3jax.planning import next_views as real
 from r3jax.scoring.batch import score_positions, score_views, score_views_near
 from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.utility import view_utility
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.known_hall import (
     CAMERA,
     CONFIG,
@@ -51,10 +50,10 @@ def by_brute_force(poses: np.ndarray, k: int) -> tuple[list[int], list[float]]:
     return chosen, worth
 
 
-def law_greedy(modules: Modules, seed: int = 0) -> None:
+def law_greedy(seed: int = 0) -> None:
     state, grid = known()
     poses = poses_of(seed)
-    views = modules["next_views"].next_views(state, grid, CAMERA, 5, poses=poses, config=CONFIG)
+    views = real.next_views(state, grid, CAMERA, 5, poses=poses, config=CONFIG)
     chosen, worth = by_brute_force(poses, 5)
     np.testing.assert_allclose(views.utility, worth, rtol=2e-5)
     np.testing.assert_array_equal(views.T_world_camera, poses[chosen])
@@ -62,42 +61,38 @@ def law_greedy(modules: Modules, seed: int = 0) -> None:
     assert worth[-1] < 0.9 * worth[0]  # or nothing was conditioned on anything
 
 
-def law_each_once(modules: Modules) -> None:
+def test_no_pose_is_taken_twice() -> None:
     state, grid = known()
     poses = poses_of(1)
-    views = modules["next_views"].next_views(state, grid, CAMERA, NUM, poses=poses, config=CONFIG)
+    views = real.next_views(state, grid, CAMERA, NUM, poses=poses, config=CONFIG)
     order = [np.flatnonzero((poses == T).all(axis=(1, 2)))[0] for T in views.T_world_camera]
     assert sorted(order) == list(range(NUM))
 
 
-def law_lazy(modules: Modules) -> None:
+def law_lazy() -> None:
     """Hopeless poses are scored once."""
-    module, scored = modules["next_views"], []
+    scored = []
 
     def count(voxels, cells, camera, poses, config):
         scored.append(len(poses))
         return score_views_near(voxels, cells, camera, poses, config)
 
-    with mock.patch.object(module, "score_views_near", count):
-        module.next_views(*known(), CAMERA, 3, poses=poses_of(2), config=CONFIG)
+    with mock.patch.object(real, "score_views_near", count):
+        real.next_views(*known(), CAMERA, 3, poses=poses_of(2), config=CONFIG)
     assert scored[0] == NUM
     assert sum(scored[1:]) < 2 * NUM
 
 
 @pytest.mark.full
 def test_only_what_may_win_is_scored_again():
-    law_lazy({"next_views": real})
-
-
-def test_no_pose_is_taken_twice():
-    law_each_once({"next_views": real})
+    law_lazy()
 
 
 @pytest.mark.full
 @given(st.integers(0, 300))
 @settings(max_examples=5)
 def test_lazy_choice_is_that_of_scoring_all_again(seed):
-    law_greedy({"next_views": real}, seed)
+    law_greedy(seed)
 
 
 @given(st.integers(0, 300))
@@ -159,21 +154,5 @@ def test_what_cannot_be_chosen_from_is_refused():
         r3jax.next_views(state, unknown, CAMERA, 1, config=CONFIG)
 
 
-CHAIN = ("r3jax.mapping.seen", "r3jax.scoring.simulated", "r3jax.planning.next_views")
-MUTANTS = [
-    Mutant("next_views", "is_new[:] = False", "is_new[:] = True", law_greedy),
-    Mutant("next_views", "left[best] -= 1", "left[best] -= 0", law_each_once),
-    Mutant("next_views", "np.argsort(-bound[stale]", "np.argsort(bound[stale]", law_lazy),
-    Mutant("simulated", "& ~empty", "| empty", law_greedy),
-    Mutant("seen", "visited[:, index] | words", "visited[:, index]", law_greedy),
-]
-
-
-@pytest.mark.mutant
 def test_the_law_holds_without_a_fault():
-    law_greedy(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
+    law_greedy()

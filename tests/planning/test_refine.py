@@ -31,7 +31,6 @@ from r3jax.planning.robot.motion import MOTIONS, Motion
 from r3jax.planning.robot.travel import plan_travel
 from r3jax.scoring.batch import score_views
 from r3jax.scoring.config import ScoringConfig
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import center, known_flat
 from tests.planning.walls import SEEN_FROM, VOXEL, box, wall
 
@@ -85,17 +84,16 @@ def is_other(after: Candidates, before: Candidates) -> np.ndarray:
     return moved | np.any(after.direction != before.direction, axis=1)
 
 
-def refined(modules: Modules, where: Situation, poses: Candidates, config: PlannerConfig = CONFIG):
+def refined(where: Situation, poses: Candidates, config: PlannerConfig = CONFIG):
     """Before and after: utilities, paths and totals, the latter by the same sums."""
     utility, path = utility_of(where, poses), paths_of(where, poses)
     weigh = functools.partial(net_utility, lambda2=config.lambda2, among=(utility, path))
     known_of = {"utility": utility, "path": path}
-    after, found = modules["refine"].refine_best(where, poses, known_of, config, weigh)
+    after, found = real.refine_best(where, poses, known_of, config, weigh)
     return weigh(utility, path), after, found, weigh
 
 
 def law_never_worse(
-    modules: Modules,
     seed: int = 0,
     motion: Motion = MOTIONS["free"],
     *,
@@ -105,7 +103,7 @@ def law_never_worse(
     where = situation_of(motion)
     poses = candidates(where, seed, poor=poor)
     before = utility_of(where, poses)
-    total, after, found, weigh = refined(modules, where, poses, config)
+    total, after, found, weigh = refined(where, poses, config)
     is_new = is_other(after, poses)
     assert is_new.sum() <= REFINED
     exact = utility_of(where, after)
@@ -118,11 +116,11 @@ def law_never_worse(
     assert set(np.flatnonzero(is_new)) <= set(best)
 
 
-def law_safe(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
+def law_safe(seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
     """Every view that is new stands in a stop, within reach of its start, and is allowed."""
     where = situation_of(motion)
     poses = candidates(where, seed)
-    _, after, found, _ = refined(modules, where, poses)
+    _, after, found, _ = refined(where, poses)
     stops = where.travel.safe & where.travel.reachable
     for start, pose in zip(poses.position, after.T_world_camera, strict=True):
         assert stops[where.travel.cell_of(pose[:3, 3])]
@@ -139,11 +137,11 @@ def law_safe(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) 
 @given(seeds, st.sampled_from(list(MOTIONS)))
 @settings(max_examples=12)
 def test_no_view_gets_worse_or_collides(seed, motion_name):
-    law_never_worse({"refine": real}, seed, MOTIONS[motion_name])
-    law_safe({"refine": real}, seed, MOTIONS[motion_name])
+    law_never_worse(seed, MOTIONS[motion_name])
+    law_safe(seed, MOTIONS[motion_name])
 
 
-def law_whatever_climbs(modules: Modules, seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
+def law_whatever_climbs(seed: int = 0, motion: Motion = MOTIONS["free"]) -> None:
     """The same where a climb ends anywhere, and the way counts for more than the view."""
 
     def stray(*args, moves: bool) -> np.ndarray:
@@ -155,28 +153,28 @@ def law_whatever_climbs(modules: Modules, seed: int = 0, motion: Motion = MOTION
 
     better = np.repeat([0.0, 1e9], REFINED)
     all_better = SimpleNamespace(total=better, exploration=better, rendering=better)
-    with mock.patch.object(modules["refine"], "climb", stray):
+    with mock.patch.object(real, "climb", stray):
         for lambda2 in (0.5, 5.0):
             config = dataclasses.replace(CONFIG, lambda2=lambda2)
-            law_never_worse(modules, seed, motion, config=config, poor=True)
-        with mock.patch.object(modules["refine"], "score_views_near", return_value=all_better):
-            law_safe(modules, seed, motion)
+            law_never_worse(seed, motion, config=config, poor=True)
+        with mock.patch.object(real, "score_views_near", return_value=all_better):
+            law_safe(seed, motion)
 
 
 @pytest.mark.full
 @given(seeds, st.sampled_from(list(MOTIONS)))
 @settings(max_examples=12)
 def test_where_a_climb_ends_is_checked(seed, motion_name):
-    law_whatever_climbs({"refine": real}, seed, MOTIONS[motion_name])
+    law_whatever_climbs(seed, MOTIONS[motion_name])
 
 
-def law_gains(modules: Modules) -> None:
+def law_gains() -> None:
     """Random directions leave much to gain: half of the best of these, a tenth or more."""
     where, gains = situation_of(MOTIONS["free"]), []
     for seed in range(4):
         poses = candidates(where, seed)
         before = utility_of(where, poses)
-        total, _, found, _ = refined(modules, where, poses)
+        total, _, found, _ = refined(where, poses)
         best = np.argsort(-total)[:REFINED]
         gains += list(found["utility"][best] / before[best] - 1.0)
     assert np.median(gains) > 0.1
@@ -184,7 +182,7 @@ def law_gains(modules: Modules) -> None:
 
 @pytest.mark.full
 def test_climbing_gains():
-    law_gains({"refine": real})
+    law_gains()
 
 
 @pytest.mark.full
@@ -193,7 +191,7 @@ def test_turning_alone_gains_and_stays():
     config = dataclasses.replace(CONFIG, refine_radius=0.0)
     poses = candidates(where, 1)
     before = utility_of(where, poses)
-    _, after, found, _ = refined({"refine": real}, where, poses, config)
+    _, after, found, _ = refined(where, poses, config)
     np.testing.assert_array_equal(after.position, poses.position)
     assert (found["utility"] / before).max() > 1.05
 
@@ -201,11 +199,11 @@ def test_turning_alone_gains_and_stays():
 @pytest.mark.full
 def test_climbs_compile_once():
     where = situation_of(MOTIONS["free"])
-    refined({"refine": real}, where, candidates(where, 0))
+    refined(where, candidates(where, 0))
     before = climb._move._cache_size()
     for seed, motion in enumerate(("free", "gimbal", "handheld", "ground")):
         where = situation_of(MOTIONS[motion])
-        refined({"refine": real}, where, candidates(where, seed))
+        refined(where, candidates(where, seed))
     assert climb._move._cache_size() == before
 
 
@@ -301,42 +299,12 @@ def test_nothing_to_climb_is_no_error():
     assert found is known_of
 
 
-CHAIN = ("r3jax.planning.refinement.refine",)
-
-
 def over_motions(law):
     return lambda modules: [
-        law(modules, seed, MOTIONS[name])
-        for seed, name in enumerate(("free", "gimbal", "handheld"))
+        law(seed, MOTIONS[name]) for seed, name in enumerate(("free", "gimbal", "handheld"))
     ]
 
 
-MUTANTS = [
-    Mutant("refine", "gains[\"utility\"] > 0.0", "gains[\"utility\"] > -np.inf",
-           over_motions(law_whatever_climbs)),
-    Mutant("refine", "limits.project_to_feasible(Candidates(positions, ",
-           "(Candidates(positions, ",
-           over_motions(law_whatever_climbs)),
-    Mutant("refine", "is_better &= weigh", "weigh", over_motions(law_whatever_climbs)),
-    Mutant("refine", "np.clip(numbers[:, :3], low, high)", "numbers[:, :3]",
-           over_motions(law_whatever_climbs)),
-    Mutant("refine", "found[name][taken] += gains", "found[name][taken] -= gains",
-           over_motions(law_never_worse)),
-    Mutant("refine", "found[\"path\"][taken] = path[is_better]", "pass",
-           over_motions(law_never_worse)),
-    Mutant("refine", "np.argsort(-total,", "np.argsort(total,", over_motions(law_never_worse)),
-    Mutant("refine", "directions_along(*numbers[:, 3:].T)", "directions_along(*numbers[:, :2].T)",
-           law_gains),
-]  # fmt: skip
-
-
-@pytest.mark.mutant
 def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
     for law in (over_motions(law_never_worse), over_motions(law_whatever_climbs), law_gains):
-        law(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
+        law()

@@ -9,12 +9,9 @@ from hypothesis import strategies as st
 
 from r3jax.planning.robot import travel
 from r3jax.planning.robot.travel import plan_travel
-from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, two_rooms
 from tests.planning.test_travel import assert_inside
 
-CHAIN = ("r3jax.planning.robot.travel",)
-REAL: Modules = {"travel": travel}
 SHAPE = (8, 7, 9)
 LOW = float(ORIGIN[2])
 
@@ -34,26 +31,26 @@ def closed_one_by_one(occupied, body, margin, heights) -> np.ndarray:
     return closed
 
 
-def law_closed(modules: Modules, seed: int = 0) -> None:
+def law_closed(seed: int = 0) -> None:
     rng = np.random.default_rng(seed)
     occupied = rng.random(SHAPE) < 0.02
     for body, margin in ((0.45, 0.3), (0.93, 0.5), (5.0, 0.05)):
         for heights in ((LOW, LOW + 1.79), (LOW + 1.13, LOW + 1.13), (LOW + 0.71, LOW + 1.33)):
             arguments = occupied, body, margin, heights, LOW, CELL
-            closed = modules["travel"].cells_over_matter(*arguments)
+            closed = travel.cells_over_matter(*arguments)
             expected = closed_one_by_one(occupied, body, margin, heights)
             np.testing.assert_array_equal(closed, expected)
             assert expected.any()
-    nobody = modules["travel"].cells_over_matter(occupied, 0.0, 0.3, (0.0, 3.0), LOW, CELL)
+    nobody = travel.cells_over_matter(occupied, 0.0, 0.3, (0.0, 3.0), LOW, CELL)
     assert not nobody.any()
 
 
-def law_unlimited(modules: Modules) -> None:
+def law_unlimited() -> None:
     """Without limits of height every cell over matter is closed, however tall the grid."""
     occupied = np.zeros(SHAPE, bool)
     occupied[4, 3, 2] = True
     everywhere = (-np.inf, np.inf)
-    closed = modules["travel"].cells_over_matter(occupied, 0.5, 0.05, everywhere, LOW, CELL)
+    closed = travel.cells_over_matter(occupied, 0.5, 0.05, everywhere, LOW, CELL)
     np.testing.assert_array_equal(np.argwhere(closed), [[4, 3, 3], [4, 3, 4], [4, 3, 5]])
 
 
@@ -64,11 +61,11 @@ def with_table() -> tuple[np.ndarray, np.ndarray]:
     return free, occupied
 
 
-def law_round_the_table(modules: Modules) -> None:
+def law_round_the_table() -> None:
     """A robot goes round a table that a camera flies over; it never leaves its height."""
     start, goal = center(3, 3, 6), center(10, 3, 6)
     grid = grid_of(*with_table())
-    plan, height = modules["travel"].plan_travel, (float(start[2]), float(start[2]))
+    plan, height = travel.plan_travel, (float(start[2]), float(start[2]))
     flying = plan(grid, start)
     np.testing.assert_array_equal(flying.path(goal), [start, goal])
     robot = plan(grid, start, heights=height, body=0.8)
@@ -83,11 +80,11 @@ def law_round_the_table(modules: Modules) -> None:
     np.testing.assert_array_equal(over.path(goal), [start, goal])
 
 
-def law_level(modules: Modules) -> None:
+def law_level() -> None:
     """Off the middle of its layer the robot stays off it, round corners too."""
     start, goal = center(3, 3, 6.35), center(10, 3, 6.35)
     height = (float(start[2]), float(start[2]))
-    robot = modules["travel"].plan_travel(grid_of(*with_table()), start, heights=height, body=0.8)
+    robot = travel.plan_travel(grid_of(*with_table()), start, heights=height, body=0.8)
     assert len(robot.path(goal)) > 2
     assert np.all(robot.path(goal)[:, 2] == start[2])
 
@@ -97,7 +94,7 @@ LAWS = [law_closed, law_unlimited, law_round_the_table, law_level]
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
 def test_law(law):
-    law(REAL)
+    law()
 
 
 @given(seed=st.integers(0, 1000))
@@ -134,23 +131,3 @@ def test_ways_at_any_fixed_height_are_level_and_safe(height, x, y):
 def test_a_camera_beyond_its_heights_is_told():
     with pytest.raises(ValueError, match=r"at a height of 1.800 m, but its motion's heights are"):
         plan_travel(grid_of(*two_rooms()), center(6, 6, 6), heights=(0.6, 1.2))
-
-
-MUTANTS = [
-    Mutant("travel", "gap < radius - _TOUCH", "gap < radius - 0.6", law_closed),
-    Mutant("travel", "* cell_size, heights[0])", "* cell_size, -9.0)", law_closed),
-    Mutant("travel", "lowest - body - origin", "lowest - origin", law_closed),
-    Mutant("travel", "wide[:, :, below:layer]", "wide[:, :, :layer]", law_closed),
-    Mutant("travel", "occupied.shape[2] - 1) + 1", "occupied.shape[2] - 1)", law_closed),
-    Mutant("travel", "max(abs(x) - 0.5, 0.0)", "abs(x)", law_closed),
-    Mutant("travel", "max(foot, -1.0) + _TOUCH", "max(foot, -1.0) + 1.0", law_closed),
-    Mutant("travel", "safe[:, :, last + 1 :] = False", "pass", law_round_the_table),
-    Mutant("travel", "safe[:, :, : max(first, 0)] = False", "pass", law_round_the_table),
-    Mutant("travel", "safe &= ~cells_over", "safe &= True | cells_over", law_round_the_table),
-    Mutant("travel", "places[..., 2] = np.clip(places[..., 2], *self.heights)", "pass", law_level),
-]
-
-
-@each(MUTANTS)
-def test_a_fault_is_noticed(mutant):
-    assert_caught(CHAIN, mutant)

@@ -13,6 +13,7 @@ from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.frame import Frame
 from r3jax.planning.registry import make_policy
+from r3jax.runs import explain
 from r3jax.runs.explain import explain_run
 from r3jax.runs.header import RunError, camera_fields, plain_settings
 from r3jax.runs.reader import read_run
@@ -20,14 +21,12 @@ from r3jax.runs.replay import rebuild, states_of
 from r3jax.runs.settings import planner_config_of
 from r3jax.runs.writer import RunWriter
 from tests.exploration.toys import UPPER, BoxRoom
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.runs.runs import make_header
 
 pytestmark = pytest.mark.full
 
 VIEWS = 10
 CONFIG = ExplorationConfig(voxel_size=0.1, capacity=1 << 14, clock="model", num_probes=1)
-CHAIN = ("r3jax.planning.decision", "r3jax.runs.explain")
 
 
 class GlassRoom(BoxRoom):
@@ -65,9 +64,9 @@ def states(run):
     return list(states_of(run))
 
 
-def law_of_the_trace(modules: Modules, run, states) -> None:
+def test_reasons_are_the_utilities_of_the_trace(run, states) -> None:
     """The unexplored cells and the sum of 1 - R are those that the trace says were weighed."""
-    reasons = list(modules["explain"].explain_run(run, states))
+    reasons = list(explain.explain_run(run, states))
     assert len(reasons) == VIEWS
     assert reasons[0] is None
     for row, reason in zip(run.rows[1:], reasons[1:], strict=True):
@@ -76,26 +75,6 @@ def law_of_the_trace(modules: Modules, run, states) -> None:
         assert reason.totals[0] == 3.0 * best["exploration"][0]
         assert reason.totals[1:].sum() == pytest.approx(best["rendering"][0], rel=1e-5)
         assert reason.utility == pytest.approx(best["utility"][0], rel=1e-5)
-
-
-def test_reasons_are_the_utilities_of_the_trace(run, states):
-    law_of_the_trace(load(CHAIN), run, states)
-
-
-MUTANTS = [
-    Mutant("explain", "memory = memory or initial_state(",
-           "memory = initial_state(", law_of_the_trace),
-    Mutant("decision", "explain_view(map_state, scoring_grid,", "explain_view(map_state, grid,",
-           law_of_the_trace),
-    Mutant("explain", "map_state, grid, pose, choice.pose", "map_state, grid, pose, pose",
-           law_of_the_trace),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant, run, states):
-    law = lambda modules: law_of_the_trace(modules, run, states)
-    assert_caught(CHAIN, mutant._replace(law=law))
 
 
 def test_a_reason_holds_the_voxels_that_lack_something(run, states):

@@ -18,7 +18,6 @@ from r3jax.planning.registry import make_policy
 from r3jax.scoring import batch, sharding
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
-from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, pose_at, two_rooms
 
 NUM = 10
@@ -97,36 +96,13 @@ def size_of_share(scale, candidates):
     return scale * candidates[:, 0], jnp.full(candidates.shape[0], candidates.shape[0])
 
 
-def law_each_device_scores_its_share_only(modules: Modules) -> None:
+def test_each_device_scores_its_share_only() -> None:
     for count in (3, 4, 5, 11):
         candidates = jnp.arange(count, dtype=jnp.float32)[:, None]
         score = functools.partial(size_of_share, jnp.float32(2.0))
-        values, shares = modules["batch"].map_over_devices(score, candidates)
+        values, shares = batch.map_over_devices(score, candidates)
         np.testing.assert_array_equal(values, 2.0 * np.arange(count))
         np.testing.assert_array_equal(shares, np.full(count, -(-count // min(4, count))))
-
-
-CHAIN = ("r3jax.scoring.sharding", "r3jax.scoring.batch")
-MUTANTS = [
-    Mutant("batch", "len(devices) > 1", "len(devices) > 4", law_each_device_scores_its_share_only),
-    Mutant("batch", "x[:num], jax", "x, jax", law_each_device_scores_its_share_only),
-    Mutant("batch", "devices is None else devices)[:num]", "devices is None else devices)[:2]",
-           law_each_device_scores_its_share_only),
-    Mutant("sharding", "jnp.concatenate([rows, last])", "jnp.concatenate([last, rows])",
-           law_each_device_scores_its_share_only),
-    Mutant("sharding", "(PartitionSpec(), split), out_specs=split",
-           "(PartitionSpec(), PartitionSpec()), out_specs=PartitionSpec()",
-           law_each_device_scores_its_share_only),
-]  # fmt: skip
-
-
-def test_each_device_scores_its_share_only():
-    law_each_device_scores_its_share_only({"batch": batch})
-
-
-@each(MUTANTS)
-def test_faults_are_noticed(mutant):
-    assert_caught(CHAIN, mutant)
 
 
 def test_scores_compile_once_for_all_maps_and_settings():

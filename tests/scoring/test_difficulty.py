@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import r3jax
 from r3jax.geometry.voxels import unpack
-from tests.mutants import Modules, Mutant, assert_caught, each, load
+from r3jax.scoring import difficulty
 from tests.strategies import VOXEL_SIZE, Sighting, sightings
 
 CAPACITY = 1 << 9
@@ -55,39 +55,13 @@ def random_colors(seed: int) -> dict[tuple[int, int, int], np.ndarray]:
     return {i: random.random(3).astype(np.float32).astype(np.float64) for i in sorted(index)}
 
 
-def law_contrast(modules: Modules) -> None:
+def test_the_difficulty_is_the_contrast_to_what_touches_a_voxel() -> None:
     for seed in range(3):
         colors = random_colors(seed)
-        found = difficulties(map_of_colors(colors), modules["difficulty"])
+        found = difficulties(map_of_colors(colors), difficulty)
         assert found.keys() == colors.keys()
         for at, value in found.items():
             assert value == pytest.approx(expected_difficulty(colors, at), abs=1e-5), at
-
-
-CHAIN = ("r3jax.scoring.difficulty",)
-MUTANTS = [
-    Mutant("difficulty", "if (x, y, z) != (0, 0, 0)", "if x != 0", law_contrast),
-    Mutant("difficulty", "if (x, y, z) != (0, 0, 0)", "if True", law_contrast),
-    Mutant(
-        "difficulty",
-        "squares + jnp.where(is_seen, difference, 0.0)",
-        "squares + difference",
-        law_contrast,
-    ),
-    Mutant("difficulty", "number + is_seen.astype(jnp.float32))", "number + 1.0)", law_contrast),
-    Mutant("difficulty", "jnp.mean((color - own)", "jnp.sum((color - own)", law_contrast),
-    Mutant("difficulty", "jnp.asarray(0.5)", "jnp.asarray(1.0)", law_contrast),
-    Mutant("difficulty", "z + step[2]", "z", law_contrast),
-]
-
-
-def test_the_difficulty_is_the_contrast_to_what_touches_a_voxel():
-    law_contrast(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_a_fault_in_the_difficulty_is_noticed(mutant):
-    assert_caught(CHAIN, mutant)
 
 
 def joined(state: r3jax.MapState, found: list[Sighting]) -> r3jax.MapState:

@@ -16,11 +16,9 @@ from r3jax.scoring import explain
 from r3jax.scoring.explain import CAUSES, explain_view
 from r3jax.scoring.utility import visible_unexplored
 from tests.exploration.toys import BoxRoom
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.scoring.test_laws import FOCAL, NUM, POSITION, expected_terms, make_voxels
 
 NUM_FACTORS, NUM_VOXELS = 3, 8  # one shape: one compile
-CHAIN = ("r3jax.scoring.explain",)
 
 factor = st.one_of(
     st.sampled_from([0.0, 1e-38, 1e-30, 0.5, 1.0 - 2.0**-24, 1.0]), st.floats(0, 1, width=32)
@@ -94,7 +92,10 @@ def test_a_factor_that_falls_takes_more(factors, which, scale):
 @given(tables)
 def test_the_division_is_that_of_float64(factors):
     # What 1 - R loses to rounding is lost to its shares: 6e-8 of 1.
-    np.testing.assert_allclose(divided(factors), by_hand(factors), rtol=2e-6, atol=1.5e-7)
+    # 1e-38 may be a 0, as above.
+    normal = (factors != np.float32(1e-38)).all(axis=0)
+    found, expected = divided(factors)[:, normal], by_hand(factors)[:, normal]
+    np.testing.assert_allclose(found, expected, rtol=2e-6, atol=1.5e-7)
 
 
 SHIFT = 23
@@ -122,14 +123,14 @@ TINY_CAMERA = r3jax.Camera(64, 64, fx=FOCAL, fy=FOCAL, cx=32.0, cy=32.0)
 TINY_BOX = np.array([[-1.0, -1.0, -0.4], [1.0, 1.0, 1.2]])
 
 
-def law_of_the_tiny_map(modules: Modules) -> None:
+def test_a_tiny_map_is_divided_as_float64_divides_it() -> None:
     """Every voxel that is seen has the shares that float64 gives its terms; no other has any."""
     # Past the middle of the row: its near end lies outside the image.
     direction = jnp.asarray(np.array([0.3, 0.175, 0.15]) - POSITION, jnp.float32)
     pose = pose_along(jnp.asarray(POSITION, jnp.float32), direction)
     config = r3jax.ScoringConfig(lambda1=3.0, zbuffer_size=64)
     grid = r3jax.empty_grid(TINY_BOX)
-    found = modules["explain"].explain_view(tiny_map(), grid, TINY_CAMERA, pose, config)
+    found = explain.explain_view(tiny_map(), grid, TINY_CAMERA, pose, config)
     visible = np.asarray(found.visible)
     assert 20 < visible.sum() < NUM - 5
     assert visible[-1]
@@ -148,11 +149,7 @@ def law_of_the_tiny_map(modules: Modules) -> None:
     assert float(found.totals[0]) == 3.0 * num_cells
 
 
-def test_a_tiny_map_is_divided_as_float64_divides_it():
-    law_of_the_tiny_map(load(CHAIN))
-
-
-def law_of_the_division(modules: Modules) -> None:
+def test_the_division_reaches_every_branch() -> None:
     """All laws above on a table that reaches every branch."""
     factors = np.array(
         [
@@ -162,30 +159,9 @@ def law_of_the_division(modules: Modules) -> None:
         ],
         np.float32,
     )
-    shares = modules["explain"].divide_lack(jnp.asarray(lack_of(factors)), jnp.asarray(factors))
+    shares = explain.divide_lack(jnp.asarray(lack_of(factors)), jnp.asarray(factors))
     found = np.asarray(shares, np.float64)
     np.testing.assert_allclose(found, by_hand(factors), rtol=2e-6, atol=1.5e-7)
-
-
-MUTANTS = [
-    Mutant("explain", "cost = -jnp.log(", "cost = 1.0 - (", law_of_the_division),
-    Mutant("explain", "weight * (lack /", "weight * (1.0 /", law_of_the_division),
-    Mutant("explain", "is_zero = factors < _LEAST", "is_zero = factors < 1e-3",
-           law_of_the_division),
-    Mutant("explain", "jnp.any(is_zero, axis=0)", "jnp.all(is_zero, axis=0)", law_of_the_division),
-    Mutant("explain", "total > 0.0, total, 1.0", "total > 9.0, total, 1.0", law_of_the_division),
-    Mutant("explain", "[terms.bias, terms.noise, terms.resolution]",
-           "[terms.bias, terms.resolution, terms.noise]", law_of_the_tiny_map),
-    Mutant("explain", "config.lambda1 * jnp.sum", "jnp.sum", law_of_the_tiny_map),
-    Mutant("explain", "jnp.where(valid[None, :], divide", "jnp.where(valid[None, :] | True, divide",
-           law_of_the_tiny_map),
-    Mutant("explain", "jnp.where(valid, index, num)", "index", law_of_the_tiny_map),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
 
 
 @pytest.fixture(scope="module")

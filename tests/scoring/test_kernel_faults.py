@@ -18,8 +18,7 @@ from r3jax.scoring.backends.views import row_of
 from r3jax.scoring.cells import cells_of
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import wrap
-from tests.mutants import Modules, Mutant, assert_caught, each, load
-from tests.plain_kernels import kernels_as_python
+from tests.plain_kernels import Modules, kernels_as_python, load
 from tests.scoring.test_backends import (
     CAMERA,
     CONFIG,
@@ -213,83 +212,6 @@ def changes_agree(modules: Modules) -> None:
     np.testing.assert_array_equal(results[1], explored)
 
 
-MUTANTS = [
-    Mutant("changes", "num += after[row] > before[row]", "num += after[row] < before[row]",
-           changes_agree),
-    Mutant("changes", "(7 - (item & 7))", "(item & 7)", changes_agree),
-    Mutant("changes", "weights[j] -= was[j]", "weights[j] += was[j]", changes_agree),
-    Mutant("changes", "explored, kept[1][i]", "explored, kept[1][0]", changes_agree),
-    Mutant("changes", "sums[bin], results[1][i, bin] = 0.0, 0.0", "results[1][i, bin] = 0.0",
-           changes_agree),
-    Mutant("views", "placed[COLUMN + i] = column * half + half",
-           "placed[COLUMN + i] = column * half", sums_agree),
-    Mutant("views", "q = a if is_lower else b", "q = b", sums_agree),
-    Mutant("views", "abs(-_ONE - apart * sign_y)", "abs(_ONE - apart * sign_y)", sums_agree),
-    Mutant("views", "distance if distance <= far else _INFINITE", "distance", sums_agree),
-    Mutant("views", "c0, r0 = along_x * (xx - slope_x * xz), along_y",
-           "c0, r0 = along_x * xx, along_y", in_images),
-    Mutant("views", "abs(c0 - r0) + abs(c1 - r1)", "abs(c0 - r0) + abs(c1 + r1)", in_images),
-    Mutant("picture", "height - 1 - row if crosses_column", "row if crosses_column",
-           borders_agree),
-    Mutant("picture", "i -= 2 * (width + 2)", "i -= 2 * width", borders_agree),
-    Mutant("picture", "        if wraps:\n            fold", "        if False:\n            fold",
-           images_all_round),
-    Mutant("picture", "above + (r >> 1) * stride", "above + r * stride", sums_agree),
-    Mutant("splat", "spread = _QUARTER if begins_level else _ZERO", "spread = _ZERO", sums_agree),
-    Mutant("splat", "(in_slants | is_own)", "is_own", sums_agree),
-    Mutant("splat", "+ _TWO * _RING * level + _RING", "+ _RING", sums_agree),
-    Mutant("limit", "_flatter(before, after, np.float32(step))", "_ZERO", sums_agree),
-    Mutant("limit", "return least if before * after > _ZERO else _ZERO", "return least",
-           sums_agree),
-    Mutant("limit", ", _MAX_STRETCH)", ", _ONE)", sums_agree),
-    Mutant("seen", "first = max(limit", "first = min(limit", sums_agree),
-    Mutant("seen", "(distance <= nearest[pixel])", "(distance <= 2 * nearest[pixel])", sums_agree),
-    Mutant("bricks", "reach, wide = far + radius", "reach, wide = far", sums_agree),
-    Mutant("bricks", "(down - slopes[2] * ahead >= -wide * slants[2])",
-           "(down - slopes[2] * ahead >= wide * slants[2])", in_images),
-    Mutant("bricks", "spheres[b, 3] = 0.9 * edge", "spheres[b, 3] = 0.5 * edge",
-           points_lie_in_their_bricks),
-    Mutant("bricks", "(cell[axis] + 0.5) * edge", "cell[axis] * edge", points_lie_in_their_bricks),
-    Mutant("bricks", "order[counts[0, slots[i]]] = i", "order[counts[0, slots[i]]] = num - 1 - i",
-           points_lie_in_their_bricks),
-    Mutant("near", "& (count[i] > _ZERO)", "& (count[i] >= _ZERO)", few_agree),
-    Mutant("near", "MARGIN = np.float32(4.0)", "MARGIN = np.float32(-2.0)", few_agree),
-    Mutant("few", "least[i] = min(least[i], own[i])", "least[i] = own[i]", few_agree),
-    Mutant("few", "lack += sums[worker, bin]", "lack = sums[worker, bin]", few_agree),
-    Mutant("few", "count += found[worker, bin]", "count = found[worker, bin]", few_agree),
-    Mutant("few", "numbers.shape[0] * share // workers", "0 * share", few_agree),
-    Mutant("voxels", "math.sqrt(_TWO_THIRDS_OF_TWO * variance)", "math.sqrt(variance)",
-           sums_agree),
-    Mutant("voxels", "max(count - _ONE, _ONE)", "count", terms_agree),
-    Mutant("voxels", "counts[group] += 1\n        rows", "rows", sums_agree),
-    Mutant("terms", "best = max(best, cosine)", "best = cosine", images_agree),
-    Mutant("terms", "apart = _ZERO if cosine > _ZERO else _INFINITE", "apart = _ZERO",
-           terms_agree),
-    Mutant("terms", "-z * a_y, z * a_x", "-z * a_x, z * a_y", terms_agree),
-    Mutant("terms", "cosine if is_one else cosine * cosine", "cosine", sums_agree),
-    Mutant("terms", "_ONE - delta * bias", "_ONE - bias", sums_agree),
-    Mutant("terms", "kappa * (_ONE - bias)", "(_ONE - bias)", terms_agree),
-    Mutant("bins", "is_better = cosine > best", "is_better = k == 0", sums_agree),
-    Mutant("shown", "num += is_seen[i]", "num += 1", sums_agree),
-    Mutant("sums", "empty[axis, k] = centers[axis, order[k]]", "empty[axis, k] = centers[axis, k]",
-           in_images),
-    Mutant("sums", "x + 3 * y + 2 * z", "x + y + z", samples_agree),
-    Mutant("sums", "starts, spheres, voxels, _, _ = hiding",
-           "starts, spheres, voxels, _, _ = scored", samples_agree),
-    Mutant("sums", "runs, voxels, _, _ = hiding", "runs, voxels, _, _ = scored",
-           few_samples_agree),
-    Mutant("sums", "state, some, views, is_sound, layout",
-           "state, state[2], views, is_sound, layout", few_samples_agree),
-    Mutant("pixels", "key_of(placed[DISTANCE + i], rows[first + i])",
-           "key_of(placed[DISTANCE + i], first + i)", images_agree),
-    Mutant("pixels", "if row != last:", "if last < 0:", images_agree),
-    Mutant("rows", "is_there * bias * noise * resolution", "bias * noise * resolution",
-           terms_agree),
-    Mutant("rows", "(word & (word - _ONE_BIT) != _NO_BITS) | ", "", terms_agree),
-    Mutant("rows", "| (np.uint64(own[j]) << shift)", "| np.uint64(own[j])", terms_agree),
-]  # fmt: skip
-
-
 LAWS = (
     borders_agree, points_lie_in_their_bricks, sums_agree, few_agree, samples_agree,
     few_samples_agree, in_images, images_agree, images_all_round, terms_agree, changes_agree,
@@ -299,8 +221,3 @@ LAWS = (
 @pytest.mark.parametrize("law", LAWS)
 def test_the_laws_hold(law):
     law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_faults_are_noticed(mutant):
-    assert_caught(CHAIN, mutant)

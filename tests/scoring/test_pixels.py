@@ -16,7 +16,6 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.scoring import pixels
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import view_utility
-from tests.mutants import Modules, Mutant, assert_caught, each
 
 VOXEL = 0.1
 CAPACITY = 1 << 13
@@ -133,10 +132,10 @@ def traced_rays() -> list[tuple[np.ndarray, np.ndarray]]:
     return list(zip(far, near, strict=True))
 
 
-def law_rows(modules: Modules) -> None:
+def test_rows() -> None:
     """A pixel carries the row of its voxel, and the voxel's place."""
     state, table = small_map()
-    views = look(modules["pixels"], state, some_grid())
+    views = look(pixels, state, some_grid())
     for i, pose in enumerate(POSES):
         hit, row = np.asarray(views.hit[i]), np.asarray(views.rows["row"][i])
         assert hit.any() == (i < 3)
@@ -150,10 +149,10 @@ def law_rows(modules: Modules) -> None:
         assert not hit.any() or depth[hit].min() > 0.0
 
 
-def law_rays(modules: Modules) -> None:
+def test_rays() -> None:
     """What a pixel shows lies between what its ray must hit and what it may touch."""
     state, _ = small_map()
-    views = look(modules["pixels"], state, some_grid())
+    views = look(pixels, state, some_grid())
     for i, (farthest, nearest) in enumerate(traced_rays()):
         offset = np.linalg.norm(np.asarray(views.offset[i]), axis=0)
         distance = np.where(views.hit[i], offset, np.inf)
@@ -163,16 +162,16 @@ def law_rays(modules: Modules) -> None:
         assert i >= 2 or (np.isfinite(farthest) & is_fine).sum() > 100
 
 
-def law_cells_as_in_utility(modules: Modules) -> None:
+def test_cells_as_in_utility() -> None:
     """The unexplored cells in view are those of U_G, exactly."""
     state, grid = small_map()[0], some_grid()
-    views = look(modules["pixels"], state, grid)
+    views = look(pixels, state, grid)
     expected = [float(view_utility(state, grid, CAMERA, p, CONFIG).exploration) for p in POSES]
     assert min(expected) > 5.0
     np.testing.assert_array_equal(views.cells, np.float32(expected))
 
 
-def law_single_cells(modules: Modules) -> None:
+def test_single_cells() -> None:
     """One unexplored cell counts, but not if it is hidden, out of range or of view."""
     state, _ = small_map()
     cases = {
@@ -188,14 +187,14 @@ def law_single_cells(modules: Modules) -> None:
         center = np.array(where)
         unexplored = np.zeros(GRID_SHAPE, bool)
         unexplored[tuple(np.floor((center - GRID_ORIGIN) / CELL).astype(int))] = True
-        views = look(modules["pixels"], state, grid_where(unexplored))
+        views = look(pixels, state, grid_where(unexplored))
         assert float(views.cells[pose]) == is_seen, where
 
 
-def law_reach(modules: Modules) -> None:
+def test_reach() -> None:
     """Voxels beyond the range show where nothing was before; cells beyond it never do."""
     state, grid = small_map()[0], some_grid()
-    near, far = (look(modules["pixels"], state, grid, reach) for reach in (None, 8.0))
+    near, far = (look(pixels, state, grid, reach) for reach in (None, 8.0))
     was_hit, is_hit = np.asarray(near.hit), np.asarray(far.hit)
     assert np.all(is_hit[was_hit])
     np.testing.assert_allclose(far.depth[was_hit], near.depth[was_hit], atol=1e-5)
@@ -204,33 +203,6 @@ def law_reach(modules: Modules) -> None:
     assert distance.min() > float(CONFIG.max_range) - STEP
     assert distance.max() <= 8.0 + STEP
     np.testing.assert_array_equal(far.cells, near.cells)
-
-
-LAWS = [law_rows, law_rays, law_cells_as_in_utility, law_single_cells, law_reach]
-CHAIN = ("r3jax.scoring.pixels",)
-MUTANTS = [
-    Mutant("pixels", "jnp.minimum(index, last)]", "jnp.arange(index.shape[0])]", law_rows),
-    Mutant("pixels", "x[..., item], rows", "x[..., item + 1], rows", law_rows),
-    Mutant("pixels", "[:, None, None] - center", "[:, None, None] + center", law_rows),
-    Mutant("pixels", "-jnp.sum(offset * axis", "jnp.sum(offset * axis", law_rows),
-    Mutant("pixels", "jnp.minimum(item, num - 1)", "jnp.minimum(item, 40)", law_rays),
-    Mutant("pixels", "hit = item < num", "hit = item <= num", law_rays),
-    Mutant("pixels", "rows_in_pixels(voxels, far, config)",
-           "rows_in_pixels(voxels, pinhole_view(camera, pose, config), config)", law_reach),
-    Mutant("pixels", "jnp.sum(unexplored, dtype", "jnp.sum(~unexplored, dtype", law_single_cells),
-    Mutant("pixels", "seen_in_view(voxels, cells, view, config)[1]",
-           "seen_in_view(voxels, cells, far, config)[1]", law_reach),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
-def test_a_view_shows_what_rays_meet(law):
-    law({"pixels": pixels})
-
-
-@each(MUTANTS)
-def test_faults_are_noticed(mutant):
-    assert_caught(CHAIN, mutant)
 
 
 def test_a_value_is_compiled_once_for_all_poses_and_maps_of_a_size():

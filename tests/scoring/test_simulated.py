@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,7 +15,6 @@ from r3jax.scoring import simulated as real
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import voxel_renderability
 from r3jax.scoring.terms import consistency
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 CAPACITY, VOXEL = 1024, 0.1  # one shape: one compile
 CAMERA = Camera(32, 24, 20.0, 20.0, 16.0, 12.0)
@@ -54,12 +52,12 @@ def value_from(state: MapState, position) -> np.ndarray:
     return np.asarray(voxel_renderability(state, position, 20.0).value)
 
 
-def law_value(modules: Modules, seed: int = 0) -> None:
+def law_value(seed: int = 0) -> None:
     before = seen_map(seed)
     rng = np.random.default_rng([seed, 1])
     after = before
     for pose in poses_of(seed):
-        after, _ = modules["simulated"].simulate_view(after, CAMERA, pose, CONFIG)
+        after, _ = real.simulate_view(after, CAMERA, pose, CONFIG)
     for position in rng.uniform([-0.5, -1.5, -1], [1.2, 1.5, 1], (3, 3)).astype(np.float32):
         low, high = value_from(before, position), value_from(after, position)
         assert (high >= low - 1e-5).all()
@@ -70,12 +68,12 @@ def law_value(modules: Modules, seed: int = 0) -> None:
 
 @given(seeds)
 def test_no_renderability_falls(seed):
-    law_value({"simulated": real}, seed)
+    law_value(seed)
 
 
-def law_order(modules: Modules, seed: int = 0) -> None:
+def law_order(seed: int = 0) -> None:
     before, (first, second) = seen_map(seed), poses_of(seed)
-    simulate_view = modules["simulated"].simulate_view
+    simulate_view = real.simulate_view
     one = simulate_view(simulate_view(before, CAMERA, first, CONFIG)[0], CAMERA, second, CONFIG)[0]
     other = simulate_view(simulate_view(before, CAMERA, second, CONFIG)[0], CAMERA, first, CONFIG)[
         0
@@ -87,13 +85,13 @@ def law_order(modules: Modules, seed: int = 0) -> None:
 
 @given(seeds)
 def test_the_order_does_not_matter(seed):
-    law_order({"simulated": real}, seed)
+    law_order(seed)
 
 
-def law_observation(modules: Modules, seed: int = 0) -> None:
+def law_observation(seed: int = 0) -> None:
     """What each voxel gains, worked out voxel by voxel in double precision."""
     before, pose = seen_map(seed), poses_of(seed)[0]
-    after, shown = modules["simulated"].simulate_view(before, CAMERA, pose, CONFIG)
+    after, shown = real.simulate_view(before, CAMERA, pose, CONFIG)
     shown = np.asarray(shown)
     present = np.asarray(before.occupied)
     assert 20 < shown.sum() <= present.sum()
@@ -116,14 +114,14 @@ def law_observation(modules: Modules, seed: int = 0) -> None:
 
 @given(seeds)
 def test_bins_counts_and_resolution_are_those_of_a_view_that_agrees(seed):
-    law_observation({"simulated": real}, seed)
+    law_observation(seed)
 
 
-def law_hidden(modules: Modules) -> None:
+def test_what_is_hidden_is_not_foreseen() -> None:
     """The wall behind the plate is not observed, the wall beside it is."""
     before = seen_map()
     pose = look_at(np.zeros(3), np.array([2.0, 0.0, 0.0]))
-    _, shown = modules["simulated"].simulate_view(before, CAMERA, pose, CONFIG)
+    _, shown = real.simulate_view(before, CAMERA, pose, CONFIG)
     index = jnp.stack(unpack(before.key[0], before.key[1]))
     x, y, z = np.asarray(voxel_center(index, before.voxel_size))
     is_wall = np.asarray(before.occupied) & (x > 1.8)
@@ -132,37 +130,3 @@ def law_hidden(modules: Modules) -> None:
     assert behind.sum() > 2
     assert not np.asarray(shown)[behind].any()
     assert np.asarray(shown)[beside].mean() > 0.9
-
-
-def test_what_is_hidden_is_not_foreseen():
-    law_hidden({"simulated": real})
-
-
-CHAIN = ("r3jax.visibility.depth_buffer", "r3jax.mapping.seen", "r3jax.scoring.simulated")
-MUTANTS = [
-    Mutant("seen", "visited[:, index] | words", "words", law_value),
-    Mutant("seen", "visited[:, index] | words", "visited[:, index]", law_observation),
-    Mutant("simulated", "voxels.m2 * n /", "voxels.m2 /", law_observation),
-    Mutant("simulated", "voxels.m2 * n / jnp.maximum(n - 1.0, 1.0)", "3.0 * voxels.m2", law_value),
-    Mutant("simulated", "n + shown.astype", "n + 2.0 * shown.astype", law_observation),
-    Mutant("seen", ", focal / distance", ", focal * distance", law_observation),
-    Mutant("seen", "[row].max(sharper", "[row].set(sharper", law_order),
-    Mutant(
-        "depth_buffer",
-        "return buffer, visible_voxels(voxels, candidates, view, buffer)",
-        "return buffer, candidates",
-        law_hidden,
-    ),
-]
-
-
-@pytest.mark.mutant
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    for law in (law_value, law_order, law_observation, law_hidden):
-        law(modules)
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

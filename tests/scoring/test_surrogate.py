@@ -20,7 +20,6 @@ from r3jax.scoring import surrogate as real
 from r3jax.scoring.cells import cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import utility_of_view
-from tests.mutants import Modules, Mutant, assert_caught, each
 
 pytestmark = pytest.mark.full
 
@@ -151,8 +150,8 @@ def by_hand(around, numbers: np.ndarray, angle: float) -> float:
     return float((inside * total).sum())
 
 
-def law_oracle(modules: Modules, seed: int = 0) -> None:
-    stand = STAND if modules["surrogate"] is real else Stand(modules["surrogate"])
+def law_oracle(seed: int = 0) -> None:
+    stand = STAND
     around = stand.around(hidden(), cells(), SOFT, HALF)
     numbers = numbers_of(seed)
     found = float(stand.value(around, jnp.asarray(numbers, jnp.float32), SOFT))
@@ -161,7 +160,7 @@ def law_oracle(modules: Modules, seed: int = 0) -> None:
 
 @given(seeds)
 def test_the_sum_matches_an_oracle(seed):
-    law_oracle({"surrogate": real}, seed)
+    law_oracle(seed)
 
 
 @given(seeds)
@@ -187,9 +186,9 @@ def on_the_border(around, numbers: np.ndarray) -> float:
     return abs(near) + float(np.asarray(around.worth).max(axis=0)[at_range].sum())
 
 
-def law_exact(modules: Modules, seed: int = 0) -> None:
+def law_exact(seed: int = 0) -> None:
     """Nothing hides, hard borders: from the middle of the box it is the utility of any view."""
-    stand = STAND if modules["surrogate"] is real else Stand(modules["surrogate"])
+    stand = STAND
     numbers = numbers_of(seed, 0.0)
     around = stand.around(bare(), cells(), CRISP, HALF)
     found = float(stand.value(around, jnp.asarray(numbers, jnp.float32), CRISP))
@@ -202,16 +201,16 @@ def law_exact(modules: Modules, seed: int = 0) -> None:
 @given(seeds)
 @settings(max_examples=20)
 def test_without_softness_it_is_the_utility(seed):
-    law_exact({"surrogate": real}, seed)
+    law_exact(seed)
 
 
-def law_nodes(modules: Modules) -> None:
+def test_at_the_nodes_it_is_the_utility() -> None:
     """Behind a plate, from the middle and from every side: what the plate hides there is left out.
 
     It hides a third of what is in view. The buffers are wider and so coarser: along the plate's
     edges they differ by a voxel.
     """
-    stand = STAND if modules["surrogate"] is real else Stand(modules["surrogate"])
+    stand = STAND
     around = stand.around(hidden(), cells(), CRISP, HALF)
     sides = [np.zeros(3), *(s * BOX * np.eye(3)[i] for i in range(3) for s in (-1.0, 1.0))]
     found, wanted = [], []
@@ -225,15 +224,11 @@ def law_nodes(modules: Modules) -> None:
     assert np.corrcoef(found, wanted)[0, 1] > 0.93
 
 
-def test_at_the_nodes_it_is_the_utility():
-    law_nodes({"surrogate": real})
-
-
-def law_sample(modules: Modules, seed: int = 0) -> None:
+def law_sample(seed: int = 0) -> None:
     """Of 300, at most 64: each chosen, none twice, and together they count for all."""
     rng = np.random.default_rng(seed)
     chosen = rng.random(300) < rng.random()
-    index, is_real, each_one = modules["surrogate"]._sample(jnp.asarray(chosen), 64)
+    index, is_real, each_one = real._sample(jnp.asarray(chosen), 64)
     kept, count = np.asarray(index)[np.asarray(is_real)], int(chosen.sum())
     assert chosen[kept].all()
     assert len(set(kept.tolist())) == len(kept)
@@ -249,7 +244,7 @@ def law_sample(modules: Modules, seed: int = 0) -> None:
 @given(seeds)
 @settings(max_examples=30)
 def test_a_sample_counts_for_all(seed):
-    law_sample({"surrogate": real}, seed)
+    law_sample(seed)
 
 
 def test_a_camera_that_stays_needs_one_node():
@@ -261,35 +256,3 @@ def test_a_camera_that_stays_needs_one_node():
     assert still.worth.shape[0] == 1
     for row in moving.worth:
         np.testing.assert_allclose(row, still.worth[0], atol=1e-5)
-
-
-CHAIN = ("r3jax.scoring.surrogate",)
-
-
-def several(law):
-    return lambda modules: [law(modules, seed) for seed in range(3)]
-
-
-MUTANTS = [
-    Mutant("surrogate", "0.5 * t * (after - before)", "0.5 * t * (before - after)",
-           several(law_oracle)),
-    Mutant("surrogate", "t * t * (0.5", "t * (0.5", several(law_oracle)),
-    Mutant("surrogate", "jnp.clip(total, worth.min(axis=0), worth.max(axis=0))", "total",
-           several(law_oracle)),
-    Mutant("surrogate", "/ jnp.sqrt(1.0 + k * k)", "", several(law_oracle)),
-    Mutant("surrogate", "(-1.0, (size - center) / focal)", "(-1.0, center / focal)",
-           several(law_oracle)),
-    Mutant("surrogate", "config.lambda1 * open_", "open_", several(law_exact)),
-    Mutant("surrogate", "margin = jnp.minimum(margin, view.max_range - place.distance)\n    return",
-           "return", several(law_exact)),
-    Mutant("surrogate", "set(position), config)", "set(middle), config)", law_nodes),
-    Mutant("surrogate", "margin = corner_margin(view, place, voxels.voxel_size, limit)",
-           "margin = jnp.full_like(place.distance, jnp.inf)", law_nodes),
-    Mutant("surrogate", "jnp.any(sight.seen, axis=0)", "sight.seen[0]", law_nodes),
-    Mutant("surrogate", "jnp.maximum(count / most, 1.0)", "1.0 + 0.0 * count", several(law_sample)),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)

@@ -7,10 +7,9 @@ import pytest
 from scipy.special import sph_harm_y
 
 from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.splatting import harmonics as harmonics_module
 from r3jax.splatting.harmonics import harmonics, view_colors
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
-CHAIN = ("r3jax.splatting.harmonics",)
 NUM = 4096
 
 
@@ -19,23 +18,23 @@ def directions() -> np.ndarray:
     return np.asarray(fibonacci_lattice(NUM), dtype=np.float32).T
 
 
-def basis(modules: Modules) -> np.ndarray:
+def basis() -> np.ndarray:
     """[16, NUM]."""
-    return np.stack(modules["harmonics"].harmonics(*map(jnp.asarray, directions()), degree=3))
+    return np.stack(harmonics_module.harmonics(*map(jnp.asarray, directions()), degree=3))
 
 
-def assert_orthonormal(modules: Modules) -> None:
+def test_orthonormal() -> None:
     """The integral of the product of two basis functions is 1 or 0."""
-    values = basis(modules).astype(np.float64)
+    values = basis().astype(np.float64)
     gram = values @ values.T * (4.0 * np.pi / NUM)
     np.testing.assert_allclose(gram, np.eye(16), atol=2e-3)
 
 
-def assert_equals_scipy(modules: Modules) -> None:
+def test_equals_scipy() -> None:
     """Real harmonics with the Condon-Shortley phase, ordered by degree, then order."""
     x, y, z = directions().astype(np.float64)
     polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
-    values = basis(modules)
+    values = basis()
     for degree in range(4):
         for order in range(-degree, degree + 1):
             value = sph_harm_y(degree, abs(order), polar, azimuth)
@@ -47,26 +46,6 @@ def assert_equals_scipy(modules: Modules) -> None:
                 expected = np.sqrt(2.0) * value.real
             found = values[degree * degree + degree + order]
             np.testing.assert_allclose(found, expected, atol=3e-6)
-
-
-LAWS = [assert_orthonormal, assert_equals_scipy]
-
-MUTANTS = [
-    Mutant("harmonics", "-C1 * y, C1 * z, -C1 * x", "-C1 * y, C1 * z, C1 * x", assert_equals_scipy),
-    Mutant("harmonics", "C2[2] * (xx - yy)", "C2[2] * (xx + yy)", assert_orthonormal),
-    Mutant("harmonics", "0.3731763325901154", "0.3831763325901154", assert_equals_scipy),
-    Mutant("harmonics", "C3[1] * x * y * z", "C3[1] * x * y", assert_orthonormal),
-]
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_laws(law):
-    law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutants_are_caught(mutant):
-    assert_caught(CHAIN, mutant)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from r3jax.formats.recordings import read_recording
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at, project
+from r3jax.splatting import views
 from r3jax.splatting.errors import ViewsError
 from r3jax.splatting.views import (
     check_views,
@@ -18,12 +19,6 @@ from r3jax.splatting.views import (
     load_views,
     split_views,
 )
-from tests.mutants import Modules, Mutant, assert_caught, each, load
-
-CHAIN = ("r3jax.splatting.views",)
-
-LAW = settings(report_multiple_bugs=False, phases=(Phase.explicit, Phase.generate))
-"""A mutant ends at its first failure: shrinking it takes long and tells nothing."""
 
 
 @st.composite
@@ -48,10 +43,9 @@ def average_slowly(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return blocks.mean(axis=(1, 3))
 
 
-def law_average(modules: Modules) -> None:
-    average = modules["views"].area_average
+def test_average() -> None:
+    average = views.area_average
 
-    @LAW
     @given(sizes(), st.integers(0, 2**32 - 1))
     def check(shapes, seed):
         full, small = shapes
@@ -83,10 +77,9 @@ def median_slowly(depth: np.ndarray, height: int, width: int) -> np.ndarray:
     return median
 
 
-def law_median(modules: Modules) -> None:
-    median = modules["views"].median_depth
+def test_median() -> None:
+    median = views.median_depth
 
-    @LAW
     @given(st.data())
     def check(data):
         full, small = data.draw(sizes())
@@ -115,12 +108,6 @@ def frames(count: int, height: int = 10, width: int = 14) -> list[Frame]:
         )
         for _ in range(count)
     ]
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    law_average(modules)
-    law_median(modules)
 
 
 def test_recorded_frames_are_kept_exactly():
@@ -249,24 +236,3 @@ def test_a_real_recording_keeps_its_share_of_holes(shared):
         np.testing.assert_array_equal(np.asarray(small.depth[i]) > 0.0, expected)
         assert (np.asarray(small.depth[i])[..., None] == depth).any(axis=-1)[expected].all()
         np.testing.assert_allclose(small.rgb[i].mean(), full.rgb[i].mean(), atol=0.1)
-
-
-MUTANTS = [
-    Mutant("views", "np.minimum(edges[1:, None], old[None, :] + 1)",
-           "np.minimum(edges[1:, None], old[None, :] + 0.5)", law_average),
-    Mutant("views", "np.maximum(edges[:-1, None], old[None, :])", "old[None, :]", law_average),
-    Mutant("views", "(rows @ channels @ columns.T).transpose(1, 2, 0)",
-           "(rows @ channels @ columns.T).transpose(1, 2, 0)[::-1]", law_average),
-    Mutant("views", " & (inside > 0.0)", "", law_median),
-    Mutant("views", "present = has_row[:, None, :, None] & ", "present = ", law_median),
-    Mutant("views", "middle = np.maximum(count - 1, 0) // 2", "middle = count // 2", law_median),
-    Mutant("views", "values.sort(axis=-1)", "values = values", law_median),
-    Mutant("views", "((np.arange(long) * 2 + 1) * short) // (2 * long)",
-           "(np.arange(long) * short) // long", law_median),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    with np.errstate(all="ignore"):
-        assert_caught(CHAIN, mutant)

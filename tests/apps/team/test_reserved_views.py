@@ -11,25 +11,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from r3jax.apps.team import reserved_views
 from r3jax.apps.team.reserved_views import PromisedView
 from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.scoring import simulated
 from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.utility import view_utility
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 from tests.scoring.test_simulated import CAMERA, CONFIG, poses_of, seen_map
 
 pytestmark = pytest.mark.full
 
-CHAIN = ("r3jax.scoring.simulated", "r3jax.apps.team.reserved_views")
 WORLD = OccupancyGrid(
     log_odds=jnp.zeros((20, 20, 16)).at[3:8].set(-3.0),
     origin=jnp.asarray([-1.0, -2.0, -1.6]),
     cell_size=jnp.asarray(0.2),
 )
 """Round the map of `seen_map`; a slice of it is known to be free."""
-
-REAL = load(CHAIN)
 
 
 def half_explored() -> tuple[np.ndarray, OccupancyGrid]:
@@ -40,10 +38,10 @@ def half_explored() -> tuple[np.ndarray, OccupancyGrid]:
     return free & ~hidden, grid_of(free & ~hidden, occupied & ~hidden)
 
 
-def law_yielded(modules: Modules, here=(9, 6, 4), others=((15, 6, 4),)) -> None:
+def law_yielded(here=(9, 6, 4), others=((15, 6, 4),)) -> None:
     free, grid = half_explored()
     places = np.array([center(*cell) for cell in others])
-    own = modules["reserved_views"].without_yielded(
+    own = reserved_views.without_yielded(
         grid, jnp.asarray(center(*here), jnp.float32), jnp.asarray(places, jnp.float32)
     )
     np.testing.assert_array_equal(own.log_odds, grid.log_odds)
@@ -62,28 +60,28 @@ cells = st.tuples(st.integers(6, 11), st.integers(1, 12), st.integers(1, 8))
 @settings(max_examples=10)
 @given(cells, st.tuples(st.integers(13, 18), st.integers(1, 12), st.integers(1, 8)))
 def test_what_is_nearer_to_others_is_theirs(here, other):
-    law_yielded(REAL, here, (other,))
+    law_yielded(here, (other,))
 
 
 def test_of_several_others_the_nearest_counts():
-    law_yielded(REAL, (9, 6, 4), ((15, 6, 4), (7, 11, 2)))
+    law_yielded((9, 6, 4), ((15, 6, 4), (7, 11, 2)))
 
 
-def law_left(modules: Modules) -> None:
+def test_whoever_has_nothing_left_leaves_nothing() -> None:
     """Whoever would have nothing to explore leaves nothing to others."""
     free, occupied = two_rooms()
     hidden = np.zeros_like(free)
     hidden[20:24] = True
     grid = grid_of(free & ~hidden, occupied & ~hidden)
     here, other = (jnp.asarray(center(*cell), jnp.float32) for cell in ((5, 6, 4), (17, 6, 4)))
-    after = modules["reserved_views"].without_yielded(grid, here, other[None])
+    after = reserved_views.without_yielded(grid, here, other[None])
     np.testing.assert_array_equal(after.unexplored, grid.unexplored)
 
 
-def law_promise(modules: Modules) -> None:
+def test_a_promised_view_has_nothing_more_to_explore() -> None:
     """The same view explores nothing any more; the map is the foreseen one, and nothing else."""
     state, (pose, _) = seen_map(), poses_of(3)
-    after, dark = modules["simulated"].imagine_view(state, WORLD, CAMERA, pose, CONFIG)
+    after, dark = simulated.imagine_view(state, WORLD, CAMERA, pose, CONFIG)
     first = view_utility(state, WORLD, CAMERA, pose, CONFIG)
     again = view_utility(after, dark, CAMERA, pose, CONFIG)
     assert first.exploration > 100.0
@@ -110,12 +108,12 @@ class Listener:
         return "decision", "state", "info"
 
 
-def law_decision(modules: Modules) -> None:
+def test_a_policy_decides_on_what_others_leave() -> None:
     """The policy decides where the camera is, on every promise, and on what is left to it."""
-    promised, listener = modules["reserved_views"], Listener()
+    listener = Listener()
     state, poses, pose = seen_map(), poses_of(3), pose_at(np.array([-0.5, -1.0, 0.0]))
     views = tuple(PromisedView(CAMERA, np.asarray(T, np.float64)) for T in poses)
-    policy = promised.ReservedViews(listener, views, CONFIG)
+    policy = reserved_views.ReservedViews(listener, views, CONFIG)
     assert (policy.name, policy.config) == ("listener", "settings")
     answer = policy.decide("memory", state, WORLD, pose, key="key")
     assert answer == ("decision", "state", "info")
@@ -124,37 +122,8 @@ def law_decision(modules: Modules) -> None:
     np.testing.assert_array_equal(T, pose)
     after, dark = state, WORLD
     for view in poses:
-        after, dark = modules["simulated"].imagine_view(after, dark, CAMERA, view, CONFIG)
+        after, dark = simulated.imagine_view(after, dark, CAMERA, view, CONFIG)
     others = jnp.stack([view[:3, 3] for view in poses])
-    left = promised.without_yielded(dark, jnp.asarray(pose[:3, 3], jnp.float32), others)
+    left = reserved_views.without_yielded(dark, jnp.asarray(pose[:3, 3], jnp.float32), others)
     np.testing.assert_array_equal(map_state.visited, after.visited)
     np.testing.assert_array_equal(grid.unexplored, left.unexplored)
-
-
-def test_whoever_has_nothing_left_leaves_nothing():
-    law_left(REAL)
-
-
-def test_a_promised_view_has_nothing_more_to_explore():
-    law_promise(REAL)
-
-
-def test_a_policy_decides_on_what_others_leave():
-    law_decision(REAL)
-
-
-MUTANTS = [
-    Mutant("reserved_views", "nearest < squared", "nearest > squared", law_yielded),
-    Mutant("reserved_views", "is_yielded & is_left", "is_yielded", law_left),
-    Mutant("reserved_views", "(grid.ignoring(is_yielded)))", "(grid))", law_left),
-    Mutant("simulated", "after, _ = simulate_view(",
-           "after = map_state; simulate_view(", law_promise),
-    Mutant("simulated", "after, grid.ignoring(shown)", "after, grid", law_promise),
-    Mutant("reserved_views", "(T_world_camera[:3, 3]", "(T_world_camera[:3, 2]", law_decision),
-    Mutant("reserved_views", "in self.promised:", "in self.promised[:1]:", law_decision),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutants_are_caught(mutant):
-    assert_caught(CHAIN, mutant)

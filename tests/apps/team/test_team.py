@@ -32,7 +32,6 @@ from r3jax.scoring.simulated import imagine_view
 from tests.exploration.killed_run import CONFIG, SCORING, small_policy
 from tests.exploration.test_guard import Cheat
 from tests.exploration.toys import BoxRoom, Wander
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
 WIDE = Camera.from_fov(32, 32, 100.0)
 VIEWS = 5
@@ -342,60 +341,3 @@ def test_what_is_no_team_is_refused():
     elsewhere = BoxRoom(bounds=np.stack([np.zeros(3), np.full(3, 4.0)]))
     with pytest.raises(ValueError, match="member 1 is in another world than member 0"):
         explore_team([Member(room(), Wander()), Member(elsewhere, Wander())], budget="views:2")
-
-
-CHAIN = ("r3jax.apps.team.team",)
-
-
-def merged(modules: Modules) -> None:
-    law_merged_is_one_cameras(5, 1.0, 1.4, modules["team"])
-
-
-def merged_in_touch(modules: Modules) -> None:
-    law_merged_is_one_cameras(5, 0.0, 1.4, modules["team"])
-
-
-def informed(modules: Modules) -> None:
-    law_nobody_knows_more_or_less(0.9, team=modules["team"])
-
-
-def own_lots(modules: Modules) -> None:
-    law_everyone_draws_for_itself(modules["team"])
-
-
-MUTANTS = [
-    Mutant("team", 'attrgetter("seconds", "member")', 'attrgetter("member", "seconds")', merged),
-    Mutant("team", "if sight.seconds > until:", "if sight.seconds >= until:", merged_in_touch),
-    Mutant("team", "math.floor(", "math.ceil(", informed),
-    Mutant("team", "planner=planner), heard=(), owed", "planner=planner), owed", informed),
-    Mutant("team", "if sight.member == me.number:", "if False:", informed),
-    Mutant("team", "if sight.member != me.number:", "if False:", informed),
-    Mutant(
-        "team", "first.setdefault(sight.member, sight)", "first[sight.member] = sight", informed
-    ),
-    Mutant("team", "if told.sight.member != me.number:", "if True:", informed),
-    Mutant("team", "exchange=me.owed", "exchange=0.0", informed),
-    Mutant("team", "rows=(*me.rows, row), owed=0.0)", "rows=(*me.rows, row))", informed),
-    Mutant(
-        "team",
-        "_meet(flying, common, math.inf, views)",
-        "_meet(flying, common, until, views)",
-        merged,
-    ),
-    Mutant("team", "me = min((me", "me = max((me", informed),
-    Mutant("team", "if i != number]", "if False]", informed),
-    Mutant("team", "jax.random.fold_in(key, number) if number else key", "key", own_lots),
-]
-
-
-@pytest.mark.mutant
-def test_the_laws_hold_on_a_fresh_copy():
-    modules = load(CHAIN)
-    merged(modules)
-    informed(modules)
-    own_lots(modules)
-
-
-@each(MUTANTS)
-def test_mutants_are_caught(mutant):
-    assert_caught(CHAIN, mutant)

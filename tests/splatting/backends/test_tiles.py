@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.mutants import Modules, Mutant, assert_caught, each, load
+from r3jax.splatting.backends import tiles
 
-CHAIN = ("r3jax.splatting.backends.tiles",)
 COUNT, WIDTH, HEIGHT, BUDGET = 60, 50, 38, 400
 COLUMNS, ROWS = 4, 3
 
@@ -42,21 +41,20 @@ def expected_lists(center, reach, depth) -> list[list[int]]:
     return lists
 
 
-def compiled(modules: Modules, budget: int = BUDGET):
-    """`list_tiles` of the given modules; the module's own function is compiled once."""
-    function = modules["tiles"].list_tiles
+def compiled(budget: int = BUDGET):
+    """`list_tiles`, for images of one size."""
+    function = tiles.list_tiles
     return jax.jit(lambda c, r, d: function(c, r, d, WIDTH, HEIGHT, budget))
 
 
-REAL = load(CHAIN)
-list_tiles = compiled(REAL)
+list_tiles = compiled()
 
 
-def assert_lists(modules: Modules, seed: int = 0) -> None:
+def assert_lists(seed: int = 0) -> None:
     """Every tile has exactly its Gaussians, in order."""
     arrays = boxes(seed)
     expected = expected_lists(*arrays)
-    found = (list_tiles if modules is REAL else compiled(modules))(*arrays)
+    found = list_tiles(*arrays)
     np.testing.assert_array_equal(found.count, [len(tile) for tile in expected])
     for start, count, tile in zip(found.start, found.count, expected, strict=True):
         np.testing.assert_array_equal(found.ids[int(start) : int(start) + int(count)], tile)
@@ -64,12 +62,12 @@ def assert_lists(modules: Modules, seed: int = 0) -> None:
     assert int(found.overflow) == 0
 
 
-def assert_overflow(modules: Modules) -> None:
+def test_overflow_is_exact() -> None:
     """What found no room is counted; what did lies in the lists, which stay in their bounds."""
     arrays = boxes(0)
     needed = sum(map(len, expected_lists(*arrays)))
     for budget in (needed, needed - 1, 7):
-        found = compiled(modules, budget)(*arrays)
+        found = compiled(budget)(*arrays)
         assert int(found.num_intersections) == needed
         assert int(found.overflow) == needed - budget
         assert int(found.count.sum()) == budget == found.ids.shape[0]
@@ -78,11 +76,7 @@ def assert_overflow(modules: Modules) -> None:
 
 @given(st.integers(0, 10_000))
 def test_lists_equal_a_plain_count(seed):
-    assert_lists(REAL, seed)
-
-
-def test_overflow_is_exact():
-    assert_overflow(REAL)
+    assert_lists(seed)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.4, 0.1, 0.0])
@@ -104,7 +98,7 @@ def test_every_size_of_the_sort_gives_the_same(share):
 
 
 _list_many = jax.jit(
-    lambda c, r, d, budget: REAL["tiles"].list_tiles(c, r, d, 64, 64, budget), static_argnums=3
+    lambda c, r, d, budget: tiles.list_tiles(c, r, d, 64, 64, budget), static_argnums=3
 )
 
 
@@ -112,7 +106,7 @@ def test_counts_saturate_where_they_would_wrap_around():
     """70 000 Gaussians that each cover 36 864 tiles: more pairs than an int32 holds."""
     count, edge = 70_000, 192 * 16
     big = jnp.full((2, count), 1e6)
-    lists = jax.jit(lambda r: REAL["tiles"].list_tiles(r * 0.0, r, r[0], edge, edge, 1000))(big)
+    lists = jax.jit(lambda r: tiles.list_tiles(r * 0.0, r, r[0], edge, edge, 1000))(big)
     assert int(lists.num_intersections) == 2**31 - 1
     assert int(lists.overflow) == 2**31 - 1 - 1000
     assert int(lists.count.sum()) == 1000
@@ -123,24 +117,7 @@ def test_pairs_that_do_not_fit_one_integer_are_sorted_all_the_same():
     rng = np.random.default_rng(2)
     tile = jnp.asarray(rng.integers(0, 10, 200), dtype=jnp.int32)
     rank = jnp.asarray(rng.permutation(200), dtype=jnp.int32)
-    sort = REAL["tiles"]._sort_pairs
+    sort = tiles._sort_pairs
     narrow, wide = sort(tile, rank, 10, 200), sort(tile, rank, 10, 2**30)
     for one, other in zip(narrow, wide, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-MUTANTS = [
-    Mutant("tiles", "- begin[rank], boxes", "- end[rank], boxes", assert_lists),
-    Mutant("tiles", "(grid[0] - wide)", "(grid[0] - 1)", assert_lists),
-    Mutant("tiles", "digits = keys[order]", "digits = keys", assert_lists),
-    Mutant("tiles", "0.0, size - 1.0)", "0.0, size - 2.0)", assert_lists),
-    Mutant("tiles", "last - jnp.uint32(1)), last)", "last), jnp.uint32(0))", assert_lists),
-    Mutant("tiles", "jnp.maximum(total - budget, 0)", "jnp.zeros_like(total)", assert_overflow),
-    Mutant("tiles", "num_intersections=total,",
-           "num_intersections=jnp.minimum(total, budget),", assert_overflow),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutants_are_caught(mutant):
-    assert_caught(CHAIN, mutant)

@@ -14,10 +14,8 @@ from hypothesis import strategies as st
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.splatting.backends import reference, xla
 from r3jax.splatting.config import RasterConfig, fitting_budget
-from tests.mutants import Modules, Mutant, assert_caught, each
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
-CHAIN = ("r3jax.splatting.backends.xla_chunk", "r3jax.splatting.backends.xla")
 COUNT, SIZE, BUDGET = 120, (50, 38), 1 << 12
 CONFIG = RasterConfig(max_intersections=BUDGET, tiles_per_batch=4, gaussians_per_chunk=16)
 
@@ -85,12 +83,6 @@ def assert_agrees(rasterize, seed, scene, camera, pose) -> None:
     for (path, by), ours in zip(paths, jax.tree.leaves(found), strict=True):
         off, whole = np.linalg.norm(ours - by), np.linalg.norm(by)
         assert off <= 1e-3 * whole + 1e-6, (jax.tree_util.keystr(path), off, whole)
-
-
-def assert_clouds_agree(modules: Modules) -> None:
-    rasterize = modules["xla"].rasterize
-    for seed, scene in ((1, random_cloud(1, COUNT)), (2, solid(2))):
-        assert_agrees(rasterize, seed, scene, *view(*SIZE))
 
 
 seeds = st.integers(0, 10_000)
@@ -232,22 +224,3 @@ def test_memory_does_not_grow_with_the_layers():
 def test_a_growing_scene_compiles_seldom():
     budgets = {fitting_budget(needed) for needed in range(1000, 1_000_000, 1000)}
     assert len(budgets) < 50
-
-
-MUTANTS = [
-    Mutant("xla_chunk", "jnp.minimum(ALPHA_MAX,", "jnp.minimum(0.999,", assert_clouds_agree),
-    Mutant("xla_chunk", "jnp.where((alpha >= ALPHA_MIN) &", "jnp.where((alpha >= 0.0) &",
-           assert_clouds_agree),
-    Mutant("xla_chunk", "behind > TRANSMITTANCE_MIN", "behind > 1e-6", assert_clouds_agree),
-    Mutant("xla_chunk", "(weight > 0.0) & (alpha < ALPHA_MAX)", "weight > 0.0",
-           assert_clouds_agree),
-    Mutant("xla_chunk", "later * (alpha / (1.0 - alpha))", "later * alpha", assert_clouds_agree),
-    Mutant("xla_chunk", "dxy = x * dy - y * mx", "dxy = x * dy - x * my", assert_clouds_agree),
-    Mutant("xla", "return j + 1, chunk.through, gain, gradient",
-           "return j + 1, chunk.through, carry[2], gradient", assert_clouds_agree),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutants_are_caught(mutant):
-    assert_caught(CHAIN, mutant)

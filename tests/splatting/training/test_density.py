@@ -4,11 +4,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
+from r3jax.splatting.training import density
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.density import (
     DensityStatistics,
@@ -17,9 +17,7 @@ from r3jax.splatting.training.density import (
     reset_opacities,
 )
 from r3jax.splatting.training.optimizer import Moments
-from tests.mutants import Modules, Mutant, assert_caught, each, load
 
-CHAIN = ("r3jax.splatting.training.density",)
 ROWS = 8
 EXTENT = jnp.asarray(2.0)
 CONFIG = TrainConfig(num_gaussians=ROWS)  # split above 2 cm, prune above 20 cm here
@@ -63,19 +61,19 @@ def assert_rows_equal(a, b) -> None:
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-def run(modules, sizes, opacities, gradients, prunes_large=False):
+def run(sizes, opacities, gradients, prunes_large=False):
     scene = some_scene(sizes, opacities)
-    after, moments, info = modules["density"].refine(
+    after, moments, info = density.refine(
         scene, some_moments(scene), statistics(gradients), EXTENT, prunes_large, CONFIG, key=KEY
     )
     return scene, after, moments, info
 
 
-def law_clone(modules: Modules) -> None:
+def test_clone() -> None:
     """Row 1 is small and pulled: an exact copy goes to row 3, the first unused one."""
     sizes = [0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 1.0, 1.0]
     scene, after, moments, info = run(
-        modules, sizes, [0.5, 0.6, 0.7] + [0.0] * 5, [WEAK, STRONG, 0.0] + [STRONG] * 5
+        sizes, [0.5, 0.6, 0.7] + [0.0] * 5, [WEAK, STRONG, 0.0] + [STRONG] * 5
     )
     assert [int(x) for x in info] == [1, 0, 0]
     for index in (0, 1, 2, 4, 5, 6, 7):
@@ -86,12 +84,10 @@ def law_clone(modules: Modules) -> None:
     assert not any(np.any(x) for x in jax.tree.leaves(row((moments.mean, moments.square), 3)))
 
 
-def law_split(modules: Modules) -> None:
+def test_split() -> None:
     """Row 0 is large and pulled: it is replaced by two children, in rows 0 and 2."""
     sizes = [0.1, 0.1] + [1.0] * 6
-    scene, after, moments, info = run(
-        modules, sizes, [0.5, 0.6] + [0.0] * 6, [STRONG, WEAK] + [0.0] * 6
-    )
+    scene, after, moments, info = run(sizes, [0.5, 0.6] + [0.0] * 6, [STRONG, WEAK] + [0.0] * 6)
     assert [int(x) for x in info] == [1, 0, 0]
     for index in (1, 3, 4, 5, 6, 7):
         assert_rows_equal(row(after, index), row(scene, index))
@@ -109,35 +105,34 @@ def law_split(modules: Modules) -> None:
     assert np.any(after.means[0] != after.means[2])
 
 
-def law_prune(modules: Modules) -> None:
+def test_prune() -> None:
     """Faint rows go; huge ones only when asked, and not if a split makes them small enough."""
     sizes = [0.01, 0.25, 0.25, 0.4, 0.01, 0.15, 0.01, 0.01]
     opacities = [0.004, 0.5, 0.5, 0.5, 0.006, 0.5, 0.0, 0.0]
     gradients = [STRONG, WEAK, STRONG, STRONG, WEAK, WEAK, 0.0, 0.0]
-    _, after, _, info = run(modules, sizes, opacities, gradients)
+    _, after, _, info = run(sizes, opacities, gradients)
     assert int(info.pruned) == 1
     assert int(after.is_alive.sum()) == 6 - 1 + 2
-    _, after, _, info = run(modules, sizes, opacities, gradients, prunes_large=True)
+    _, after, _, info = run(sizes, opacities, gradients, prunes_large=True)
     # Rows 0 (faint), 1 (0.25 m, not split) and 3 (0.4 / 1.6 = 0.25 m); row 2 splits to 0.16 m.
     assert int(info.pruned) == 3
     assert int(info.born) == 1
     assert float(jnp.exp(after.log_scales.max(axis=1))[after.is_alive].max()) < 0.2
 
 
-def law_full(modules: Modules) -> None:
+def test_full() -> None:
     """One unused row for three that want it: the most pulled gets it, two are counted."""
     sizes, opacities = [0.01] * 7 + [1.0], [0.5] * 7 + [0.0]
     gradients = [0.0, STRONG, 0.0, 9.0 * STRONG, 2.0 * STRONG, 0.0, 0.0, 0.0]
-    scene, after, _, info = run(modules, sizes, opacities, gradients)
+    scene, after, _, info = run(sizes, opacities, gradients)
     assert [int(x) for x in info] == [1, 0, 2]
     assert_rows_equal(row(after, 7), row(scene, 3))
     for index in range(7):
         assert_rows_equal(row(after, index), row(scene, index))
 
 
-def law_statistics(modules: Modules) -> None:
+def test_statistics() -> None:
     """Gradients in pixels become gradients per half image; unseen rows are not counted."""
-    density = modules["density"]
     pull = jnp.array([[3e-6, 0.0], [0.0, 1e-6], [0.0, 0.0], [0.0, 0.0]])
     in_view = jnp.array([True, False, True, False])
     seen = density.observe(empty_statistics(4), pull, in_view, 200, 100)
@@ -145,45 +140,6 @@ def law_statistics(modules: Modules) -> None:
     np.testing.assert_allclose(seen.gradient, [9e-4, 1.5e-4, 0.0, 0.0], rtol=1e-5)
     np.testing.assert_array_equal(seen.count, [2.0, 2.0, 2.0, 0.0])
     np.testing.assert_allclose(seen.mean_gradient, [4.5e-4, 7.5e-5, 0.0, 0.0], rtol=1e-5)
-
-
-LAWS = [law_clone, law_split, law_prune, law_full, law_statistics]
-MUTANTS = [
-    Mutant("density", "jnp.where(wants, -priority", "jnp.where(wants, priority", law_full),
-    Mutant("density", "jnp.sum(wants, dtype=jnp.int32) - born", "jnp.zeros((), int)", law_full),
-    Mutant("density", "jnp.argsort(~free", "jnp.argsort(free", law_clone),
-    Mutant("density", "newborn | splits | prune", "splits | prune", law_clone),
-    Mutant("density", "newborn | splits | prune", "newborn | prune", law_split),
-    Mutant("density", "newborn | splits | prune", "newborn | served | prune", law_clone),
-    Mutant("density", "splits | _marked(child, is_served & splits[parent])", "splits", law_split),
-    Mutant("density", "jnp.log(SHRINK)", "jnp.log(2.0)", law_split),
-    Mutant(
-        "density",
-        "size > config.percent_dense * extent",
-        "size > config.percent_dense * extent * 0.1",
-        law_clone,
-    ),
-    Mutant("density", "size / SHRINK, size", "size, size", law_prune),
-    Mutant("density", "jnp.asarray(prunes_large) &", "jnp.asarray(True) &", law_prune),
-    Mutant("density", "scene.is_alive & (statistics", "(statistics", law_clone),
-    Mutant(
-        "density",
-        "0.5 * jnp.array([width, height]",
-        "0.5 * jnp.array([height, width]",
-        law_statistics,
-    ),
-    Mutant("density", "in_view | (length > 0.0)", "length > 0.0", law_statistics),
-]
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_law(law):
-    law(load(CHAIN))
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    assert_caught(CHAIN, mutant)
 
 
 jitted_refine = jax.jit(refine)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
@@ -12,6 +12,7 @@ from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import Camera, look_at, transform, unproject
 from r3jax.splatting.errors import ViewsError
 from r3jax.splatting.harmonics import C0
+from r3jax.splatting.training import initialize as initialize_module
 from r3jax.splatting.training.initialize import (
     fitting_voxel_size,
     initialize,
@@ -20,9 +21,6 @@ from r3jax.splatting.training.initialize import (
     thin,
 )
 from r3jax.splatting.views import Views, load_views
-from tests.mutants import Modules, Mutant, assert_caught, each, load
-
-CHAIN = ("r3jax.splatting.training.initialize",)
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 30.0, 25.0)
 FLOOR, WALL = np.array([200, 60, 40]), np.array([30, 90, 220])
@@ -61,10 +59,10 @@ def alive(scene, values) -> np.ndarray:
     return np.asarray(values)[np.asarray(scene.is_alive)]
 
 
-def law_surfaces(modules: Modules) -> None:
+def test_surfaces() -> None:
     """Every Gaussian lies on its plane, in the plane's color, and no plane is left out."""
     views = room_views()
-    scene = modules["initialize"].initialize(views, 900, 1000)
+    scene = initialize_module.initialize(views, 900, 1000)
     means, color = alive(scene, scene.means), 0.5 + C0 * alive(scene, scene.sh[:, 0])
     on_floor, on_wall = np.abs(means[:, 2]) < 2e-5, np.abs(means[:, 0] - 2.0) < 2e-5
     # A voxel in the corner holds points of both planes.
@@ -81,14 +79,9 @@ def law_surfaces(modules: Modules) -> None:
     np.testing.assert_allclose(opacity, 0.1, rtol=1e-6)
 
 
-LAW = settings(report_multiple_bugs=False, phases=(Phase.explicit, Phase.generate))
-"""A mutant ends at its first failure: shrinking it takes long and tells nothing."""
-
-
-def law_thinning(modules: Modules) -> None:
+def test_thinning() -> None:
     """Means over voxels, against a dictionary; in voxels of 1/4 m and steps of 1/16 m."""
 
-    @LAW
     @given(st.integers(0, 2**32 - 1), st.integers(1, 60))
     def check(seed, count):
         rng = np.random.default_rng(seed)
@@ -98,7 +91,7 @@ def law_thinning(modules: Modules) -> None:
         for i, corner in enumerate(np.floor((points - points.min(0)) / 0.25)):
             members.setdefault(tuple(corner), []).append(i)
         groups = [members[corner] for corner in sorted(members)]
-        found_points, found_colors = modules["initialize"].thin(points, colors, 0.25)
+        found_points, found_colors = initialize_module.thin(points, colors, 0.25)
         expected = np.stack([points[group].mean(0) for group in groups])
         np.testing.assert_allclose(found_points, expected, atol=1e-12)
         expected = np.stack([colors[group].mean(0) for group in groups])
@@ -107,15 +100,14 @@ def law_thinning(modules: Modules) -> None:
     check()
 
 
-def law_scales(modules: Modules) -> None:
+def test_scales() -> None:
     """All distances, squared, sorted: the root of the mean of three, within limits."""
 
-    @LAW
     @given(st.integers(0, 2**32 - 1), st.integers(2, 30))
     def check(seed, count):
         rng = np.random.default_rng(seed)
         points = rng.normal(size=(count, 3)) * rng.choice([0.01, 1.0, 30.0], (count, 1))
-        found = modules["initialize"].neighbor_scales(points)
+        found = initialize_module.neighbor_scales(points)
         squared = ((points[:, None] - points[None]) ** 2).sum(-1)
         nearest = np.sort(squared, axis=1)[:, 1:4]
         exact = np.sqrt(nearest.mean(axis=1))
@@ -123,12 +115,6 @@ def law_scales(modules: Modules) -> None:
         np.testing.assert_allclose(found, exact.clip(typical / 5.0, typical * 5.0), rtol=1e-6)
 
     check()
-
-
-def test_laws_hold_without_a_fault():
-    modules = load(CHAIN)
-    for law in (law_surfaces, law_thinning, law_scales, law_edges):
-        law(modules)
 
 
 def test_points_are_the_unprojected_pixels():
@@ -143,7 +129,7 @@ def test_points_are_the_unprojected_pixels():
     np.testing.assert_allclose(colors * 255.0, views.rgb.reshape(-1, 3)[index], atol=1e-3)
 
 
-def law_edges(modules: Modules) -> None:
+def test_edges() -> None:
     """A step in depth costs the pixels on both sides of it and no others; a hole costs none."""
     depth = np.full((2, 48, 64), 2.0)
     depth[0, :, 40:] = 4.0
@@ -151,7 +137,7 @@ def law_edges(modules: Modules) -> None:
     depth[1, :3, :3] = np.inf
     poses = np.stack([np.eye(4), np.eye(4)])
     views = views_of(np.zeros((2, 48, 64, 3)), depth, poses)
-    points = modules["initialize"].surface_points(views)[0]
+    points = initialize_module.surface_points(views)[0]
     steps = 48 * 64 - 2 * 48
     assert len(points) == steps + (48 * 64 - 4 * 5 - 9 - 6)
     column = points[:steps, 0] / points[:steps, 2] * 50.0 + 30.0
@@ -283,29 +269,3 @@ def test_a_real_recording(shared):
     size = fitting_voxel_size(points, 5000)
     distance, _ = KDTree(points).query(alive(scene, scene.means))
     assert distance.max() < np.sqrt(3.0) * size
-
-
-MUTANTS = [
-    Mutant("initialize", "@ pose[:3, :3].T", "@ pose[:3, :3]", law_surfaces),
-    Mutant("initialize", "(column + 0.5 -", "(column -", law_surfaces),
-    Mutant("initialize", "(colors - 0.5) / C0", "(colors - 0.5)", law_surfaces),
-    Mutant("initialize", "colors.append(rgb[i][chosen])", "colors.append(rgb[0][chosen])",
-           law_surfaces),
-    Mutant("initialize", "INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)", "INITIAL_OPACITY",
-           law_surfaces),
-    Mutant("initialize", "np.sqrt((distance[:, 1:] ** 2)", "np.sqrt((distance ** 2)", law_scales),
-    Mutant("initialize", "scale = np.sqrt((distance[:, 1:] ** 2).mean(axis=1))",
-           "scale = distance[:, 1:].mean(axis=1)", law_scales),
-    Mutant("initialize", "min(3, len(points) - 1)", "min(4, len(points) - 1)", law_scales),
-    Mutant("initialize", "key = key * size + index", "key = key + index", law_thinning),
-    Mutant("initialize", "/ count[:, None]", "", law_thinning),
-    Mutant("initialize", "on_edge[far] |= step", "", law_edges),
-    Mutant("initialize", " & (a > 0.0) & (b > 0.0)", "", law_edges),
-    Mutant("initialize", "np.isfinite(image) & ", "", law_edges),
-]  # fmt: skip
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    with np.errstate(all="ignore"):
-        assert_caught(CHAIN, mutant)

@@ -12,8 +12,7 @@ from r3jax.kernels.native.compiled import flush_denormals, parallel_kernel
 from r3jax.splatting.scene import GaussianScene, empty_scene
 from r3jax.splatting.training import loss, optimizer
 from r3jax.splatting.training.config import TrainConfig
-from tests.mutants import Modules, Mutant, assert_caught, each, load
-from tests.plain_kernels import kernels_as_python
+from tests.plain_kernels import Modules, kernels_as_python, load
 
 CHAIN = tuple(f"{training.__name__}.{name}" for name in ("image_loss", "adam"))
 WEIGHT = 0.3
@@ -192,45 +191,3 @@ def test_all_threads_take_the_tiniest_numbers_for_0():
         ffi.register_handlers({"r3jax_test_tiny": _tiny})
     call = jax.ffi.ffi_call("r3jax_test_tiny", jax.ShapeDtypeStruct((64,), jnp.float32))
     assert not np.any(jax.jit(call)(jnp.array([1e-30, 1e-10])))
-
-
-def image_loss(original: str, mutated: str) -> Mutant:
-    return Mutant("image_loss", original, mutated, law_loss_and_its_gradient_are_the_formulas)
-
-
-def adam(original: str, mutated: str) -> Mutant:
-    return Mutant("adam", original, mutated, law_adam_is_the_formulas)
-
-
-MUTANTS = [
-    image_loss("mx, my = mx + wa, my + wb", "mx, my = mx + wa, my + wa"),
-    image_loss("fma(wa, b, xy)", "fma(wa, a, xy)"),
-    image_loss("inside = 0 <= y <", "inside = 0 < y <"),
-    image_loss("(y - _RADIUS + tap) % _WIDTH", "(y - _RADIUS + tap + 1) % _WIDTH"),
-    image_loss("light = light * load(inside, k)", "light = light + _ZERO"),
-    image_loss("my * load(inside, k) - light * mx", "my * load(inside, k) + light * mx"),
-    image_loss("fma(twice, structure * mx - my, a)", "a"),
-    image_loss("light * structure * by_q * -_ONE", "light * by_q * -_ONE"),
-    image_loss("fma(a * _TWO, _down", "fma(a, _down"),
-    image_loss("slope = fma(b, _down", "slope = fma(a, _down"),
-    image_loss("keep_gt(splat(_ONE), _ZERO, difference)", "splat(_ZERO)"),
-    image_loss("smaller(larger(a, splat(_ZERO)), splat(_ONE))", "larger(a, splat(_ZERO))"),
-    image_loss("latest[:] = _ZERO", "latest[:] = latest"),
-    image_loss("shares[band, 0] = ", "shares[0, 0] = "),
-    adam("slope = load(g, k) * load(share, at)", "slope = load(g, k)"),
-    adam("load(m, k), _BETA1", "load(m, k), _BETA2"),
-    adam("slope * slope * _REST2", "slope * _REST2"),
-    adam("root(square * corrections[1])", "root(square)"),
-    adam("mean * corrections[0]", "mean"),
-    adam("if harmonic < 3 else", "if harmonic < 4 else"),
-    adam("_ONE if harmonic < num_open", "_ONE if harmonic <= num_open"),
-    adam("at = at + 16 if at + 16 < period else 0", "at = 0"),
-    adam("if rest > 0:", "if rest > 20:"),
-    adam("min((number + 1) * CHUNK, size)", "min(16, size)"),
-]
-
-
-@each(MUTANTS)
-def test_mutant_is_caught(mutant):
-    with kernels_as_python():
-        assert_caught(CHAIN, mutant)
