@@ -152,7 +152,7 @@ def test_a_second_ctrl_c_ends_the_process():
         assert process.stderr.read() == ""
 
 
-@pytest.mark.parametrize("module", ["tyro", "r3jax.cli.checks", "numpy"])
+@pytest.mark.parametrize("module", ["tyro", "r3jax.cli.options", "numpy"])
 def test_ctrl_c_while_modules_load_shows_no_traceback(module):
     program = (
         "import os, signal, sys\n"

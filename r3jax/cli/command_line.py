@@ -6,27 +6,22 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-import tyro
-
 import r3jax
 from r3jax.cli.errors import UserError
-from r3jax.cli.options import (
-    AuditOptions,
-    BenchmarkOptions,
-    DemoOptions,
-    EvaluateOptions,
-    ExploreOptions,
+from r3jax.cli.options.audit import AuditOptions
+from r3jax.cli.options.benchmark import BenchmarkOptions
+from r3jax.cli.options.explore import DemoOptions, ExploreOptions, TeamOptions
+from r3jax.cli.options.runs import (
     ExportOptions,
     ForecastOptions,
     InfoOptions,
     MergeOptions,
     PoliciesOptions,
     ReplayOptions,
-    TeamOptions,
-    TrainOptions,
     ViewOptions,
 )
-from r3jax.cli.options.parsing import number_rules, options_of, parser_class
+from r3jax.cli.options.splats import EvaluateOptions, TrainOptions
+from r3jax.cli.parsing import parse
 from r3jax.kernels.native.ahead import cache_folder, compile_ahead
 from r3jax.validation.errors import did_you_mean
 
@@ -47,12 +42,19 @@ COMMANDS = {
     "info": InfoOptions,
 }
 
+_DESCRIPTION = """Where to look next for 3D Gaussian splatting: explores a scene with an RGB-D
+camera, chooses every view by closed-form renderability, and leaves a data set. --version prints the
+version."""
+
 _DECIDES = ("demo", "explore", "team", "benchmark")
 """Commands that decide, and may train afterwards: they need the kernels."""
 
 
 def run_command(args: Sequence[str]) -> int:
     """Runs the command that the words after `r3jax` name, and returns its exit code.
+
+    It is `run_NAME` of `r3jax.cli.commands.NAME`, imported once the options are known to be right:
+    neither `--help` nor a slip of the keyboard waits for JAX.
 
     Raises:
         UserError: something that the user can mend.
@@ -64,33 +66,10 @@ def run_command(args: Sequence[str]) -> int:
     if words and not words[0].startswith("-") and words[0] not in COMMANDS:
         hint = did_you_mean(words[0], COMMANDS)
         raise UserError(f"there is no command {words[0]!r}{hint}; `r3jax --help` lists them")
-    # The list of commands says each in a sentence; a command's own --help begins with examples.
-    one = len(words) > 0 and words[0] in COMMANDS
-    parsers = {name: parser_class(k, with_examples=one) for name, k in COMMANDS.items()}
-    parsed = tyro.extras.subcommand_cli_from_dict(
-        parsers,
-        prog="r3jax",
-        description="Where to look next for 3D Gaussian splatting: explores a scene with an RGB-D "
-        "camera, chooses every view by closed-form renderability, and leaves a data set. "
-        "--version prints the version.",
-        args=words,
-        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-        registry=number_rules(),
-    )
-    (name,) = (name for name, parser in parsers.items() if isinstance(parsed, parser))
+    options = parse(COMMANDS, words, _DESCRIPTION)
+    (name,) = (name for name, kind in COMMANDS.items() if isinstance(options, kind))
     _keep_compilations()
     warnings.formatwarning = _format_warning
-    return _run(name, options_of(COMMANDS[name], parsed))
-
-
-def _run(name: str, options: object) -> int:
-    """Checks the options, and calls `run_NAME` of `r3jax.cli.commands.NAME` for the command NAME.
-
-    Imports what the command needs and nothing else, so that --help does not wait for JAX.
-    """
-    from r3jax.cli.checks import check_options  # not for --help, which needs no NumPy
-
-    check_options(options)
     if name in _DECIDES:
         compile_ahead()
     return getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}")(options)

@@ -24,14 +24,16 @@ def check_folder_name(name: str) -> None:
         raise UserError(f"--name is the name of one folder, without a path, got {name!r}")
 
 
-def check_resolution(pixels: int | None) -> None:
-    """Refuses a --resolution that leaves nothing to compare; None is the default.
+def check_resolution(pixels: int | None, most: int | None = None) -> None:
+    """Refuses a --resolution that leaves nothing to compare, or is too large; None is the default.
 
     Raises:
-        UserError: fewer than 16 pixels.
+        UserError: fewer than 16 pixels, or more than the most.
     """
-    if pixels is not None and pixels < 16:
-        raise UserError(f"--resolution must be at least 16, got {pixels}")
+    if pixels is None or 16 <= pixels <= (most or pixels):
+        return
+    bounds = "be at least 16" if most is None else f"lie between 16 and {most}"
+    raise UserError(f"--resolution must {bounds}, got {pixels}")
 
 
 def check_viser() -> None:

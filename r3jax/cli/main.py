@@ -20,6 +20,10 @@ NO_READER = 141
 """Exit code where whoever read the output has gone (`r3jax info | head`), as shells have it."""
 
 
+_MENDABLE = (UserError, ValueError, OSError, ImportError)
+"""Errors that are told in one line: wrong input, a broken file, a full disk, a missing package."""
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Runs one command.
 
@@ -54,7 +58,7 @@ def _main(args: Sequence[str] | None) -> int:
         # A library may make another error of a KeyboardInterrupt that passes through it.
         if isinstance(error, KeyboardInterrupt) or is_interrupted():
             return _interrupted(error)
-        if not isinstance(error, UserError):
+        if not isinstance(error, _MENDABLE):
             raise
         print(f"r3jax: {printable(one_line(error))}", file=sys.stderr)
         return USER_ERROR

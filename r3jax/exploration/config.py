@@ -121,7 +121,7 @@ class ExplorationConfig(MappingConfig):
     """Flight speed [m/s] where the policy's motion has none; turning takes no time then."""
 
     clock: ClockName = "wall"
-    """`wall`: measured planning and mapping. `model`: fixed costs, the same run every time."""
+    """`wall`: measured planning and mapping, plus flight. `model`: fixed costs, repeatable."""
 
     planning_seconds: float = 0.3
     """What the clock `model` charges for a decision [s]."""
@@ -139,33 +139,34 @@ class ExplorationConfig(MappingConfig):
     """So many views in a row without moving end the run: the policy is stuck."""
 
     until: str | None = None
-    """Goal that ends the run, as text (see `apps.forecast.stopping`): `psnr:25` for the mean of all
-    views of the free space, `psnr:20@p10` for all but the worst tenth; None: the budget alone ends
-    it."""
+    """Stop before the budget is spent, when the forecast of the image quality says that the views
+    are enough: `psnr:25` for the mean of all free-space views, `psnr:20@p10` for all but the worst
+    tenth."""
 
     until_every: int = 5
     """Views from one look at the forecast to the next; it takes most of a second."""
 
     capture_every: float | None = None
-    """Longest piece of a path between two frames [m]: those between two views are captured on the
-    way. None: the camera is blind on the way, unless `capture_rate` says otherwise."""
+    """Capture frames while moving from view to view, at most this far apart [m]; by default
+    none."""
 
     capture_rate: float | None = None
-    """Frames per second of the way [Hz], instead of `capture_every`: at speed v the pieces are at
-    most v / rate long. While the camera turns at the end of a path there is no frame."""
+    """As --capture-every, by frame rate [Hz]: at speed v frames are at most v / rate apart. No
+    frames while turning in place."""
 
     gaze: str = "panorama"
-    """Where the camera points when it captures a frame while moving: one of `GazeName`."""
+    """Where the camera points while moving: `ahead`: along the path; `panorama`: at each place in
+    the direction of highest utility."""
 
     exposure: float = 0.0
-    """Time that the shutter is open for a frame on the way [s]; 0: nothing blurs."""
+    """Exposure time of a frame captured while moving [s]; 0: turning blurs nothing."""
 
     blur: float = 1.0
-    """Pixels by which a turning camera may move the image meanwhile, in its middle [px]."""
+    """Maximum motion blur from rotation [px]."""
 
     plan_while_moving: bool = False
-    """Whether the next decision is made during the flight, on the map as it will be, and only
-    reconsidered on arrival. The mission clock is charged for what the flight does not hide."""
+    """Decide on the next view during the flight, on the map as it will be, and only reconsider on
+    arrival: the clock is charged for what the flight does not hide."""
 
     @property
     def captures(self) -> bool:

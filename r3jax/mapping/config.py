@@ -22,7 +22,7 @@ class MappingConfig:
     """Direction bins per voxel."""
 
     capacity: int = 1 << 17
-    """Rows of the map at the start; a power of two."""
+    """Rows of the map at the start, a power of two."""
 
     allow_growth: bool = True
     """Double the table before it is 70 % full. If not, what finds no row is counted."""

@@ -6,61 +6,75 @@ import sys
 
 import pytest
 
-from r3jax.cli.checks import check_options, loop_of_options
-from r3jax.cli.errors import UserError
+from r3jax.cli.commands.explore import run_settings
 from r3jax.cli.main import main
-from r3jax.cli.options import ExploreOptions
-from r3jax.cli.options.parsing import whole_number
-from r3jax.runs.writer import RunWriter
-from tests.runs.runs import make_header
+from r3jax.cli.options.explore import ExploreOptions, MotionOptions
+from r3jax.cli.parsing import whole_number
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.trace.writer import RunWriter
+from tests.trace.runs import make_header
 
 REFUSED = {
-    "explore --scene apartement": "did you mean apartment?",
-    "explore --scene house.glb": "did you mean mesh:house.glb?",
-    "explore --scene mash:house.glb": "did you mean mesh:house.glb?",
-    "explore --scene mesh:nowhere.glb": "no such mesh file: nowhere.glb",
-    "explore --scene habitat:nowhere.glb": "no such file for Habitat: nowhere.glb",
-    "explore --scene flat --policy our-pano": "did you mean ours-pano?",
-    "explore --scene flat --budget hours:1": "use views:100, seconds:300 or meters:25",
+    "explore --scene apartement": "apartment",
+    "explore --scene house.glb": "mesh:house.glb",
+    "explore --scene mash:house.glb": "mesh:house.glb",
+    "explore --scene mesh:nowhere.glb": "nowhere.glb",
+    "explore --scene habitat:nowhere.glb": "nowhere.glb",
+    "explore --scene flat --policy our-pano": "ours-pano",
+    "explore --scene flat --budget hours:1": "views:100",
     "explore --scene flat --budget frames:1.5": "frames:100",
-    "explore --scene flat --until psnr": "is not understood",
-    "explore --scene flat --name a/b": "--name is the name of one folder",
-    "explore --scene flat --name run": "the run exists already",
-    "explore --scene flat --heights 1 2": "heights 1 to 2 m above the start leave out the start",
-    "explore --scene flat --speed 0": "speed must be positive",
-    "explore --scene flat --gaze ahead": "--gaze is for frames on the way: add --capture-every",
-    "explore --scene flat --exposure 0.01": "--exposure is for frames on the way",
-    "explore --scene flat --blur 2": "--blur is for frames on the way",
-    "explore --scene flat --capture-every 0.3 --blur 2": "add --exposure, or leave it out",
-    "explore --scene flat --capture-rate 21": "at most 20 Hz at this speed",
-    "explore --scene flat --capture-rate 11 --motion ground": "at most 10 Hz at this speed",
-    "explore --scene flat --speed 1e-310": "speed must be positive and finite, at least 0.001",
-    "explore --resume nowhere": "nowhere: there is no such folder",
-    "explore --fork run": "--fork RUN and --at FRAME belong together",
-    "team --scene ofice": "did you mean office?",
-    "team --scene flat --policy ours fronteer": "did you mean frontier?",
-    "team --resume run": "there is no such folder",
-    "benchmark --scenes flat,ofice": "did you mean office?",
-    "benchmark --policies ours,cvoer": "did you mean cover?",
-    "benchmark --seeds 0,-1": "--seeds must lie between 0 and 2^31 - 1, got -1",
-    f"benchmark --seeds 0,{1 << 31}": "--seeds must lie between 0 and 2^31 - 1, got 2147483648",
-    "benchmark --submission runs --check": "runs: this is a folder; a submission is a file",
-    "benchmark --snapshots views:x": "'x' is not a number",
-    "train nowhere": "nowhere: there is no such folder",
-    "train runs --resolution 3": "--resolution must be at least 16",
-    "evaluate runs --name ../x": "--name is the name of one folder",
-    "audit scan.mp4": "scan.mp4: this is a video without poses: ns-process-data video",
-    "audit scan.ply": "scan.ply: this is a file; a capture is a folder",
-    "audit runs --live --path scan.ply": "--live follows a capture, --path judges a path",
-    "audit scan.r3d --live": "a file that does not grow",
-    "audit /camera/color --live": "no such capture, and no folder in which it could be recorded",
-    "audit runs --port 9000": "--port and --host are for the page of --live",
-    "audit runs --live --port 99999": "--port must lie between 0 and 65535",
-    "replay runs": "runs: this folder is not a run",
-    "merge runs/run nowhere": "nowhere: there is no such folder",
-    "info nowhere": "nowhere: there is no such folder",
-    "demo --views 0": "must be positive",
+    "explore --scene flat --until psnr": "psnr",
+    "explore --scene flat --name a/b": "--name",
+    "explore --scene flat --name run": "--overwrite",
+    "explore --scene flat --heights 1 2": "heights 1 to 2 m",
+    "explore --scene flat --speed 0": "speed",
+    "explore --scene flat --gaze ahead": "--gaze",
+    "explore --scene flat --gaze up": "panorama",
+    "explore --scene flat --exposure 0.01": "--exposure",
+    "explore --scene flat --blur 2": "--capture-every",
+    "explore --scene flat --capture-every 0.3 --blur 2": "--exposure",
+    "explore --scene flat --capture-rate 21": "20 Hz",
+    "explore --scene flat --capture-rate 11 --motion ground": "10 Hz",
+    "explore --scene flat --speed 1e-310": "0.001",
+    "explore --scene flat --voxel-size 5": "voxel_size",
+    "explore --scene flat --capacity 1000": "power of two",
+    "explore --resume nowhere": "nowhere",
+    "explore --fork run": "--at",
+    "team --scene ofice": "office",
+    "team --scene flat --policy ours fronteer": "frontier",
+    "team --scene flat --cameras 3 --fov 60 90": "--fov",
+    "team --resume run": "no such folder",
+    "benchmark --scenes flat,ofice": "office",
+    "benchmark --policies ours,cvoer": "cover",
+    "benchmark --seeds 0,-1": "got -1",
+    f"benchmark --seeds 0,{1 << 31}": "got 2147483648",
+    "benchmark --submission runs --check": "this is a folder",
+    "benchmark --site page --seeds 1": "--seeds",
+    "benchmark --jobs -1": "--jobs",
+    "benchmark --slurm time": "--slurm",
+    "benchmark --snapshots views:x": "'x'",
+    "train nowhere": "nowhere",
+    "train runs --resolution 3": "--resolution",
+    "evaluate runs --name ../x": "--name",
+    "evaluate runs --worst -1": "--worst",
+    "audit scan.mp4": "ns-process-data video",
+    "audit scan.ply": "scan.ply",
+    "audit runs --live --path scan.ply": "--path",
+    "audit runs --folds 1": "--folds",
+    "audit scan.r3d --live": "--live",
+    "audit /camera/color --live": "ros2_node.py",
+    "audit runs --port 9000": "--live",
+    "audit runs --live --port 99999": "--port",
+    "audit runs --live --depth-scale 2": "--depth-scale",
+    "replay runs": "runs",
+    "merge runs/run nowhere": "nowhere",
+    "merge runs/run runs/run": "runs/run",
+    "export runs/run --out runs": "runs",
+    "view runs/run --video": "--export",
+    "info nowhere": "nowhere",
+    "demo --views 0": "views",
 }
+"""Command lines, and the fact or the remedy that their refusal names."""
 
 
 def test_names_budgets_and_paths_are_refused_before_jax_is_imported(tmp_path):
@@ -93,17 +107,20 @@ def test_names_budgets_and_paths_are_refused_before_jax_is_imported(tmp_path):
 
 def test_the_largest_capture_rate_is_one_frame_every_voxel():
     """0.7 / 0.05 is a little less than 14."""
-    check_options(ExploreOptions(scene="flat", name="none", speed=0.7, capture_rate=14.0))
-    with pytest.raises(UserError, match="at most 14 Hz"):
-        check_options(ExploreOptions(scene="flat", name="none", speed=0.7, capture_rate=14.1))
+    slow = MotionOptions(speed=0.7)
+    ExploreOptions(scene="flat", robot=slow, loop=ExplorationConfig(capture_rate=14.0))
+    with pytest.raises(ValueError, match="at most 14 Hz"):
+        ExploreOptions(scene="flat", robot=slow, loop=ExplorationConfig(capture_rate=14.1))
 
 
 def test_a_map_that_may_grow_begins_with_room():
-    assert loop_of_options(ExploreOptions(capacity=2)).capacity == 1 << 14
-    assert loop_of_options(ExploreOptions(capacity=2, fixed_capacity=True)).capacity == 2
-    assert loop_of_options(ExploreOptions(capacity=1 << 15)).capacity == 1 << 15
-    with pytest.raises(ValueError, match="power of two"):
-        loop_of_options(ExploreOptions(capacity=1000))
+    def rows(capacity, **given):
+        loop = ExplorationConfig(capacity=capacity)
+        return run_settings(ExploreOptions(scene="flat", loop=loop, **given)).config.capacity
+
+    assert rows(2) == 1 << 14
+    assert rows(2, fixed_capacity=True) == 2
+    assert rows(1 << 15) == 1 << 15
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,7 @@
 
 import pytest
 
-from r3jax.cli.checks import default_name
-from r3jax.cli.options import ExploreOptions
+from r3jax.cli.options.explore import ExploreOptions, MotionOptions
 
 
 @pytest.mark.parametrize(
@@ -16,5 +15,9 @@ from r3jax.cli.options import ExploreOptions
         ("habitat:/data/office_0/a.stage_config.json", "habitat-a"),
     ],
 )
-def test_default_names(scene, expected):
-    assert default_name(ExploreOptions(seed=3), scene, "ours") == f"{expected}-ours-seed3"
+def test_default_names(scene, expected, monkeypatch):
+    monkeypatch.setattr("r3jax.cli.options.explore.check_scene", lambda *_: None)
+    options = ExploreOptions(scene=scene, seed=3)
+    assert options.path("ours").name == f"{expected}-ours-seed3"
+    options = ExploreOptions(scene=scene, seed=3, robot=MotionOptions(motion="ground"))
+    assert options.path("ours").name == f"{expected}-ours-ground-seed3"

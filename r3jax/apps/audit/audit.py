@@ -23,9 +23,10 @@ from r3jax.apps.audit.diagnosis import (
     view_score,
 )
 from r3jax.apps.audit.faults.faults import Faults, find_faults, stray_finding
+from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import Source, thinned
 from r3jax.apps.audit.suggest import SuggestedViews, Task, suggest
-from r3jax.apps.audit.survey import RANGE, AuditSettings, Survey, survey_of
+from r3jax.apps.audit.survey import RANGE, Survey, survey_of
 from r3jax.formats.lenses import Lens
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -192,10 +193,10 @@ def audit(
     on_progress("evaluating frames", 0)
     frames = tuple(_evaluated_frames(source, survey, seen, config, path, step, on_progress))
     open_grid = _open_grid(source, survey, seen, cameras, config)
-    on_progress("choosing views", settings.num_views)
+    on_progress("choosing views", settings.views)
     task = Task(camera, demand_of(seen.state, standpoints, config), config)
     plan = suggest(
-        seen.state, open_grid, task, places, settings.num_views, seed=settings.seed, on_view=step
+        seen.state, open_grid, task, places, settings.views, seed=settings.seed, on_view=step
     )
     edges = np.asarray(open_grid.unexplored)
     return Audit(

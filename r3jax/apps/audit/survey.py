@@ -26,6 +26,7 @@ from scipy.spatial import KDTree
 
 from r3jax.apps.audit.agreement import DepthImage, check_agreement
 from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
+from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import Source
 from r3jax.apps.audit.vertical import Vertical, block_normals, estimated_up
 from r3jax.formats.errors import FormatError
@@ -138,59 +139,8 @@ _VALUES, _FEW_VALUES = 4000, 1000
 _FAR_AWAY = 100.0
 """Cameras farther from the origin than this lose digits of float32 [audit units]."""
 
-_LEAST = {"max_frames": 2, "folds": 2, "num_views": 0, "seed": 0}
-"""Least values of settings that count something."""
-
-_OPTIONS = {"num_views": "views"}
-"""How the command calls a setting, where it is not the field's own name."""
-
-_MOST_VIEWS = 200
-"""A report of more is read by nobody."""
-
 _MOST_CELLS = 1_000_000
 """Cells of the coarse grid; they become larger where a place would have more."""
-
-
-@dataclass(frozen=True)
-class AuditSettings:
-    """What the user may decide."""
-
-    voxel_size: float | None = None
-    """Edge of a voxel [capture units]; None: from the depths."""
-
-    max_range: float | None = None
-    """What is farther does not count as visible [capture units]; None: from the depths."""
-
-    up: str | None = None
-    """Vertical of the capture: an axis such as `y` or `-y`, or three numbers with commas; None: as
-    the format says, or as cameras and surfaces suggest."""
-
-    max_frames: int = 400
-    """Images that are used at most, evenly spread."""
-
-    folds: int = 8
-    """Every image is evaluated by a map that lacks one image in so many: its own among them."""
-
-    num_views: int = 10
-    """Views to suggest."""
-
-    num_places: int = 64
-    """Places at which views are looked for, at most."""
-
-    num_standpoints: int = 24
-    """Places from which every surface is evaluated: the first of the others, at most."""
-
-    seed: int = 0
-    """Seed of the random views that the suggested ones are compared with."""
-
-    depth_scale: float = 1.0
-    """Depths of depth images are multiplied by this."""
-
-    depth_along_ray: bool = False
-    """True: depth images hold distances along the pixels' rays, and not z."""
-
-    trust_depth: bool = False
-    """True: depth images are taken as they are, even if they contradict the poses."""
 
 
 @dataclass(frozen=True)
@@ -251,7 +201,6 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
         ValueError: a setting that makes no sense; depth images that contradict the poses.
         FormatError: no image has any depth; or a file is missing or broken.
     """
-    _check(settings)
     count = min(len(source), settings.max_frames)
     chosen = np.unique(np.linspace(0, len(source) - 1, count).round().astype(np.int64))
     images = _depth_images(source, chosen)
@@ -297,20 +246,6 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
         unit="m" if source.is_metric else "u",
         doubt=doubt,
     )
-
-
-def _check(settings: AuditSettings) -> None:
-    for name in ("voxel_size", "max_range"):
-        value = getattr(settings, name)
-        if value is not None and not 0.0 < value < np.inf:
-            raise ValueError(f"--{name.replace('_', '-')} must be positive, got {value}")
-    for name, least in _LEAST.items():
-        value = getattr(settings, name)
-        option = _OPTIONS.get(name, name.replace("_", "-"))
-        if value < least:
-            raise ValueError(f"--{option} must be at least {least}, got {value}")
-    if settings.num_views > _MOST_VIEWS:
-        raise ValueError(f"--views must be at most {_MOST_VIEWS}, got {settings.num_views}")
 
 
 def _depth_images(source: Source, chosen: np.ndarray) -> list[DepthImage]:

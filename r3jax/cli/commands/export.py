@@ -4,16 +4,13 @@ import shlex
 from pathlib import Path
 
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import ExportOptions
+from r3jax.cli.options.runs import ExportOptions
 from r3jax.cli.progress import Stages
-from r3jax.exploration.config import DEPTH_STEPS_PER_METRE
 from r3jax.files import make_folder
-from r3jax.formats.errors import FormatError
 from r3jax.formats.exports import export_run
 from r3jax.formats.submissions import submission_of_run, write_submission
-from r3jax.runs.header import RunError
-from r3jax.runs.reader import Run, read_run
+from r3jax.trace import DEPTH_STEPS_PER_METRE
+from r3jax.trace.reader import Run, read_run
 
 
 def run_export(options: ExportOptions) -> int:
@@ -23,15 +20,12 @@ def run_export(options: ExportOptions) -> int:
         UserError: not a run, no views, a folder that holds something, a disk that is full.
     """
     console = Console(stderr=True)
-    try:
-        run = read_run(options.path)
-        if options.format == "submission":
-            return _write_submission(console, run, options.out)
-        with Stages(console) as stages:
-            stages.on_progress("copying the images", len(run.rows))
-            points = export_run(run, options.out, options.format, lambda: stages.on_progress("", 1))
-    except (RunError, FormatError, OSError) as error:
-        raise UserError(one_line(error)) from error
+    run = read_run(options.path)
+    if options.format == "submission":
+        return _write_submission(console, run, options.out)
+    with Stages(console) as stages:
+        stages.on_progress("copying the images", len(run.rows))
+        points = export_run(run, options.out, options.format, lambda: stages.on_progress("", 1))
     console.say(f"{len(run.rows)} images, {points} points")
     console.say(f"exported  {options.out}")
     if options.format == "nerfstudio":

@@ -6,14 +6,12 @@ from r3jax.apps.forecast.forecast import Outlook
 from r3jax.apps.forecast.psnr import default_calibration, read_calibration
 from r3jax.apps.report.figures import LEVEL, outlook_figure, outlook_lines
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import ForecastOptions
+from r3jax.cli.options.runs import ForecastOptions
 from r3jax.cli.progress import Stages
+from r3jax.exploration.replay import states_of
 from r3jax.files import check_replaceable, write_atomic
 from r3jax.plots.style import PNG_MARK, to_png
-from r3jax.runs.header import RunError
-from r3jax.runs.reader import read_run
-from r3jax.runs.replay import states_of
+from r3jax.trace.reader import read_run
 
 
 def run_forecast(options: ForecastOptions) -> int:
@@ -23,21 +21,18 @@ def run_forecast(options: ForecastOptions) -> int:
         UserError: not a run, a frame that is missing, or a file that is no calibration.
     """
     console = Console(stderr=True)
-    try:
-        if options.plot is not None:
-            check_replaceable(options.plot, PNG_MARK)
-        chosen = options.calibration
-        calibration = default_calibration() if chosen is None else read_calibration(chosen)
-        outlook = Outlook(read_run(options.path), calibration=calibration)
-        with Stages(console) as stages:
-            states = states_of(outlook.run)
-            total = len(outlook.run.rows)
-            followed = stages.each("rebuilding the map from the frames", states, total)
-            deque(outlook.watch(followed), maxlen=0)
-        if options.plot is not None:
-            write_atomic(options.plot, to_png(outlook_figure(outlook)))
-    except (RunError, ValueError, OSError) as error:
-        raise UserError(one_line(error)) from error
+    if options.plot is not None:
+        check_replaceable(options.plot, PNG_MARK)
+    chosen = options.calibration
+    calibration = default_calibration() if chosen is None else read_calibration(chosen)
+    outlook = Outlook(read_run(options.path), calibration=calibration)
+    with Stages(console) as stages:
+        states = states_of(outlook.run)
+        total = len(outlook.run.rows)
+        followed = stages.each("rebuilding the map from the frames", states, total)
+        deque(outlook.watch(followed), maxlen=0)
+    if options.plot is not None:
+        write_atomic(options.plot, to_png(outlook_figure(outlook)))
     out = Console()
     out.say(
         f"PSNR of free-space views [dB], calibrated on {calibration.source}; intervals hold "

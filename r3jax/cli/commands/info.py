@@ -4,14 +4,12 @@ from pathlib import Path
 
 from r3jax.apps.report.summary import stage_times, summary
 from r3jax.cli.console import Console, Table
-from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import InfoOptions
+from r3jax.cli.errors import UserError
+from r3jax.cli.options.runs import InfoOptions
 from r3jax.files import check_replaceable, write_atomic
-from r3jax.formats.errors import FormatError
 from r3jax.formats.recordings import is_recording, read_recording
 from r3jax.interrupts import check_interrupt
-from r3jax.runs.header import RunError
-from r3jax.runs.reader import read_run
+from r3jax.trace.reader import read_run
 
 
 def run_info(options: InfoOptions) -> int:
@@ -22,27 +20,24 @@ def run_info(options: InfoOptions) -> int:
     """
     console = Console()
     path = options.path
-    try:
-        if path is None:
-            _show_inventory(console)
-        elif (path / "run.json").exists():
-            _show_run(console, path)
-        elif is_recording(path):
-            _show_recording(console, options, path)
-        else:
-            raise UserError(
-                f"{path}: neither a run (no run.json) nor a recording (no poses.txt and images/)"
-            )
-    except (RunError, FormatError, OSError) as error:
-        raise UserError(one_line(error)) from error
+    if path is None:
+        _show_inventory(console)
+    elif (path / "run.json").exists():
+        _show_run(console, path)
+    elif is_recording(path):
+        _show_recording(console, options, path)
+    else:
+        raise UserError(
+            f"{path}: neither a run (no run.json) nor a recording (no poses.txt and images/)"
+        )
     return 0
 
 
 def _show_inventory(console: Console) -> None:
     from r3jax.kernels.native.platform import describe_kernels
     from r3jax.planning.registry import describe, policy_names
-    from r3jax.runs.header import package_versions
     from r3jax.simulators.scenes import registry
+    from r3jax.trace.header import package_versions
 
     scenes = {name: registry.describe(name) for name in registry.scene_names()}
     scenes |= registry.outside_scenes()

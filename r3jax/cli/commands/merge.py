@@ -1,13 +1,11 @@
 """`r3jax merge`: two runs of one scene as one data set, with the map that saw both."""
 
+from r3jax.apps.runs.merge import merge_runs
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import MergeOptions
+from r3jax.cli.options.runs import MergeOptions
 from r3jax.cli.progress import Stages
 from r3jax.exploration.state import in_words
-from r3jax.formats.exports import write_data_set
-from r3jax.runs.begin import merge_runs
-from r3jax.runs.reader import read_run
+from r3jax.trace.reader import read_run
 
 
 def run_merge(options: MergeOptions) -> int:
@@ -18,17 +16,13 @@ def run_merge(options: MergeOptions) -> int:
     """
     console = Console(stderr=True)
     out = options.out or options.first.parent / f"{options.first.name}+{options.second.name}"
-    try:
-        runs = [read_run(path) for path in (options.first, options.second)]
-        total = sum(len(run.rows) for run in runs)
-        with Stages(console) as stages:
-            stages.on_progress("integrating the frames of both", total)
-            map_state = merge_runs(
-                runs, out, overwrite=options.overwrite, on_frame=lambda: stages.on_progress("", 1)
-            )
-        write_data_set(read_run(out), map_state)
-    except (ValueError, OSError) as error:
-        raise UserError(one_line(error)) from error
+    runs = [read_run(path) for path in (options.first, options.second)]
+    total = sum(len(run.rows) for run in runs)
+    with Stages(console) as stages:
+        stages.on_progress("integrating the frames of both", total)
+        map_state = merge_runs(
+            runs, out, overwrite=options.overwrite, on_frame=lambda: stages.on_progress("", 1)
+        )
     views = " + ".join(in_words(run.rows) for run in runs)
     console.say(f"{views}, {int(map_state.num_occupied)} voxels")
     console.say(f"merged    {out}")

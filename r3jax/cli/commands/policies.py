@@ -1,7 +1,7 @@
 """`r3jax policies`: who can choose views, and where each rule comes from."""
 
 from r3jax.cli.console import Console, Table, Text
-from r3jax.cli.options import PoliciesOptions
+from r3jax.cli.options.runs import PoliciesOptions
 from r3jax.planning.registry import describe, policy_names, source_of
 
 

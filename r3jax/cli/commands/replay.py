@@ -1,12 +1,10 @@
 """`r3jax replay`: do the recorded frames rebuild the stored map?"""
 
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, one_line
-from r3jax.cli.options import ReplayOptions
+from r3jax.cli.options.runs import ReplayOptions
 from r3jax.cli.progress import Stages
-from r3jax.runs.header import RunError
-from r3jax.runs.reader import read_run
-from r3jax.runs.replay import differences
+from r3jax.exploration.replay import differences
+from r3jax.trace.reader import read_run
 
 _DIFFERS = 1
 """Exit code where the maps are not equal."""
@@ -19,13 +17,10 @@ def run_replay(options: ReplayOptions) -> int:
         UserError: not a run, no stored map, a frame that is missing or not the recorded one.
     """
     console = Console(stderr=True)
-    try:
-        run = read_run(options.path)
-        with Stages(console) as stages:
-            stages.on_progress("integrating the recorded frames", len(run.rows))
-            views, found = differences(run, lambda: stages.on_progress("", 1))
-    except (RunError, OSError) as error:
-        raise UserError(one_line(error)) from error
+    run = read_run(options.path)
+    with Stages(console) as stages:
+        stages.on_progress("integrating the recorded frames", len(run.rows))
+        views, found = differences(run, lambda: stages.on_progress("", 1))
     if not found:
         console.say(f"{views} frames rebuild the stored map and grid, bit for bit")
         console.next("train", options.path)

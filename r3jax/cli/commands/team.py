@@ -1,24 +1,24 @@
 """`r3jax team`: several cameras in one scene at once, each with a run of its own."""
 
 import contextlib
-import dataclasses
 from pathlib import Path
 
 from r3jax.apps.report.report import write_report
 from r3jax.apps.team.crew import Crew, begin_team, resume_team, write_team_data
 from r3jax.apps.team.team import TeamResult, TeamView, explore_team
-from r3jax.cli.checks import singles_of, team_folder
-from r3jax.cli.commands.explore import EXIT_CODES, warn_of_versions
+from r3jax.cli.commands.explore import (
+    EXIT_CODES,
+    run_settings,
+    scene_settings,
+    warn_of_versions,
+)
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, one_line, resumable, resume_command
-from r3jax.cli.from_options import run_settings, scene_settings
-from r3jax.cli.options import TeamOptions
+from r3jax.cli.options.explore import TeamOptions
 from r3jax.cli.progress import RunProgress, Stages
 from r3jax.interrupts import settle_interrupt
 from r3jax.planning.policy import PolicyError
 from r3jax.runs.header import RunError
-
-DEFAULT_BUDGET = "seconds:120"
 
 
 def run_team(options: TeamOptions) -> int:
@@ -30,10 +30,7 @@ def run_team(options: TeamOptions) -> int:
     """
     console = Console(stderr=True)
     with contextlib.ExitStack() as stack:
-        try:
-            folder, crew = _crew(options, console, stack)
-        except (ValueError, OSError, ImportError) as error:
-            raise UserError(one_line(error)) from error
+        folder, crew = _crew(options, console, stack)
         stack.enter_context(resumable("team", folder))
         progress = stack.enter_context(RunProgress(console, crew.settings.budget))
         try:
@@ -48,7 +45,7 @@ def run_team(options: TeamOptions) -> int:
                 on_row=lambda number, row: progress.on_row(row),
                 on_stage=progress.on_stage,
             )
-        except (RunError, PolicyError) as error:
+        except PolicyError as error:
             raise UserError(one_line(error)) from error
     with resumable("team", folder):
         _conclude(console, folder, result)
@@ -63,15 +60,10 @@ def _crew(options: TeamOptions, console: Console, stack: contextlib.ExitStack) -
         recorded = crew.recorded or []
         warn_of_versions(console, recorded[0])
         views = " + ".join(str(len(run.rows)) for run in recorded)
-        console.say(f"goes on behind views {views} of {options.resume}, decided and mapped anew")
+        console.say(f"resuming {options.resume} after views {views}, decided and mapped again")
         return options.resume, crew
-    assert options.scene is not None
-    singles = [
-        dataclasses.replace(single, budget=options.budget or DEFAULT_BUDGET)
-        for single in singles_of(options)
-    ]
+    singles, folder = options.singles(), options.path
     settings = [run_settings(single) for single in singles]
-    folder = team_folder(options, options.scene)
     with console.status(f"opening {options.scene} {options.cameras} times ..."):
         crew = begin_team(
             settings,
@@ -79,7 +71,7 @@ def _crew(options: TeamOptions, console: Console, stack: contextlib.ExitStack) -
             folder,
             stack,
             meet_every=options.meet_every,
-            overwrite=options.overwrite,
+            overwrite=options.folder.overwrite,
         )
     return folder, crew
 

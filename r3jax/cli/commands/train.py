@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, check_folder_name, check_resolution, one_line
-from r3jax.cli.options import TrainOptions
-from r3jax.cli.options.parsing import given_words
+from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.options.splats import ModelFolderOptions, TrainOptions
+from r3jax.cli.parsing import given_words, settings_for
 from r3jax.cli.progress import Stages, TrainProgress
 from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
@@ -13,6 +13,7 @@ from r3jax.formats.points import write_points
 from r3jax.formats.ros.bags import parse_topics
 from r3jax.runs.header import package_versions
 from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.errors import TrainingDiverged
 from r3jax.splatting.model import check_free, only_writer, scene_points, write_model
 from r3jax.splatting.training import train
 from r3jax.splatting.training.config import TrainConfig
@@ -26,52 +27,42 @@ def run_train(options: TrainOptions) -> int:
         0 done, 130 interrupted (it can be resumed).
 
     Raises:
-        UserError: bad input, a model that exists, too little memory, training that diverged.
+        UserError: training that diverged.
+        ValueError, OSError, ImportError: bad input, a model that exists, too little memory.
     """
     console = Console(stderr=True)
+    config = TrainConfig(
+        num_gaussians=options.model.gaussians,
+        raster=RasterConfig(backend=options.reading.backend),
+        **settings_for(TrainConfig, options),
+    )
+    capture = open_capture(options.path, options.reading.up, parse_topics(options.reading.topics))
+    folder = (options.folder.out or capture.models) / options.folder.name
+    resume, overwrite = options.folder.resume, options.folder.overwrite
+    check_free(folder, replace=overwrite or resume)
+    split = split_views(len(capture), options.hold_out)
+    with Stages(console) as stages:
+        frames = stages.each("reading the views", capture.frames(), len(capture))
+        views = load_views(frames, options.resolution).take(split[0])
+    if capture.run is not None and options.folder.out is None:
+        own_folder(capture.path, "run")
     try:
-        check_resolution(options.resolution)
-        check_folder_name(options.name)
-        config = _config(options)
-        capture = open_capture(options.path, options.up, parse_topics(options.topics))
-        folder = (options.out or capture.models) / options.name
-        replace = options.overwrite or options.resume
-        check_free(folder, replace=replace)
-        split = split_views(len(capture), options.hold_out)
-        with Stages(console) as stages:
-            frames = stages.each("reading the views", capture.frames(), len(capture))
-            views = load_views(frames, options.resolution).take(split[0])
-        if capture.run is not None and options.out is None:
-            own_folder(capture.path, "run")
-        with only_writer(folder, replace=replace):
+        with only_writer(folder, replace=overwrite or resume):
             with TrainProgress(console, config.iterations) as progress:
                 result = train.fit(
                     views,
                     config,
                     folder=folder / "checkpoints",
-                    resume=options.resume,
-                    overwrite=options.overwrite,
+                    resume=resume,
+                    overwrite=overwrite,
                     on_progress=progress.on_progress,
                 )
             write_points(folder / "points.ply", *scene_points(result.scene))
             write_model(folder, result, options.path, views, split, config, package_versions())
-    except (ValueError, ArithmeticError, OSError, ImportError) as error:
+    except TrainingDiverged as error:
         raise UserError(one_line(error)) from error
     _conclude(console, options, folder, result)
     return 130 if result.interrupted else 0
-
-
-def _config(options: TrainOptions) -> TrainConfig:
-    return TrainConfig(
-        iterations=options.iterations,
-        strategy=options.strategy,
-        num_gaussians=options.gaussians,
-        capacity=options.capacity,
-        views_per_step=options.views_per_step,
-        background=options.background,
-        raster=RasterConfig(backend=options.backend),
-        seed=options.seed,
-    )
 
 
 def _conclude(
@@ -80,7 +71,7 @@ def _conclude(
     history = result.history
     done = history.first_step + len(history.loss) - 1
     if result.interrupted:
-        console.say(f"interrupted after step {done}; the same command with --resume goes on")
+        console.say(f"interrupted after step {done}; add --resume to the same command to go on")
     if len(history.psnr):
         latest = history.psnr[-100:].mean()
         console.say(
@@ -95,7 +86,8 @@ def _conclude(
     console.say(f"model     {folder / 'scene.ply'}")
     if result.interrupted:
         return
-    which = () if options.name == TrainOptions.name else ("--name", options.name)
-    where = which if options.out is None else ("--model", folder)
+    name = options.folder.name
+    which = () if name == ModelFolderOptions.name else ("--name", name)
+    where = which if options.folder.out is None else ("--model", folder)
     how = () if options.hold_out else ("--views", "all")
     console.next("evaluate", options.path, *where, *how, *given_words(options, ("up", "topics")))

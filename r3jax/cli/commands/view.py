@@ -6,8 +6,8 @@ from pathlib import Path
 
 from r3jax.apps.viewer.film import export_film, load_av
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, check_viser, one_line
-from r3jax.cli.options import ViewOptions
+from r3jax.cli.errors import UserError, check_viser
+from r3jax.cli.options.runs import ViewOptions
 from r3jax.cli.progress import Stages
 from r3jax.interrupts import deferred_interrupt, end_process
 from r3jax.network import who_sees
@@ -19,20 +19,18 @@ def run_view(options: ViewOptions) -> int:
     """Shows a run until Ctrl-C, or writes its images.
 
     Raises:
-        UserError: not a run, no views, a port that is in use, a folder that holds something, a
-            missing package.
+        UserError: no views yet.
+        ValueError, OSError, ImportError: not a run, a port that is in use, a folder that holds
+            something, a missing package.
     """
     console = Console(stderr=True)
-    try:
-        run = read_run(options.path)
-        if not run.rows:
-            raise UserError(f"{run.path}: the run has no views yet: there is nothing to see")
-        config_of(run)  # says what is wrong with it
-        if options.export is not None:
-            return _export(run, options.export, options.video, console)
-        _show(options, run, console)
-    except (ValueError, OSError, ImportError) as error:
-        raise UserError(one_line(error)) from error
+    run = read_run(options.path)
+    if not run.rows:
+        raise UserError(f"{run.path}: the run has no views yet: there is nothing to see")
+    config_of(run)  # says what is wrong with it
+    if options.export is not None:
+        return _export(run, options.export, options.video, console)
+    _show(options, run, console)
     return 0
 
 

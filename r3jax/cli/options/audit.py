@@ -1,57 +1,30 @@
 """The options of `r3jax audit`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
-from r3jax.cli.options.bags import BagOptions
+from r3jax.apps.audit.settings import AuditSettings
+from r3jax.cli.options.groups import check_folder
+from r3jax.cli.parsing import FieldsOf
+from r3jax.files import check_own
+from r3jax.formats.errors import check_capture
+from r3jax.formats.ros.names import parse_topics
 
+_GROWING = (".json", ".mcap", ".db3", ".bag", ".active")
+"""Suffixes of files that may grow; of those that may not be followed their reader says why."""
 
-@dataclass(frozen=True, kw_only=True)
-class AuditTermOptions(BagOptions):
-    """How the capture is judged."""
-
-    TITLE: ClassVar[str] = "terms"
-
-    voxel_size: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
-    """Edge of a voxel in the capture's units; by default 5 cm, or from the depths."""
-
-    max_range: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
-    """Surfaces farther from a camera count as invisible, in the capture's units; by default 5 m,
-    or from the depths."""
-
-    up: Annotated[str | None, tyro.conf.arg(metavar="DIRECTION")] = None
-    """Direction of the capture that points up: x, y, z, -x, -y or -z (`--up=-y`), or three numbers
-    (`--up=0.1,-0.9,0.4`). By default as the format says, or a guess from floors, walls and how the
-    cameras were held."""
-
-    max_frames: int = 400
-    """Images to use at most, evenly spread."""
-
-    folds: int = 8
-    """Own frames are judged by a map without every N-th image, themselves among them."""
-
-    depth_scale: Annotated[float, tyro.conf.arg(metavar="FACTOR")] = 1.0
-    """Multiply all depths of depth images, where their unit is not the one that was read."""
-
-    depth_along_ray: bool = False
-    """Depth images hold the distance along each pixel's ray, as those of Hypersim and SceneNet do,
-    and not z: convert it."""
-
-    trust_depth: bool = False
-    """Take the depth images as they are, even if they contradict the poses or each other."""
-
-    seed: int = 0
-    """Seed of the random views that the suggested ones are compared with."""
+_TERMS = FieldsOf(
+    "views", "voxel_size", "max_range", "up", "max_frames", "folds", "seed", "depth_scale",
+    "depth_along_ray", "trust_depth",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
 class GuideOptions:
     """A page that says where to go next, while the capture is being taken."""
-
-    TITLE: ClassVar[str] = "guidance while scanning"
 
     live: bool = False
     """Follow a folder or ROS bag that another program is writing: the page in the browser shows
@@ -64,28 +37,84 @@ class GuideOptions:
     """Address that --live listens at. By default nobody but this machine can see the page; 0.0.0.0
     shows it to everybody who can reach the machine, such as a phone."""
 
+    def __post_init__(self) -> None:
+        """Refuses a page that would not be shown, or could not be."""
+        if not self.live and (self.port, self.host) != (GuideOptions.port, GuideOptions.host):
+            raise ValueError("--port and --host are for the page of --live")
+        if not 0 <= self.port <= 65535:
+            raise ValueError(f"--port must lie between 0 and 65535, got {self.port}")
 
-@dataclass(frozen=True)
-class AuditOptions(GuideOptions, AuditTermOptions):
-    """Audit a capture: what it lacks for splats, how frames would render, which views to add."""
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = (
-        "r3jax audit scans/kitchen",
-        "r3jax audit scans/kitchen --live --host 0.0.0.0",
-        "r3jax audit scans/kitchen/transforms.json --path camera_path.json --views 20",
-    )
+@dataclass(frozen=True, kw_only=True)
+class AuditOptions:
+    """Audit a capture: what it lacks for splats, how frames would render, which views to add.
 
-    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
+    For example
+        r3jax audit scans/kitchen
+        r3jax audit scans/kitchen --live --host 0.0.0.0
+        r3jax audit scans/kitchen/transforms.json --path camera_path.json --views 20
+    """
+
+    capture: Annotated[Path, Positional, arg(metavar="CAPTURE")]
     """A phone's scan as the app shares it, a ROS bag, nerfstudio's transforms.json or its folder, a
     COLMAP model, a scene of ScanNet, Replica-SLAM, TUM or 7-Scenes, a recording (images/, depth/,
     poses.txt, K.txt), or a run."""
 
-    path: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    path: Annotated[Path | None, arg(metavar="FILE")] = None
     """Camera path to judge, in the capture's coordinates: nerfstudio's camera_path.json, or any
     capture. By default the capture's own frames, each judged without itself."""
 
-    views: int = 10
-    """Further views to suggest."""
-
     out: Path | None = None
     """Folder of the audit; by default runs/audit/NAME. An earlier audit in it is replaced."""
+
+    topics: Annotated[str | None, arg(metavar="NAMES")] = None
+    """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
+    depth_info, frame, world. By default they are found."""
+
+    terms: Annotated[AuditSettings, _TERMS] = field(default_factory=AuditSettings)
+    guide: Annotated[GuideOptions, arg(name="guidance while scanning")] = field(
+        default_factory=GuideOptions
+    )
+
+    def __post_init__(self) -> None:
+        """Refuses what can be seen to be wrong before the capture is read."""
+        parse_topics(self.topics)
+        if self.guide.live:
+            _check_live(self.capture)
+            if self.path is not None:
+                raise ValueError(
+                    "--live follows a capture, --path judges a path in one: give one of them"
+                )
+            if self.terms.depth_scale != 1.0 or self.terms.depth_along_ray:
+                raise ValueError(
+                    "--depth-scale and --depth-along-ray cannot be used with --live: audit the "
+                    "capture with them once it is finished"
+                )
+        else:
+            check_capture(self.capture)
+        if self.out is not None:
+            check_folder(self.out)
+            check_own(self.out, "audit", "give another --out")
+        if self.path is not None and not self.path.exists():
+            raise ValueError(f"{self.path}: there is no such folder or file")
+
+
+def _check_live(path: Path) -> None:
+    """Refuses what does not grow, and what can never come to be, such as the name of a topic.
+
+    Raises:
+        ValueError: says what can be followed.
+    """
+    if path.is_file() and path.suffix not in _GROWING:
+        raise ValueError(
+            f"{path}: --live needs a growing recording; drop --live for a finished file"
+        )
+    if path.exists() or path.absolute().parent.is_dir():
+        return
+    raise ValueError(
+        f"{path}: there is no such capture, and no folder in which it could be recorded. Topics of "
+        "a running ROS 2 are followed by the node, which shows the same page: python "
+        f"examples/ros2_node.py --ros-args -p page_port:=8080 -r color:={path} -r depth:=... -r "
+        "camera_info:=...; or follow a bag: ros2 bag record -o drive --storage mcap TOPICS, and "
+        "r3jax audit drive --live"
+    )

@@ -1,31 +1,62 @@
-"""The options of the commands that explore with one camera."""
+"""The options of the commands that explore: `explore`, `team`, `demo`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
-import tyro
+from tyro.conf import arg
 
+from r3jax.cli.errors import check_resolution
 from r3jax.cli.options.groups import (
-    DepthOptions,
+    CameraOptions,
     FolderOptions,
-    MapOptions,
-    RepeatOptions,
-    SceneOptions,
+    WorldOptions,
+    check_folder,
+    check_free,
+    check_policy_here,
+    check_run,
+    check_scene,
+    refuse_others,
 )
+from r3jax.cli.parsing import FieldsOf, settings_for
+from r3jax.exploration.budget import parse_budget
+from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig
+from r3jax.planning.policies.foreign.commands import short_name
+from r3jax.planning.robot.motion import Motion, make_motion
+
+DEFAULT_POLICY = "ours-pano"
+
+_WITH_RESUME = ("resume", "budget", "until", "live", "port")
+_WITH_FORK = (
+    "fork", "at", "policy", "budget", "until", "name", "out", "overwrite", "candidates", "lambda1",
+    "lambda2", "refine", "live", "port",
+)  # fmt: skip
+"""Options that make sense beside these; all others are fixed by what was recorded."""
+
+MapAndClock = FieldsOf("voxel_size", "cell_size", "max_range", "capacity", "clock")
+"""Settings of the loop for a team."""
+
+Loop = FieldsOf(
+    *MapAndClock.names, "until", "capture_every", "capture_rate", "gaze", "exposure", "blur",
+    "plan_while_moving",
+)  # fmt: skip
+"""Settings of the loop for one camera."""
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Explore a small embedded flat, train splats on the frames, judge them; takes minutes."""
+    """Explore a small embedded flat, train splats on the frames, judge them; takes minutes.
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax demo", "r3jax demo --views 12 --iterations 500")
+    For example
+        r3jax demo
+        r3jax demo --views 12 --iterations 500
+    """
 
     out: Path = Path("runs")
     """Folder that holds the runs; the demo overwrites `demo` in it and nothing else."""
 
     views: int = 16
-    """Views to choose; frames on the way to them come on top."""
+    """Views to choose; frames captured while moving come on top."""
 
     resolution: int = 256
     """Width and height of the images [px]."""
@@ -36,132 +67,103 @@ class DemoOptions:
     iterations: int = 1000
     """Steps of the training."""
 
+    def __post_init__(self) -> None:
+        """Refuses what no run or training can be made of."""
+        parse_budget(f"views:{self.views}")
+        check_resolution(self.resolution, most=4096)
+        check_resolution(self.train_resolution)
+        check_folder(self.out)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ContinueOptions:
-    """A run that is gone on with, or left for another."""
+    """A run that is resumed, or left for another."""
 
-    TITLE: ClassVar[str] = "resume and fork"
+    resume: Annotated[Path | None, arg(metavar="RUN")] = None
+    """Resume an interrupted run with its own settings; a larger --budget extends it."""
 
-    resume: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Go on with a run that was cut off; all settings are its own. Another --budget extends it."""
+    fork: Annotated[Path | None, arg(metavar="RUN")] = None
+    """Start a new run from a frame of an existing one, with another --policy; the scene and the
+    sensor are the run's."""
 
-    fork: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Try another --policy from a frame of a run on; the scene and the sensor are the run's."""
+    at: Annotated[int | None, arg(metavar="FRAME")] = None
+    """First frame to replace; earlier frames are reused. Without frames captured while moving every
+    frame is a view."""
 
-    at: Annotated[int | None, tyro.conf.arg(metavar="FRAME")] = None
-    """Number of the frame that the fork takes anew; those before it are kept. Without frames on the
-    way every frame is a view."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImageOptions:
-    """What the color camera sees."""
-
-    TITLE: ClassVar[str] = "camera"
-
-    resolution: int = 512
-    """Width and height of the images [px]."""
-
-    fov: float = 60.0
-    """Field of view [degrees]."""
+    def __post_init__(self) -> None:
+        """Refuses both at once, and a fork from nowhere."""
+        if self.resume is not None and self.fork is not None:
+            raise ValueError(
+                "--resume goes on with a run, --fork begins another one: give one of them"
+            )
+        if (self.at is None) != (self.fork is None):
+            raise ValueError("--fork RUN and --at FRAME belong together")
+        for path in (self.resume, self.fork):
+            if path is not None:
+                check_run(path)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions:
-    """What carries the camera."""
-
-    TITLE: ClassVar[str] = "motion"
+    """How the camera moves: a preset, and what differs from it."""
 
     motion: Literal["free", "ground", "gimbal", "handheld"] = "free"
-    """What carries the camera: `free`: a camera that flies; `ground`: a robot whose camera is level
-    and at the height where it starts; `gimbal`: a drone that cannot look up far; `handheld`: a
-    person. The options below change it."""
+    """Camera platform: `free`: a camera that flies; `ground`: a robot whose camera is level and at
+    the height where it starts; `gimbal`: a drone that cannot look up far; `handheld`: a person. The
+    options below change it."""
 
-    heights: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
+    heights: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
     """Lowest and highest place of the camera, above the start [m]."""
 
     heights_above: Literal["start", "world"] | None = None
     """What --heights count from: `start`, or `world` for z = 0."""
 
-    elevations: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
+    elevations: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
     """Lowest and highest angle of the line of sight above the horizon [degrees]."""
 
-    body: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
+    body: Annotated[float | None, arg(metavar="LENGTH")] = None
     """Clearance that the robot needs below the camera [m]."""
 
-    speed: Annotated[float | None, tyro.conf.arg(metavar="SPEED")] = None
+    speed: Annotated[float | None, arg(metavar="SPEED")] = None
     """Speed along the path [m/s]."""
 
-    turn_rate: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
+    turn_rate: Annotated[float | None, arg(metavar="RATE")] = None
     """How fast the line of sight turns [degrees/s]."""
 
-    turn_per_meter: Annotated[float | None, tyro.conf.arg(metavar="ANGLE")] = None
+    turn_per_meter: Annotated[float | None, arg(metavar="ANGLE")] = None
     """Largest turn for each meter between a view and the next [degrees/m]."""
 
+    def __post_init__(self) -> None:
+        """Refuses what cannot move."""
+        _ = self.of_robot
 
-@dataclass(frozen=True, kw_only=True)
-class CaptureOptions:
-    """Frames on the way from view to view."""
-
-    TITLE: ClassVar[str] = "captures on the way"
-
-    capture_every: Annotated[float | None, tyro.conf.arg(metavar="LENGTH")] = None
-    """Capture frames on the way from view to view, at most so far apart [m]; by default none."""
-
-    capture_rate: Annotated[float | None, tyro.conf.arg(metavar="RATE")] = None
-    """The same by frames per second of the way [Hz]; none is taken while the camera turns at its
-    end."""
-
-    gaze: Literal["ahead", "panorama"] = "panorama"
-    """Where the camera points while moving: `ahead`: along the path; `panorama`: at each place in
-    the direction of highest utility."""
-
-    exposure: float = 0.0
-    """Time that the shutter is open for a frame on the way [s]; 0: turning blurs nothing."""
-
-    blur: float = 1.0
-    """So many pixels the image may move meanwhile by turning [px]."""
-
-    plan_while_moving: bool = False
-    """Decide on the next view during the flight, on the map as it will be, and only reconsider on
-    arrival: the clock is charged for what the flight does not hide."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GrowthOptions(MapOptions):
-    """What the map is made of, and whether it grows."""
-
-    TITLE: ClassVar[str] = "map"
-
-    fixed_capacity: bool = False
-    """Never grow the map: what finds no row is counted as dropped and reported."""
+    @property
+    def of_robot(self) -> Motion:
+        """The preset with the options that are given."""
+        given = settings_for(Motion, self)
+        return make_motion(self.motion, **{k: v for k, v in given.items() if v is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningOptions:
     """How a view is chosen."""
 
-    TITLE: ClassVar[str] = "planning"
-
-    candidates: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    candidates: Annotated[int | None, arg(metavar="N")] = None
     """Candidates per decision (policy's default: 100)."""
 
-    lambda1: Annotated[float | None, tyro.conf.arg(metavar="WEIGHT")] = None
+    lambda1: Annotated[float | None, arg(metavar="WEIGHT")] = None
     """Weight of a visible unexplored cell against a voxel that renders badly."""
 
-    lambda2: Annotated[float | None, tyro.conf.arg(metavar="WEIGHT")] = None
+    lambda2: Annotated[float | None, arg(metavar="WEIGHT")] = None
     """Weight of the path length against the utility (policy's default: 0.5)."""
 
-    refine: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """The best N candidates of `ours` and its kin climb the utility by its gradient (0: none)."""
+    refine: Annotated[int | None, arg(metavar="N")] = None
+    """Refine the best N candidates by gradient ascent (`ours` and its kin only; 0: none)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PageOptions:
     """A page that shows the exploration."""
-
-    TITLE: ClassVar[str] = "live page"
 
     live: bool = False
     """Show the exploration in the browser while it runs, on this machine only (extra `viewer`)."""
@@ -170,47 +172,212 @@ class PageOptions:
     """Port of the page that --live shows; 0 takes any free one."""
 
 
-@dataclass(frozen=True)
-class ExploreOptions(
-    ContinueOptions,
-    FolderOptions,
-    ImageOptions,
-    DepthOptions,
-    MotionOptions,
-    CaptureOptions,
-    PlanningOptions,
-    SceneOptions,
-    GrowthOptions,
-    RepeatOptions,
-    PageOptions,
-):
-    """Explore a scene: choose every view, record images, depth, poses, and write a report."""
+@dataclass(frozen=True, kw_only=True)
+class ExploreOptions:
+    """Explore a scene: choose every view, record images, depth, poses, and write a report.
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = (
-        "r3jax explore --scene flat --budget views:50",
-        "r3jax explore --scene mesh:house.glb --policy frontier --live",
-        "r3jax explore --resume runs/flat-ours-pano-seed0 --budget views:100",
-    )
+    For example
+        r3jax explore --scene flat --budget views:50
+        r3jax explore --scene mesh:house.glb --policy frontier --live
+        r3jax explore --resume runs/flat-ours-pano-seed0 --budget views:100
+    """
 
-    scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE")] = None
+    scene: Annotated[str | None, arg(metavar="SCENE")] = None
     """Embedded scene by name (`r3jax info` lists them), `mesh:<file>` (GLB, PLY, OBJ),
     `replica:<name>`, or `habitat:<file>` (GLB, PLY, stage config)."""
 
-    policy: Annotated[str | None, tyro.conf.arg(metavar="POLICY")] = None
-    """Who chooses the next view: `ours-pano` by default; `r3jax policies` lists them. A class of
-    yours is `module:Class`, a program in any language `exec:COMMAND`."""
+    policy: Annotated[str | None, arg(metavar="POLICY")] = None
+    """Policy that chooses the views: `ours-pano` by default; `r3jax policies` lists them. A class
+    of yours is `module:Class`, a program in any language `exec:COMMAND`."""
 
-    budget: Annotated[str | None, tyro.conf.arg(metavar="BUDGET")] = None
+    budget: Annotated[str | None, arg(metavar="BUDGET")] = None
     """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `meters:M`, or
-    `frames:N`, those captured on the way included."""
+    `frames:N`, those captured while moving included."""
 
-    until: Annotated[str | None, tyro.conf.arg(metavar="GOAL")] = None
-    """Stop before the budget is spent, when the forecast of the image quality says that the views
-    are enough: `psnr:25` for the mean of all free-space views, `psnr:20@p10` for all but the worst
-    tenth."""
+    seed: int = 0
+    """Random seed."""
+
+    fixed_capacity: bool = False
+    """Never grow the map, which has 16384 rows at least where it may grow: what finds no row is
+    counted as dropped and reported."""
+
+    earlier: Annotated[ContinueOptions, arg(name="resume and fork")] = field(
+        default_factory=ContinueOptions
+    )
+    folder: FolderOptions = field(default_factory=FolderOptions)
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    robot: Annotated[MotionOptions, arg(name="motion")] = field(default_factory=MotionOptions)
+    loop: Annotated[ExplorationConfig, arg(name="map and exploration"), Loop] = field(
+        default_factory=ExplorationConfig
+    )
+    planning: PlanningOptions = field(default_factory=PlanningOptions)
+    world: Annotated[WorldOptions, arg(name="scene")] = field(default_factory=WorldOptions)
+    page: Annotated[PageOptions, arg(name="live page")] = field(default_factory=PageOptions)
 
     @property
     def changes_policy(self) -> bool:
         """True if a fork decides otherwise than the run that it leaves."""
-        given = (self.policy, self.candidates, self.lambda1, self.lambda2, self.refine)
-        return any(value is not None for value in given)
+        return self.policy is not None or self.planning != PlanningOptions()
+
+    def path(self, policy: str) -> Path:
+        """The folder of a new run of the scene with a policy."""
+        kind, colon, rest = (self.scene or "").partition(":")
+        stem = Path(rest).stem if colon else kind
+        if kind == "habitat" and colon:
+            stem = f"habitat-{stem.removesuffix('.stage_config')}"
+        motion = "" if self.robot.motion == "free" else f"-{self.robot.motion}"
+        name = f"{stem}-{short_name(policy)}{motion}-seed{self.seed}"
+        return self.folder.out / (self.folder.name or name)
+
+    def __post_init__(self) -> None:
+        """Refuses what can be seen to be wrong before JAX is imported and the scene is opened."""
+        if self.earlier.resume is not None:
+            refuse_others(self, "--resume", "recorded run", _WITH_RESUME)
+        elif self.earlier.fork is not None:
+            refuse_others(self, "--fork", "recorded run", _WITH_FORK)
+        elif self.scene is None:
+            raise ValueError("give a --scene, or --resume RUN; `r3jax info` lists the scenes")
+        else:
+            check_scene(self.scene, self.world.scale)
+            check_free(self.path(self.policy or DEFAULT_POLICY), self.folder.overwrite)
+        if self.policy is not None:
+            check_policy_here(self.policy)
+        if self.budget is not None:
+            parse_budget(self.budget)
+        if not 0 <= self.seed < 1 << 32:
+            raise ValueError(f"--seed must lie between 0 and 2^32 - 1, got {self.seed}")
+        if self.loop.until is not None:
+            from r3jax.apps.forecast.psnr import parse_goal  # imports NumPy
+
+            parse_goal(self.loop.until)
+        self.loop.check_scales()
+        self._check_captures()
+
+    def _check_captures(self) -> None:
+        """Refuses settings of captures that would be ignored, or not be kept."""
+        loop, default = self.loop, ExplorationConfig()
+        for name in ("gaze", "exposure", "blur"):
+            if getattr(loop, name) != getattr(default, name) and not loop.captures:
+                raise ValueError(
+                    f"--{name} is for frames captured while moving: add --capture-every or "
+                    "--capture-rate, or leave it out"
+                )
+        if loop.blur != default.blur and loop.exposure == 0.0:
+            raise ValueError(
+                "--blur does nothing while nothing blurs: add --exposure, or leave it out"
+            )
+        largest = (self.robot.of_robot.speed or loop.speed) / LEAST_PIECE
+        if loop.capture_rate is not None and loop.capture_rate > largest * (1.0 + 1e-9):
+            raise ValueError(
+                f"--capture-rate must be at most {largest:g} Hz at this speed, one frame every "
+                f"{LEAST_PIECE:g} m, got {loop.capture_rate:g}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeamOptions:
+    """Explore a scene with several cameras at once that share what they see.
+
+    For example
+        r3jax team --scene office --cameras 3 --budget seconds:120
+        r3jax team --resume runs/office-team3-seed0 --budget seconds:240
+    """
+
+    scene: Annotated[str | None, arg(metavar="SCENE")] = None
+    """Embedded scene by name (`r3jax info` lists them), `mesh:<file>` (GLB, PLY, OBJ),
+    `replica:<name>`, or `habitat:<file>` (GLB, PLY, stage config)."""
+
+    cameras: int = 2
+    """Number of cameras that fly at the same time."""
+
+    policy: tuple[str, ...] = (DEFAULT_POLICY,)
+    """Policy of each camera; one for all, or one for each."""
+
+    fov: tuple[float, ...] = (60.0,)
+    """Fields of view [degrees]; one for all, or one for each."""
+
+    resolution: tuple[int, ...] = (512,)
+    """Widths and heights of the images [px]; one for all, or one for each."""
+
+    noise: float = 0.01
+    """Standard deviation of the depth noise as a share of the depth."""
+
+    budget: Annotated[str | None, arg(metavar="BUDGET")] = None
+    """When each camera stops: `seconds:S` of its mission clock (120 by default), `views:N`,
+    `meters:M`."""
+
+    meet_every: float = 0.0
+    """Seconds of the mission clock between two meetings; 0: they are always in touch."""
+
+    resume: Annotated[Path | None, arg(metavar="TEAM")] = None
+    """Resume an interrupted team with its own settings; a larger --budget extends it."""
+
+    candidates: Annotated[int | None, arg(metavar="N")] = None
+    """Candidates per decision (policy's default: 100)."""
+
+    seed: int = 0
+    """Random seed."""
+
+    folder: FolderOptions = field(default_factory=FolderOptions)
+    loop: Annotated[ExplorationConfig, arg(name="map and exploration"), MapAndClock] = field(
+        default_factory=ExplorationConfig
+    )
+    world: Annotated[WorldOptions, arg(name="scene")] = field(default_factory=WorldOptions)
+
+    @property
+    def path(self) -> Path:
+        """The folder of a new team."""
+        kind, _, rest = (self.scene or "").partition(":")
+        name = f"{Path(rest or kind).stem}-team{self.cameras}-seed{self.seed}"
+        return self.folder.out / (self.folder.name or name)
+
+    def singles(self) -> list[ExploreOptions]:
+        """The options of each camera as if it flew alone.
+
+        Raises:
+            ValueError: neither one value for all cameras nor one for each, or one that a camera
+                alone could not have.
+        """
+        if not 1 <= self.cameras <= 16:
+            raise ValueError(f"--cameras must lie between 1 and 16, got {self.cameras}")
+        for name in ("policy", "fov", "resolution"):
+            num = len(getattr(self, name))
+            if num not in (1, self.cameras):
+                raise ValueError(
+                    f"--{name} takes one value for all {self.cameras} cameras or one for each, "
+                    f"got {num}"
+                )
+        return [
+            ExploreOptions(
+                scene=self.scene,
+                policy=self.policy[number % len(self.policy)],
+                budget=self.budget or "seconds:120",
+                seed=self.seed,
+                folder=FolderOptions(
+                    name=str(number), out=self.path, overwrite=self.folder.overwrite
+                ),
+                camera=CameraOptions(
+                    resolution=self.resolution[number % len(self.resolution)],
+                    fov=self.fov[number % len(self.fov)],
+                    noise=self.noise,
+                ),
+                loop=self.loop,
+                planning=PlanningOptions(candidates=self.candidates),
+                world=self.world,
+            )
+            for number in range(self.cameras)
+        ]
+
+    def __post_init__(self) -> None:
+        """Refuses what can be seen to be wrong before JAX is imported and the scene is opened."""
+        if self.resume is not None:
+            if self.budget is not None:
+                parse_budget(self.budget)
+            refuse_others(self, "--resume", "recorded run", ("resume", "budget"))
+            check_run(self.resume / "0")
+            return
+        if self.scene is None:
+            raise ValueError("give a --scene, or --resume TEAM; `r3jax info` lists the scenes")
+        if not self.meet_every >= 0.0:
+            raise ValueError(f"--meet-every must be a time >= 0 [s], got {self.meet_every}")
+        _ = self.singles()

@@ -1,35 +1,46 @@
-"""Options that several commands share: one class, and one box of `--help`, for each group."""
+"""Groups of options that several commands share, and what several of them refuse.
 
+Nothing here imports JAX: `--help` and a slip of the keyboard must not wait for it.
+"""
+
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-import tyro
+from tyro.conf import arg
+
+from r3jax.cli.errors import check_folder_name, check_resolution
+from r3jax.cli.parsing import flat
+from r3jax.formats.errors import check_capture
+from r3jax.formats.ros.names import parse_topics
+from r3jax.planning.policies import check_policy
 
 
 @dataclass(frozen=True, kw_only=True)
 class FolderOptions:
     """Where a run is kept."""
 
-    TITLE: ClassVar[str] = "folder"
-
-    name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Name of the folder; by default made of the scene, who chooses the views, and the seed."""
+    name: Annotated[str | None, arg(metavar="NAME")] = None
+    """Name of the folder; by default made of the scene, the policy and the seed."""
 
     out: Path = Path("runs")
     """Folder that holds it."""
 
     overwrite: bool = False
-    """Replace what has that name, if there is one."""
+    """Overwrite an existing run of that name."""
+
+    def __post_init__(self) -> None:
+        """Refuses a path as a name."""
+        if self.name is not None:
+            check_folder_name(self.name)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions:
+class WorldOptions:
     """How a scene is opened."""
 
-    TITLE: ClassVar[str] = "scene"
-
-    start: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    start: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z")] = None
     """Start position in the z-up world [m]; by default the scene's own, or a search."""
 
     up: Literal["y", "z"] | None = None
@@ -43,42 +54,129 @@ class SceneOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthOptions:
-    """What the depth sensor measures."""
+class CameraOptions:
+    """What the camera sees."""
 
-    TITLE: ClassVar[str] = "depth sensor"
+    resolution: int = 512
+    """Width and height of the images [px]."""
+
+    fov: float = 60.0
+    """Field of view [degrees]."""
 
     noise: float = 0.01
     """Standard deviation of the depth noise as a share of the depth."""
 
-    max_range: float = 5.0
-    """Range of the depth sensor [m]."""
+    def __post_init__(self) -> None:
+        """Refuses images that no run is made of."""
+        check_resolution(self.resolution, most=4096)
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapOptions:
-    """What the map is made of."""
+class ReadingOptions:
+    """How splats are rendered, and how a recording is read."""
 
-    TITLE: ClassVar[str] = "map"
+    backend: Literal["auto", "numba", "xla", "splax"] = "auto"
+    """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
 
-    voxel_size: float = 0.05
-    """Edge of a voxel of the map [m]."""
-
-    cell_size: float = 0.2
-    """Edge of a cell of the coarse grid [m]."""
-
-    capacity: Annotated[int, tyro.conf.arg(metavar="ROWS")] = 1 << 17
-    """Rows of the map at the start, a power of two; a map that may grow has 16384 at least."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RepeatOptions:
-    """What makes a run repeatable."""
-
-    TITLE: ClassVar[str] = "repeatability"
+    up: Literal["y", "z"] = "y"
+    """Axis of a recording's world that points up."""
 
     seed: int = 0
-    """All randomness follows from it."""
+    """Random seed."""
 
-    clock: Literal["wall", "model"] = "wall"
-    """`wall`: measured planning and mapping, plus flight. `model`: fixed costs, repeatable."""
+    topics: Annotated[str | None, arg(metavar="NAMES")] = None
+    """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
+    depth_info, frame, world. By default they are found."""
+
+    def __post_init__(self) -> None:
+        """Refuses topics that are not understood."""
+        parse_topics(self.topics)
+
+
+def refuse_others(options: Any, flag: str, source: str, allowed: tuple[str, ...]) -> None:
+    """Refuses options that would be ignored beside another one.
+
+    Args:
+        options: of a command.
+        flag: the option that decides the others.
+        source: where their values come from instead.
+        allowed: options that make sense beside it.
+
+    Raises:
+        ValueError: names the options to leave out.
+    """
+    given = [field.name for field, value in flat(options) if value != field.default]
+    names = ", ".join(f"--{name.replace('_', '-')}" for name in given if name not in allowed)
+    if names:
+        raise ValueError(f"{flag} takes these from the {source}, leave them out: {names}")
+
+
+def check_policy_here(name: str) -> None:
+    """Refuses a policy that is not there; a class may be in the current folder.
+
+    Raises:
+        ValueError: as `check_policy`.
+    """
+    here = str(Path.cwd())
+    if ":" in name and here not in sys.path:
+        sys.path.insert(0, here)
+    check_policy(name)
+
+
+def check_scene(name: str, scale: float) -> None:
+    """Refuses a scene that is not there.
+
+    Raises:
+        ValueError: names the known ones, or the file.
+    """
+    from r3jax.simulators.scenes import names  # imports NumPy, which `--help` can do without
+
+    names.check_scene(name, scale)
+
+
+def check_run(path: Path) -> None:
+    """Refuses what is no folder of a run.
+
+    Raises:
+        ValueError: names the folder.
+    """
+    if not path.is_dir():
+        what = "this is a file; a run is a folder" if path.exists() else "there is no such folder"
+        raise ValueError(f"{path}: {what}")
+    if not (path / "run.json").exists():
+        raise ValueError(f"{path}: this folder is not a run (it has no run.json)")
+
+
+def check_free(folder: Path, overwrite: bool) -> None:
+    """Refuses to begin a run where one is, unless it is to be replaced.
+
+    Raises:
+        ValueError: names the folder.
+    """
+    if (folder / "run.json").exists() and not overwrite:
+        raise ValueError(
+            f"{folder}: the run exists already: choose another name or give --overwrite"
+        )
+
+
+def check_folder(path: Path) -> None:
+    """Refuses a file where a folder is to be written, and what no folder can be called.
+
+    Raises:
+        ValueError: names the path.
+    """
+    if "\0" in str(path):
+        raise ValueError("--out: this cannot be the name of a folder")
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"{path}: this is a file, --out is a folder")
+
+
+def check_model(path: Path, name: str, resolution: int | None) -> None:
+    """Refuses what no model can be trained on or judged by, and what none can be called.
+
+    Raises:
+        ValueError: names the option or the path.
+    """
+    check_folder_name(name)
+    check_resolution(resolution)
+    check_capture(path)

@@ -2,24 +2,28 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
+
+from r3jax.cli.errors import check_folder_name
+from r3jax.cli.options.groups import check_folder, check_run
+from r3jax.formats.errors import check_capture
 
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """List scenes, policies and versions; or show a run or a recording, given its folder."""
+    """List scenes, policies and versions; or show a run or a recording, given its folder.
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = (
-        "r3jax info",
-        "r3jax info runs/demo",
-    )
+    For example
+        r3jax info
+        r3jax info runs/demo
+    """
 
-    path: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")] = None
+    path: Annotated[Path | None, Positional, arg(metavar="FOLDER")] = None
     """A run folder, or a recording (images/, depth/, poses.txt, K.txt)."""
 
-    plot: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None
+    plot: Annotated[Path | None, arg(metavar="PNG")] = None
     """PNG for a recording's renderability, frame by frame."""
 
     up: Literal["y", "z"] = "y"
@@ -28,27 +32,40 @@ class InfoOptions:
     voxel_size: float = 0.05
     """Edge of a voxel when a recording is mapped [m]."""
 
+    def __post_init__(self) -> None:
+        """Refuses a path where nothing is."""
+        if self.path is not None:
+            check_capture(self.path)
+
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Rebuild the map of a run from its recorded frames, and compare it with the stored one."""
+    """Rebuild the map of a run from its recorded frames, and compare it with the stored one.
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax replay runs/demo",)
+    For example
+        r3jax replay runs/demo
+    """
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    path: Annotated[Path, Positional, arg(metavar="RUN")]
     """A run folder."""
+
+    def __post_init__(self) -> None:
+        """Refuses what is no run."""
+        check_run(self.path)
 
 
 @dataclass(frozen=True)
 class MergeOptions:
-    """Merge two runs of one scene: their frames in one data set, and the map that saw both."""
+    """Merge two runs of one scene: their frames in one data set, and the map that saw both.
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax merge runs/first runs/second --out runs/both",)
+    For example
+        r3jax merge runs/first runs/second --out runs/both
+    """
 
-    first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    first: Annotated[Path, Positional, arg(metavar="RUN")]
     """A run folder."""
 
-    second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    second: Annotated[Path, Positional, arg(metavar="RUN")]
     """Another one: the same scene, sensor, voxels and cells."""
 
     out: Path | None = None
@@ -57,37 +74,52 @@ class MergeOptions:
     overwrite: bool = False
     """Replace the run that is there."""
 
+    def __post_init__(self) -> None:
+        """Refuses what are no two runs."""
+        for path in (self.first, self.second):
+            check_run(path)
+        if self.first.samefile(self.second):
+            raise ValueError(
+                f"{self.first}: a run is not merged with itself: give two different runs"
+            )
+
 
 @dataclass(frozen=True)
 class ForecastOptions:
-    """Forecast the PSNR that a model of a run's views would have all over the place."""
+    """Predict the PSNR that a model of a run's views would reach throughout the scene.
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax forecast runs/demo --plot forecast.png",)
+    For example
+        r3jax forecast runs/demo --plot forecast.png
+    """
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    path: Annotated[Path, Positional, arg(metavar="RUN")]
     """A run folder."""
 
-    calibration: Annotated[Path | None, tyro.conf.arg(metavar="JSON")] = None
+    calibration: Annotated[Path | None, arg(metavar="JSON")] = None
     """A calibration of your own (`python -m experiments.forecast`); by default the package's."""
 
-    plot: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None
+    plot: Annotated[Path | None, arg(metavar="PNG")] = None
     """PNG for the forecast along the run."""
+
+    def __post_init__(self) -> None:
+        """Refuses what is no run."""
+        check_run(self.path)
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Export a run for other programs: nerfstudio, COLMAP, or a submission to the benchmark."""
+    """Export a run for other programs: nerfstudio, COLMAP, or a submission to the benchmark.
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = (
-        "r3jax export runs/demo --out kitchen",
-        "r3jax export runs/demo --format colmap --out kitchen-colmap",
-        "r3jax export runs/demo --format submission --out demo.jsonl",
-    )
+    For example
+        r3jax export runs/demo --out kitchen
+        r3jax export runs/demo --format colmap --out kitchen-colmap
+        r3jax export runs/demo --format submission --out demo.jsonl
+    """
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    path: Annotated[Path, Positional, arg(metavar="RUN")]
     """A run folder."""
 
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+    out: Annotated[Path, arg(metavar="FOLDER")]
     """Where to: a folder that does not exist yet; of a submission, a file. It needs the run no
     longer."""
 
@@ -96,20 +128,30 @@ class ExportOptions:
     sparse/0/*.bin in place of transforms.json; `colmap-text`: with *.txt. `submission`: one file of
     poses, some kB, that `r3jax benchmark --submission` judges."""
 
+    def __post_init__(self) -> None:
+        """Refuses what is no run, and to write over anything."""
+        check_run(self.path)
+        if self.format == "submission":
+            if self.out.exists():
+                raise ValueError(f"{self.out}: something is there already: give another file")
+            return
+        check_folder(self.out)
+        if self.out.is_dir() and any(self.out.iterdir()):
+            raise ValueError(f"{self.out}: something is there already: give another folder")
+
 
 @dataclass(frozen=True)
 class ViewOptions:
     """Look at a run in the browser: the map over time, and what a camera that you drag would see.
 
     Or, with --export, write the images without a browser.
+
+    For example
+        r3jax view runs/demo
+        r3jax view runs/demo --export pictures --video
     """
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = (
-        "r3jax view runs/demo",
-        "r3jax view runs/demo --export pictures --video",
-    )
-
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    path: Annotated[Path, Positional, arg(metavar="RUN")]
     """A run folder."""
 
     port: int = 8080
@@ -119,25 +161,35 @@ class ViewOptions:
     """Address to listen at. By default nobody but this machine can see the page; 0.0.0.0 shows it
     to everybody who can reach the machine."""
 
-    allow: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
+    allow: Annotated[tuple[str, ...], arg(metavar="NAME")] = ()
     """Names under which the page may be asked for, and whose web pages may use it, beside this
     machine's own: of a proxy, or of a name server's."""
 
-    name: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    name: Annotated[str | None, arg(metavar="MODEL")] = None
     """Name of the trained model, as given to `r3jax train`; by default `last` or the newest."""
 
     no_scene: bool = False
     """Do not open the scene that the run was recorded in: no true image, no mesh."""
 
-    export: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    export: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Write images of the map and one for every view into a folder that does not exist yet."""
 
     video: bool = False
     """With --export: a film of the run too (MP4)."""
 
+    def __post_init__(self) -> None:
+        """Refuses what is no run, and a film that would not be written."""
+        check_run(self.path)
+        if self.name is not None:
+            check_folder_name(self.name)
+        if self.video and self.export is None:
+            raise ValueError("--video belongs to --export FOLDER")
+
 
 @dataclass(frozen=True)
 class PoliciesOptions:
-    """List who can choose views: every policy in a sentence, and where its rule comes from."""
+    """List the available policies with a sentence and their source.
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = ("r3jax policies",)
+    For example
+        r3jax policies
+    """

@@ -1,19 +1,17 @@
 """The options of the commands that train and judge splats."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
-from r3jax.cli.options.bags import BagOptions
+from r3jax.cli.options.groups import ReadingOptions, check_model
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
     """What is optimized."""
-
-    TITLE: ClassVar[str] = "model"
 
     strategy: Literal["vanilla", "mcmc"] = "vanilla"
     """`vanilla`: clone, split, prune, reset. `mcmc`: relocation and noise within a fixed budget."""
@@ -22,7 +20,7 @@ class ModelOptions:
     """Gaussians at the start, on the recorded surfaces."""
 
     capacity: int | None = None
-    """Gaussians that there may ever be; by default twice those of the start."""
+    """Maximum number of Gaussians; by default twice those of the start."""
 
     background: Literal["black", "white", "random"] = "black"
     """Color behind everything."""
@@ -32,8 +30,6 @@ class ModelOptions:
 class ModelFolderOptions:
     """Where a model is kept."""
 
-    TITLE: ClassVar[str] = "folder"
-
     name: str = "last"
     """Name of the model."""
 
@@ -41,38 +37,23 @@ class ModelFolderOptions:
     """Folder that holds the models; by default RUN/models, for a recording runs/NAME/models."""
 
     overwrite: bool = False
-    """Replace the model of that name if there is one."""
+    """Overwrite an existing model of that name."""
 
     resume: bool = False
-    """Go on from the newest checkpoint of that model; the result is the same as without a break."""
+    """Resume from the newest checkpoint of that model; the result is the same as without a
+    break."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderingOptions(BagOptions):
-    """How splats are rendered, and how a recording is read."""
+class TrainOptions:
+    """Train 3D Gaussian splatting from scratch on a run or a recording.
 
-    TITLE: ClassVar[str] = "machine and recording"
+    For example
+        r3jax train runs/flat-ours-pano-seed0
+        r3jax train runs/flat-ours-pano-seed0 --iterations 30000 --name long
+    """
 
-    backend: Literal["auto", "numba", "xla", "splax"] = "auto"
-    """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
-
-    up: Literal["y", "z"] = "y"
-    """Axis of a recording's world that points up."""
-
-    seed: int = 0
-    """All randomness follows from it."""
-
-
-@dataclass(frozen=True)
-class TrainOptions(ModelFolderOptions, ModelOptions, RenderingOptions):
-    """Train 3D Gaussian splatting from scratch on a run or a recording."""
-
-    EXAMPLES: ClassVar[tuple[str, ...]] = (
-        "r3jax train runs/flat-ours-pano-seed0",
-        "r3jax train runs/flat-ours-pano-seed0 --iterations 30000 --name long",
-    )
-
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    path: Annotated[Path, Positional, arg(metavar="RUN")]
     """A run folder, or a recording (images/, depth/, poses.txt, K.txt)."""
 
     iterations: int = 7000
@@ -87,12 +68,20 @@ class TrainOptions(ModelFolderOptions, ModelOptions, RenderingOptions):
     views_per_step: int = 1
     """Views whose losses are averaged for one step."""
 
+    folder: ModelFolderOptions = field(default_factory=ModelFolderOptions)
+    model: ModelOptions = field(default_factory=ModelOptions)
+    reading: Annotated[ReadingOptions, arg(name="machine and recording")] = field(
+        default_factory=ReadingOptions
+    )
+
+    def __post_init__(self) -> None:
+        """Refuses what no model can be trained on, and what none can be called."""
+        check_model(self.path, self.folder.name, self.resolution)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions:
     """What is written."""
-
-    TITLE: ClassVar[str] = "results"
 
     out: Path | None = None
     """Folder for the results; by default RUN/report, for a recording the model's folder."""
@@ -106,27 +95,32 @@ class ResultOptions:
     no_renderability: bool = False
     """Do not map the training views to set the map's expectation beside the result."""
 
+    def __post_init__(self) -> None:
+        """Refuses fewer views than none."""
+        if self.worst < 0:
+            raise ValueError(f"--worst must not be negative, got {self.worst}")
 
-@dataclass(frozen=True)
-class EvaluateOptions(ResultOptions, RenderingOptions):
-    """Judge a model by test views: PSNR, SSIM, LPIPS, their tails, and the worst views."""
 
-    EXAMPLES: ClassVar[tuple[str, ...]] = (
-        "r3jax evaluate runs/flat-ours-pano-seed0",
-        "r3jax evaluate runs/flat-ours-pano-seed0 --views runs/flat-random-seed0",
-    )
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Evaluate a model on test views: PSNR, SSIM and LPIPS, their tails, and the worst views.
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    For example
+        r3jax evaluate runs/flat-ours-pano-seed0
+        r3jax evaluate runs/flat-ours-pano-seed0 --views runs/flat-random-seed0
+    """
+
+    path: Annotated[Path, Positional, arg(metavar="RUN")]
     """The run or the recording that the model was trained on."""
 
-    views: Annotated[str, tyro.conf.arg(metavar="SPEC")] = "heldout"
+    views: Annotated[str, arg(metavar="SPEC")] = "heldout"
     """Test views: `heldout` (those that the training left out), `all`, `every:N` (views 0, N, 2N,
     ...), or the folder of another run or recording of the same place."""
 
     name: str = "last"
     """Name of the model, as given to `r3jax train`."""
 
-    model: Annotated[Path | None, tyro.conf.arg(metavar="PLY")] = None
+    model: Annotated[Path | None, arg(metavar="PLY")] = None
     """The model's file, if it lies elsewhere."""
 
     lpips: Literal["alex", "vgg", "none"] = "alex"
@@ -134,3 +128,12 @@ class EvaluateOptions(ResultOptions, RenderingOptions):
 
     resolution: int | None = None
     """Longer side of the images [px]; by default that of the training."""
+
+    results: ResultOptions = field(default_factory=ResultOptions)
+    reading: Annotated[ReadingOptions, arg(name="machine and recording")] = field(
+        default_factory=ReadingOptions
+    )
+
+    def __post_init__(self) -> None:
+        """Refuses what no model can be judged by, and what none can be called."""
+        check_model(self.path, self.name, self.resolution)

@@ -18,8 +18,9 @@ from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
 from r3jax.apps.audit.ground_plan import _value_picture
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
 from r3jax.apps.audit.sentences import CONTRADICTED, directions, method, verdict
+from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import Source, source_of
-from r3jax.apps.audit.survey import MARGIN, AuditSettings, survey_of
+from r3jax.apps.audit.survey import MARGIN, survey_of
 from r3jax.apps.audit.vertical import Vertical
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.errors import FormatError
@@ -40,9 +41,9 @@ from tests.apps.audit.room import (
 pytestmark = pytest.mark.full
 
 VOXEL = 0.15
-SETTINGS = AuditSettings(voxel_size=VOXEL, num_views=3, folds=4, num_places=16, num_standpoints=8)
-FEW_VIEWS = dataclasses.replace(SETTINGS, voxel_size=None, num_views=2)
-NO_VIEWS = dataclasses.replace(SETTINGS, num_views=0)
+SETTINGS = AuditSettings(voxel_size=VOXEL, views=3, folds=4, num_places=16, num_standpoints=8)
+FEW_VIEWS = dataclasses.replace(SETTINGS, voxel_size=None, views=2)
+NO_VIEWS = dataclasses.replace(SETTINGS, views=0)
 
 
 def corner_poses() -> np.ndarray:
@@ -79,7 +80,7 @@ def cloud(folder) -> Audit:
 def test_an_audit_in_coordinates_of_utm_says_so_and_comes_back_in_them(folder, tmp_path):
     far = np.array([500_000.0, 4_600_000.0, 100.0])
     recording = read_recording(write_far_recording(folder / "far", corner_poses(), far), "z")
-    found = audit(source_of(recording, "far"), dataclasses.replace(SETTINGS, num_views=1))
+    found = audit(source_of(recording, "far"), dataclasses.replace(SETTINGS, views=1))
     assert "was subtracted" in " ".join(method(found))
     written = write_outputs(found, tmp_path, tmp_path / "capture")
     points, _ = read_points(written["causes"])
@@ -255,7 +256,7 @@ def test_tracks_of_a_model_are_as_good_as_a_cloud(folder, cloud):
     images = read_colmap(write_colmap(folder / "model", round_poses()))
     source = source_of(images, "model")
     assert (source.kind, source.is_metric, source.has_images) == ("tracks", False, True)
-    found = audit(source, dataclasses.replace(FEW_VIEWS, num_views=0))
+    found = audit(source, dataclasses.replace(FEW_VIEWS, views=0))
     np.testing.assert_allclose(found.renderability, cloud.renderability, atol=0.15)
     assert found.diagnosis.fine_share > 0.3
 
@@ -310,7 +311,7 @@ def test_a_model_without_images_is_audited_by_its_points(folder):
         image.unlink()
     source = source_of(read_colmap(path), "bare")
     assert not source.has_images
-    found = audit(source, dataclasses.replace(FEW_VIEWS, num_views=0))
+    found = audit(source, dataclasses.replace(FEW_VIEWS, views=0))
     assert found.diagnosis.share("noise") == 0.0
     assert "nothing can be said about noise" in method(found)[-1]
     assert verdict(found)[0].startswith("None of the 8 pictures is there")
@@ -465,8 +466,8 @@ def test_meters_read_as_millimeters_are_refused_with_the_factor():
         ({"max_range": float("nan")}, "--max-range must be positive"),
         ({"max_range": 5000.0}, "--max-range 5000 is far beyond what the pictures show"),
         ({"voxel_size": 5.0}, "larger than a fifth of the range"),
-        ({"num_views": -1}, "--views must be at least 0"),
-        ({"num_views": 10**9}, "--views must be at most"),
+        ({"views": -1}, "--views must be at least 0"),
+        ({"views": 10**9}, "--views must be at most"),
         ({"folds": 1}, "--folds must be at least 2"),
         ({"max_frames": 0}, "--max-frames must be at least 2"),
         ({"seed": -1}, "--seed must be at least 0"),

@@ -10,8 +10,9 @@ import pytest
 
 from r3jax.apps.audit import capture_maps as real
 from r3jax.apps.audit.capture_maps import Seen, see
+from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import Source, source_of
-from r3jax.apps.audit.survey import RANGE, AuditSettings, Survey, survey_of
+from r3jax.apps.audit.survey import RANGE, Survey, survey_of
 from r3jax.formats.recordings import read_recording
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate

@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import source_of
-from r3jax.apps.audit.survey import AuditSettings, strays, survey_of
+from r3jax.apps.audit.survey import strays, survey_of
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.nerfstudio import read_transforms
 from tests.apps.audit.room import round_poses, write_colmap, write_nerfstudio

@@ -8,8 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from r3jax.apps.audit.agreement import DepthImage, check_agreement
+from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import ray_lengths, source_of
-from r3jax.apps.audit.survey import AuditSettings, survey_of
+from r3jax.apps.audit.survey import survey_of
 from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import Camera
 from tests.apps.audit.room import (
