@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from experiments.seen_pixels import recorded, seen_pixels
-from r3jax.apps.benchmark.conditions import Conditions, snapshot_slug
+from r3jax.apps.benchmark.cells import Conditions, snapshot_slug
 from r3jax.apps.benchmark.reference_images import (
     ReferenceImages,
     read_reference_images,

@@ -20,8 +20,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, Literal
 
-from r3jax.apps.benchmark.cells import Cell
-from r3jax.apps.benchmark.conditions import OWN_OF_LOOP, OWN_OF_TRAINER, Conditions
+from r3jax.apps.benchmark.cells import OWN_OF_LOOP, OWN_OF_TRAINER, Cell, Conditions
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.planning.policies.ahead.lookahead import AheadConfig
 from r3jax.scoring.config import ScoringConfig

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from experiments.pages.artifacts import Origin, joint_origin
-from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of, snapshots_left
 from r3jax.apps.benchmark.engines.local import Event, run_in_processes
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan

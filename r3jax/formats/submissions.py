@@ -1,11 +1,11 @@
-"""Submissions: an exploration as its poses, a JSON line each, from which all else is made again.
+"""Submissions: an exploration as its poses, a JSON line each; all else is computed from these.
 
     {"format": "r3jax-submission", "version": 1, "protocol": 1, "scene": {...}, "seed": 0, ...}
     {"frame": 0, "pose": [[...], [...], [...], [...]], "seconds": 0.02}
     {"frame": 1, "pose": [[...], [...], [...], [...]], "seconds": 1.7}
 
-The first line says on what terms the views were taken, each other line is a frame. Whoever can
-write such a file, in whatever language, can be judged by `r3jax benchmark --submission FILE`.
+The first line says on what terms the views were taken, each other line is a frame. Any program
+that writes such a file can be judged by `r3jax benchmark --submission FILE`.
 
 Shape symbols: K waypoints.
 """
@@ -35,8 +35,9 @@ from r3jax.runs.replay import check_decided_alone
 from r3jax.runs.rows import paths_to, rigid_pose, shortest_floats, table_of
 from r3jax.runs.settings import config_of
 from r3jax.validation.errors import ForeignFileError, check_version
+from r3jax.validation.fields import build
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import build, check_type, parse_json
+from r3jax.validation.json_text import check_fields, parse_json
 
 FORMAT = "r3jax-submission"
 """What the first line says it is."""
@@ -51,19 +52,24 @@ _MAX_BYTES = 64 << 20
 """A frame takes some hundred bytes."""
 
 MAX_FRAMES = 20_000
-"""Of a submission; the protocol's budgets end at 300 views, and at ten frames a second on the way
+"""Of a submission; the protocol's budgets end at 300 views, and at ten frames a second while moving
 this is half an hour."""
 
 MAX_WAYPOINTS = 100_000
 """Of all paths of a submission."""
 
-_LENS = ("fx", "fy", "cx", "cy")
+_SCENE: dict[str, Any] = {
+    "name": str, "hash": str, "up": str | None, "scale": float, "cull_backfaces": bool,
+    "noise": float, "max_range": float,
+}  # fmt: skip
+"""How a scene is opened: its name and hash, and what a run's header has of it."""
+
+_CAMERA: dict[str, Any] = {"width": int, "height": int} | dict.fromkeys(
+    ("fx", "fy", "cx", "cy"), float
+)
 
 _LARGEST = {"capacity": 1 << 22, "num_bins": 1024, "num_probes": 1024}
 """Settings of the loop that a stranger's file could fill the memory with."""
-
-_SENSOR = ("up", "scale", "cull_backfaces", "noise", "max_range")
-"""How a scene is opened, beside its name and hash."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +95,10 @@ class SubmittedFrame:
     """Waypoints from the frame before to this one, [K, 3] float32 [m]; None: a straight line."""
 
     captured: bool = False
-    """True if the frame was captured on the way to a view, and not chosen itself."""
+    """True if the frame was captured while moving to a view, and not chosen itself."""
 
     sha256: str | None = None
-    """Hash of the stored pixels (`exploration.taken_views.content_hash`); None: nobody knows."""
+    """Hash of the stored pixels (`exploration.taken_views.content_hash`); None: unknown."""
 
     @property
     def position(self) -> np.ndarray:
@@ -118,7 +124,7 @@ class Submission:
     """`width`, `height`, `fx`, `fy`, `cx`, `cy` [px]."""
 
     policy: dict[str, Any]
-    """`name`, `version`, and what else its author wants to tell."""
+    """`name`, `version`, and further fields of its author."""
 
     frames: tuple[SubmittedFrame, ...]
     """In the order in which they were taken."""
@@ -127,7 +133,7 @@ class Submission:
     """Settings of the loop that differ from those of `ExplorationConfig`: clock, speed, ..."""
 
     motion: dict[str, Any] | None = None
-    """What carries the camera, as in `Motion`; None: a camera that flies."""
+    """How the camera moves, as in `Motion`; None: a camera that flies."""
 
     outcome: str = "budget"
     """Why the exploration ended: `exploration.state.StopReason`."""
@@ -146,7 +152,7 @@ class Submission:
 
     @property
     def robot(self) -> Motion:
-        """What carries the camera.
+        """How the camera moves.
 
         Raises:
             ValueError: a setting that cannot work.
@@ -199,10 +205,10 @@ def submission_of_run(run: Run) -> Submission:
     # Of the record itself: the policy may be of a package that is not installed here.
     motion = header.policy.get("settings", {}).get("motion")
     opened: dict[str, Any] = {"up": None, "scale": 1.0, "cull_backfaces": False} | header.scene
-    if missing := [name for name in ("name", "hash", *_SENSOR) if opened.get(name, ...) is ...]:
+    if missing := [name for name in _SCENE if name not in opened]:
         raise RunError(run.path, f"an early version recorded it without {', '.join(missing)}")
     return Submission(
-        scene={name: opened[name] for name in ("name", "hash", *_SENSOR)},
+        scene={name: opened[name] for name in _SCENE},
         seed=header.seed,
         budget=header.budget,
         camera=dict(header.camera),
@@ -251,10 +257,8 @@ def write_submission(path: Path, submission: Submission) -> None:
 
 def submission_text(submission: Submission) -> str:
     """The lines of the file."""
-    first = {"format": FORMAT, "version": VERSION, "protocol": PROTOCOL}
-    for item in dataclasses.fields(Submission):
-        if item.name != "frames":
-            first[item.name] = getattr(submission, item.name)
+    first = {"format": FORMAT, "version": VERSION, "protocol": PROTOCOL} | vars(submission)
+    del first["frames"]
     lines = [first, *(_plain(frame) for frame in submission.frames)]
     return "".join(
         json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n" for line in lines
@@ -294,44 +298,30 @@ def parse_submission(data: bytes) -> Submission:
         ForeignFileError: as `read_submission` says.
     """
     text = data.removeprefix(codecs.BOM_UTF8).rstrip()
-    if not text:
-        raise ForeignFileError("the file is empty: its first line should say what it is")
     if (num := text.count(b"\n")) > MAX_FRAMES:
         raise ForeignFileError(
             f"it has {num:,} frames, a submission may have {MAX_FRAMES:,}: submit a shorter run"
         )
-    lines, waypoints = text.split(b"\n"), 0
+    waypoints, header = 0, dict[str, Any]()
     frames: list[SubmittedFrame] = []
-    header: dict[str, Any] = {}
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text.split(b"\n"), start=1):
         try:
-            plain = _object_of(line, is_end=number == len(lines) and not data.endswith(b"\n"))
             if number == 1:
-                header = _header_of(plain)
-            else:
-                frames.append(_frame_of(plain, len(frames)))
-                path = frames[-1].path
-                waypoints += 0 if path is None else len(path)
-                if waypoints > MAX_WAYPOINTS:
-                    raise ForeignFileError(
-                        f"with it the paths have {waypoints:,} waypoints, {MAX_WAYPOINTS:,} are "
-                        "allowed: leave out those on straight lines"
-                    )
+                header = _header_of(parse_json(line))
+                continue
+            frames.append(_frame_of(parse_json(line), len(frames)))
+            path = frames[-1].path
+            waypoints += 0 if path is None else len(path)
+            if waypoints > MAX_WAYPOINTS:
+                raise ForeignFileError(
+                    f"with it the paths have {waypoints:,} waypoints, {MAX_WAYPOINTS:,} are "
+                    "allowed: leave out those on straight lines"
+                )
         except ForeignFileError as error:
             raise ForeignFileError(f"line {number}: {error}") from None
     if not frames:
         raise ForeignFileError("there are no frames: each takes a line after the first one")
     return build(Submission, header, frames=tuple(frames))
-
-
-def _object_of(line: bytes, *, is_end: bool) -> Any:
-    """What a line holds; `is_end`: no line feed follows."""
-    text = line.strip()
-    if not text:
-        raise ForeignFileError("the line is empty")
-    if is_end and text.startswith(b"{") and not text.endswith(b"}"):
-        raise ForeignFileError("the file is cut off: its last line is not whole")
-    return parse_json(line)
 
 
 def _header_of(plain: Any) -> dict[str, Any]:
@@ -353,19 +343,17 @@ def _header_of(plain: Any) -> dict[str, Any]:
 
 def _check_parts(header: Submission) -> None:
     """Refuses what the types of the fields alone do not tell."""
-    kinds: dict[str, Any] = {"name": str, "hash": str, "noise": float, "max_range": float}
-    kinds |= {"up": str | None, "scale": float, "cull_backfaces": bool}
-    for name, kind in kinds.items():
-        check_type(f"scene.{name}", header.scene.get(name), kind)
-    sizes, lens = dict.fromkeys(("width", "height"), int), dict.fromkeys(_LENS, float)
-    for name, kind in (sizes | lens).items():
-        check_type(f"camera.{name}", header.camera.get(name), kind)
-    for name in ("name", "version"):
-        check_type(f"policy.{name}", header.policy.get(name), str)
+    check_fields("scene", header.scene, _SCENE)
+    check_fields("camera", header.camera, _CAMERA)
+    check_fields("policy", header.policy, {"name": str, "version": str})
     if header.outcome not in COMPLETE:
         raise ForeignFileError(f"`outcome` must be one of {', '.join(sorted(COMPLETE))}")
-    _check_settings("exploration", header.exploration, ExplorationConfig)
-    _check_settings("motion", header.motion or {}, Motion)
+    settings = {"exploration": (header.exploration, ExplorationConfig)}
+    for name, (plain, kind) in (settings | {"motion": (header.motion or {}, Motion)}).items():
+        hints = get_type_hints(kind)
+        if unknown := sorted(plain.keys() - hints.keys()):
+            raise ForeignFileError(f"`{name}` has an unknown {unknown[0]!r:.80}")
+        check_fields(name, plain, {field: hints[field] for field in plain})
     for name, largest in _LARGEST.items():
         if header.exploration.get(name, 0) > largest:
             raise ForeignFileError(f"`exploration.{name}` is more than {largest}")
@@ -373,15 +361,6 @@ def _check_parts(header: Submission) -> None:
         _ = header.config, header.robot, header.intrinsics
     except ValueError as error:
         raise ForeignFileError(str(error)) from None
-
-
-def _check_settings(name: str, plain: dict[str, Any], kind: type) -> None:
-    """Refuses settings of other types than those of the fields of `kind`, and unknown ones."""
-    hints = get_type_hints(kind)
-    for field_name, value in plain.items():
-        if field_name not in hints:
-            raise ForeignFileError(f"`{name}` has an unknown {field_name!r:.80}")
-        check_type(f"{name}.{field_name}", value, hints[field_name])
 
 
 def _frame_of(plain: Any, number: int) -> SubmittedFrame:
@@ -393,9 +372,7 @@ def _frame_of(plain: Any, number: int) -> SubmittedFrame:
     if known.get("path") is not None:
         ready["path"] = table_of("path", known["path"], (-1, 3))
     frame = build(SubmittedFrame, plain, **ready)
-    if frame.frame < number:
-        raise ForeignFileError(f"frame {frame.frame} occurs twice: number the frames 0, 1, 2, ...")
-    if frame.frame > number:
+    if frame.frame != number:
         raise ForeignFileError(f"frame {frame.frame} comes where frame {number} should be")
     if frame.path is not None and len(frame.path) < 2:
         raise ForeignFileError("`path` needs two waypoints: where it begins, and where it ends")

@@ -11,8 +11,8 @@ from r3jax.cli.main import main
 from r3jax.cli.options.explore import ExploreOptions, MotionOptions
 from r3jax.cli.parsing import whole_number
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.trace.writer import RunWriter
-from tests.trace.runs import make_header
+from r3jax.runs.writer import RunWriter
+from tests.runs.runs import make_header
 
 REFUSED = {
     "explore --scene apartement": "apartment",

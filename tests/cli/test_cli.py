@@ -13,14 +13,14 @@ from r3jax.cli.command_line import COMMANDS
 from r3jax.cli.main import main
 from r3jax.cli.options.benchmark import PhotoOptions, SubmissionOptions
 from r3jax.cli.parsing import parse
-from r3jax.exploration.budget import parse_budget
+from r3jax.exploration.config import parse_budget
+from r3jax.runs.reader import read_run
+from r3jax.runs.writer import RunWriter
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from r3jax.trace.reader import read_run
-from r3jax.trace.writer import RunWriter
 from tests.box_room import write_room
 from tests.cli.small_runs import explore, main_without_report
+from tests.runs.runs import make_header, make_view
 from tests.tiers import quick_and_full
-from tests.trace.runs import make_header, make_view
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ from experiments import captures, flights
 from experiments.captures import TABLES, Options, Row, as_line, quality_rows, rows_of, run_in_turn
 from experiments.pages.artifacts import Origin
 from experiments.suite import request_of
-from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of, snapshots_left
 from r3jax.apps.benchmark.record import read_lines, write_record
 from r3jax.planning.registry import make_policy
 from tests.evaluation.records import record as benchmark_record

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from experiments import flights
-from r3jax.apps.benchmark.cells import Cell, paths_of
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of
 from r3jax.formats.submissions import read_submission
 from tests.formats.test_submissions import make_submission
 

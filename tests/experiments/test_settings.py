@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.settings import find_setting, known_settings, with_settings
-from r3jax.apps.benchmark.cells import Cell, paths_of
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of
 from r3jax.apps.benchmark.record import read_records
 from r3jax.apps.benchmark.run_cell import run_cell
 from r3jax.exploration.clock import compilations

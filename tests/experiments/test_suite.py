@@ -11,8 +11,7 @@ from PIL import Image
 from experiments import degeneracy, quality_over_budget, replica_dense
 from experiments.pages.artifacts import Origin
 from experiments.suite import HOUSE, Options, request_of, take_over
-from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of, snapshots_left
 from r3jax.apps.benchmark.record import read_lines, read_records, write_record, write_records
 from r3jax.planning.registry import policy_names
 from r3jax.runs.writer import RunWriter

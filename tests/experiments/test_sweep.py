@@ -14,7 +14,7 @@ from experiments.pages.sweep_page import Sweep, setting_figure, write_page
 from experiments.settings import known_settings
 from experiments.sweep import Options
 from experiments.sweep_choice import Trial, choose, leave_one_out
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Conditions
 from r3jax.apps.benchmark.engines.local import run_here
 from r3jax.apps.benchmark.plan import Request
 from r3jax.evaluation.statistics import mean_over_scenes, paired_difference

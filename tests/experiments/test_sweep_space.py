@@ -14,7 +14,7 @@ from experiments.sweep_space import (
     random_points,
     with_default,
 )
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Conditions
 
 KNOWN = known_settings(Conditions())
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.apps.audit.camera_paths import is_camera_path, read_camera_path
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Conditions
 from r3jax.apps.benchmark.record import read_records
 from r3jax.apps.benchmark.reference_images import (
     ReferenceImages,

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.apps.benchmark.cells import Cell, snapshots_left, sources_of
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions, snapshots_left, sources_of
 from r3jax.apps.benchmark.reference_images import (
     FOLDER,
     ReferenceImages,

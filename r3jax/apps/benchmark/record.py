@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from r3jax.apps.benchmark.cells import Cell, paths_of
-from r3jax.apps.benchmark.conditions import snapshot_order
+from r3jax.apps.benchmark.cells import Cell, paths_of, snapshot_order
 from r3jax.evaluation.scores import METRICS, ViewRow, summarize
 from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic

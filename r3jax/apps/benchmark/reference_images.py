@@ -15,8 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.apps.benchmark.cells import Cell
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions
 from r3jax.files import make_folder, write_atomic
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.splatting.views import Views

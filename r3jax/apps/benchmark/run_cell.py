@@ -28,8 +28,7 @@ from r3jax.apps.benchmark.cells import (
 )
 from r3jax.apps.benchmark.record import make_record, write_record
 from r3jax.apps.benchmark.reference_images import ReferenceImages, load_reference_images
-from r3jax.apps.benchmark.retake import retake
-from r3jax.apps.benchmark.submitted import load_submission
+from r3jax.apps.benchmark.submitted import load_submission, retake
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.evaluation.maps import map_of

@@ -1,31 +1,58 @@
-"""Submissions as cells of a benchmark: explored on their own terms, trained like all others."""
+"""Submissions as cells of a benchmark: checked, rendered again, then trained like all others."""
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r3jax.apps.benchmark.cells import Cell
-from r3jax.apps.benchmark.conditions import OWN_OF_LOOP, Conditions
+import numpy as np
+
+from r3jax.apps.benchmark.cells import OWN_OF_LOOP, Cell, Conditions
 from r3jax.apps.benchmark.plan import Request, prepare_scene
-from r3jax.apps.benchmark.submission_checks import Problem, check_submission
+from r3jax.exploration.clock import model_clock
+from r3jax.exploration.config import ExplorationConfig, as_written, parse_budget
+from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.guard import check_world
+from r3jax.exploration.taken_views import Choice, StepRow, frame_hash, stored_form
 from r3jax.files import make_folder
 from r3jax.formats.submissions import (
     Submission,
+    SubmittedFrame,
     content_hash,
     read_submission,
     write_submission,
 )
-from r3jax.geometry.cameras import Camera
+from r3jax.geometry.cameras import Camera, angle_between
+from r3jax.mapping.state import empty_map
+from r3jax.planning.planner import add_frame, first_grid
+from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import MOTIONS
-from r3jax.runs.header import camera_fields
+from r3jax.runs.header import RunHeader, camera_fields
+from r3jax.runs.stored_states import map_tables
+from r3jax.runs.writer import RunWriter
 from r3jax.simulators.base import Simulator
-from r3jax.simulators.scenes.registry import open_scene
+from r3jax.simulators.free_space import GroundTruth
+from r3jax.simulators.scenes.registry import open_scene, scene_hash
 
 FOLDER = "submissions"
 """Folder of a benchmark for the submissions that it judges."""
+
+CLEARANCE = 0.15
+"""Least distance of the camera's path to every surface [m]. Paths of policies keep a cell of 0.2 m
+between them and what is not known to be free; a surface may reach 0.05 m into a cell before a hit
+marks it. Glass that the depth sensor does not see is left out, as no policy can know of it."""
+
+_MAX_LENGTH = 20_000.0
+"""Of all paths together [m]; eleven hours of flight at the speed of the protocol."""
+
+_SAME_PLACE = 2e-3
+"""Places this close are one [m]."""
+
+_SAME_ANGLE = 0.1
+"""Angles this close are one [deg]."""
 
 
 def open_submitted(submission: Submission) -> Simulator:
@@ -48,11 +75,29 @@ def open_submitted(submission: Submission) -> Simulator:
     )
 
 
+@dataclass(frozen=True)
+class Problem:
+    """A rule that a submission breaks."""
+
+    frame: int | None
+    """Number of the frame; None: of the terms, in the first line."""
+
+    text: str
+    """What is wrong, and what to do."""
+
+    def __str__(self) -> str:
+        """Says where, then what."""
+        where = "line 1" if self.frame is None else f"line {self.frame + 2}, frame {self.frame}"
+        return f"{where}: {self.text}"
+
+
 def problems_of(submission: Submission) -> list[Problem]:
     """Lists what keeps a submission from being judged: rules of the protocol that it breaks."""
     try:
-        _check_terms(submission)
-        _ = conditions_of(submission, Conditions(train_resolution=16))
+        if len(submission.frames) < 2:
+            raise ValueError("a model is trained on two frames at least, and there is one")
+        submission.config.check_scales()
+        _ = conditions_of(submission, Conditions(train_resolution=16)).train_config(submission.seed)
         simulator = open_submitted(submission)
         check_world(simulator.bounds, submission.config.cell_size, "`exploration.cell_size`")
         return check_submission(submission, simulator)
@@ -60,17 +105,143 @@ def problems_of(submission: Submission) -> list[Problem]:
         return [Problem(None, str(error))]
 
 
-def _check_terms(submission: Submission) -> None:
-    """Refuses what no map or training could be made of.
+def check_submission(submission: Submission, simulator: Simulator) -> list[Problem]:
+    """Lists the rules that a submission breaks, in the order of its lines.
+
+    They are the rules that bound what a camera can do from outside: the scene is the same one, the
+    path begins at its start and stays clear of every surface, the clock leaves time for it, frames
+    captured while moving are no more than the loop takes, and all arrive within the budget. How a
+    policy came to its views is its own affair.
+
+    Args:
+        submission: as it was read.
+        simulator: its scene, opened as it says.
 
     Raises:
-        ValueError: names the field.
+        ValueError: the simulator has no mesh to check paths against; a budget, or a start, that
+            cannot be.
     """
-    if not 0 <= submission.seed < 1 << 31:
-        raise ValueError(f"`seed` must lie between 0 and 2^31 - 1, got {submission.seed}")
-    if len(submission.frames) < 2:
-        raise ValueError("a model is trained on two frames at least, and there is one")
-    submission.config.check_scales()
+    found = scene_hash(simulator)
+    if found != submission.scene["hash"]:
+        told = (
+            f"the scene {submission.scene['name']} has the hash {found[:12]} here, "
+            f"{submission.scene['hash'][:12]} in the submission: use the file of the scene, and "
+            "the r3jax, that the views were chosen with"
+        )
+        return [Problem(None, told)]
+    paths, budget = submission.paths(), parse_budget(submission.budget)
+    lengths = [float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in paths]
+    if not sum(lengths) <= _MAX_LENGTH:
+        told = f"its paths are {sum(lengths):.3g} m long, more than {_MAX_LENGTH:g} m"
+        return [Problem(None, f"{told}: are the positions in meters? Submit a shorter run")]
+    problems = [*_check_start(submission, simulator), *check_captures(submission, lengths)]
+    # All paths at once: one by one, ten thousand frames would take a minute.
+    rooms = GroundTruth(simulator).room_along(paths, CLEARANCE)
+    before, metres, views = submission.frames[0], 0.0, 0
+    for frame, path, length, room, place in zip(
+        submission.frames, paths, lengths, *rooms, strict=True
+    ):
+        if room < CLEARANCE:
+            what = "runs through a surface" if room == 0.0 else f"comes within {room:.3f} m of one"
+            told = f"its path {what} at {place.round(3).tolist()}: keep {CLEARANCE} m"
+            problems.append(Problem(frame.frame, told))
+        ends = np.stack([before.position, frame.position])
+        apart = float(np.linalg.norm(path[[0, -1]] - ends, axis=1).max())
+        if apart > _SAME_PLACE:
+            told = f"its path ends {apart:.3f} m from a view: begin at the one before, end at it"
+            problems.append(Problem(frame.frame, told))
+        flown = metres + length if frame.metres is None else frame.metres
+        problems += [
+            Problem(frame.frame, text)
+            for text in check_times(submission, before, frame, flown - metres, length)
+        ]
+        # A frame captured while moving belongs to the view that it was captured before.
+        arrival = frame.seconds - frame.mapping
+        spent = {"views": views + 1, "frames": frame.frame + 1, "seconds": arrival, "metres": flown}
+        if not budget.allows(**spent):  # pyright: ignore[reportArgumentType]
+            told = f"it takes {spent[budget.unit]:g} {budget.unit}, beyond the budget {budget}"
+            problems.append(Problem(frame.frame, as_written(f"{told}: end before it")))
+        before, metres, views = frame, flown, views + (not frame.captured)
+    return sorted(problems, key=lambda problem: problem.frame or 0)
+
+
+def _check_start(submission: Submission, simulator: Simulator) -> Iterator[Problem]:
+    """The first frame is taken at the scene's start, at no cost."""
+    first, start = submission.frames[0], begin_at(submission.robot, simulator.start_pose)
+    apart = float(np.linalg.norm(first.position - start[:3, 3]))
+    turned = math.degrees(angle_between(first.pose.astype(np.float64), start))
+    if apart > _SAME_PLACE or turned > _SAME_ANGLE:
+        told = f"it lies {apart:.3f} m and {turned:.2f} degrees from the scene's start"
+        where = start[:3, 3].round(4).tolist()
+        yield Problem(0, f"{told} with the seed {submission.seed}, {where}: begin there")
+    if first.captured or first.metres:
+        yield Problem(0, "the path begins here: leave out `captured`, and `metres`")
+
+
+def check_captures(submission: Submission, lengths: Sequence[float]) -> Iterator[Problem]:
+    """Before a view there are no more frames captured while moving than the loop takes.
+
+    The loop cuts a path into the fewest equal pieces that are not too long, and captures a frame
+    between two of them: for n frames the whole path is longer than n of the longest pieces, and
+    the way up to the last of them longer than n / (n + 1) of that.
+    """
+    config, frames = submission.config, submission.frames
+    longest = config.piece_at(submission.robot.speed or config.speed)
+    for is_captured, group in itertools.groupby(frames, key=lambda frame: frame.captured):
+        captured = [frame.frame for frame in group]
+        num, after = len(captured), captured[-1] + 1
+        if not is_captured:
+            continue
+        if not config.captures:
+            told = "`exploration` in line 1 has neither `capture_every` nor `capture_rate`"
+            yield Problem(captured[0], f"it is captured while moving, but {told}")
+            return
+        is_whole = after < len(frames)
+        length = sum(lengths[captured[0] : after + is_whole])
+        least = num * longest if is_whole else num * longest * num / (num + 1)
+        if length < _less(least):
+            told = f"{num} frames are captured on {length:.3f} m, they take {least:.3f} m"
+            yield Problem(captured[0], f"{told}: capture fewer")
+
+
+def check_times(
+    submission: Submission,
+    before: SubmittedFrame,
+    frame: SubmittedFrame,
+    flown: float,
+    length: float,
+) -> Iterator[str]:
+    """The clock leaves time for deciding, flying and mapping."""
+    config, motion = submission.config, submission.robot
+    costs = model_clock(config).costs if config.clock == "model" else {}
+    if frame.mapping < _less(costs.get("mapping", 0.0)):
+        yield f"`mapping` is {frame.mapping:g} s, it takes {costs.get('mapping', 0.0):g} s or more"
+    if flown < _less(length):
+        yield f"`metres` grows by {flown:.4f}, the path has {length:.4f} m: count all of it"
+    if frame.frame == 0:
+        if frame.seconds < _less(frame.mapping):
+            yield f"`seconds` is {frame.seconds:g}, less than its mapping: the clock begins at 0"
+        return
+    speed, rate = motion.speed or config.speed, motion.turn_rate
+    angle = angle_between(before.pose.astype(np.float64), frame.pose.astype(np.float64))
+    turning = 0.0 if rate is None else math.degrees(angle) / rate
+    flight = max(flown, length) / speed
+    # Between captured frames the camera turns while it flies; to a view it flies first.
+    is_whole = not (frame.captured or before.captured)
+    needed = flight + turning if is_whole else max(flight, turning)
+    if not before.captured:  # what follows a captured frame was decided before it
+        needed += costs.get("reconsidering" if config.plan_while_moving else "planning", 0.0)
+    taken = frame.seconds - frame.mapping - before.seconds
+    if taken < _less(needed):
+        yield (
+            f"it arrives {taken:.4f} s after the frame before; deciding, {length:.3f} m at "
+            f"{speed:g} m/s and the turn take {needed:.4f} s: count all of them"
+        )
+
+
+def _less(value: float) -> float:
+    """A length [m] or a time [s] with what rounding may take from it."""
+    return value * (1.0 - 1e-4) - 1e-4
 
 
 def conditions_of(
@@ -196,3 +367,94 @@ def load_submission(root: Path, digest: str) -> Submission:
     if content_hash(submission) != digest:
         raise ValueError(f"{path} is not what was planned: start the benchmark again")
     return submission
+
+
+def retake(
+    submission: Submission,
+    simulator: Simulator,
+    config: ExplorationConfig,
+    header: RunHeader,
+    path: Path,
+    on_frame: Callable[[int], None] = lambda frame: None,
+) -> None:
+    """Renders and maps the frames of a submission, and records them as a run.
+
+    The noise of the sensor follows from the seed and the pose: the frames are those that the
+    exploration saw, bit for bit, where the simulator computes as it did there.
+
+    Args:
+        submission: checked (`check_submission`).
+        simulator: its scene, opened as it says.
+        config: how frames join the map, and what is measured.
+        header: of the run.
+        path: its folder; a run that is there is replaced.
+        on_frame: called with the number of every frame that is recorded.
+
+    Raises:
+        RunError: the folder holds something else, or cannot be written.
+    """
+    pose = begin_at(submission.robot, simulator.start_pose)
+    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
+    grid = first_grid(np.asarray(simulator.bounds, np.float64), [pose], config)
+    radians = metres = seconds = 0.0
+    with RunWriter(path, header, overwrite=True) as recorder:
+        paths = submission.paths()
+        for frame, way, choice in zip(
+            submission.frames, paths, _choices(submission.frames, paths), strict=True
+        ):
+            taken = stored_form(simulator.render(frame.pose.astype(np.float64)))
+            arrival = view_renderability(map_state, taken.camera, taken.T_world_camera)
+            map_state, grid = add_frame(map_state, grid, taken, config)
+            radians += angle_between(pose, frame.pose.astype(np.float64))
+            pose = frame.pose.astype(np.float64)
+            length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+            metres = metres + length if frame.metres is None else frame.metres
+            row = StepRow(
+                step=frame.frame,
+                pose=frame.pose,
+                sha256=frame_hash(taken),
+                choice=choice,
+                seconds=frame.seconds,
+                metres=metres,
+                radians=radians,
+                # Planning and flight are not told apart: a policy's own affair.
+                charged={
+                    "planning": 0.0,
+                    "flight": frame.seconds - frame.mapping - seconds,
+                    "mapping": frame.mapping,
+                },
+                coverage=measure_coverage(
+                    map_state,
+                    grid,
+                    taken.camera,
+                    arrival_renderability=arrival,
+                    num_probes=config.num_probes,
+                ),
+                captured=frame.captured,
+            )
+            seconds = frame.seconds
+            recorder.add(row, taken)
+            on_frame(frame.frame)
+        recorder.checkpoint(len(submission.frames) - 1, map_tables(map_state, grid), wait=True)
+        recorder.finish(submission.outcome, "the frames of a submission, taken again")
+
+
+def _choices(frames: Sequence[SubmittedFrame], paths: Sequence[np.ndarray]) -> list[Choice | None]:
+    """The path to each view, all that is known of its choice.
+
+    As in a trace, it belongs to the first frame that was taken on the path.
+    """
+    choices: list[Choice | None] = [None] * len(frames)
+    first = 1
+    for last in range(1, len(frames)):
+        if frames[last].captured and last + 1 < len(frames):
+            continue  # captured while moving to a view
+        pieces = [path[1:] for path in paths[first : last + 1]]
+        whole = np.concatenate([paths[first][:1], *pieces])
+        length = float(np.linalg.norm(np.diff(whole, axis=0), axis=1).sum())
+        waypoints = whole.astype(np.float32)
+        choices[first] = Choice(
+            frames[last].pose, 0.0, waypoints, length, num_candidates=0, num_reachable=0
+        )
+        first = last + 1
+    return choices

@@ -10,8 +10,7 @@ from typing import Any
 
 import jax
 
-from r3jax.apps.benchmark.cells import Cell, paths_of
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of
 from r3jax.apps.benchmark.engines.local import (
     Event,
     Report,
@@ -20,12 +19,11 @@ from r3jax.apps.benchmark.engines.local import (
     visible_gpus,
 )
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
-from r3jax.apps.benchmark.groups import headed_groups, on_equal_terms
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
 from r3jax.apps.benchmark.record import collect, read_records
 from r3jax.apps.benchmark.site import write_site
 from r3jax.apps.benchmark.submitted import plan_submission, problems_of
-from r3jax.apps.benchmark.tables import Entry, Table, quality_table
+from r3jax.apps.benchmark.tables import Entry, Table, headed_groups, on_equal_terms, quality_table
 from r3jax.cli.commands.benchmark_photos import run_photos_of
 from r3jax.cli.console import (
     BarColumn,

@@ -8,21 +8,16 @@ from typing import Any
 
 from r3jax.apps.forecast.forecast import stopping_rule
 from r3jax.apps.report.report import write_report
-from r3jax.apps.runs.begin import Expedition, begin_run, fork_run, resume_run, write_data_set
-from r3jax.apps.runs.settings import (
-    RunSettings,
-    SceneSettings,
-    changed_versions,
-    settings_of_run,
-)
 from r3jax.cli.console import Console
 from r3jax.cli.errors import UserError, check_viser, one_line, resumable, resume_command
 from r3jax.cli.options.explore import DEFAULT_POLICY, ExploreOptions, PageOptions
 from r3jax.cli.parsing import settings_for
 from r3jax.cli.progress import RunProgress, Stages
-from r3jax.exploration.budget import parse_budget
+from r3jax.exploration.config import parse_budget
 from r3jax.exploration.loop import Result, explore
-from r3jax.exploration.state import StopReason, TakenView, in_words
+from r3jax.exploration.state import StopReason, in_words
+from r3jax.exploration.taken_views import TakenView
+from r3jax.formats.exports import write_data_set
 from r3jax.geometry.cameras import Camera
 from r3jax.interrupts import settle_interrupt
 from r3jax.planning.config import PlannerConfig
@@ -30,10 +25,12 @@ from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Policy, PolicyError
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import Motion, motion_of
+from r3jax.runs.begin import Expedition, begin_run, fork_run, resume_run
+from r3jax.runs.header import RunError
+from r3jax.runs.reader import Run, read_run
+from r3jax.runs.settings import RunSettings, SceneSettings, changed_versions, settings_of_run
 from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.meshes import assumptions
-from r3jax.trace.errors import RunError
-from r3jax.trace.reader import Run, read_run
 
 LEAST_CAPACITY = 1 << 14
 """Rows that a map which may grow has at the start: all is compiled again whenever it doubles."""
@@ -236,7 +233,7 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
         with Stages(console) as stages:
             stages.on_progress("writing the data set", 0)
             run = read_run(path)
-            write_data_set(run, result)
+            write_data_set(run, result.state.map_state)
             state = result.state
             page = write_report(run, state.map_state, state.grid, stages.on_progress)
     except (RunError, OSError) as error:

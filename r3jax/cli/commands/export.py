@@ -6,11 +6,11 @@ from pathlib import Path
 from r3jax.cli.console import Console
 from r3jax.cli.options.runs import ExportOptions
 from r3jax.cli.progress import Stages
+from r3jax.exploration.config import DEPTH_STEPS_PER_METRE
 from r3jax.files import make_folder
 from r3jax.formats.exports import export_run
 from r3jax.formats.submissions import submission_of_run, write_submission
-from r3jax.trace import DEPTH_STEPS_PER_METRE
-from r3jax.trace.reader import Run, read_run
+from r3jax.runs.reader import Run, read_run
 
 
 def run_export(options: ExportOptions) -> int:

@@ -8,10 +8,10 @@ from r3jax.apps.report.figures import LEVEL, outlook_figure, outlook_lines
 from r3jax.cli.console import Console
 from r3jax.cli.options.runs import ForecastOptions
 from r3jax.cli.progress import Stages
-from r3jax.exploration.replay import states_of
 from r3jax.files import check_replaceable, write_atomic
 from r3jax.plots.style import PNG_MARK, to_png
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import states_of
 
 
 def run_forecast(options: ForecastOptions) -> int:

@@ -9,7 +9,7 @@ from r3jax.cli.options.runs import InfoOptions
 from r3jax.files import check_replaceable, write_atomic
 from r3jax.formats.recordings import is_recording, read_recording
 from r3jax.interrupts import check_interrupt
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
 
 
 def run_info(options: InfoOptions) -> int:
@@ -36,8 +36,8 @@ def run_info(options: InfoOptions) -> int:
 def _show_inventory(console: Console) -> None:
     from r3jax.kernels.native.platform import describe_kernels
     from r3jax.planning.registry import describe, policy_names
+    from r3jax.runs.header import package_versions
     from r3jax.simulators.scenes import registry
-    from r3jax.trace.header import package_versions
 
     scenes = {name: registry.describe(name) for name in registry.scene_names()}
     scenes |= registry.outside_scenes()

@@ -1,18 +1,19 @@
 """`r3jax merge`: two runs of one scene as one data set, with the map that saw both."""
 
-from r3jax.apps.runs.merge import merge_runs
 from r3jax.cli.console import Console
 from r3jax.cli.options.runs import MergeOptions
 from r3jax.cli.progress import Stages
 from r3jax.exploration.state import in_words
-from r3jax.trace.reader import read_run
+from r3jax.formats.exports import write_data_set
+from r3jax.runs.begin import merge_runs
+from r3jax.runs.reader import read_run
 
 
 def run_merge(options: MergeOptions) -> int:
     """Writes the merged run: the views of both, the map, transforms.json and points.
 
     Raises:
-        UserError: not runs, of different scenes or settings, or the folder cannot be written.
+        ValueError, OSError: not runs, of different scenes or settings, or the folder cannot be written.
     """
     console = Console(stderr=True)
     out = options.out or options.first.parent / f"{options.first.name}+{options.second.name}"
@@ -23,6 +24,7 @@ def run_merge(options: MergeOptions) -> int:
         map_state = merge_runs(
             runs, out, overwrite=options.overwrite, on_frame=lambda: stages.on_progress("", 1)
         )
+        write_data_set(read_run(out), map_state)
     views = " + ".join(in_words(run.rows) for run in runs)
     console.say(f"{views}, {int(map_state.num_occupied)} voxels")
     console.say(f"merged    {out}")

@@ -3,8 +3,8 @@
 from r3jax.cli.console import Console
 from r3jax.cli.options.runs import ReplayOptions
 from r3jax.cli.progress import Stages
-from r3jax.exploration.replay import differences
-from r3jax.trace.reader import read_run
+from r3jax.runs.reader import read_run
+from r3jax.runs.replay import differences
 
 _DIFFERS = 1
 """Exit code where the maps are not equal."""

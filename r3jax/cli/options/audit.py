@@ -11,7 +11,7 @@ from r3jax.cli.options.groups import check_folder
 from r3jax.cli.parsing import FieldsOf
 from r3jax.files import check_own
 from r3jax.formats.errors import check_capture
-from r3jax.formats.ros.names import parse_topics
+from r3jax.formats.ros.bags import parse_topics
 
 _GROWING = (".json", ".mcap", ".db3", ".bag", ".active")
 """Suffixes of files that may grow; of those that may not be followed their reader says why."""

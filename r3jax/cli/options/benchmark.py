@@ -10,7 +10,7 @@ from tyro.conf import arg
 
 from r3jax.cli.errors import check_resolution
 from r3jax.cli.options.groups import check_folder, check_policy_here, check_scene, refuse_others
-from r3jax.exploration.budget import parse_budget
+from r3jax.exploration.config import parse_budget
 from r3jax.formats.errors import check_capture
 
 _WITH_SUBMISSION = (

@@ -19,8 +19,7 @@ from r3jax.cli.options.groups import (
     refuse_others,
 )
 from r3jax.cli.parsing import FieldsOf, settings_for
-from r3jax.exploration.budget import parse_budget
-from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig
+from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig, parse_budget
 from r3jax.planning.policies.foreign.commands import short_name
 from r3jax.planning.robot.motion import Motion, make_motion
 

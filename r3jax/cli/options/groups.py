@@ -13,7 +13,7 @@ from tyro.conf import arg
 from r3jax.cli.errors import check_folder_name, check_resolution
 from r3jax.cli.parsing import flat
 from r3jax.formats.errors import check_capture
-from r3jax.formats.ros.names import parse_topics
+from r3jax.formats.ros.bags import parse_topics
 from r3jax.planning.policies import check_policy
 
 

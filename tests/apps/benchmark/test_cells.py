@@ -10,8 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.apps.benchmark import plan
-from r3jax.apps.benchmark.cells import Cell, identity, paths_of, snapshots_left, sources_of
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import (
+    Cell,
+    Conditions,
+    identity,
+    paths_of,
+    snapshots_left,
+    sources_of,
+)
 from r3jax.evaluation.test_views import ViewSet
 from r3jax.planning.policies import REGISTERED
 from r3jax.planning.registry import policy_names

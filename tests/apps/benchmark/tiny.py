@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.apps.benchmark.cells import Cell
-from r3jax.apps.benchmark.conditions import Conditions
+from r3jax.apps.benchmark.cells import Cell, Conditions
 from r3jax.apps.benchmark.reference_images import (
     ReferenceImages,
     reference_path,

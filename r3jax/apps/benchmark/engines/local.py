@@ -1,10 +1,10 @@
 """Runs cells in processes of their own on this machine, one GPU each where there are several.
 
-A process that crashes, or is killed for its memory, costs its cell and nothing else. Light on
-purpose: a worker imports this module before its environment is set, and nothing here may wake JAX.
-What any engine tells while cells run (`Event`) stands here too.
+A process that crashes, or is killed for its memory, costs its cell and nothing else. What any
+engine reports while cells run (`Event`) stands here too.
 """
 
+import contextlib
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -14,18 +14,14 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from r3jax.apps.benchmark.cells import Cell
 from r3jax.kernels.native.platform import num_cores
-
-if TYPE_CHECKING:
-    from r3jax.apps.benchmark.cells import Cell
-
 
 Kind = Literal["started", "stage", "done", "failed"]
 
@@ -49,10 +45,9 @@ _STAGE_EVERY = 0.5
 """Stages are told at most this often [s]."""
 
 
-def run_here(cells: Sequence["Cell"], root: Path, report: "Report") -> None:
+def run_here(cells: Sequence[Cell], root: Path, report: Report) -> None:
     """Runs cells one after the other in this process."""
-    from r3jax.apps.benchmark.engines.local import Event
-    from r3jax.apps.benchmark.run_cell import run_cell
+    from r3jax.apps.benchmark.run_cell import run_cell  # imports what trains
 
     for cell in cells:
         report(Event(cell, "started"))
@@ -64,9 +59,7 @@ def run_here(cells: Sequence["Cell"], root: Path, report: "Report") -> None:
             report(Event(cell, "done"))
 
 
-def run_in_processes(
-    cells: Sequence["Cell"], root: Path, report: "Report", *, jobs: int = 1
-) -> None:
+def run_in_processes(cells: Sequence[Cell], root: Path, report: Report, *, jobs: int = 1) -> None:
     """Runs cells in `jobs` processes; each takes the next cell when it is free.
 
     Args:
@@ -79,8 +72,6 @@ def run_in_processes(
         ValueError: jobs below 1.
         KeyboardInterrupt: Ctrl-C; the processes are ended, what is complete stays.
     """
-    from r3jax.apps.benchmark.engines.local import Event
-
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs}")
     waiting = deque(cells)
@@ -110,16 +101,15 @@ class _Worker:
         self.pipe: Connection | None = None
         self.cell: Cell | None = None
 
-    def start(self, cell: "Cell", root: Path) -> None:
+    def start(self, cell: Cell, root: Path) -> None:
         """Gives it a cell."""
         if self._process is None:
             # JAX runs threads, which do not survive a fork.
             context = multiprocessing.get_context("spawn")
             self.pipe, far_end = context.Pipe()
-            self._process = context.Process(
-                target=_serve, args=(far_end, self._environment), daemon=True
-            )
-            self._process.start()
+            self._process = context.Process(target=_serve, args=(far_end,), daemon=True)
+            with _environment(self._environment):
+                self._process.start()
             far_end.close()  # so that the pipe ends when the process does
         assert self.pipe is not None
         self.cell = cell
@@ -127,8 +117,6 @@ class _Worker:
 
     def receive(self) -> Any:
         """The next event of its cell; a process that died makes it a failure."""
-        from r3jax.apps.benchmark.engines.local import Event
-
         assert self.pipe is not None
         assert self.cell is not None
         cell = self.cell
@@ -164,9 +152,23 @@ def in_words(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-def _serve(pipe: Connection, environment: dict[str, str]) -> None:
+@contextlib.contextmanager
+def _environment(changes: dict[str, str]) -> Generator[None]:
+    """Changes the environment for a process that begins here.
+
+    Numba reads it when it is imported: in the new process that would be too late.
+    """
+    before = dict(os.environ)
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+def _serve(pipe: Connection) -> None:
     """A worker's life: cells in, stages and ends out."""
-    os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us
     threading.Thread(target=_die_with_parent, daemon=True).start()
     while True:
@@ -177,7 +179,7 @@ def _serve(pipe: Connection, environment: dict[str, str]) -> None:
         pipe.send(_outcome(cell, root, pipe))
 
 
-def _outcome(cell: "Cell", root: Path, pipe: Connection) -> tuple[str, str]:
+def _outcome(cell: Cell, root: Path, pipe: Connection) -> tuple[str, str]:
     last = -_STAGE_EVERY
 
     def on_stage(stage: str) -> None:

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.benchmark.groups import groups_on_equal_terms, headed_groups, on_equal_terms
+from r3jax.apps.benchmark.tables import groups_on_equal_terms, headed_groups, on_equal_terms
 from r3jax.evaluation.comparison import check_equal_terms
 from tests.evaluation.records import benchmark, record
 
