@@ -14,28 +14,6 @@ class UserError(Exception):
     """Something that the user can mend, in one line."""
 
 
-def check_folder_name(name: str) -> None:
-    """Refuses a --name that would lead out of the folder it is meant for.
-
-    Raises:
-        UserError: the name is a path.
-    """
-    if Path(name).name != name or name == "..":
-        raise UserError(f"--name is the name of one folder, without a path, got {name!r}")
-
-
-def check_resolution(pixels: int | None, most: int | None = None) -> None:
-    """Refuses a --resolution that leaves nothing to compare, or is too large; None is the default.
-
-    Raises:
-        UserError: fewer than 16 pixels, or more than the most.
-    """
-    if pixels is None or 16 <= pixels <= (most or pixels):
-        return
-    bounds = "be at least 16" if most is None else f"lie between 16 and {most}"
-    raise UserError(f"--resolution must {bounds}, got {pixels}")
-
-
 def check_viser() -> None:
     """Refuses to go on without viser, which shows pages.
 

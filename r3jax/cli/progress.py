@@ -4,12 +4,12 @@ All long loops come by here between their steps, which is where a Ctrl-C that go
 """
 
 from collections.abc import Iterable, Iterator
-from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
 from r3jax.cli.console import (
     BarColumn,
     Console,
+    Progress,
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
@@ -21,9 +21,10 @@ from r3jax.exploration.taken_views import StepRow
 from r3jax.interrupts import check_interrupt
 
 if TYPE_CHECKING:  # training imports what an exploration does not need
-    from r3jax.splatting.training.train import Progress
+    from r3jax.splatting.training import train
 
 T = TypeVar("T")
+B = TypeVar("B", bound="Bar")
 
 _STAGES = {
     "forecast": "forecasting the quality",
@@ -39,7 +40,22 @@ _LOG_LINES = 10
 """Lines that a run or a training leaves in a log."""
 
 
-class RunProgress:
+class Bar:
+    """A bar that is shown inside of a `with`; it has the attribute `_bar`."""
+
+    _bar: Progress
+
+    def __enter__(self: B) -> B:
+        """Shows the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Takes the bar down."""
+        self._bar.stop()
+
+
+class RunProgress(Bar):
     """Follows a run; hand its methods to `explore`."""
 
     def __init__(self, console: Console, budget: Budget, captured: int = 0):
@@ -95,22 +111,8 @@ class RunProgress:
             self._logged = line
             self._console.print(f"view {self._views}: {facts}")
 
-    def __enter__(self) -> "RunProgress":
-        """Shows the bar."""
-        self._bar.start()
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Takes the bar down."""
-        self._bar.stop()
-
-
-class Stages:
+class Stages(Bar):
     """A bar on a terminal, a line for each stage in a log."""
 
     def __init__(self, console: Console):
@@ -153,17 +155,8 @@ class Stages:
             self.at(stage, done, total)
             yield item
 
-    def __enter__(self) -> "Stages":
-        """Shows the bar."""
-        self._bar.start()
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        """Takes the bar down."""
-        self._bar.stop()
-
-
-class TrainProgress:
+class TrainProgress(Bar):
     """A bar on a terminal, ten lines in a log; hand `on_progress` to `fit`."""
 
     def __init__(self, console: Console, iterations: int):
@@ -178,7 +171,7 @@ class TrainProgress:
         )
         self._task = self._bar.add_task("", total=iterations, facts="compiling on first use")
 
-    def on_progress(self, progress: "Progress") -> None:
+    def on_progress(self, progress: "train.Progress") -> None:
         """Some steps are done."""
         facts = (
             f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, "
@@ -189,12 +182,3 @@ class TrainProgress:
         if not self._console.is_terminal and line > self._logged:
             self._logged = line
             self._console.print(f"step {progress.step}: {facts}")
-
-    def __enter__(self) -> "TrainProgress":
-        """Shows the bar."""
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Takes the bar down."""
-        self._bar.stop()

@@ -106,17 +106,17 @@ def test_a_cell_that_fails_is_named_and_the_exit_code_says_so(room, tmp_path, ca
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scenes": "castle"}, "unknown scene 'castle'"),
+        ({"scenes": "castle"}, "'castle'"),
         ({"scenes": ""}, "no scenes"),
-        ({"policies": "oracle"}, "unknown policy 'oracle'"),
+        ({"policies": "oracle"}, "'oracle'"),
         ({"seeds": "0,x"}, "--seeds"),
-        ({"seeds": "1,1"}, "seeds holds something twice: 1, 1"),
+        ({"seeds": "1,1"}, "1, 1"),
         ({"budget": "views"}, "views:100"),
-        ({"snapshots": "views:9"}, "views:9 lies beyond the budget"),
-        ({"train_resolution": 64}, "more than the images have"),
-        ({"test_views": 3}, "max_views must be at least 6"),
+        ({"snapshots": "views:9"}, "views:9"),
+        ({"train_resolution": 64}, "train_resolution 64"),
+        ({"test_views": 3}, "max_views"),
         ({"jobs": -1}, "--jobs"),
-        ({"slurm": "partition"}, "--slurm takes NAME=VALUE"),
+        ({"slurm": "partition"}, "--slurm"),
     ],
 )
 def test_a_mistake_gets_one_line_and_starts_nothing(room, tmp_path, capsys, changes, message):

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import jax
@@ -38,6 +37,7 @@ from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import UserError, one_line
 from r3jax.cli.options.benchmark import BenchmarkOptions, parse_settings, words
 from r3jax.cli.parsing import settings_for
+from r3jax.cli.progress import Bar
 from r3jax.files import MARKER, lock_folder, own_folder, remove_own
 from r3jax.formats.submissions import Submission, read_submission
 from r3jax.interrupts import check_interrupt, settle_interrupt
@@ -57,7 +57,8 @@ def run_benchmark(options: BenchmarkOptions) -> int:
         again to go on).
 
     Raises:
-        UserError: an unknown scene or policy, a setting that cannot work, a missing package.
+        ValueError, OSError, ImportError: an unknown scene or policy, a setting that cannot work, a
+            missing package.
     """
     console = Console(stderr=True)
     if options.submissions.check:
@@ -284,7 +285,7 @@ def _conclude(console: Console, failures: Sequence[Event], interrupted: bool) ->
     return 1 if failures else 0
 
 
-class BenchmarkProgress:
+class BenchmarkProgress(Bar):
     """Cells done, time left and what each running cell does; a line per cell in a log."""
 
     def __init__(self, console: Console, total: int, left: int, root: Path):
@@ -347,20 +348,6 @@ class BenchmarkProgress:
             seconds = (time.monotonic() - self._begin) / self._finished * remaining
             text += f", about {_duration(seconds)} left"
         return text
-
-    def __enter__(self) -> "BenchmarkProgress":
-        """Shows the bar."""
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Takes the bar down."""
-        self._bar.stop()
 
 
 def _duration(seconds: float) -> str:

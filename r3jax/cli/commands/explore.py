@@ -43,12 +43,12 @@ def run_explore(options: ExploreOptions) -> int:
     """Explores a scene and writes the data set and the report.
 
     Raises:
-        UserError: an unknown scene or policy, a setting that cannot work, a run that exists, or
-            one that cannot be gone on with.
+        ValueError, OSError, ImportError: an unknown scene, a setting that cannot work, a run that
+            exists, or one that cannot be resumed.
     """
     console = Console(stderr=True)
     with contextlib.ExitStack() as stack:
-        # A port that is in use must be told before there is a folder.
+        # A port that is in use is refused before there is a folder.
         page = _open_page(options.page, stack) if options.page.live else None
         expedition = _expedition(options, console)
         settings, recorder = expedition.settings, stack.enter_context(expedition.recorder)

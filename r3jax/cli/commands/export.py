@@ -17,7 +17,8 @@ def run_export(options: ExportOptions) -> int:
     """Writes the folder, or the file of a submission.
 
     Raises:
-        UserError: not a run, no views, a folder that holds something, a disk that is full.
+        ValueError, OSError: not a run, no views, a folder that holds something, a disk that is
+            full.
     """
     console = Console(stderr=True)
     run = read_run(options.path)

@@ -18,7 +18,7 @@ def run_forecast(options: ForecastOptions) -> int:
     """Prints the forecast along the run, and what one more decibel would take.
 
     Raises:
-        UserError: not a run, a frame that is missing, or a file that is no calibration.
+        ValueError, OSError: not a run, a frame that is missing, or a file that is no calibration.
     """
     console = Console(stderr=True)
     if options.plot is not None:

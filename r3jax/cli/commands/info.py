@@ -16,7 +16,7 @@ def run_info(options: InfoOptions) -> int:
     """Prints what is asked for.
 
     Raises:
-        UserError: a folder that is neither a run nor a recording, or a broken one.
+        UserError, ValueError, OSError: neither a run nor a recording, or a broken one.
     """
     console = Console()
     path = options.path

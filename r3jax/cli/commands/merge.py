@@ -13,7 +13,8 @@ def run_merge(options: MergeOptions) -> int:
     """Writes the merged run: the views of both, the map, transforms.json and points.
 
     Raises:
-        ValueError, OSError: not runs, of different scenes or settings, or the folder cannot be written.
+        ValueError, OSError: not runs, of different scenes or settings, or the folder cannot be
+            written.
     """
     console = Console(stderr=True)
     out = options.out or options.first.parent / f"{options.first.name}+{options.second.name}"

@@ -14,7 +14,8 @@ def run_replay(options: ReplayOptions) -> int:
     """Rebuilds map and grid from the frames and compares them, array by array, bit by bit.
 
     Raises:
-        UserError: not a run, no stored map, a frame that is missing or not the recorded one.
+        ValueError, OSError: not a run, no stored map, a frame that is missing or not the recorded
+            one.
     """
     console = Console(stderr=True)
     run = read_run(options.path)

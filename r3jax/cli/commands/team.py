@@ -25,8 +25,8 @@ def run_team(options: TeamOptions) -> int:
     """Explores a scene with several cameras and writes their runs, and what they share.
 
     Raises:
-        UserError: an unknown scene or policy, a setting that cannot work, no room beside the
-            start, a team that exists, or one that cannot be gone on with.
+        ValueError, OSError, ImportError: an unknown scene, a setting that cannot work, no room
+            beside the start, a team that exists, or one that cannot be resumed.
     """
     console = Console(stderr=True)
     with contextlib.ExitStack() as stack:

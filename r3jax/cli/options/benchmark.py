@@ -8,8 +8,13 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from r3jax.cli.errors import check_resolution
-from r3jax.cli.options.groups import check_folder, check_policy_here, check_scene, refuse_others
+from r3jax.cli.options.groups import (
+    check_folder,
+    check_policy_here,
+    check_resolution,
+    check_scene,
+    refuse_others,
+)
 from r3jax.exploration.config import parse_budget
 from r3jax.formats.errors import check_capture
 

@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
-from r3jax.cli.errors import check_resolution
 from r3jax.cli.options.groups import (
     CameraOptions,
     FolderOptions,
@@ -14,6 +13,7 @@ from r3jax.cli.options.groups import (
     check_folder,
     check_free,
     check_policy_here,
+    check_resolution,
     check_run,
     check_scene,
     refuse_others,

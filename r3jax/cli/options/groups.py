@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from r3jax.cli.errors import check_folder_name, check_resolution
 from r3jax.cli.parsing import flat
 from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.bags import parse_topics
@@ -132,6 +131,28 @@ def check_scene(name: str, scale: float) -> None:
     from r3jax.simulators.scenes import names  # imports NumPy, which `--help` can do without
 
     names.check_scene(name, scale)
+
+
+def check_folder_name(name: str) -> None:
+    """Refuses a --name that would lead out of the folder it is meant for.
+
+    Raises:
+        ValueError: the name is a path.
+    """
+    if Path(name).name != name or name == "..":
+        raise ValueError(f"--name is the name of one folder, without a path, got {name!r}")
+
+
+def check_resolution(pixels: int | None, most: int | None = None) -> None:
+    """Refuses a --resolution that leaves nothing to compare, or is too large; None is the default.
+
+    Raises:
+        ValueError: fewer than 16 pixels, or more than the most.
+    """
+    if pixels is None or 16 <= pixels <= (most or pixels):
+        return
+    bounds = "be at least 16" if most is None else f"lie between 16 and {most}"
+    raise ValueError(f"--resolution must {bounds}, got {pixels}")
 
 
 def check_run(path: Path) -> None:

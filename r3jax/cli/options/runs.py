@@ -6,8 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from r3jax.cli.errors import check_folder_name
-from r3jax.cli.options.groups import check_folder, check_run
+from r3jax.cli.options.groups import check_folder, check_folder_name, check_run
 from r3jax.formats.errors import check_capture
 
 
