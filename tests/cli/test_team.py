@@ -72,7 +72,7 @@ def test_a_team_goes_on(pair, room, tmp_path, capsys):
     assert team(room, tmp_path, "--name", "long", *budget) == 0
     shutil.copytree(pair, tmp_path / "pair")
     assert main(["team", "--resume", str(tmp_path / "pair"), *budget]) == 0
-    assert f"goes on behind views {VIEWS} + {VIEWS} of" in capsys.readouterr().err
+    assert f"views {VIEWS} + {VIEWS}" in capsys.readouterr().err
     for name in ("transforms.json", "coverage.jsonl", "0/trace.jsonl", "1/run.json"):
         assert (tmp_path / "pair" / name).read_bytes() == (tmp_path / "long" / name).read_bytes()
 
