@@ -159,7 +159,7 @@ def test_ctrl_c_while_modules_load_shows_no_traceback(module):
         "class Finder:\n    def find_spec(self, name, path, target=None):\n"
         f"        if name == {module!r}: os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.meta_path.insert(0, Finder())\n"
-        "from r3jax.cli import main\nsys.exit(main(['replay', 'nowhere']))\n"
+        "from r3jax.cli import main\nsys.exit(main(['explore', '--scene', 'nowhere']))\n"
     )
     with run(program) as process:
         said = process.communicate(timeout=60)[1]
