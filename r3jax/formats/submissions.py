@@ -35,9 +35,8 @@ from r3jax.runs.replay import check_decided_alone
 from r3jax.runs.rows import paths_to, rigid_pose, shortest_floats, table_of
 from r3jax.runs.settings import config_of
 from r3jax.validation.errors import ForeignFileError, check_version
-from r3jax.validation.fields import build
 from r3jax.validation.files import read_bytes
-from r3jax.validation.json_text import check_fields, parse_json
+from r3jax.validation.json_text import build, check_fields, parse_json
 
 FORMAT = "r3jax-submission"
 """What the first line says it is."""
