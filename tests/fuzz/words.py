@@ -5,11 +5,11 @@ ends where it would begin. What was asked is refused with one line and exit code
 """
 
 import contextlib
-import dataclasses
 import functools
 import io
 import json
 import os
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from r3jax.apps.report import revisits
-from r3jax.cli import command_line
 from r3jax.cli.commands import audit, benchmark, explore, replay, train
 from r3jax.cli.main import main
 from r3jax.evaluation import judge
@@ -64,13 +63,16 @@ COMMANDS = (
     ("audit", "run", "--path", "recording", "--views", "3"),
 )
 
-OPTIONS = {
-    name: [
-        f"--{field.name.replace('_', '-')}"
-        for field in dataclasses.fields(command_line.COMMANDS[name])
-    ]
-    for name in sorted({words[0] for words in COMMANDS})
-}
+
+def options_of(command: str) -> list[str]:
+    """The options that its help names."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+        main([command, "--help"])
+    return sorted(set(re.findall(r"--[a-z][a-z0-9-]+", said.getvalue())) - {"--help"})
+
+
+OPTIONS = {name: options_of(name) for name in sorted({words[0] for words in COMMANDS})}
 """The options of each command."""
 
 WORDS = (
