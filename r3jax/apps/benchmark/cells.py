@@ -171,7 +171,7 @@ class Conditions:
         """A policy that scores what this sensor sees.
 
         Args:
-            name: one of `planning.policy.policy_names()`.
+            name: one of `planning.registry.policy_names()`.
             settings: fields of `PlannerConfig`; `scoring.NAME` is a field of `ScoringConfig`,
                 `motion` the name of a motion or its settings.
 

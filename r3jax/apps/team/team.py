@@ -4,7 +4,7 @@ They fly at the same time. Every member has its own lens, policy, map and missio
 whose clock is behind steps next, so a mission lasts as long as its longest clock. At a meeting
 all learn the frames that were taken until then; in between each has its own frames on top. When
 it decides, it takes the views that the others were heading for at the last meeting as taken,
-and leaves to them what lies nearer to them (`planning.promised`).
+and leaves to them what lies nearer to them (`apps.team.reserved_views`).
 
 Nobody knows anything before it happened: a frame is told once it is taken, and a member hears of
 it at the first meeting after that. Members that decide at the same time decide in turn.

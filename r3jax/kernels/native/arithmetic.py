@@ -236,7 +236,7 @@ _E4, _E5 = np.float32(9.675541892647743e-3), np.float32(1.3276472454890609e-3)
 def exp2(power):
     """2^power to 2e-7, and 2^-126 for all powers below.
 
-    2^n p(f) with n the nearest integer and p of degree 5 (as in `splatting.backends.numba.lanes`).
+    2^n p(f) with n the nearest integer and p of degree 5 (as in `kernels.splatting.lanes`).
     """
     x = power if power > _LOWEST else _LOWEST
     shifted = x + _ROUND

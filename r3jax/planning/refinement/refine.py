@@ -2,7 +2,7 @@
 
 Candidates are drawn by chance, and a panorama knows directions to 10 degrees. From the best few the
 utility is climbed over position and direction (`planning.refinement.climb`), on a smooth surrogate
-(`scoring.soft`), within a box of free space: boxes are
+(`scoring.surrogate`), within a box of free space: boxes are
 convex, so that what climbs in one need not look out. Where a climb ends becomes the
 nearest view that the robot may take; and then the exact utility decides: a view replaces its
 start only if it is worth more, both alone and net of the way. On the host; scores are jitted.
