@@ -32,7 +32,7 @@ from experiments.planner_runs import process_memory
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.planner import Planner, decide, observe, start
-from r3jax.planning.policies.renderability import OursPano
+from r3jax.planning.policies.r3 import OursPano
 from r3jax.plots import style
 from r3jax.simulators.scenes import procedural
 from r3jax.simulators.scenes.registry import open_scene

@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from r3jax.apps.benchmark.cells import OWN_OF_LOOP, OWN_OF_TRAINER, Cell, Conditions
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.planning.policies.ahead.lookahead import AheadConfig
+from r3jax.planning.policies.r3_ahead import AheadConfig
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.training.config import TrainConfig
 

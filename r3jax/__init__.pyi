@@ -8,7 +8,7 @@ from .mapping.lookup import lookup
 from .mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth
 from .mapping.state import MapState, empty_map
 from .mapping.update import integrate, integrate_points
-from .planning.greedy import GreedyPolicy
+from .planning.decide import GreedyPolicy
 from .planning.next_views import NextViews, next_views
 from .planning.planner import Planner, decide, observe, start
 from .planning.policy import Decision
@@ -29,6 +29,7 @@ from .scoring.renderability import (
     renderability_image,
     voxel_renderability,
 )
+from .scoring.soft_utility import SoftUtility, soft_utility
 from .scoring.utility import ViewUtility, view_utility
 from .simulators.scenes.registry import open_scene
 from .splatting.config import RasterConfig
@@ -63,6 +64,7 @@ __all__ = [
     "Rendering",
     "Result",
     "ScoringConfig",
+    "SoftUtility",
     "TrainConfig",
     "ViewUtility",
     "Views",
@@ -94,6 +96,7 @@ __all__ = [
     "render",
     "renderability",
     "renderability_image",
+    "soft_utility",
     "start",
     "view_utility",
     "voxel_difficulty",

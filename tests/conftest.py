@@ -36,7 +36,7 @@ _LEFT_TO_TEST_ALL = (
     "baselines/test_active_gamer.py", "baselines/test_gavis.py",
     "baselines/test_r3con.py",
     "planning/test_motions_of_policies.py", "planning/test_next_views.py",
-    "scoring/test_explain.py", "scoring/test_leaks.py", "scoring/test_pixels.py",
+    "scoring/test_explain.py", "scoring/test_leaks.py", "baselines/test_pixels.py",
     "scoring/test_simulated.py",
     "simulators/scenes/test_procedural.py", "simulators/test_free_space.py",
     "simulators/habitat/test_habitat.py", "simulators/test_start.py",

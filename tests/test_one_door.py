@@ -17,8 +17,6 @@ OF_OS |= {"removedirs", "symlink", "link", "truncate", "mkfifo", "mknod", "open"
 HARMLESS = {"shutil": {"which"}, "tempfile": {"gettempdir"}}
 
 EXCEPTIONS = {
-    # Its own entry in /proc: a setting of the process, no file.
-    "planning/policies/foreign/launch.py": {"open"},
     # PyAV seeks in what it writes: a file in a folder that `whole_folder` has just made.
     "apps/viewer/film.py": {"open"},
     # The null device, in the place of a pipe without a reader.

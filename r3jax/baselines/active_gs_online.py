@@ -19,16 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r3jax.baselines.active_gs.policy import EXPLORATION_WEIGHT, draw_views
-from r3jax.baselines.active_gs.regions import LOW_CONFIDENCE
-from r3jax.baselines.online_map import OnlineMap, Seen, colored, supported_by
+from r3jax.baselines.active_gs import EXPLORATION_WEIGHT, LOW_CONFIDENCE, draw_views
+from r3jax.baselines.online_map import DISCS, OnlineMap, Seen, colored, supported_by
 from r3jax.baselines.policy import OnlinePolicy, memory_of
-from r3jax.baselines.settings import DISCS
 from r3jax.geometry.cameras import Camera, invert_pose, project, transform
 from r3jax.geometry.numerics import safe_norm
 from r3jax.mapping.occupancy import OccupancyGrid, world_to_cell
-from r3jax.planning.candidates import Candidates
-from r3jax.planning.greedy import Drawn, draw_lots
+from r3jax.planning.candidates import Candidates, draw_lots
+from r3jax.planning.decide import Drawn
 from r3jax.planning.policy import Situation
 from r3jax.scoring.cells import Cells, cells_of
 from r3jax.splatting.backend import find_backend

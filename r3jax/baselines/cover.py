@@ -15,14 +15,13 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, UInt32
 
+from r3jax.baselines.pixels import PixelView, score_by_pixels
 from r3jax.planning.candidates import Candidates
-from r3jax.planning.greedy import GreedyPolicy, score_by_pixels
+from r3jax.planning.decide import GreedyPolicy, Scored
 from r3jax.planning.policy import Situation
 from r3jax.scoring.directions import nearest_seen
-from r3jax.scoring.pixels import PixelView
 
 UNSEEN_WEIGHT = 1000.0
 """Worth of a view that shows every cell of the grid, all unexplored (Active-GS)."""
@@ -72,9 +71,7 @@ class Cover(GreedyPolicy):
     name = "cover"
     source = "COVER of NBV-Gym, CVPR 2026, plus unexplored cells"
 
-    def score(
-        self, situation: Situation, candidates: Candidates, *, key: Array
-    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+    def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
         """New directions (`rendering`) and unexplored cells (`exploration`) of every view."""
         del key
         state = situation.map_state

@@ -24,13 +24,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r3jax.baselines.online_map import OnlineMap, Seen, colored, show
+from r3jax.baselines.online_map import GAUSS_MI, OnlineMap, Seen, colored, show
 from r3jax.baselines.policy import OnlineConfig, OnlinePolicy, memory_of
-from r3jax.baselines.settings import GAUSS_MI
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.geometry.numerics import safe_norm
-from r3jax.planning.candidates import Candidates
-from r3jax.planning.greedy import draw_lots
+from r3jax.planning.candidates import Candidates, draw_lots
 from r3jax.planning.policy import Situation
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.config import RasterConfig

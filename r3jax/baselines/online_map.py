@@ -4,10 +4,13 @@ After a frame: Gaussians are born where the map renders it wrongly, some steps o
 this and earlier frames, and now and then what is faint goes. All randomness follows from the key
 of the run and the number of key frames, so that the same frames make the same map.
 
+Births and rows that are added or dropped are worked out on the host. Settings are one set per
+rival.
+
 Shape symbols: n rows of the scene; F key frames; h w their size; m marks per Gaussian.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,8 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
-from r3jax.baselines.births import born_in, grown, kept_rows
-from r3jax.baselines.settings import MapSettings
+from r3jax.baselines.normals import pixel_normals
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.backend import find_backend
@@ -29,6 +31,241 @@ from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene, empty_scene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.optimizer import Moments, adam_update, empty_moments
 from r3jax.splatting.views import fitted_size, load_views
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """How Gaussians are born, trained and pruned; the defaults are those of Active-GS."""
+
+    flat: bool = True
+    """Discs along the measured surface; False: balls."""
+
+    image_width: int = 128
+    """Longer side of the images that the map is trained on [px]; never larger than recorded."""
+
+    spacing: float = 0.02
+    """One new Gaussian at most per voxel of this edge and key frame [m]."""
+
+    size: float = 0.01
+    """Standard deviation of a new Gaussian [m]."""
+
+    max_size: float = 0.05
+    """Larger ones are cut down to this [m]."""
+
+    birth_color: float = 0.25
+    """Squared color error, mean of the channels, above which a pixel gets a new Gaussian."""
+
+    birth_opacity: float = 0.5
+    """Rendered opacity below which it does."""
+
+    birth_depth: float = 0.05
+    """It does where the measured surface is nearer than the rendered one by this share."""
+
+    steps: int = 10
+    """Steps of Adam per key frame; Adam begins anew at each."""
+
+    recent: int = 3
+    """Latest key frames in every batch."""
+
+    older: int = 5
+    """Earlier ones in it, drawn at random."""
+
+    by_error: bool = True
+    """Draws them in proportion to the last error of each; False: all alike."""
+
+    color_weight: float = 1.0
+    """Weight of the mean absolute error of colors."""
+
+    depth_weight: float = 0.8
+    """Weight of that of depths [1/m]."""
+
+    isotropy: float = 0.0
+    """Weight of the mean difference between a Gaussian's sizes and their mean [1/m], beside the sum
+    of the losses of a batch."""
+
+    rate_means: float = 5e-4
+    """Learning rate of the centers [m]."""
+
+    rate_quats: float = 5e-4
+    """Learning rate of the rotations."""
+
+    rate_opacities: float = 0.01
+    """Learning rate of the opacity logits."""
+
+    rate_log_scales: float = 0.01
+    """Learning rate of the log scales."""
+
+    rate_color: float = 1e-4
+    """Learning rate of the colors."""
+
+    prune_every: int = 5
+    """Key frames between two prunings."""
+
+    prune_opacity: float = 0.1
+    """What is fainter than this is pruned, and what no key frame sees any more."""
+
+
+DISCS = MapSettings()
+"""Active-GS: mapper/incremental.yaml."""
+
+BALLS = MapSettings(flat=False)
+"""The same map of balls, for FisherRF's rule for photos, which brings no online map of its own."""
+
+GAUSS_MI = MapSettings(
+    flat=False, steps=20, recent=8, older=2, by_error=False, color_weight=0.9, depth_weight=0.1,
+    isotropy=10.0,
+)  # fmt: skip
+"""GauSS-MI: 20 steps per key frame over a window of 8 and 2 older ones, with its loss."""
+
+
+_THICKNESS = 1e-5
+"""Standard deviation of a disc across its plane [m]; it must not be 0."""
+
+_FACING = -0.01
+"""Cosine between ray and normal above which a surface is seen edge-on."""
+
+_EDGE = 0.05
+"""A step of depth up to this is no edge, for normals [m]."""
+
+_normals = jax.jit(pixel_normals)
+
+
+@dataclass(frozen=True)
+class Born:
+    """New Gaussians."""
+
+    means: np.ndarray
+    """Centers [b, 3] [m]."""
+
+    quats: np.ndarray
+    """Rotations, wxyz [b, 4]."""
+
+    log_scales: np.ndarray
+    """Logarithms of the standard deviations [b, 3]."""
+
+    colors: np.ndarray
+    """RGB in [0, 1] [b, 3]."""
+
+
+def born_in(
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    pose: np.ndarray,
+    camera: Camera,
+    seen: tuple[np.ndarray, np.ndarray, np.ndarray],
+    settings: MapSettings,
+    rng: np.random.Generator,
+) -> Born:
+    """Finds the pixels that the map renders wrongly; one Gaussian per voxel of the spacing.
+
+    Args:
+        rgb: the frame's color in steps of 1/255, [h, w, 3].
+        depth: its depth, 0 where there is none, [h, w] [m].
+        pose: its T_world_camera.
+        camera: its intrinsics.
+        seen: color, depth and opacity that the map renders there, composited on black.
+        settings: thresholds, spacing and size.
+        rng: which pixel of a voxel is taken.
+    """
+    rgb = rgb.astype(np.float32) / 255.0
+    is_valid = depth > 0.0
+    normals = np.asarray(
+        _normals(camera, jnp.asarray(depth), jnp.asarray(is_valid), jnp.float32(_EDGE))
+    ).T
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    rays = _rays(camera)
+    cosine = np.sum(normals * rays, axis=1) / np.linalg.norm(rays, axis=1)
+    wanted = is_wrong(rgb, depth, seen, settings).ravel() & is_valid.ravel() & (cosine < _FACING)
+    points = (rays * depth.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
+    chosen = one_per_voxel(points, np.flatnonzero(wanted), settings.spacing, rng)
+    size = np.full((len(chosen), 3), np.log(settings.size))
+    if settings.flat:
+        size[:, 2] = np.log(_THICKNESS)
+    return Born(
+        means=points[chosen].astype(np.float32),
+        quats=turned_to(normals[chosen] @ pose[:3, :3].T).astype(np.float32),
+        log_scales=size.astype(np.float32),
+        colors=rgb.reshape(-1, 3)[chosen],
+    )
+
+
+def is_wrong(
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    seen: tuple[np.ndarray, np.ndarray, np.ndarray],
+    settings: MapSettings,
+) -> np.ndarray:
+    """Pixels of the wrong color, too little opacity, or a surface in front of the map's."""
+    color, distance, alpha = seen
+    error = np.mean((color - rgb) ** 2, axis=-1)
+    return (
+        (error > settings.birth_color)
+        | (alpha < settings.birth_opacity)
+        | (depth - distance < -settings.birth_depth * depth)
+    )
+
+
+def one_per_voxel(
+    points: np.ndarray, index: np.ndarray, spacing: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Draws one of the points [p, 3] at `index` for each voxel that holds any, in their order."""
+    shuffled = rng.permutation(index)
+    voxel = np.floor(points[shuffled] / spacing).astype(np.int64)
+    _, first = np.unique(voxel, axis=0, return_index=True)
+    return np.sort(shuffled[first])
+
+
+def turned_to(normals: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz that turn the z axis to unit vectors [b, 3], along the shortest arc."""
+    x, y, z = normals.T
+    quats = np.stack([1.0 + z, -y, x, np.zeros_like(x)], axis=1)
+    # Straight down there is no shortest arc: half a turn about x.
+    quats[z < -0.999999] = (0.0, 1.0, 0.0, 0.0)
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    """Rays (u, v, 1) of all pixels, row by row, [h w, 3]."""
+    fx, fy, cx, cy = (float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+    u = (np.arange(camera.width) + 0.5 - cx) / fx
+    v = (np.arange(camera.height) + 0.5 - cy) / fy
+    columns, rows = np.meshgrid(u, v)
+    return np.stack([columns, rows, np.ones_like(columns)], axis=-1).reshape(-1, 3)
+
+
+Rows = tuple[GaussianScene, Array]
+"""The scene and the marks: all that is kept per Gaussian."""
+
+
+def grown(rows: Rows, capacity: int) -> Rows:
+    """Adds unused rows up to a capacity."""
+    before = rows[0].capacity
+    more = capacity - before
+    if more == 0:
+        return rows
+
+    def extended(x: Array) -> np.ndarray:
+        return np.concatenate([x, np.zeros((more, *x.shape[1:]), x.dtype)])
+
+    return _with_unused(jax.tree.map(extended, rows), before)
+
+
+def kept_rows(rows: Rows, keep: np.ndarray) -> Rows:
+    """Moves the rows to keep [n] to the front, in their order; the others are unused."""
+    # Stable: what stays keeps its order, and with it every later result.
+    order = np.argsort(~keep, kind="stable")
+    return _with_unused(jax.tree.map(lambda x: np.asarray(x)[order], rows), int(keep.sum()))
+
+
+def _with_unused(rows: Any, num: int) -> Rows:
+    """Marks all rows from `num` on as unused, in place, and moves all to the device."""
+    for array in jax.tree.leaves(rows):
+        array[num:] = 0
+    scene: Any = rows[0]
+    scene.quats[num:, 0] = 1.0
+    scene.opacity_logits[num:] = DEAD_LOGIT
+    return jax.tree.map(jnp.asarray, rows)
+
 
 FIRST_CAPACITY = 1 << 14
 """Rows at the start; they double when they are used up."""

@@ -6,15 +6,13 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.baselines.online_map import OnlineMap, add_frame, empty_online_map
-from r3jax.baselines.settings import BALLS, MapSettings
+from r3jax.baselines.online_map import BALLS, MapSettings, OnlineMap, add_frame, empty_online_map
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decision import PlannerState
-from r3jax.planning.greedy import GreedyPolicy
+from r3jax.planning.decide import GreedyPolicy, PlannerState
 from r3jax.splatting.views import fitted_size
 
 

@@ -30,8 +30,7 @@ from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import Candidates, candidates_along, candidates_at, host_generator
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decision import net_utility
-from r3jax.planning.greedy import Drawn, GreedyPolicy
+from r3jax.planning.decide import Drawn, GreedyPolicy, net_utility
 from r3jax.planning.policy import Situation
 from r3jax.scoring.backend import sums_and_seen
 from r3jax.scoring.batch import map_over_devices

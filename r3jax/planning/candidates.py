@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import pose_along
+from r3jax.mapping.occupancy import OccupancyGrid, frontier
+from r3jax.planning.config import PlannerConfig
 from r3jax.planning.robot.travel import Travel, segment_is_inside
 
 JITTER = 0.25
@@ -77,7 +79,9 @@ class Candidates(eqx.Module):
         return jax.tree.map(lambda x: x[index], self)
 
     def padded(self, num: int) -> "Candidates":
-        """Repeats rows up to `num` in all; the repeats are not valid."""
+        """Repeats rows up to `num` in all; the repeats are not valid. None at all stay none."""
+        if not len(self.valid):
+            return self
         rows = np.arange(num)
         # Repeats, not zeros: padding must not widen the box that voxels are gathered for.
         repeated = self.take(rows % len(self.valid))
@@ -99,6 +103,75 @@ def host_generator(key: Array) -> np.random.Generator:
     # Both kinds of JAX keys are welcome, old arrays of words and typed ones.
     is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     return np.random.default_rng(np.asarray(jax.random.key_data(key) if is_typed else key))
+
+
+def random_views(
+    travel: Travel, scoring_grid: OccupancyGrid, config: PlannerConfig, *, key: Array
+) -> Candidates:
+    """Draws C views: local ones look anywhere, those drawn for the frontier look at it."""
+    position_key, direction_key = jax.random.split(key)
+    positions, aims = draw_positions(travel, scoring_grid, config, key=position_key)
+    directions = random_directions(len(positions), key=direction_key)
+    # Directions are drawn for all rows, aimed or not: recorded runs hold to this stream.
+    is_aimed = np.isfinite(aims[:, :1])
+    drawn = candidates_along(positions, np.where(is_aimed, aims - positions, directions))
+    return drawn.padded(config.num_candidates)
+
+
+def random_places(
+    travel: Travel, scoring_grid: OccupancyGrid, config: PlannerConfig, *, key: Array
+) -> Candidates:
+    """Draws the positions of `random_views` for a score that finds the directions."""
+    # The same half of the key as there: both draw the same positions.
+    position_key, _ = jax.random.split(key)
+    positions, _ = draw_positions(travel, scoring_grid, config, key=position_key)
+    return candidates_at(positions).padded(config.num_candidates)
+
+
+def free_views(travel: Travel, num: int, radius: float, *, key: Array) -> Candidates:
+    """Draws `num` views from safe places within `radius` of the robot, looking anywhere.
+
+    Returns:
+        `num` candidates; none if the robot can stop nowhere.
+    """
+    position_key, direction_key = jax.random.split(key)
+    positions = local_random(travel, num, radius, key=position_key)
+    directions = random_directions(len(positions), key=direction_key)
+    return candidates_along(positions, directions)
+
+
+def draw_lots(num: int, *, key: Array) -> dict[str, np.ndarray]:
+    """A `lot` for each of `num` candidates, where nothing else tells them apart."""
+    return {"lot": host_generator(key).random(num)}
+
+
+def draw_positions(
+    travel: Travel, scoring_grid: OccupancyGrid, config: PlannerConfig, *, key: Array
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws n positions: up to `num_frontier` in sight of the frontier, the others local.
+
+    Args:
+        travel: where the robot can go.
+        scoring_grid: the grid without hopeless unexplored cells (`mask_unexplorable`).
+        config: how many, and how near.
+        key: source of randomness.
+
+    Returns:
+        Positions [n, 3] and the frontier cell each one is meant for [n, 3] (NaN for local
+        ones), float64 [m]; fewer than `num_candidates` if there is no local one, [0, 3] if the
+        robot can stop nowhere.
+    """
+    frontier_key, local_key = jax.random.split(key)
+    # Of the masked grid: a frontier that nobody can get beyond is none.
+    targets = np.asarray(frontier(scoring_grid))
+    positions, aims = region_of_interest(travel, targets, config.num_frontier, key=frontier_key)
+    # What the frontier leaves goes to local positions: every decision scores the same number.
+    local = local_random(
+        travel, config.num_candidates - len(positions), config.radius, key=local_key
+    )
+    # Local views have no aim; NaN keeps the two arrays row by row alike.
+    aims = np.concatenate([aims, np.full_like(local, np.nan)])
+    return np.concatenate([positions, local]), aims
 
 
 def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -> np.ndarray:
@@ -181,37 +254,13 @@ def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
         Indices of cells, [n, 3], n <= 256.
     """
     # Imported only here: whoever plans no way does not wait for Numba.
-    from r3jax.planning.robot.cells import nearest_in_ring
+    from r3jax.kernels.robot.cells import nearest_in_ring
 
     reach = int(np.ceil(VIEW_DISTANCE[1] / travel.cell_size))
     # Cut after the nearest are taken, so that a near wall leaves few places, not far ones.
     return nearest_in_ring(
         travel.goals, target, reach, travel.cell_size, *VIEW_DISTANCE, _NEIGHBORS
     )
-
-
-def lattice(travel: Travel, spacing: tuple[float, float, float] = (1.0, 1.0, 0.75)) -> np.ndarray:
-    """Positions on a regular lattice that fall into cells where the robot may stop.
-
-    Args:
-        travel: where the robot may stop.
-        spacing: distance between lattice points along x, y and z [m].
-
-    Returns:
-        [n, 3] float64 [m], each where the camera stands in its cell, no cell twice.
-    """
-    shape = travel.usable.shape
-    # Half a step inside the box: cells at its faces do not keep the usual margin.
-    axes = [
-        np.arange(0.5 * step, n * travel.cell_size, step)
-        for n, step in zip(shape, spacing, strict=True)
-    ]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    # The nudge puts points that lie on a border of cells on the same side of it.
-    cells = np.unique(np.floor(points / travel.cell_size + 1e-3).astype(np.int64), axis=0)
-    # Nudged, a point at the very end of the box would lie past the array.
-    cells = cells[np.all(cells < np.array(shape), axis=1)]
-    return travel.stops(cells[travel.goals[tuple(cells.T)]])
 
 
 def spread(places: np.ndarray, num: int) -> np.ndarray:

@@ -45,8 +45,8 @@ class PlannerConfig:
     """A path keeps its cells' centers this far from anything not known to be free [m]."""
 
     refine: int = 0
-    """So many of the best candidates of `ours`, `ours-pano` and `ours-ahead` climb
-    the utility by its gradient (`planning.refinement.refine`); 0: none."""
+    """How many of the best candidates of `ours` and `ours-pano` ascend the gradient of the smooth
+    utility (`planning.refine`); 0: none."""
 
     refine_radius: float = 0.4
     """A climb ends at this distance along each axis [m]; 0: it turns the view and no more."""

@@ -29,7 +29,7 @@ from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
-from r3jax.planning.decision import PlannerState
+from r3jax.planning.decide import PlannerState
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PlansAhead, Policy
 from r3jax.planning.registry import make_policy
 from r3jax.scoring.config import ScoringConfig

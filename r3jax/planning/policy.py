@@ -81,7 +81,7 @@ class Situation:
     """Grid as it is; for travel."""
 
     scoring_grid: OccupancyGrid
-    """The same with a mask of the cells that are worth a look (`prepare_decision`); for
+    """The same with a mask of the cells that are worth a look (`look_round`); for
     utilities."""
 
     travel: Travel

@@ -22,8 +22,9 @@ from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.decision import ENOUGH_LOOKS, PlannerState
+from r3jax.planning.decide import MAX_FAILED_LOOKS, PlannerState
 from r3jax.planning.robot.explorable import mask_unexplorable
+from r3jax.planning.robot.limits import angles_of, rotations, wrapped
 from r3jax.scoring.batch import score_positions
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
@@ -101,8 +102,7 @@ def turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """From one direction to another, [..., 2], round the shorter side."""
     difference = np.asarray(second, dtype=np.float64) - first
-    azimuth = np.pi - np.mod(np.pi - difference[..., 0], 2.0 * np.pi)
-    return np.stack([azimuth, difference[..., 1]], axis=-1)
+    return np.stack([wrapped(difference[..., 0]), difference[..., 1]], axis=-1)
 
 
 def _towards(now: np.ndarray, goal: np.ndarray, most: float) -> np.ndarray:
@@ -113,19 +113,13 @@ def _towards(now: np.ndarray, goal: np.ndarray, most: float) -> np.ndarray:
 
 def direction_of(T_world_camera: np.ndarray) -> np.ndarray:
     """Azimuth and elevation [2] of a pose [4, 4] without roll, as its level axis has it."""
-    x, y, z = T_world_camera[:3, 2]
-    azimuth = np.arctan2(T_world_camera[0, 0], -T_world_camera[1, 0])
-    return np.array([azimuth, np.arctan2(z, np.hypot(x, y))])
+    return np.concatenate(angles_of(T_world_camera[None]))
 
 
 def pose_towards(position: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """The pose without roll at a position [3] that looks in a direction [2], [4, 4] float64."""
-    azimuth, elevation = direction
-    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    forward = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
-    right = np.array([level[1], -level[0], 0.0])
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, :3] = rotations(*np.asarray(direction, dtype=np.float64)[:, None])[0]
     pose[:3, 3] = position
     return pose
 
@@ -177,7 +171,7 @@ def exhausted_cells(policy_state: Any) -> np.ndarray | None:
     """Cells that enough views failed to show, [X, Y, Z] bool; None if the policy does not count."""
     if not isinstance(policy_state, PlannerState):
         return None
-    return np.asarray(policy_state.looks) >= ENOUGH_LOOKS
+    return np.asarray(policy_state.looks) >= MAX_FAILED_LOOKS
 
 
 def count_look(
@@ -190,7 +184,7 @@ def count_look(
 ) -> Any:
     """The policy's memory with the cells counted that a frame in map and grid failed to show.
 
-    What `prepare_decision` does for the view that a decision is made from.
+    What `look_round` does for the view that a decision is made from.
     """
     if not isinstance(policy_state, PlannerState):
         return policy_state

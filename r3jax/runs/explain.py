@@ -16,7 +16,7 @@ import numpy as np
 from r3jax.exploration.captures import scoring_on_the_way
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
-from r3jax.planning.decision import explain_path, initial_state
+from r3jax.planning.decide import explain_path, initial_state
 from r3jax.planning.turning import count_look
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run

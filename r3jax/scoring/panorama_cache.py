@@ -38,14 +38,6 @@ class PanoramaCache(eqx.Module):
         """Those of some of many positions."""
         return PanoramaCache(self.bin_scores[index], self.voxels[index], self.cells[index])
 
-    def replaced(self, index: Int[Array, " k"], others: "PanoramaCache") -> "PanoramaCache":
-        """The same of many positions, but for some."""
-        return PanoramaCache(
-            self.bin_scores.at[index].set(others.bin_scores),
-            self.voxels.at[index].set(others.voxels),
-            self.cells.at[index].set(others.cells),
-        )
-
 
 def cached_panorama(
     voxels: MapState,

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.numerics import safe_norm, safe_power
 from r3jax.mapping.state import MapState
@@ -59,6 +59,7 @@ def score_voxels(
     camera_position: Float[Array, " 3"],
     focal: Float[Array, ""],
     forms: Forms = PAPER,
+    kappa_is_one: Bool[Array, " n"] | None = None,
 ) -> Renderability:
     """The terms of every voxel as seen from one camera position.
 
@@ -67,6 +68,7 @@ def score_voxels(
         camera_position: center of the camera that asks [m].
         focal: its focal length [px], in the unit used when the map was made.
         forms: of kappa and delta.
+        kappa_is_one: kappa, where it was determined elsewhere; None: from here.
     """
     delta = consistency(voxels.count, voxels.m2, forms.delta)
     # From the voxel to the camera, as the visited bins were recorded.
@@ -74,7 +76,7 @@ def score_voxels(
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     direction = offset / distance[None, :]
     cosine, inside = seen_directions(voxels.visited, direction, voxels.num_bins)
-    is_one = (inside > 0.0) | (forms.kappa == "one")
+    is_one = (inside > 0.0) | (forms.kappa == "one") if kappa_is_one is None else kappa_is_one
     kappa_value = jnp.where(is_one, 1.0, 2.0)
     # kappa is 1 or 2: a product will do, and no power whose gradient could fail at 0.
     bias = jnp.where(is_one, cosine, cosine * cosine)

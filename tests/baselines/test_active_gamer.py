@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.baselines.active_gamer import policy as policy_module
-from r3jax.baselines.active_gamer.policy import ActiveGamer, empty_share, score_of
+from r3jax.baselines import active_gamer
+from r3jax.baselines.active_gamer import ActiveGamer, empty_share, score_of
+from r3jax.baselines.pixels import score_pixels
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along, rigid_error
 from r3jax.geometry.sphere import fibonacci_lattice
@@ -19,7 +20,6 @@ from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policy import DecisionOutcome, Policy
-from r3jax.scoring.pixels import score_pixels
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 
 CAMERA = Camera.from_fov(32, 32)
@@ -55,7 +55,7 @@ def decide(policy, world, state=None, cell=(6, 6, 4), key=KEY):
 
 def test_score() -> None:
     """Distances 0, ln 2, ln 5 have softmax 1/8, 2/8, 5/8; gains 1, 3, 4 are 1/8, 3/8, 4/8."""
-    score_of = policy_module.score_of
+    score_of = active_gamer.score_of
     distance, gain = np.log([1.0, 2.0, 5.0]), np.array([1.0, 3.0, 4.0])
     np.testing.assert_allclose(
         score_of(gain, distance), [7 / 8 / 8, 6 / 8 * 3 / 8, 3 / 8 * 4 / 8], rtol=1e-12
@@ -65,18 +65,19 @@ def test_score() -> None:
     np.testing.assert_allclose(far, score_of(gain, distance), rtol=1e-9)
 
 
-def law_nearer_of_equal_gains(seed: int = 0) -> None:
+@given(st.integers(0, 10_000))
+def test_nearer_of_equal_gains(seed):
     rng = np.random.default_rng(seed)
     distance, gain = rng.uniform(0, 9, 8), rng.uniform(0.01, 1, 8)
     gain[3] = gain[5]
     distance[3] = distance[5] + rng.uniform(0.1, 3)
-    score = policy_module.score_of(gain, distance)
+    score = active_gamer.score_of(gain, distance)
     assert 0 <= score[3] < score[5] <= gain[5] / gain.sum()
 
 
 def test_gain_is_the_share_of_empty_pixels() -> None:
     hit = jnp.asarray(np.arange(12).reshape(3, 4) < 5)
-    share = policy_module.empty_share(SimpleNamespace(hit=hit))
+    share = active_gamer.empty_share(SimpleNamespace(hit=hit))
     np.testing.assert_allclose(share, 7 / 12, rtol=1e-6)
 
 
@@ -84,7 +85,7 @@ def test_decision() -> None:
     """The greatest score is taken, leaves the pool, and so do the worthless."""
     # The robot stands by the wall; two of the twelve lie behind it, a detour away.
     scorer = Scorer(lambda p: np.where(p[:, 0] > 0.9, 0.004, 0.1 * (p[:, 1] - 2.0)))
-    policy = policy_module.ActiveGamer(CONFIG, scorer)
+    policy = active_gamer.ActiveGamer(CONFIG, scorer)
     world = empty_map(64), grid_of(*two_rooms())
     decision, state, _ = decide(policy, world, cell=(10, 2, 4))
     u, positions = decision.utilities, decision.candidates[:, :3, 3]
@@ -108,7 +109,7 @@ def test_decision() -> None:
 
 @given(seed=st.integers(0, 10_000))
 def test_the_nearer_of_two_equal_gains_scores_higher(seed):
-    law_nearer_of_equal_gains({"policy": SimpleNamespace(score_of=score_of)}, seed)
+    test_nearer_of_equal_gains({"policy": SimpleNamespace(score_of=score_of)}, seed)
 
 
 def test_decisions_are_safe_complete_and_repeatable(world):

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import r3jax
-from r3jax.baselines.active_gs import ActiveGS, policy, regions
-from r3jax.baselines.active_gs.confidence import no_sightings
+from r3jax.baselines import active_gs
+from r3jax.baselines.active_gs import ActiveGS
+from r3jax.baselines.confidence import no_sightings
+from r3jax.baselines.pixels import PixelView
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.join import grow
@@ -18,7 +20,6 @@ from r3jax.planning.candidates import candidates_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policy import DecisionOutcome, Situation
 from r3jax.planning.robot.travel import plan_travel
-from r3jax.scoring.pixels import PixelView
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, pose_at, two_rooms
 
 pytestmark = pytest.mark.full
@@ -72,7 +73,7 @@ def some_view() -> PixelView:
     )
 
 
-def law_pixels() -> None:
+def test_pixels() -> None:
     view = some_view()
     hit, depth, confidence = (np.asarray(x, float) for x in (view.hit, view.depth, view.rows))
     near = far = nothing = 0
@@ -87,7 +88,7 @@ def law_pixels() -> None:
             near += 1
         expected.append((1.0 - c) * d / 5.0)
     assert min(near, far, nothing) > 5
-    cells, rendering = policy.cells_and_doubt(view)
+    cells, rendering = active_gs.cells_and_doubt(view)
     assert float(cells) == 17.0
     np.testing.assert_allclose(float(rendering), np.mean(expected), rtol=1e-5)
 
@@ -117,36 +118,37 @@ def score(policy_class, state, confidence, grid=None, direction=(1.0, 0.0, 0.0))
     return policy_class(CONFIG).score(situation, candidates, key=KEY)[1]
 
 
-def law_scores() -> None:
+def test_scores() -> None:
     """Square on to a wall: (1 - C) d / d_max, to half a voxel; nothing known: one half."""
+    module = active_gs
     wall = wall_at(3.0)
-    u = score(policy.ActiveGS, wall, 0.25)
+    u = score(module.ActiveGS, wall, 0.25)
     np.testing.assert_allclose(u["rendering"], 0.75 * 3.0 / 5.0, atol=0.01)
     np.testing.assert_array_equal(u["exploration"], 0.0)
     np.testing.assert_allclose(u["utility"], u["rendering"])
-    away = score(policy.ActiveGS, wall, 0.25, direction=(-1.0, 0.0, 0.0))
+    away = score(module.ActiveGS, wall, 0.25, direction=(-1.0, 0.0, 0.0))
     np.testing.assert_allclose(away["rendering"], 0.5, atol=1e-5)
     assert u["lot"].shape == (2,)
 
 
-def law_far_walls() -> None:
+def test_far_walls() -> None:
     """A known wall out of range promises nothing; unexplored cells out of range do not count."""
     known = np.ones((50, 14, 10), bool)
     known[34:36, 4:9, 2:7] = False  # from 5.5 m on
     grid = grid_of(known)
     wall = wall_at(8.0)
-    u = score(policy.ActiveGS, wall, 0.0, grid)
+    u = score(active_gs.ActiveGS, wall, 0.0, grid)
     np.testing.assert_array_equal(u["exploration"], 0.0)
     # The wall covers 3.8 m of 9.2 m across the picture, squared; the rest shows nothing.
     share = (3.8 / (2 * 8.0 * np.tan(np.deg2rad(30.0)))) ** 2
     np.testing.assert_allclose(u["rendering"], 0.5 * (1.0 - share), atol=0.02)
 
 
-def law_exploration() -> None:
+def test_exploration() -> None:
     """Four unexplored cells in plain view of 40 x 14 x 10."""
     known = np.ones((40, 14, 10), bool)
     known[14:16, 6:8, 4] = False
-    u = score(policy.ActiveGS, map_of(center(30, 6, 4)[None]), 1.0, grid_of(known))
+    u = score(active_gs.ActiveGS, map_of(center(30, 6, 4)[None]), 1.0, grid_of(known))
     np.testing.assert_allclose(u["exploration"], 4 / 5600)
     np.testing.assert_allclose(u["utility"], 1000 * 4 / 5600 + u["rendering"])
 
@@ -171,10 +173,11 @@ def some_world():
     return grid, state, sightings_of(state, confidence, normal)
 
 
-def law_regions() -> None:
+def test_regions() -> None:
+    module = active_gs
     grid, state, seen = some_world()
     free, unexplored = np.asarray(grid.free), np.asarray(grid.unexplored)
-    count, total = regions.low_confidence(state, seen, grid)
+    count, total = module.low_confidence(state, seen, grid)
     expected_count = np.zeros(free.shape, int)
     expected_total = np.zeros((3, *free.shape))
     centers = np.asarray(state.center, float)
@@ -186,7 +189,7 @@ def law_regions() -> None:
             expected_total[(slice(None), *cell)] += normals[:, row]
     np.testing.assert_array_equal(count, expected_count)
     np.testing.assert_allclose(total, expected_total, atol=1e-4)
-    found = regions.regions_of(free, unexplored, np.asarray(count), np.asarray(total))
+    found = module.regions_of(free, unexplored, np.asarray(count), np.asarray(total))
     sides = {tuple(cell): normal for cell, normal in zip(found.cells, found.normals, strict=True)}
     both = set()
     for cell in np.ndindex(free.shape):
@@ -208,14 +211,15 @@ def law_regions() -> None:
     assert {(True, True), (False, True), (True, False)} <= both
 
 
-def law_aims() -> None:
+def test_aims() -> None:
     """Every candidate keeps every rule; the nearest regions come first; nobody is left out."""
+    module = active_gs
     grid, state, seen = some_world()
     travel = plan_travel(grid, START)
-    count, total = (np.asarray(x) for x in regions.low_confidence(state, seen, grid))
-    found = regions.regions_of(travel.free, np.asarray(grid.unexplored), count, total)
+    count, total = (np.asarray(x) for x in module.low_confidence(state, seen, grid))
+    found = module.regions_of(travel.free, np.asarray(grid.unexplored), count, total)
     side_of = {tuple(c): n for c, n in zip(found.cells, found.normals, strict=True)}
-    places, aims = regions.aimed_views(travel, found, AIMED, key=KEY)
+    places, aims = module.aimed_views(travel, found, AIMED, key=KEY)
     assert places.shape == aims.shape == (AIMED, 3)
     away = np.linalg.norm(aims - START, axis=1)
     assert np.all(np.diff(away) > -1e-9)
@@ -234,31 +238,23 @@ def law_aims() -> None:
         longest = max((len(list(g)) for k, g in itertools.groupby(blocked) if k), default=0)
         assert longest * distance / 399 <= 0.25 * CELL + 0.01
     assert max(numbers.values()) == 5
-    for place, aim in zip(*regions.aimed_views(travel, found, 600, key=KEY), strict=True):
+    for place, aim in zip(*module.aimed_views(travel, found, 600, key=KEY), strict=True):
         distance, side = np.linalg.norm(place - aim), side_of[travel.cell_of(aim)]
         assert 0.3 <= distance <= 2.0
         assert not side.any() or side @ (place - aim) >= 0.5 * distance - 1e-9
     bare, axis = plan_travel(grid_of(*two_rooms()), START), np.array([0.6, 0.0, 0.8])
-    open_space = regions.Regions(np.array([[5, 6, 3]]), axis[None])
+    open_space = module.Regions(np.array([[5, 6, 3]]), axis[None])
     for i in range(60):
-        places, aims = regions.aimed_views(bare, open_space, 5, key=jax.random.key(i))
+        places, aims = module.aimed_views(bare, open_space, 5, key=jax.random.key(i))
         assert np.all((places - aims) @ axis >= 0.5 * np.linalg.norm(places - aims, axis=1))
-    few, _ = regions.aimed_views(travel, found, 7, key=KEY)
+    few, _ = module.aimed_views(travel, found, 7, key=KEY)
     assert len(few) == 7
-    nothing = regions.Regions(found.cells[:0], found.normals[:0])
-    assert regions.aimed_views(travel, nothing, AIMED, key=KEY)[0].shape == (0, 3)
+    nothing = module.Regions(found.cells[:0], found.normals[:0])
+    assert module.aimed_views(travel, nothing, AIMED, key=KEY)[0].shape == (0, 3)
     # A cell of a bare wall gets its five from the front and none from behind.
     for side, expected in ((1.0, 5), (0.0, 5), (-1.0, 0)):
-        one = regions.Regions(np.array([[0, 6, 4]]), np.array([[side, 0.0, 0.0]]))
-        assert len(regions.aimed_views(bare, one, AIMED, key=KEY)[0]) == expected
-
-
-LAWS = [law_pixels, law_scores, law_far_walls, law_exploration, law_regions, law_aims]
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_laws(law):
-    law({"policy": policy, "regions": regions})
+        one = module.Regions(np.array([[0, 6, 4]]), np.array([[side, 0.0, 0.0]]))
+        assert len(module.aimed_views(bare, one, AIMED, key=KEY)[0]) == expected
 
 
 # ---- decisions -------------------------------------------------------------------------------

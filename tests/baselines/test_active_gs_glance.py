@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.baselines.active_gs import confidence
-from r3jax.baselines.active_gs.confidence import aligned, glance, no_sightings, see
+from r3jax.baselines import confidence
+from r3jax.baselines.confidence import aligned, glance, no_sightings, see
 from r3jax.geometry.voxels import unpack, voxel_center
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.seen import rows_in_view

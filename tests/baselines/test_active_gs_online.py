@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.baselines import active_gs_online
-from r3jax.baselines.births import turned_to
-from r3jax.baselines.online_map import Seen
+from r3jax.baselines.online_map import Seen, turned_to
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.scoring.cells import Cells
 from tests.splatting.clouds import random_cloud
@@ -27,24 +26,25 @@ def discs(means, normals):
 
 def test_confidence_by_hand() -> None:
     """One look from 3 m; the same look again; one from the side; edge-on; from behind; too far."""
+    module = active_gs_online
     scene = discs([[0, 0, 0]] * 3, [[0, 0, 1], [0, 0, 1], [1, 0, 0]])
     here, marks = jnp.array([0.0, 0.0, 3.0]), jnp.zeros((3, 5))
-    marks = active_gs_online.support(marks, scene, here, jnp.array([True, False, True]), RANGE)
-    np.testing.assert_allclose(active_gs_online.confidence(marks), [0.4, 0.0, 0.0], atol=1e-6)
+    marks = module.support(marks, scene, here, jnp.array([True, False, True]), RANGE)
+    np.testing.assert_allclose(module.confidence(marks), [0.4, 0.0, 0.0], atol=1e-6)
     assert marks[2, 0] == 1.0  # seen edge-on: supported, of no weight
     # From 4 m, 60 degrees aside: weight 0.2 x 0.5; the mean direction is cos 30 degrees long.
     aside = jnp.array([2.0 * np.sqrt(3.0), 0.0, 2.0])
-    marks = active_gs_online.support(marks, scene, aside, jnp.array([True, True, False]), RANGE)
+    marks = module.support(marks, scene, aside, jnp.array([True, True, False]), RANGE)
     expected = [np.exp(1.0 - np.cos(np.pi / 6.0)) * 0.5, 0.1]
-    np.testing.assert_allclose(active_gs_online.confidence(marks)[:2], expected, rtol=1e-5)
+    np.testing.assert_allclose(module.confidence(marks)[:2], expected, rtol=1e-5)
     behind, far = jnp.array([0.0, 0.0, -1.0]), jnp.array([0.0, 0.0, 7.0])
     for place in (behind, far):
-        later = active_gs_online.support(marks, scene, place, jnp.array([True] * 3), RANGE)
+        later = module.support(marks, scene, place, jnp.array([True] * 3), RANGE)
         assert float(later[0, 4]) == pytest.approx(0.5)
     # Many good looks: no more than 1.
     for _ in range(5):
-        marks = active_gs_online.support(marks, scene, here, jnp.array([True] * 3), RANGE)
-    assert float(active_gs_online.confidence(marks)[0]) == 1.0
+        marks = module.support(marks, scene, here, jnp.array([True] * 3), RANGE)
+    assert float(module.confidence(marks)[0]) == 1.0
 
 
 def test_utility_by_hand() -> None:

@@ -12,7 +12,7 @@ from r3jax.baselines.cover import Cover
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import candidates_along
-from r3jax.planning.decision import net_utility
+from r3jax.planning.decide import net_utility
 from tests.planning import walls
 
 pytestmark = pytest.mark.full
@@ -38,7 +38,7 @@ def coverage(module, bins: list[list[int]], offset: np.ndarray, hit: list[int]) 
 
 def test_the_term_by_hand() -> None:
     """One covered pixel at a time, then some together."""
-    q = LATTICE
+    q, module = LATTICE, cover
     between = (q[3] + q[40]) / np.linalg.norm(q[3] + q[40])
     cases = [
         ([5], q[5], 1.0),  # seen from there
@@ -51,11 +51,16 @@ def test_the_term_by_hand() -> None:
     bins, offset, value = (list(part) for part in zip(*cases, strict=True))
     for pixel in range(NUM):
         hit = np.eye(NUM, dtype=int)[pixel].tolist()
-        found = coverage(cover, bins, np.array(offset), hit)
+        found = coverage(module, bins, np.array(offset), hit)
         np.testing.assert_allclose(found, value[pixel], atol=1e-6)
-    found = coverage(cover, bins, np.array(offset), [1, 1, 0, 1, 0, 1])
+    found = coverage(module, bins, np.array(offset), [1, 1, 0, 1, 0, 1])
     np.testing.assert_allclose(found, (1.0 + 0.0 + 0.0 + value[5]) / 4.0, atol=1e-6)
-    assert coverage(cover, bins, np.array(offset), [0] * NUM) == 1.0
+    assert coverage(module, bins, np.array(offset), [0] * NUM) == 1.0
+
+
+_IS_VISITED = """(visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
+        cosine = q_x"""
+_NEAREST = "jnp.maximum(best, jnp.where(is_visited, cosine, -1.0))"
 
 
 BINS = st.lists(st.lists(st.integers(0, 63), max_size=5), min_size=NUM, max_size=NUM)

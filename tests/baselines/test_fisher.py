@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r3jax.baselines import fisher
-from r3jax.baselines.fisher import Form, greedy_batch, known_information, scores
+from r3jax.baselines import fisherrf
+from r3jax.baselines.fisherrf import Form, greedy_batch, known_information, scores
 from r3jax.geometry.cameras import look_at
 from r3jax.splatting import harmonics
 from r3jax.splatting.config import RasterConfig
@@ -70,7 +70,7 @@ def test_information_is_the_sum_of_squared_dense_jacobians() -> None:
         expected = {q: dense_information(scene, camera, pose, quirk=q) for q in (False, True)}
     for quirk in (False, True):
         form = Form(quirk=quirk, background=BEHIND)
-        found, overflow = fisher.information(CONFIG, scene, camera, pose, form)
+        found, overflow = fisherrf.information(CONFIG, scene, camera, pose, form)
         assert int(overflow) == 0
         assert not np.asarray(found.quats).any()
         for name in PARTS:
@@ -83,7 +83,7 @@ def test_opacities_of_one_say_nothing_and_disturb_nothing():
     scene, camera, pose = a_case()
     full = replace(scene, opacity_logits=scene.opacity_logits.at[0].set(40.0))
     for quirk in (False, True):
-        found, _ = fisher.information(CONFIG, full, camera, pose, Form(quirk=quirk))
+        found, _ = fisherrf.information(CONFIG, full, camera, pose, Form(quirk=quirk))
         assert float(found.opacity_logits[0]) == 0.0
         assert all(np.isfinite(part).all() for part in jax.tree.leaves(found))
 
@@ -98,7 +98,7 @@ def numbers(*values):
 def gains_by_hand() -> None:
     """H_v = 3, 1, 0 where H = 1, 0, 5 is known, with lambda = 0.5."""
     found, known = numbers(3.0, 1.0, 0.0), numbers(1.0, 0.0, 5.0)
-    gain = fisher.gain
+    gain = fisherrf.gain
     assert float(gain(found, known, Form(damping=0.5))) == pytest.approx(3.0 / 1.5 + 1.0 / 0.5)
     d_opt = gain(found, known, Form(criterion="d-opt", damping=0.5))
     assert float(d_opt) == pytest.approx(np.log(3.0) + np.log(3.0), rel=1e-5)
@@ -108,7 +108,7 @@ def test_gains_worked_out_by_hand():
     gains_by_hand()
     assert Form().damping == 1e-6  # the authors' lambda
     # What was never seen counts a million times what was.
-    assert float(fisher.gain(numbers(1, 0, 0), numbers(0, 0, 0), Form())) == pytest.approx(1e6)
+    assert float(fisherrf.gain(numbers(1, 0, 0), numbers(0, 0, 0), Form())) == pytest.approx(1e6)
 
 
 @settings(max_examples=50, deadline=None)
@@ -120,9 +120,9 @@ def test_gains_worked_out_by_hand():
 )
 def test_what_is_known_better_is_worth_less(new, old, more, criterion):
     form = Form(criterion=criterion, damping=1e-3)
-    before = float(fisher.gain(numbers(*new), numbers(*old), form))
+    before = float(fisherrf.gain(numbers(*new), numbers(*old), form))
     known = numbers(*(a + b for a, b in zip(old, more, strict=True)))
-    after = float(fisher.gain(numbers(*new), known, form))
+    after = float(fisherrf.gain(numbers(*new), known, form))
     assert 0.0 <= after <= before * (1.0 + 1e-5)
 
 
@@ -135,11 +135,12 @@ def a_pool(num: int = 7):
 
 def test_batches_are_those_of_brute_force() -> None:
     """By brute force: all H of all views at hand, ratios and sums in NumPy."""
+    module = fisherrf
     scene, camera, pool = random_cloud(4, 20, 0), view(16, 16)[0], a_pool()
     form = Form(quirk=False)
     table = []
     for pose in pool:
-        found, _ = fisher.information(CONFIG, scene, camera, jnp.asarray(pose), form)
+        found, _ = module.information(CONFIG, scene, camera, jnp.asarray(pose), form)
         table.append(np.concatenate([np.ravel(x) for x in jax.tree.leaves(found)]))
     table = np.asarray(table, np.float64)
     known, expected = 3.0 * table[3] + table[0], []
@@ -148,7 +149,7 @@ def test_batches_are_those_of_brute_force() -> None:
         ratio[expected] = -np.inf
         expected.append(int(np.argmax(ratio)))
         known = known + table[expected[-1]]
-    assert fisher.greedy_batch(scene, camera, pool, pool[[3, 3, 3, 0]], 7, form) == expected
+    assert module.greedy_batch(scene, camera, pool, pool[[3, 3, 3, 0]], 7, form) == expected
 
 
 def test_a_larger_batch_begins_with_the_smaller_one_and_repeats_nothing():

@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import r3jax
+from r3jax.baselines import gavis
 from r3jax.baselines.gavis import Gavis, GavisConfig
-from r3jax.baselines.gavis import rays as rays_now
-from r3jax.baselines.gavis import visibility as visibility_now
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -64,14 +63,14 @@ def draw_directions(seed: int, num: int) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def law_visibility() -> None:
+def test_visibility() -> None:
     """Random voxels, directions and kappa against float64."""
     random = np.random.default_rng(3)
     for kappa in (0.0, 0.7, 4.0, 30.0):
         bins = [random.integers(0, BINS, size=n).tolist() for n in (0, 1, 1, 2, 3, 8, 20, 64)]
         directions = draw_directions(int(10 * kappa), len(bins))
         directions[1] = LATTICE[bins[1][0]]  # exactly as seen
-        found = visibility(visibility_now, bins, directions, kappa)
+        found = visibility(gavis, bins, directions, kappa)
         truth = [
             expected_visibility(seen, d, kappa) for seen, d in zip(bins, directions, strict=True)
         ]
@@ -121,7 +120,7 @@ def test_it_is_what_the_paper_bounds_from_below(seen, kappa, seed, blind):
 
 
 def _visibility_now(seen, direction, kappa) -> float:
-    return float(visibility(visibility_now, [list(seen)], np.array([direction]), kappa)[0])
+    return float(visibility(gavis, [list(seen)], np.array([direction]), kappa)[0])
 
 
 # ---- rays ------------------------------------------------------------------------------------
@@ -202,31 +201,33 @@ def expected_entropy(ends, bins, poses, grid, is_unexplored) -> np.ndarray:
     return np.array(values)
 
 
-def law_rays() -> None:
+def test_rays() -> None:
+    module = gavis
     for seed in range(4):
         grid, is_unexplored = room(seed)
-        ends, bins, poses = scene_of_rays(rays_now, seed)
-        found = rays_now.entropy_of_views(
+        ends, bins, poses = scene_of_rays(module, seed)
+        found = module.entropy_of_views(
             ends, grid, CAMERA, jnp.asarray(poses, jnp.float32), jnp.float32(RANGE),
-            beliefs_of(rays_now), num_bins=BINS, num_steps=STEPS,
+            beliefs_of(module), num_bins=BINS, num_steps=STEPS,
         )  # fmt: skip
         truth = expected_entropy(ends, bins, poses, grid, is_unexplored)
         np.testing.assert_allclose(np.asarray(found), truth, rtol=2e-4)
         assert len(np.unique(truth)) == len(poses)
 
 
-def law_entropy() -> None:
+def test_entropy() -> None:
     """0 for a ray that is known for certain, h for one that is not known at all."""
-    found = rays_now.entropy(jnp.asarray([[0.0, 0.5, 1.0]], jnp.float32), beliefs_of(rays_now))
+    module = gavis
+    found = module.entropy(jnp.asarray([[0.0, 0.5, 1.0]], jnp.float32), beliefs_of(module))
     np.testing.assert_allclose(found[0], [0.0, np.log(2.0) + 2.5, 5.0], rtol=1e-6)
 
 
 @given(st.floats(0.0, 1.0), st.integers(0, 30), st.floats(0.0, 1.0), st.booleans())
 def test_more_unknown_cells_and_less_visibility_make_a_ray_less_known(unseen, cells, opacity, hit):
     share = lambda unseen, cells: float(
-        rays_now.unknown_share(
+        gavis.unknown_share(
             jnp.full((1, 1), hit), jnp.full((1, 1), unseen), jnp.full((1, 1), float(cells)),
-            beliefs_of(rays_now, opacity=opacity),
+            beliefs_of(gavis, opacity=opacity),
         )[0, 0]
     )  # fmt: skip
     found = share(unseen, cells)
@@ -234,14 +235,6 @@ def test_more_unknown_cells_and_less_visibility_make_a_ray_less_known(unseen, ce
     assert share(unseen, cells + 1) >= found - 1e-6
     assert share(min(1.0, unseen + 0.1), cells) >= found - 1e-6
     assert hit or share(0.0, cells) == found  # what ends nowhere has no voxel to be seen
-
-
-LAWS = [law_visibility, law_rays, law_entropy]
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_laws(law):
-    law()
 
 
 # ---- the policy ------------------------------------------------------------------------------

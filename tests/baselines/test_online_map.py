@@ -11,11 +11,13 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from r3jax.baselines import births
-from r3jax.baselines.births import grown, kept_rows, one_per_voxel, turned_to
+from r3jax.baselines import online_map
 from r3jax.baselines.online_map import (
+    BALLS,
+    DISCS,
     FIRST_CAPACITY,
     FIRST_ERROR,
+    GAUSS_MI,
     _added,
     _gradient_of_view,
     _pruned,
@@ -24,11 +26,14 @@ from r3jax.baselines.online_map import (
     colored,
     drawn_batch,
     empty_online_map,
+    grown,
+    kept_rows,
+    one_per_voxel,
     rows_in_view,
     show,
     supported_by,
+    turned_to,
 )
-from r3jax.baselines.settings import BALLS, DISCS, GAUSS_MI
 from r3jax.exploration.clock import compilations
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.splatting.config import RasterConfig
@@ -215,7 +220,7 @@ def test_births_by_hand() -> None:
     color[0, 5, 0] += 0.7
     distance = np.array([[2.0, 2.0, 2.0, 2.0, 2.11, 2.09]])
     alpha = np.array([[1.0, 1.0, 0.49, 0.51, 1.0, 1.0]])
-    found = births.is_wrong(rgb, depth, (color, distance, alpha), DISCS)
+    found = online_map.is_wrong(rgb, depth, (color, distance, alpha), DISCS)
     assert found.tolist() == [[True, False, True, False, True, False]]
 
 
@@ -234,7 +239,7 @@ def test_discs_lie_on_their_wall() -> None:
     nothing = np.zeros((20, 24, 3)), np.zeros((20, 24)), np.zeros((20, 24))
     settings = replace(DISCS, spacing=1e-3)
     rng = np.random.default_rng(0)
-    born = births.born_in(rgb, depth, pose, camera, nothing, settings, rng)
+    born = online_map.born_in(rgb, depth, pose, camera, nothing, settings, rng)
     assert len(born.means) == 20 * 24 - 1
     np.testing.assert_allclose(born.means @ normal, height, atol=1e-4)
     rotation = rotation_rows(jnp.asarray(born.quats))
@@ -253,7 +258,7 @@ def test_rows_move_whole() -> None:
     scene = random_cloud(1, 6, 0)
     marks = jnp.arange(12.0).reshape(6, 2) + 1.0
     keep = np.array([False, True, True, False, True, False])
-    kept, moved = births.kept_rows((scene, marks), keep)
+    kept, moved = online_map.kept_rows((scene, marks), keep)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         a, b = np.asarray(getattr(kept, name)), np.asarray(getattr(scene, name))
         np.testing.assert_array_equal(a[:3], b[keep])

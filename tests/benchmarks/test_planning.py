@@ -8,8 +8,8 @@ import pytest
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth
+from r3jax.planning.candidates import draw_positions
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.greedy import draw_positions
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.travel import plan_travel
 

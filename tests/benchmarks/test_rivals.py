@@ -8,9 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.baselines.births import grown
-from r3jax.baselines.online_map import Keyframes, _trained, empty_online_map
-from r3jax.baselines.settings import GAUSS_MI
+from r3jax.baselines.online_map import GAUSS_MI, Keyframes, _trained, empty_online_map, grown
 from r3jax.geometry.cameras import Camera, pose_along
 from tests.benchmarks.test_splatting import ROOM, room_cloud
 

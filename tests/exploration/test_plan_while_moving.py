@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from r3jax.exploration import explore
-from r3jax.planning.decision import prepare_decision
-from r3jax.planning.greedy import RECONSIDERED
+from r3jax.planning.decide import RECONSIDERED, look_round
 from r3jax.planning.planner import decide, decide_ahead, observe, reconsider
 from r3jax.runs.reader import read_run
 from r3jax.runs.rows import from_json, to_json
@@ -92,12 +91,14 @@ def test_on_arrival_the_best_are_scored_again_on_what_has_come_in():
     np.testing.assert_allclose(decision.candidates, best, atol=1e-6)
     # Their utilities are those of the map now, cell by cell worth a look now.
     policy = planner.policy
-    _, _, masked = prepare_decision(
-        arrived.policy_state, arrived.map_state, arrived.grid, T, policy.config
-    )
+    _, where = look_round(arrived.policy_state, arrived.map_state, arrived.grid, T, policy.config)
     for pose, utility in zip(decision.candidates, decision.utilities["utility"], strict=True):
         expected = view_utility(
-            arrived.map_state, masked, simulator.camera, jnp.asarray(pose, jnp.float32), SCORING
+            arrived.map_state,
+            where.scoring_grid,
+            simulator.camera,
+            jnp.asarray(pose, jnp.float32),
+            SCORING,
         )
         np.testing.assert_allclose(utility, float(expected.total), rtol=1e-4)
     chosen = int(np.argmax(decision.utilities["total"]))

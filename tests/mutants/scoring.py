@@ -123,4 +123,22 @@ MUTANTS = [
         ("jnp.maximum(count - 1.0, 1.0)", "jnp.maximum(count, 1.0)"),
         ("count > 1.0, jnp.clip", "count > 3.0, jnp.clip"),
     ),
+    *faults(
+        "r3jax/scoring/soft_utility.py",
+        "tests/scoring/test_soft_utility.py::test_the_sum_matches_an_oracle",
+        ("* jnp.sqrt(1.0 + k * k))", ")"),
+        ("(-1.0, (size - center) / focal)", "(-1.0, center / focal)"),
+        ("visible = self.count * jax.nn.sigmoid(left)", "visible = self.count"),
+    ),
+    *faults(
+        "r3jax/scoring/soft_utility.py",
+        "tests/scoring/test_soft_utility.py::test_without_softness_it_is_the_utility",
+        ("broadcast_to(self.config.lambda1,", "broadcast_to(1.0,"),
+        ("half + _MARGIN, _WIDEST", "0.5 * half, _WIDEST"),
+    ),
+    *faults(
+        "r3jax/scoring/soft_utility.py",
+        "tests/scoring/test_soft_utility.py::test_a_sample_counts_for_all",
+        ("jnp.maximum(count / most, 1.0)", "1.0 + 0.0 * count"),
+    ),
 ]

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from r3jax.planning.candidates import (
     candidates_along,
     in_plain_view,
-    lattice,
     local_random,
     path_lengths,
     poses_along,
@@ -103,14 +102,6 @@ def test_no_region_of_interest_gives_no_position(travel):
     behind = nothing.copy()
     behind[0, 0, 0] = True  # inside a wall: near enough, but never in plain view
     assert len(region_of_interest(travel, behind, 10, key=KEY)[0]) == 0
-
-
-def test_lattice_positions_are_spread_over_the_places_to_stop(travel):
-    positions = lattice(travel, (0.8, 0.8, 0.4))
-    cells = cells_of(positions)
-    assert travel.goals[tuple(cells.T)].all()
-    np.testing.assert_array_equal(np.unique(cells[:, 0]), [2, 6, 10, 14, 18, 22])
-    assert len(np.unique(cells, axis=0)) == len(cells)
 
 
 def test_directions_cover_the_sphere_evenly():

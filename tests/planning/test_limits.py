@@ -65,7 +65,8 @@ def is_allowed(limits, poses: np.ndarray, slack: float) -> np.ndarray:
     return fine
 
 
-def law_obeyed(seed: int = 0) -> None:
+@given(st.integers(0, 1000))
+def test_any_view_becomes_an_allowed_one(seed):
     """Allowed and without roll; what was allowed is left as it is; a second time nothing moves."""
     for motion in MOTIONS_TRIED:
         limits = limited(limits_module, motion, seed)
@@ -88,21 +89,21 @@ def law_obeyed(seed: int = 0) -> None:
             np.testing.assert_array_equal(obeyed[:, :2, 3], poses[:, :2, 3])
 
 
-def law_nearest() -> None:
+def test_nearest() -> None:
     """By hand: 45 degrees up become 30; half a turn at 0.5 m becomes 45 degrees that way."""
-    here = np.zeros(3)
+    module, here = limits_module, np.zeros(3)
     now = poses_along(here[None], np.array([[1.0, 0.0, 0.0]]))[0]
-    tilted = limits_module.Limits(MOTIONS["gimbal"], now)
+    tilted = module.Limits(MOTIONS["gimbal"], now)
     up = poses_along(here[None], np.array([[0.0, -1.0, 1.0]]))
     half = math.sqrt(0.75)
     np.testing.assert_allclose(feasible(tilted, up)[0, :3, 2], [0.0, -half, 0.5], atol=1e-6)
-    walking = limits_module.Limits(Motion(turn_per_meter=90.0), now)
+    walking = module.Limits(Motion(turn_per_meter=90.0), now)
     place = np.array([[0.3, 0.4, 0.0]])
     back = poses_along(place, np.array([[-1.0, 1e-3, 0.0]]))
     root = math.sqrt(0.5)
     np.testing.assert_allclose(feasible(walking, back)[0, :3, 2], [root, root, 0.0], atol=1e-6)
     # Across the azimuth where the angles begin again: 20 degrees are 20, not 340.
-    wrapped = limits_module.Limits(Motion(turn_per_meter=90.0), _level(170.0, here))
+    wrapped = module.Limits(Motion(turn_per_meter=90.0), _level(170.0, here))
     there = _level(-170.0, place[0])[None]
     np.testing.assert_allclose(feasible(wrapped, there), there, atol=1e-6)
 
@@ -112,7 +113,9 @@ def _level(degrees: float, place: np.ndarray) -> np.ndarray:
     return poses_along(place[None], np.array([[math.cos(angle), math.sin(angle), 0.0]]))[0]
 
 
-def law_axes(seed: int = 0) -> None:
+@pytest.mark.full
+@given(st.integers(0, 1000))
+def test_any_place_has_its_allowed_axes(seed):
     """A direction is allowed where it, or one within its bin, is; somewhere there is always one."""
     positions = views(seed, 0.5)[:, :3, 3]
     cap = math.degrees(math.acos(1.0 - 2.0 / 526.0))
@@ -149,7 +152,8 @@ def elevation_of(directions: np.ndarray) -> np.ndarray:
     return np.degrees(np.arcsin(directions[:, 2]))
 
 
-def law_turns(seed: int = 0) -> None:
+@given(st.integers(0, 1000))
+def test_a_turn_takes_its_time(seed):
     """Where the carrier may turn far enough is where the elevation alone settles the view."""
     positions, directions = views(seed)[:, :3, 3], LATTICE[::40]
     limits = limited(limits_module, TURNING, seed)
@@ -167,7 +171,7 @@ def law_turns(seed: int = 0) -> None:
     assert limited(limits_module, MOTIONS["ground"], seed).may_turn(positions, LATTICE[:1]).all()
 
 
-def law_costs() -> None:
+def test_costs() -> None:
     """By hand: at 2 m/s and 45 degrees/s a quarter turn takes 2 s, in which 4 m could be flown."""
     here = np.zeros(3)
     poses = np.stack([_level(0.0, here), _level(90.0, here), _level(180.0, here)])
@@ -181,7 +185,7 @@ def law_costs() -> None:
     assert free.seconds(3.0, axes[1]) is None
 
 
-def law_begin() -> None:
+def test_begin() -> None:
     """A mission begins at an allowed elevation, whatever the turn; not at a height beyond reach."""
     begin_at, steep = limits_module.begin_at, views(3)[7]
     for motion in (*MOTIONS_TRIED, Motion(elevations=(-5.0, 5.0), turn_per_meter=10.0)):
@@ -197,22 +201,3 @@ def law_begin() -> None:
     except ValueError as error:
         said = str(error)
     assert "heights are 4.000 to 5.000 m above the world's z = 0" in said
-
-
-LAWS = [law_obeyed, law_nearest, law_axes, law_turns, law_costs, law_begin]
-
-
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
-def test_law(law):
-    law()
-
-
-@given(seed=st.integers(0, 1000))
-def test_any_view_becomes_an_allowed_one(seed):
-    law_obeyed(seed)
-
-
-@pytest.mark.full
-@given(seed=st.integers(0, 1000))
-def test_any_place_has_its_allowed_axes(seed):
-    law_axes(seed)

@@ -50,7 +50,10 @@ def by_brute_force(poses: np.ndarray, k: int) -> tuple[list[int], list[float]]:
     return chosen, worth
 
 
-def law_greedy(seed: int = 0) -> None:
+@pytest.mark.full
+@given(st.integers(0, 300))
+@settings(max_examples=5)
+def test_lazy_choice_is_that_of_scoring_all_again(seed):
     state, grid = known()
     poses = poses_of(seed)
     views = real.next_views(state, grid, CAMERA, 5, poses=poses, config=CONFIG)
@@ -61,7 +64,7 @@ def law_greedy(seed: int = 0) -> None:
     assert worth[-1] < 0.9 * worth[0]  # or nothing was conditioned on anything
 
 
-def test_no_pose_is_taken_twice() -> None:
+def test_no_pose_is_taken_twice():
     state, grid = known()
     poses = poses_of(1)
     views = real.next_views(state, grid, CAMERA, NUM, poses=poses, config=CONFIG)
@@ -69,30 +72,19 @@ def test_no_pose_is_taken_twice() -> None:
     assert sorted(order) == list(range(NUM))
 
 
-def law_lazy() -> None:
+@pytest.mark.full
+def test_only_what_may_win_is_scored_again() -> None:
     """Hopeless poses are scored once."""
-    scored = []
+    module, scored = real, []
 
     def count(voxels, cells, camera, poses, config):
         scored.append(len(poses))
         return score_views_near(voxels, cells, camera, poses, config)
 
-    with mock.patch.object(real, "score_views_near", count):
-        real.next_views(*known(), CAMERA, 3, poses=poses_of(2), config=CONFIG)
+    with mock.patch.object(module, "score_views_near", count):
+        module.next_views(*known(), CAMERA, 3, poses=poses_of(2), config=CONFIG)
     assert scored[0] == NUM
     assert sum(scored[1:]) < 2 * NUM
-
-
-@pytest.mark.full
-def test_only_what_may_win_is_scored_again():
-    law_lazy()
-
-
-@pytest.mark.full
-@given(st.integers(0, 300))
-@settings(max_examples=5)
-def test_lazy_choice_is_that_of_scoring_all_again(seed):
-    law_greedy(seed)
 
 
 @given(st.integers(0, 300))
@@ -152,7 +144,3 @@ def test_what_cannot_be_chosen_from_is_refused():
     unknown = eqx.tree_at(lambda g: g.log_odds, grid, jnp.zeros_like(grid.log_odds))
     with pytest.raises(ValueError, match="no free cell that keeps the safety margin"):
         r3jax.next_views(state, unknown, CAMERA, 1, config=CONFIG)
-
-
-def test_the_law_holds_without_a_fault():
-    law_greedy()

@@ -5,7 +5,6 @@ candidates; utilities left undivided; the worst candidate taken; hopeless cells 
 scorer's grid; the trail forgotten; `frontier` looking at the same cell again.
 """
 
-import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -16,14 +15,13 @@ from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.mapping.state import empty_map
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decision import ENOUGH_LOOKS, initial_state, net_utility, prepare_decision
+from r3jax.planning.decide import MAX_FAILED_LOOKS, initial_state, look_round, net_utility
 from r3jax.planning.policies.frontier import Frontier
+from r3jax.planning.policies.r3 import Ours, OursPano
 from r3jax.planning.policies.random import Random
-from r3jax.planning.policies.renderability import SETTLED, Ours, OursPano
 from r3jax.planning.policy import DecisionOutcome, Policy
 from r3jax.planning.registry import describe, make_policy, policy_names, source_of
 from r3jax.planning.robot.travel import plan_travel
-from r3jax.scoring.config import ScoringConfig
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 from tests.planning.test_travel import assert_inside
 
@@ -66,30 +64,6 @@ def policies() -> list:
         Frontier(CONFIG),
         Random(CONFIG),
     ]
-
-
-def test_the_last_word_on_a_sample_is_exact(world):
-    """Estimates are half too high here: the best are replaced, the others scaled alike."""
-    asked = []
-
-    def score(map_state, grid, camera, positions, config, allowed):
-        asked.append((config.sample, np.asarray(positions)))
-        factor, axis = (1.5, 2) if config.sample > 1 else (1.0, 0)
-        worth = 1.0 + np.asarray(positions, np.float64)[:, 0]
-        direction = np.tile(np.eye(3)[axis], (len(positions), 1))
-        return SimpleNamespace(best_direction=direction, best_score=factor * worth)
-
-    config = dataclasses.replace(CONFIG, scoring=ScoringConfig(sample=4))
-    decision, _, _ = decide(OursPano(config, score), world, center((4, 4, 3)))
-    assert [sample for sample, _ in asked] == [4, 1]
-    x = decision.candidates[:, 0, 3]
-    settled = np.flatnonzero(decision.candidates[:, 0, 2] > 0.5)
-    assert len(settled) == len(asked[1][1]) == SETTLED
-    assert x[settled].min() >= np.sort(x)[-SETTLED]
-    np.testing.assert_allclose(decision.utilities["utility"], 1.0 + x, rtol=1e-6)
-    exact, _, _ = decide(OursPano(CONFIG, score), world, center((4, 4, 3)))
-    np.testing.assert_array_equal(exact.T_world_camera, decision.T_world_camera)
-    assert [sample for sample, _ in asked] == [4, 1, 1]
 
 
 @pytest.fixture(scope="module")
@@ -320,15 +294,16 @@ def test_cells_looked_at_in_vain_are_left_alone():
     pose = poses_along(center(14, 6, 4)[None], np.array([[1.0, 0.0, 0.0]]))[0]
     config = PlannerConfig()
     in_view = None
-    for look in range(ENOUGH_LOOKS):
-        state, _, masked = prepare_decision(state, empty_map(64), grid, pose, config)
+    for look in range(MAX_FAILED_LOOKS):
+        state, where = look_round(state, empty_map(64), grid, pose, config)
+        masked = where.scoring_grid
         seen = np.asarray(state.looks) == look + 1
         assert in_view is None or np.array_equal(seen, in_view)
         in_view = seen
         left = np.asarray(masked.unexplored)
-        assert left[in_view].any() == (look < ENOUGH_LOOKS - 1)
+        assert left[in_view].any() == (look < MAX_FAILED_LOOKS - 1)
     assert in_view.sum() > 50
     assert np.asarray(masked.unexplored).any()  # what no view has shown still counts
     away = poses_along(center(14, 6, 4)[None], np.array([[-1.0, 0.0, 0.0]]))[0]
-    state, _, _ = prepare_decision(state, empty_map(64), grid, away, config)
-    assert not np.any((np.asarray(state.looks) > ENOUGH_LOOKS) & in_view)
+    state, _ = look_round(state, empty_map(64), grid, away, config)
+    assert not np.any((np.asarray(state.looks) > MAX_FAILED_LOOKS) & in_view)

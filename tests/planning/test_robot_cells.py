@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from r3jax.planning.robot import travel
@@ -31,7 +31,10 @@ def closed_one_by_one(occupied, body, margin, heights) -> np.ndarray:
     return closed
 
 
-def law_closed(seed: int = 0) -> None:
+@given(st.integers(0, 1000))
+@example(0)
+@settings(max_examples=10)
+def test_cells_are_closed_as_defined(seed):
     rng = np.random.default_rng(seed)
     occupied = rng.random(SHAPE) < 0.02
     for body, margin in ((0.45, 0.3), (0.93, 0.5), (5.0, 0.05)):
@@ -40,12 +43,12 @@ def law_closed(seed: int = 0) -> None:
             closed = travel.cells_over_matter(*arguments)
             expected = closed_one_by_one(occupied, body, margin, heights)
             np.testing.assert_array_equal(closed, expected)
-            assert expected.any()
+            assert expected.any() or seed != 0
     nobody = travel.cells_over_matter(occupied, 0.0, 0.3, (0.0, 3.0), LOW, CELL)
     assert not nobody.any()
 
 
-def law_unlimited() -> None:
+def test_unlimited() -> None:
     """Without limits of height every cell over matter is closed, however tall the grid."""
     occupied = np.zeros(SHAPE, bool)
     occupied[4, 3, 2] = True
@@ -61,7 +64,7 @@ def with_table() -> tuple[np.ndarray, np.ndarray]:
     return free, occupied
 
 
-def law_round_the_table() -> None:
+def test_round_the_table() -> None:
     """A robot goes round a table that a camera flies over; it never leaves its height."""
     start, goal = center(3, 3, 6), center(10, 3, 6)
     grid = grid_of(*with_table())
@@ -80,29 +83,13 @@ def law_round_the_table() -> None:
     np.testing.assert_array_equal(over.path(goal), [start, goal])
 
 
-def law_level() -> None:
+def test_level() -> None:
     """Off the middle of its layer the robot stays off it, round corners too."""
     start, goal = center(3, 3, 6.35), center(10, 3, 6.35)
     height = (float(start[2]), float(start[2]))
     robot = travel.plan_travel(grid_of(*with_table()), start, heights=height, body=0.8)
     assert len(robot.path(goal)) > 2
     assert np.all(robot.path(goal)[:, 2] == start[2])
-
-
-LAWS = [law_closed, law_unlimited, law_round_the_table, law_level]
-
-
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
-def test_law(law):
-    law()
-
-
-@given(seed=st.integers(0, 1000))
-def test_cells_are_closed_as_defined(seed):
-    occupied = np.random.default_rng(seed).random(SHAPE) < 0.02
-    heights = (LOW + 0.71, LOW + 1.33)
-    closed = travel.cells_over_matter(occupied, 0.45, 0.3, heights, LOW, CELL)
-    np.testing.assert_array_equal(closed, closed_one_by_one(occupied, 0.45, 0.3, heights))
 
 
 @given(

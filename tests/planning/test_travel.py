@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from skimage.graph import MCP_Geometric
 
-from r3jax.planning.robot.cells import segment_cells
+from r3jax.kernels.robot.cells import segment_cells
 from r3jax.planning.robot.travel import plan_travel, safe_cells, segment_is_inside
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, two_rooms
 

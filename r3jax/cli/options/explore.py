@@ -157,7 +157,7 @@ class PlanningOptions:
     """Weight of the path length against the utility (policy's default: 0.5)."""
 
     refine: Annotated[int | None, arg(metavar="N")] = None
-    """Refine the best N candidates by gradient ascent (`ours` and its kin only; 0: none)."""
+    """Refine the best N candidates of `r3` or `r3-pano` by gradient ascent (0: none)."""
 
 
 @dataclass(frozen=True, kw_only=True)

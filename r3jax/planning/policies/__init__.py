@@ -19,9 +19,9 @@ GROUP = "r3jax.policies"
 HOMES = {
     name: f"r3jax.{home}"
     for name, home in {
-        "ours": "planning.policies.renderability:Ours",
-        "ours-pano": "planning.policies.renderability:OursPano",
-        "ours-ahead": "planning.policies.ahead:OursAhead",
+        "ours": "planning.policies.r3:Ours",
+        "ours-pano": "planning.policies.r3:OursPano",
+        "ours-ahead": "planning.policies.r3_ahead:OursAhead",
         "r3con": "baselines.r3con:R3con",
         "active-gs": "baselines.active_gs:ActiveGS",
         "active-gs-online": "baselines.active_gs_online:ActiveGSOnline",

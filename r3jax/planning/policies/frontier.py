@@ -18,10 +18,12 @@ from r3jax.planning.candidates import (
     VIEW_DISTANCE,
     Candidates,
     candidates_along,
+    draw_lots,
+    free_views,
     host_generator,
     in_plain_view,
 )
-from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_lots, free_views
+from r3jax.planning.decide import Drawn, GreedyPolicy, Scored
 from r3jax.planning.policy import Situation
 from r3jax.planning.robot.limits import UNBOUND, Limits
 from r3jax.planning.robot.travel import Travel
@@ -43,7 +45,6 @@ class Frontier(GreedyPolicy):
     """The nearest view of a frontier cell by path length; random views when none is left."""
 
     name = "frontier"
-    scores_by_notes = True
     source = "Yamauchi, CIRA 1997: the nearest frontier"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> np.ndarray:
@@ -66,16 +67,21 @@ class Frontier(GreedyPolicy):
         stops, aims = nearest_views(situation.travel, fresh, num, situation.limits, key=target_key)
         if len(stops) == 0:
             # The memory stays as it was: random views are no attempt at the frontier.
-            anywhere = free_views(situation, num, self.config.radius, key=random_key)
+            anywhere = free_views(situation.travel, num, self.config.radius, key=random_key)
             return Drawn(anywhere, situation.memory, notes=False)
         return Drawn(candidates_along(stops, aims - stops).padded(num), attempted, notes=True)
 
-    def score(
-        self, situation: Situation, candidates: Candidates, *, key: Array
-    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+    def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
         """Nothing: the path alone decides; lots where no frontier is in reach."""
         lots = {} if situation.notes else draw_lots(len(candidates.valid), key=key)
         return candidates, lots
+
+    def score_again(
+        self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
+    ) -> Scored:
+        """Their order stays: which cells they were drawn for is not known any more."""
+        del situation, key
+        return candidates, {"lot": before}
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """Minus the path length, or the lots."""

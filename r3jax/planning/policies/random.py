@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array
 
-from r3jax.planning.candidates import Candidates
-from r3jax.planning.greedy import Drawn, GreedyPolicy, draw_lots, free_views
+from r3jax.planning.candidates import Candidates, draw_lots, free_views
+from r3jax.planning.decide import Drawn, GreedyPolicy, Scored
 from r3jax.planning.policy import Situation
 
 
@@ -20,11 +20,9 @@ class Random(GreedyPolicy):
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """Nearby positions, random directions."""
         num, radius = self.config.num_candidates, self.config.radius
-        return Drawn(free_views(situation, num, radius, key=key), situation.memory)
+        return Drawn(free_views(situation.travel, num, radius, key=key), situation.memory)
 
-    def score(
-        self, situation: Situation, candidates: Candidates, *, key: Array
-    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+    def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
         """The lot that each candidate draws."""
         del situation
         return candidates, draw_lots(len(candidates.valid), key=key)

@@ -25,7 +25,7 @@ def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarr
         The unexplored cells that count, [X, Y, Z] bool.
     """
     # Imported only here: whoever plans no way does not wait for Numba.
-    from r3jax.planning.robot.cells import flood
+    from r3jax.kernels.robot.cells import flood
 
     # Free space seen through a window counts for nothing: no robot gets there to look on.
     open_space = flood(free, reached)

@@ -34,7 +34,7 @@ class Limits:
     def project_to_feasible(self, candidates: Candidates) -> Candidates:
         """Projects views onto what is allowed; those that are allowed are left as they are."""
         positions = self.at_height(candidates.position)
-        wanted = _angles_along(candidates.direction)
+        wanted = angles_along(candidates.direction)
         allowed = self._turned(positions, *wanted)
         # Angles and back again would round: only what must turn is turned.
         is_turned = _distance(wanted, allowed) > _SAME
@@ -58,7 +58,7 @@ class Limits:
         Returns:
             [C, B], or [C].
         """
-        nearest = directions_along(*self._turned(positions, *_angles_along(directions)))
+        nearest = directions_along(*self._turned(positions, *angles_along(directions)))
         return np.clip(np.sum(nearest * directions, axis=-1), -1.0, 1.0)
 
     def allowed_axes(self, positions: np.ndarray, num_bins: int) -> np.ndarray:
@@ -77,7 +77,7 @@ class Limits:
     def may_turn(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Where the path is long enough for the turn, elevation clipped; as `nearness` [bool]."""
         # The elevation is clipped first: a tilt that stops short is no turn cut short.
-        azimuth, elevation = self.clipped(*_angles_along(directions))
+        azimuth, elevation = self.clipped(*angles_along(directions))
         turned = self._turned(positions, azimuth, elevation)
         return _distance((azimuth, elevation), turned) <= _SAME
 
@@ -102,9 +102,9 @@ class Limits:
 
     def turns(self, directions: np.ndarray) -> np.ndarray:
         """Angles of the rotations from the present view to those along directions [C, 3] [rad]."""
-        (azimuth_now,), (elevation_now,) = _angles_of(self.T_world_camera[None])
-        azimuth, elevation = _angles_along(directions)
-        return _angle_of_turn(_wrapped(azimuth - azimuth_now), elevation - elevation_now)
+        (azimuth_now,), (elevation_now,) = angles_of(self.T_world_camera[None])
+        azimuth, elevation = angles_along(directions)
+        return _angle_of_turn(wrapped(azimuth - azimuth_now), elevation - elevation_now)
 
     def _turned(
         self, positions: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray
@@ -120,11 +120,11 @@ class Limits:
         )
         if self.motion.turn_per_meter is None:
             return azimuth, elevation
-        (azimuth_now,), (elevation_now,) = _angles_of(self.T_world_camera[None])
+        (azimuth_now,), (elevation_now,) = angles_of(self.T_world_camera[None])
         # The straight line, not the path: who walks round a table may turn no more for it.
         straight = np.linalg.norm(positions - self.T_world_camera[:3, 3], axis=-1)
         allowed = np.radians(self.motion.turn_per_meter) * straight
-        by = _wrapped(azimuth - azimuth_now), elevation - elevation_now
+        by = wrapped(azimuth - azimuth_now), elevation - elevation_now
         angle = _angle_of_turn(*by)
         # No turn at all has no direction: the share of it must not be 0 / 0.
         whole = np.maximum(np.hypot(*by), _SAME)
@@ -151,15 +151,15 @@ def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
     low, high = motion.heights_from(height)
     check_height(height, (low, high))
     pose = np.array(T_world_camera, dtype=np.float64)
-    wanted = _angles_of(pose[None])
+    wanted = angles_of(pose[None])
     # The elevation alone: nobody came from anywhere, so that no turn can be too long.
     allowed = Limits(motion, pose).clipped(*wanted)
     if _distance(wanted, allowed)[0] > _SAME:
-        pose[:3, :3] = _rotations(*allowed)[0]
+        pose[:3, :3] = rotations(*allowed)[0]
     return pose
 
 
-def _angles_of(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def angles_of(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth and elevation [rad] of poses [C, 4, 4] without roll, [C] each.
 
     The azimuth is read off the level axis of the image: it means something straight up, too.
@@ -169,7 +169,7 @@ def _angles_of(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return azimuth, np.arctan2(forward[:, 2], np.hypot(forward[:, 0], forward[:, 1]))
 
 
-def _angles_along(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def angles_along(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth and elevation [rad] of the poses along directions [..., 3], [...] each."""
     x, y, z = np.moveaxis(directions, -1, 0)
     level = np.hypot(x, y)
@@ -184,7 +184,7 @@ def directions_along(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
-def _rotations(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+def rotations(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     """Axes of the cameras that look there without roll, [C, 3, 3]."""
     forward = directions_along(azimuth, elevation)
     # From the azimuth: a cross product with the vertical vanishes straight up and down.
@@ -202,13 +202,13 @@ def _angle_of_turn(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     return 2.0 * np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
+def wrapped(angle: np.ndarray) -> np.ndarray:
     """Angles [rad] as turns by at most half a circle."""
-    return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+    return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi))
 
 
 def _distance(
     first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
     """Between pairs of azimuth and elevation [rad]."""
-    return np.hypot(_wrapped(second[0] - first[0]), second[1] - first[1])
+    return np.hypot(wrapped(second[0] - first[0]), second[1] - first[1])

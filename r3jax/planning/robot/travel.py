@@ -19,9 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r3jax.kernels.robot.shortest_paths import shortest_paths
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.planning.robot.motion import UNLIMITED, check_height
-from r3jax.planning.robot.shortest_paths import shortest_paths
 
 _INSET = 1e-2
 """A camera at a fixed height that is a border of layers counts as so far inside its own [cells]:
@@ -114,7 +114,7 @@ class Travel:
         The straight line where it is safe, else the path over the cells' centers: no shorter
         than what `path` returns.
         """
-        from r3jax.planning.robot.cells import segments_are_inside
+        from r3jax.kernels.robot.cells import segments_are_inside
 
         cells = np.floor((positions - self.origin) / self.cell_size).astype(np.int64)
         is_inside = np.all((cells >= 0) & (cells < self.usable.shape), axis=1)
@@ -152,7 +152,7 @@ class Travel:
 
     def cells_along(self, waypoints: np.ndarray) -> np.ndarray:
         """Cells of the grid that the path over waypoints [K, 3] [m] crosses, [X, Y, Z] bool."""
-        from r3jax.planning.robot.cells import segment_cells
+        from r3jax.kernels.robot.cells import segment_cells
 
         swept = np.zeros(self.usable.shape, dtype=bool)
         for a, b in itertools.pairwise(waypoints):
@@ -294,7 +294,7 @@ def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
         b: the other end.
     """
     # Imported only here: whoever plans no way does not wait for Numba.
-    from r3jax.planning.robot.cells import segments_are_inside
+    from r3jax.kernels.robot.cells import segments_are_inside
 
     return bool(segments_are_inside(mask, a, b[None])[0])
 

@@ -67,9 +67,5 @@ def is_running(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    return state_of(pid) != "Z"  # one that has ended may wait to be reaped
-
-
-def state_of(pid: int) -> str:
-    """The letter that Linux has for what a process does: T is paused, Z has ended."""
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    # One that has ended may wait to be reaped.
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"

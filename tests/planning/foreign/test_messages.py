@@ -12,7 +12,6 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from r3jax.planning.policies.foreign.messages import (
     DTYPES,
-    MAX_ARRAYS,
     MAX_HEADER,
     PREFIX,
     Message,
@@ -44,21 +43,30 @@ def messages(draw):
 
 
 @given(messages())
-def test_what_is_encoded_is_decoded(message):
+def test_what_is_encoded_is_a_header_and_the_bytes_of_its_arrays(message):
     data = encode(message)
+    end = 8 + struct.unpack("<I", data[:4])[0]
+    header = json.loads(data[8:end])
+    assert len(data) == end + struct.unpack("<I", data[4:8])[0]
+    assert header.pop("kind") == message.kind
+    assert [entry["name"] for entry in header.pop("arrays")] == list(message.arrays)
+    assert header == message.fields
+    assert data[end:] == b"".join(
+        array.astype(array.dtype.newbyteorder("<")).tobytes() for array in message.arrays.values()
+    )
+
+
+@given(messages())
+def test_an_answer_is_decoded(message):
+    data = encode(Message(message.kind, message.fields))
     assert length_of(data[: PREFIX.size]) == len(data)
-    again = decode(data)
-    assert (again.kind, again.fields) == (message.kind, message.fields)
-    assert list(again.arrays) == list(message.arrays)
-    for name, array in message.arrays.items():
-        assert again.arrays[name].dtype == array.dtype
-        np.testing.assert_array_equal(again.arrays[name], array)
+    assert decode(data) == Message(message.kind, message.fields)
 
 
 @given(messages(), st.data())
 def test_damaged_bytes_are_refused_or_another_message(message, data):
     """A byte changed, a piece taken out or put in: a message or a `MessageError`, nothing else."""
-    whole = bytearray(encode(message))
+    whole = bytearray(encode(Message(message.kind, message.fields)))
     place = data.draw(st.integers(0, len(whole) - 1))
     piece = data.draw(st.binary(max_size=6))
     whole[place : place + data.draw(st.integers(0, 6))] = piece
@@ -71,39 +79,29 @@ def raw(header, data=b""):
     return PREFIX.pack(len(text), len(data)) + text + data
 
 
-def listed(**entry):
-    return {"kind": "view", "arrays": [{"name": "a", "dtype": "uint8", "shape": [2]} | entry]}
-
-
 @pytest.mark.parametrize(
-    ("data", "says"),
+    "data",
     [
-        (b"", "0 bytes are not a whole message"),
-        (raw({"kind": "view"})[:-1], "bytes are not a whole message"),
-        (b"Loading weights ...\n", "nothing but messages may go to the standard output"),
-        (PREFIX.pack(MAX_HEADER + 1, 0), "announce a header of 1048577"),
-        (PREFIX.pack(2, MAX_ARRAYS + 1) + b"{}", "and arrays of 67108865 bytes"),
-        (raw(b"\x80\x04]\x94."), "the header is not understood: this is not JSON"),
-        (raw(b'{"kind": "view", "position": [NaN]}'), "NaN is no number"),
-        (raw([1]), "`header` must be dict"),
-        (raw({}), "`kind` must be str"),
-        (raw({"kind": "view", "arrays": 3}), "`arrays` must be list"),
-        (raw(listed(shape=[-1])), "is odd or listed twice"),
-        (raw(listed(shape=2)), "`a.shape` must be list"),
-        (raw(listed(dtype="object"), b"ab"), "is odd or listed twice"),
-        (raw(listed(shape=[1 << 40])), "more numbers than bytes were sent"),
-        (raw(listed(), b"a"), "more numbers than bytes were sent"),
-        (raw(listed(), b"abc"), "1 bytes belong to no array"),
-        (raw({"kind": "view", "arrays": 2 * listed()["arrays"]}, b"abcd"), "listed twice"),
+        b"",
+        raw({"kind": "view"})[:-1],
+        b"Loading weights ...\n",
+        PREFIX.pack(MAX_HEADER + 1, 0),
+        raw({"kind": "view"}, b"ab"),
+        raw(b"\x80\x04]\x94."),
+        raw(b'{"kind": "view", "position": [NaN]}'),
+        raw([1]),
+        raw({}),
+        raw({"kind": "view", "arrays": 3}),
+        raw({"kind": "view", "arrays": [{"name": "a", "dtype": "uint8", "shape": [0]}]}),
     ],
 )
-def test_what_is_no_message_is_refused(data, says):
-    with pytest.raises(MessageError, match=says):
+def test_what_is_no_answer_is_refused(data):
+    with pytest.raises(MessageError):
         decode(data)
 
 
 def test_what_cannot_be_sent_is_refused():
-    with pytest.raises(ValueError, match="the array 'a' is complex128"):
+    with pytest.raises(ValueError, match="complex128"):
         encode(Message("decide", arrays={"a": np.zeros(2, complex)}))
     with pytest.raises(ValueError, match="JSON"):
         encode(Message("decide", {"path": float("inf")}))

@@ -8,9 +8,9 @@ import pytest
 
 from r3jax.planning.policies.foreign.commands import short_name, words_of
 from r3jax.planning.policies.foreign.messages import Message
-from r3jax.planning.policies.foreign.program import Program, network
+from r3jax.planning.policies.foreign.program import IS_LINUX, Program
 from r3jax.planning.policy import PolicyError
-from tests.planning.foreign.children import is_running, state_of
+from tests.planning.foreign.children import is_running
 
 BEGIN = """
 import json, os, socket, struct, subprocess, sys, time
@@ -81,50 +81,6 @@ def test_what_goes_wrong_is_told_and_the_program_ended(code, says):
     assert not is_running(pid)
 
 
-TICKS = """
-import threading
-gaps = [0.0]
-def tick():
-    last = time.monotonic()
-    while True:
-        time.sleep(0.001)
-        now = time.monotonic()
-        gaps[0], last = max(gaps[0], now - last), now
-threading.Thread(target=tick, daemon=True).start()
-"""
-"""Runs beside the answers, and notes for how long it could not."""
-
-
-def test_nothing_is_computed_between_questions():
-    code = TICKS + "while True: receive(); time.sleep(0.05); send(kind='a', gap=gaps[0])"
-    program = Program(python(code), 0.0)
-    program.ask(Message("decide"), 20.0)
-    time.sleep(0.5)
-    gap = program.ask(Message("decide"), 20.0).fields["gap"]
-    program.close()
-    assert gap >= 0.5
-
-
-def test_what_a_program_has_started_is_paused_and_ended_with_it():
-    """On Linux: also a daemon that has left its group, and its parent."""
-    daemon = "import os, time; os.setsid(); os.fork() and os._exit(0); "
-    daemon += "print(os.getpid(), flush=True); time.sleep(600)"
-    code = f"""
-made = subprocess.Popen([sys.executable, '-c', {daemon!r}], stdout=subprocess.PIPE)
-pid = int(made.stdout.readline())
-made.wait()
-while True: receive(); send(kind='a', pid=pid)
-"""
-    if sys.platform != "linux":
-        pytest.skip("only Linux tells what a process has started")
-    program = Program(python(code), 0.0)
-    pid = program.ask(Message("decide"), 20.0).fields["pid"]
-    assert eventually(lambda: state_of(pid) == state_of(program._process.pid) == "T")
-    assert program.ask(Message("decide"), 20.0).fields["pid"] == pid
-    program.close()
-    assert eventually(lambda: not is_running(pid))
-
-
 def eventually(holds):
     end = time.monotonic() + 5.0
     while not holds() and time.monotonic() < end:
@@ -174,7 +130,7 @@ def test_a_program_may_say_much_on_its_standard_error():
 
 def test_memory_has_a_limit():
     code = "receive(); x = bytearray(600 << 20); send(kind='fine')"
-    if sys.platform == "linux":
+    if IS_LINUX:
         with pytest.raises(PolicyError, match="MemoryError"):
             asked(code, memory=0.25)
     assert (
@@ -192,7 +148,7 @@ def test_memory_has_a_limit():
     ],
 )
 def test_memory_is_that_of_all_processes_and_what_they_share(code):
-    if sys.platform != "linux":
+    if not IS_LINUX:
         pytest.skip("elsewhere nothing tells what processes share")
     with pytest.raises(PolicyError, match=r"takes .* GiB .* its memory is 0\.25 GiB"):
         asked(f"receive()\n{code}\nsend(kind='fine')", memory=0.25)
@@ -202,7 +158,7 @@ def test_memory_is_that_of_all_processes_and_what_they_share(code):
     "file", ["open('/dev/shm/r3jax_test', 'wb')", "os.fdopen(os.memfd_create('x'), 'wb')"]
 )
 def test_a_file_in_memory_is_no_larger_than_the_limit(file):
-    if sys.platform != "linux":
+    if not IS_LINUX:
         pytest.skip("elsewhere there are no files in memory")
     code = f"f = {file}\nif isinstance(f.name, str): os.unlink(f.name)\n"
     code += "for _ in range(400): f.write(b'x' * (1 << 20))\nf.flush(); send(kind='fine')"
@@ -216,13 +172,6 @@ def test_what_processes_share_counts_once():
         "receive(); time.sleep(0.5); send(kind='fine')"
     )
     assert asked(code, memory=0.3).kind == "fine"
-
-
-def test_there_is_no_network():
-    if network() == "shared":
-        pytest.skip("this system does not let a program leave the network")
-    code = "receive(); send(kind='saw', names=[name for _, name in socket.if_nameindex()])"
-    assert asked(code).fields["names"] in ([], ["lo"])
 
 
 @pytest.mark.parametrize(

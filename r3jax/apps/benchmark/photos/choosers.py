@@ -11,14 +11,14 @@ import jax
 import numpy as np
 
 from r3jax.apps.benchmark.photos.known import Known
-from r3jax.baselines.active_gamer.policy import ActiveGamer, empty_share
-from r3jax.baselines.fisher import Form, known_information, scores
+from r3jax.baselines.active_gamer import ActiveGamer, empty_share
+from r3jax.baselines.fisherrf import Form, known_information, scores
+from r3jax.baselines.pixels import score_pixels
 from r3jax.frame import Frame
 from r3jax.planning.candidates import candidates_along
 from r3jax.planning.policy import Situation
 from r3jax.planning.registry import make_policy
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.pixels import score_pixels
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import fitted_size
 
@@ -82,7 +82,7 @@ class FisherChooser:
     def score(
         self, memory: Any, known: Known, model: GaussianScene, poses: np.ndarray, *, key: jax.Array
     ) -> np.ndarray:
-        """Scores of `baselines.fisher`, at `_FISHER_WIDTH`."""
+        """Scores of `baselines.fisherrf`, at `_FISHER_WIDTH`."""
         del memory, key
         camera = known.camera
         camera = camera.resized(*fitted_size(camera.width, camera.height, _FISHER_WIDTH))

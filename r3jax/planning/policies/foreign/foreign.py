@@ -8,6 +8,7 @@ Shape symbols: n frames; H W image size; X Y Z cells; C candidates.
 """
 
 import itertools
+import operator
 import time
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,24 +21,28 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.candidates import Candidates, candidates_along, host_generator, path_lengths
-from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decision import (
-    PlannerState,
-    Stopwatch,
-    follow_path,
-    initial_state,
-    no_decision,
-    prepare_decision,
-    select_best,
+from r3jax.planning.candidates import (
+    Candidates,
+    candidates_along,
+    host_generator,
+    path_lengths,
+    random_views,
 )
-from r3jax.planning.greedy import random_views
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.decide import (
+    Drawn,
+    PlannerState,
+    Rule,
+    Scored,
+    decide,
+    initial_state,
+    look_round,
+    with_path,
+)
 from r3jax.planning.policies.foreign.commands import COMMAND
 from r3jax.planning.policies.foreign.messages import Message
-from r3jax.planning.policies.foreign.program import Program, limits_memory, network
-from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PolicyError, Situation
-from r3jax.planning.robot.limits import Limits
-from r3jax.planning.robot.travel import Travel
+from r3jax.planning.policies.foreign.program import IS_LINUX, Program
+from r3jax.planning.policy import Decision, PlanInfo, PolicyError, Situation
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.json_text import check_type
 
@@ -50,7 +55,7 @@ _SAME_PLACE = 1e-6
 
 @dataclass(frozen=True)
 class ForeignConfig(PlannerConfig):
-    """What a program is held to, and the candidates that it is offered."""
+    """Limits of a program, and the candidates that it is offered."""
 
     command: str = ""
     """Program and arguments."""
@@ -59,7 +64,7 @@ class ForeignConfig(PlannerConfig):
     """Time limit of an answer [s]."""
 
     memory: float = 8.0
-    """What the program and all that it has started may take [GiB]; 0: no limit."""
+    """Limit for the program and all that it has started [GiB]; 0: none."""
 
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""
@@ -107,9 +112,8 @@ class Foreign:
 
     @property
     def isolation(self) -> dict[str, Any]:
-        """What a program is held to on this system; None where it cannot be."""
-        held = self.config.memory if limits_memory() and self.config.memory else None
-        return {"memory_gib": held, "network": network()}
+        """The limits that hold on this system; None where one cannot."""
+        return {"memory_gib": self.config.memory if IS_LINUX and self.config.memory else None}
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
         """Starts the program and greets it.
@@ -131,7 +135,7 @@ class Foreign:
         return initial_state(camera, grid, memory, self.config.motion)
 
     def _hello(self, camera: Camera, grid: OccupancyGrid, key: Array) -> Message:
-        """What holds for the whole run."""
+        """Everything that holds for the whole run."""
         origin, size = np.asarray(grid.origin, np.float64), float(grid.cell_size)
         far = origin + size * np.asarray(grid.log_odds.shape)
         lens = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
@@ -152,7 +156,7 @@ class Foreign:
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
         """Keeps the frame for the next question."""
         del map_state
-        session, seen = self._session(state)
+        session, seen = self._session(state.memory)
         # By number: a call that is made again to be timed changes nothing.
         session.frames[seen] = frame
         return replace(state, memory=state.memory + np.array([0, 1]))
@@ -171,44 +175,36 @@ class Foreign:
         Raises:
             PolicyError: no answer, or one that cannot be taken; the program has ended then.
         """
-        stopwatch = Stopwatch()
         # As a policy of this package: the same key offers the same candidates.
-        draw_key, ask_key = jax.random.split(key)
-        with stopwatch.part("travel"):
-            state, travel, masked = prepare_decision(
-                state, map_state, grid, T_world_camera, self.config
-            )
-        pose = np.asarray(T_world_camera, dtype=np.float64)
-        limits = Limits(self.config.motion, pose, travel.heights)
-        with stopwatch.part("candidates"):
-            situation = Situation(map_state, grid, masked, travel, state.camera, None, limits)
-            drawn = random_views(situation, self.config, key=draw_key)
-            offered = _in_reach(limits.project_to_feasible(drawn), travel, limits)
+        rule = Rule(self._draw, self._ask, operator.itemgetter("utility"))
+        return decide(rule, (state, map_state, grid, T_world_camera), self.config, key=key)
+
+    def _draw(self, situation: Situation, *, key: Array) -> Drawn:
+        travel, grid = situation.travel, situation.scoring_grid
+        return Drawn(random_views(travel, grid, self.config, key=key), situation.memory)
+
+    def _ask(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
+        """What is on offer, with utility 1 for the view that the program chooses, else 0.
+
+        Raises:
+            PolicyError: no answer, or one that cannot be taken.
+        """
+        session, seen = self._session(situation.memory)
+        offered = candidates.take(np.isfinite(_costs(candidates, situation)))
         if not len(offered.valid):
-            decision, info = no_decision(travel, self.config, stopwatch)
-            return decision, state, info
-        session, seen = self._session(state)
-        with stopwatch.part("scoring"):
-            path = _costs(offered, travel, limits)
-            question = Message("decide", {"view": seen, "seed": _seed(ask_key)})
-            question.arrays.update(_surroundings(grid, travel, pose, offered, path))
-            answer = self._answer(session, seen, question)
+            return candidates, {"utility": np.zeros(len(candidates.valid))}
+        question = Message("decide", {"view": seen, "seed": _seed(key)}, _shown(situation, offered))
+        answer = self._answer(session, seen, question)
         try:
             _check_view(answer, seen)
-            chosen = _view_of(answer, offered, travel, limits)
+            chosen = _view_of(answer, offered, situation)
         except ForeignFileError as error:
             raise self._refused(session, f"was asked for view {seen}: {error}") from None
         if chosen is None:
-            info = PlanInfo(DecisionOutcome.NO_CANDIDATE, len(path), len(path), stopwatch.seconds)
-            return None, state, info
-        candidates, best = chosen
-        total = np.zeros(len(candidates.valid))
-        total[best] = 1.0
-        utilities = {"total": total, "path": _costs(candidates, travel, limits)}
-        _, decision, state, info = select_best(
-            state, travel, candidates, utilities, limits, stopwatch
-        )
-        return decision, state, info
+            nothing = replace(offered, valid=np.zeros_like(offered.valid))
+            return nothing, {"utility": np.zeros(len(offered.valid))}
+        views, best = chosen
+        return views, {"utility": np.eye(len(views.valid))[best]}
 
     def follow(
         self,
@@ -218,8 +214,9 @@ class Foreign:
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> PlannerState:
-        """The cells on the way; the program is told of frames alone."""
-        return follow_path(state, map_state, grid, T_world_camera, waypoints, self.config)
+        """The cells on the path; the program is told of frames alone."""
+        state, situation = look_round(state, map_state, grid, T_world_camera, self.config)
+        return with_path(state, situation.travel, waypoints)
 
     def close(self) -> None:
         """Ends the programs."""
@@ -227,13 +224,13 @@ class Foreign:
             _, session = self._sessions.popitem()
             session.program.close()
 
-    def _session(self, state: PlannerState) -> tuple[_Session, int]:
-        """The session of a state, and the number of frames that it has observed.
+    def _session(self, memory: Any) -> tuple[_Session, int]:
+        """The session of a memory, and the number of frames that it has observed.
 
         Raises:
             PolicyError: it has ended.
         """
-        number, seen = (int(value) for value in np.asarray(state.memory))
+        number, seen = (int(value) for value in np.asarray(memory))
         if number not in self._sessions:
             raise PolicyError(f"the program {self.config.command!r} has ended")
         return self._sessions[number], seen
@@ -254,7 +251,7 @@ class Foreign:
         if seen < session.shown or numbers != list(range(session.shown, seen)):
             raise PolicyError(
                 f"the program {self.config.command!r} has seen {session.shown} frames and cannot "
-                f"go to view {seen} from there: start anew"
+                f"go to view {seen} from there: start a new run"
             )
         question.arrays.update(_images([session.frames[number] for number in numbers]))
         begin = time.perf_counter()
@@ -275,42 +272,33 @@ def _seed(key: Array) -> int:
     return int(host_generator(key).integers(1 << 31))
 
 
-def _in_reach(drawn: Candidates, travel: Travel, limits: Limits) -> Candidates:
-    """The views that are no padding and that a path leads to."""
-    if not len(drawn.valid):
-        return drawn
-    return drawn.take(np.isfinite(_costs(drawn, travel, limits)))
-
-
-def _costs(candidates: Candidates, travel: Travel, limits: Limits) -> np.ndarray:
-    """What the paths to views cost, turns included, [C] [m]."""
-    return limits.path_costs(path_lengths(travel, candidates), candidates.direction)
+def _costs(candidates: Candidates, situation: Situation) -> np.ndarray:
+    """Costs of the paths to views, turns included, [C] [m]."""
+    lengths = path_lengths(situation.travel, candidates)
+    return situation.limits.path_costs(lengths, candidates.direction)
 
 
 def _images(frames: list[Frame]) -> dict[str, np.ndarray]:
     """Frames as arrays: color [n, H, W, 3], depth [n, H, W] [m], poses [n, 4, 4]."""
     if not frames:
         return {}
-    rgb = np.stack([np.asarray(frame.rgb) for frame in frames])
+    stacked = lambda name: np.stack([np.asarray(getattr(f, name), np.float32) for f in frames])
     return {
-        "rgb": np.rint(rgb * np.float32(255.0)).astype(np.uint8),
-        "depth": np.stack([np.asarray(frame.depth, np.float32) for frame in frames]),
-        "T_world_camera": np.stack(
-            [np.asarray(frame.T_world_camera, np.float32) for frame in frames]
-        ),
+        "rgb": np.rint(stacked("rgb") * np.float32(255.0)).astype(np.uint8),
+        "depth": stacked("depth"),
+        "T_world_camera": stacked("T_world_camera"),
     }
 
 
-def _surroundings(
-    grid: OccupancyGrid, travel: Travel, pose: np.ndarray, offered: Candidates, path: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Where the camera is, what is on offer, and what is known of the space."""
-    free, occupied = np.asarray(grid.free), np.asarray(grid.occupied)
+def _shown(situation: Situation, offered: Candidates) -> dict[str, np.ndarray]:
+    """Where the camera is, the views on offer, and the space as it is known."""
+    free, occupied = np.asarray(situation.grid.free), np.asarray(situation.grid.occupied)
+    travel = situation.travel
     return {
-        "here": pose,
+        "here": situation.limits.T_world_camera,
         "position": offered.position,
         "direction": offered.direction,
-        "path": path,
+        "path": _costs(offered, situation),
         "cells": free.astype(np.uint8) + np.uint8(2) * occupied.astype(np.uint8),
         "stops": (travel.goals & travel.safe).astype(np.uint8),
     }
@@ -331,9 +319,9 @@ def _check_view(answer: Message, seen: int) -> None:
 
 
 def _view_of(
-    answer: Message, offered: Candidates, travel: Travel, limits: Limits
+    answer: Message, offered: Candidates, situation: Situation
 ) -> tuple[Candidates, int] | None:
-    """What is on offer, the view that was chosen among it, and its number; None: no view.
+    """The views on offer, that of the program among them, and its number; None: no view.
 
     Raises:
         ForeignFileError: the answer is none, or names a view that cannot be taken; says why.
@@ -352,23 +340,21 @@ def _view_of(
         raise ForeignFileError(
             f"{answer.kind!r:.80} is no answer: send `candidate`, `view` or `done`"
         )
-    own = limits.project_to_feasible(
+    travel = situation.travel
+    own = situation.limits.project_to_feasible(
         candidates_along(*(_point(answer, name)[None] for name in ("position", "direction")))
     )
     position = own.position[0]
     cell = travel.cell_of(position)
     is_here = bool(np.abs(position - travel.start).max() <= _SAME_PLACE)
     may_stop = travel.contains(cell) and travel.goals[cell] and travel.safe[cell]
-    if not (is_here or may_stop) or not np.isfinite(_costs(own, travel, limits)).all():
+    if not (is_here or may_stop) or not np.isfinite(_costs(own, situation)).all():
         raise ForeignFileError(
             f"the robot cannot go to {position.round(3).tolist()}: take a candidate, or stay in "
             "the cells of `stops`, which known free space leads to"
         )
-    rows = [offered, own]
-    joined = [
-        np.concatenate([getattr(c, n) for c in rows]) for n in ("position", "direction", "valid")
-    ]
-    return Candidates(*joined), len(offered.valid)
+    both = jax.tree.map(lambda *rows: np.concatenate(rows), offered, own)
+    return both, len(offered.valid)
 
 
 def _point(answer: Message, name: str) -> np.ndarray:

@@ -6,13 +6,12 @@
     M bytes   the arrays one behind the other, little-endian, rows first
 
 The header has a `kind`, and `arrays`: a list of objects with `name`, `dtype` and `shape`, in the
-order of their bytes. Nothing in a message is ever executed.
+order of their bytes; questions have arrays, answers have none. Nothing in a message is ever
+executed.
 """
 
 import json
-import math
 import struct
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,10 +24,7 @@ PREFIX = struct.Struct("<II")
 """Lengths of header and arrays."""
 
 MAX_HEADER = 1 << 20
-"""Longest header that is read [bytes]."""
-
-MAX_ARRAYS = 64 << 20
-"""Most bytes of arrays that are read; what is sent may be larger."""
+"""Longest header of a message [bytes]."""
 
 DTYPES = {"uint8": "|u1", "int32": "<i4", "int64": "<i8", "float32": "<f4", "float64": "<f8"}
 """Kinds of numbers that arrays may hold, and how NumPy calls them."""
@@ -78,63 +74,36 @@ def encode(message: Message) -> bytes:
 
 
 def length_of(prefix: bytes) -> int:
-    """Length of the message that begins with these 8 bytes, they themselves included [bytes].
+    """Length of the answer that begins with these 8 bytes, they themselves included [bytes].
 
     Raises:
-        MessageError: more than any answer has: most likely they are no message.
+        MessageError: it is too long, or has arrays: most likely they are no message.
     """
     header, data = PREFIX.unpack(prefix)
-    if header > MAX_HEADER or data > MAX_ARRAYS:
+    if header > MAX_HEADER or data:
         raise MessageError(
             f"the bytes {prefix!r} announce a header of {header} and arrays of {data} bytes, more "
-            f"than {MAX_HEADER} and {MAX_ARRAYS}: nothing but messages may go to the standard "
-            "output; print to the standard error"
+            f"than {MAX_HEADER} and 0: nothing but messages may go to the standard output; print "
+            "to the standard error"
         )
-    return PREFIX.size + header + data
+    return PREFIX.size + header
 
 
 def decode(data: bytes) -> Message:
-    """The message that bytes are: inverse of `encode`.
+    """The answer that bytes are: inverse of `encode` for a message without arrays.
 
     Raises:
         MessageError: they are none; says why.
     """
     if len(data) < PREFIX.size or len(data) != length_of(data[: PREFIX.size]):
         raise MessageError(f"{len(data)} bytes are not a whole message")
-    end = PREFIX.size + PREFIX.unpack(data[: PREFIX.size])[0]
     try:
-        plain = parse_json(data[PREFIX.size : end])
+        plain = parse_json(data[PREFIX.size :])
         check_type("header", plain, dict[str, Any])
-        kind, listed = plain.pop("kind", None), plain.pop("arrays", [])
+        kind, arrays = plain.pop("kind", None), plain.pop("arrays", [])
         check_type("kind", kind, str)
-        check_type("arrays", listed, list[dict[str, Any]])
-        return Message(kind, plain, _arrays_of(listed, data[end:]))
+        if arrays != []:
+            raise ForeignFileError("`arrays` must be empty in an answer")
+        return Message(kind, plain)
     except ForeignFileError as error:
         raise MessageError(f"the header is not understood: {error}") from None
-
-
-def _arrays_of(listed: list[Mapping[str, Any]], data: bytes) -> dict[str, np.ndarray]:
-    """The arrays that a header lists, out of their bytes.
-
-    Raises:
-        ForeignFileError: the list is odd, or the bytes are not those of its arrays.
-    """
-    arrays: dict[str, np.ndarray] = {}
-    begin = 0
-    for entry in listed:
-        parts: dict[str, Any] = {"name": None, "dtype": None, "shape": None} | dict(entry)
-        name, dtype, shape = parts["name"], parts["dtype"], parts["shape"]
-        check_type("name", name, str)
-        check_type(f"{name}.dtype", dtype, str)
-        check_type(f"{name}.shape", shape, list[int])
-        if dtype not in DTYPES or name in arrays or min([0, *shape]) < 0:
-            raise ForeignFileError(f"the array {entry!r:.200} is odd or listed twice")
-        size = math.prod(shape) * np.dtype(DTYPES[dtype]).itemsize
-        if begin + size > len(data):
-            raise ForeignFileError(f"the array {name!r:.80} has more numbers than bytes were sent")
-        part = np.frombuffer(data[begin : begin + size], DTYPES[dtype])
-        arrays[name] = part.reshape(shape)
-        begin += size
-    if begin != len(data):
-        raise ForeignFileError(f"{len(data) - begin} bytes belong to no array")
-    return arrays

@@ -1,18 +1,17 @@
-"""A program that answers messages: started under limits, runs only while asked, always ended.
+"""A program that answers messages: started under limits, always ended, in time.
 
 No sandbox: it has the rights of the user who starts it (`docs/howto/policy.md`).
 """
 
 import contextlib
-import functools
 import os
 import selectors
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import weakref
-from pathlib import Path
 
 import psutil
 
@@ -27,7 +26,8 @@ from r3jax.planning.policies.foreign.messages import (
 )
 from r3jax.planning.policy import PolicyError
 
-_LAUNCH = Path(__file__).with_name("launch.py")
+IS_LINUX = sys.platform == "linux"
+"""Memory is limited on Linux alone."""
 
 _CHUNK = 1 << 16
 _TAIL = 2000
@@ -40,32 +40,15 @@ _MEASURE_EVERY = 0.25
 """Pause between two measurements of its memory while it computes [s]."""
 
 
-@functools.cache
-def network() -> str:
-    """`none` where this system lets a program be cut off from the network, else `shared`."""
-    if sys.platform != "linux":
-        return "shared"
-    words = [sys.executable, "-I", "-S", str(_LAUNCH), "0", "none", "true"]
-    with contextlib.suppress(OSError, subprocess.SubprocessError):
-        if subprocess.run(words, capture_output=True, timeout=20).returncode == 0:
-            return "none"
-    return "shared"
-
-
-def limits_memory() -> bool:
-    """Whether this system holds a program to its memory."""
-    return sys.platform == "linux"
-
-
 class Program:
-    """A program, paused between an answer and the next question: what it computes is charged."""
+    """A program and its pipes."""
 
     def __init__(self, command: str, memory: float) -> None:
         """Starts it.
 
         Args:
             command: program and arguments, as for a shell.
-            memory: that it and all that it has started may take [GiB]; 0: no limit.
+            memory: limit for it and all that it has started [GiB]; 0: none.
 
         Raises:
             ValueError: there is no such program.
@@ -73,24 +56,23 @@ class Program:
         """
         self.command = command
         self._memory = int(memory * (1 << 30))
-        limits = [sys.executable, "-I", "-S", str(_LAUNCH), str(self._memory), network()]
+        # On Linux a parent that is killed ends its program, one that hangs, too.
+        setpriv = shutil.which("setpriv") if IS_LINUX else None
+        first = [setpriv, "--pdeathsig", "KILL"] if setpriv else []
+        pipe = subprocess.PIPE
         try:
+            # A session of its own: it is ended as a group, and Ctrl-C is the loop's.
             self._process = subprocess.Popen(
-                [*limits, *words_of(command)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                bufsize=0,
-                # A group of its own: it is ended with the program, and Ctrl-C is the loop's.
-                start_new_session=True,
-            )
+                [*first, *words_of(command)],
+                stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0, start_new_session=True,
+            )  # fmt: skip
         except OSError as error:
             raise PolicyError(f"{command!r} cannot be started ({error})") from error
-        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
-            assert pipe is not None
-            os.set_blocking(pipe.fileno(), False)
+        _limit_memory(self._process.pid, self._memory)
+        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
+            assert stream is not None
+            os.set_blocking(stream.fileno(), False)
         self._said = b""
-        self._paused: list[psutil.Process] = []
         self.close = weakref.finalize(self, _end, self._process)
 
     def ask(self, message: Message, seconds: float) -> Message:
@@ -102,10 +84,8 @@ class Program:
         """
         if not self.close.alive:
             raise PolicyError(f"the program {self.command!r} has ended")
-        _signal_all(self._process, self._paused, signal.SIGCONT)
         try:
             answer = decode(self._exchange(encode(message), time.monotonic() + seconds))
-            self._paused = _pause(self._process)
             self._check_memory()
             return answer
         except TimeoutError:
@@ -128,7 +108,7 @@ class Program:
             TimeoutError: it is past `end` on the monotonic clock.
             EOFError: the program has closed its `input` or its `output`, as the text says.
             MemoryError: the program takes more than it may.
-            MessageError: what comes is no message, or comes before the question is sent.
+            MessageError: the bytes are no message, or come before the question is sent.
         """
         streams = self._process.stdin, self._process.stdout, self._process.stderr
         into, out, errors = (pipe.fileno() for pipe in streams if pipe is not None)
@@ -157,22 +137,22 @@ class Program:
                     if not left:
                         raise EOFError("input")
                     left = left[_write(into, left) :]
-                    if not left:  # there is nothing to read: ready once nobody is at the other end
+                    if not left:  # there is nothing to read: ready once the other end is closed
                         selector.modify(into, selectors.EVENT_READ)
 
     def _check_memory(self) -> None:
-        """Measures what a limit on each process cannot see: many of them, and what they share.
+        """Measures the sum over its processes, which a limit on each does not bound.
 
         Raises:
-            MemoryError: the program and all that it has started take more than it may.
+            MemoryError: the program and all that it has started take more than they may.
         """
-        if not self._memory:
+        if not self._memory or not IS_LINUX:
             return
         family = _family(self._process.pid)
-        # What processes share is in the size of each: only if that is too much, it is divided.
+        # Shared pages are in the size of each process: if that is too much, they are divided.
         taken = sum(_size(one) for one in family)
         if taken > self._memory:
-            taken = sum(_size(one, shared=True) for one in family)
+            taken = sum(_size(one, divided=True) for one in family)
         if taken > self._memory:
             raise MemoryError(
                 f"takes {taken / (1 << 30):.2f} GiB with all that it has started, its memory is "
@@ -180,7 +160,7 @@ class Program:
             )
 
     def _listen(self, errors: int) -> bool:
-        """Keeps the end of what the program says; False once it says nothing more."""
+        """Keeps the end of its standard error; False at its end."""
         said = os.read(errors, _CHUNK)
         self._said = (self._said + said)[-_TAIL:]
         return bool(said)
@@ -200,11 +180,7 @@ class Program:
 
 
 def _is_whole(inbox: bytearray, asked: bool) -> bool:
-    """Whether a message is there.
-
-    Args:
-        inbox: what has come.
-        asked: the question is sent to its end.
+    """Whether a message has come; `asked`: the question is sent to its end.
 
     Raises:
         MessageError: too long, more than one, or before the question.
@@ -222,10 +198,10 @@ def _is_whole(inbox: bytearray, asked: bool) -> bool:
 
 
 def _write(into: int, left: memoryview) -> int:
-    """Writes what the pipe takes.
+    """Writes as much as the pipe takes.
 
     Raises:
-        EOFError: nobody reads.
+        EOFError: the other end is closed.
     """
     try:
         return os.write(into, left[:_CHUNK])
@@ -249,54 +225,43 @@ def _wait(process: "subprocess.Popen[bytes]") -> int | None:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Ends a program, its group, and what it has started outside of the group."""
-    started = _pause(process)  # so that nothing is started meanwhile
-    _signal_all(process, started, signal.SIGCONT)
+    """Ends a program, its group, and the processes below it."""
+    started = _family(process.pid)
     for pipe in (process.stdin, process.stdout):
         assert pipe is not None
         pipe.close()
     _wait(process)  # the end of its input is its sign to go
-    _signal_all(process, [*started, *_family(process.pid)], signal.SIGKILL)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    for one in [*started, *_family(process.pid)]:
+        with contextlib.suppress(psutil.Error):
+            one.kill()
     process.wait()
     assert process.stderr is not None
     process.stderr.close()
 
 
-def _pause(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
-    """Stops a program and all that it has started; returns them."""
-    _signal_all(process, [], signal.SIGSTOP)
-    family = _family(process.pid)
-    _signal_all(process, family, signal.SIGSTOP)
-    return family
-
-
-def _signal_all(
-    process: "subprocess.Popen[bytes]", family: list[psutil.Process], signum: int
-) -> None:
-    """Signals a program, its group, and what it has started."""
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signum)
-    for one in family:
-        with contextlib.suppress(psutil.Error):
-            one.send_signal(signum)
+def _limit_memory(pid: int, memory: int) -> None:
+    """Limits each process of a program that has just begun [bytes]; 0: not at all."""
+    if not memory or not IS_LINUX:
+        return
+    with contextlib.suppress(psutil.Error):
+        # Not the address space: that of GPUs and of sparse tables is reserved, never used. Files
+        # in memory (/dev/shm, memfd) count for no process: none may be larger either.
+        for limit in (psutil.RLIMIT_DATA, psutil.RLIMIT_FSIZE):
+            psutil.Process(pid).rlimit(limit, (memory, memory))
 
 
 def _family(pid: int) -> list[psutil.Process]:
-    """A process and all that descends from it.
-
-    What loses its parent becomes the program's own child on Linux, as `launch.py` has it, for as
-    long as the program is there.
-    """
+    """A process and all that descend from it."""
     with contextlib.suppress(psutil.Error):
         program = psutil.Process(pid)
         return [program, *program.children(recursive=True)]
     return []
 
 
-def _size(process: psutil.Process, *, shared: bool = False) -> int:
-    """Memory of a process [bytes]; `shared`: of what it shares its part, where that is known."""
+def _size(process: psutil.Process, *, divided: bool = False) -> int:
+    """Memory of a process [bytes]; `divided`: of shared pages its part."""
     with contextlib.suppress(psutil.Error):
-        if shared and sys.platform == "linux":
-            return int(process.memory_full_info().pss)
-        return int(process.memory_info().rss)
+        return int(process.memory_full_info().pss if divided else process.memory_info().rss)
     return 0

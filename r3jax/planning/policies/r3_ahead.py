@@ -1,6 +1,12 @@
-"""Paths of several views, searched by a beam: each view as if those before it had been taken.
+"""R3-Ahead: the first view of the best path of several, through all reachable space.
 
-A path is worth what its views add (`scoring.simulated`) over what it costs, in seconds:
+Candidates are those of R3-Pano, local ones and some in sight of the frontier, and places that are
+spread over all space that the robot can reach. A beam searches paths of `horizon` views among
+them, each view scored as if those before it had been taken (`scoring.simulated`). The best path's
+first view is taken; then all is planned again. A room that is done is left for one that is not,
+however far, if nothing nearer justifies its time.
+
+A path is compared by what its views add over what it costs, in seconds:
 
     rate = sum of the utility of each view after those before it
            / sum over its views of (seconds of a view + of the path and the turn)
@@ -8,10 +14,10 @@ A path is worth what its views add (`scoring.simulated`) over what it costs, in 
 The robot's motion says how long paths and turns take and which views there are; a camera that
 flies goes 1 m/s and turns in no time.
 
-The beam holds the paths of the greatest rate. From each, some places are tried whose panorama was
-worth most when nothing else had been seen, which bounds what it can be worth now, and the last
-place once more, in another direction. What is tried lies apart, in place or direction: a hundred
-views of one corner are one choice. On the host; scores are jitted.
+From each path of the beam, some places are tried whose panorama scored most when nothing else had
+been seen, which bounds what it can score now, and the last place once more, in another direction.
+What is tried lies apart, in place or direction: a hundred views of one corner are one choice. On
+the host; scores are jitted.
 
 Shape symbols: C places.
 """
@@ -23,18 +29,30 @@ from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import shortest_path
 
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.native.platform import num_cores
 from r3jax.mapping.state import MapState
-from r3jax.planning.candidates import Candidates, best_views, poses_along
+from r3jax.planning.candidates import (
+    Candidates,
+    best_views,
+    candidates_at,
+    draw_positions,
+    path_lengths,
+    poses_along,
+    spread,
+)
 from r3jax.planning.config import PlannerConfig
+from r3jax.planning.decide import Drawn, GreedyPolicy, Scored
+from r3jax.planning.policy import Situation
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.travel import Travel, segment_is_inside
-from r3jax.scoring.batch import score_cached_near
+from r3jax.scoring.batch import cache_positions_near, score_cached_near
 from r3jax.scoring.cells import Cells
+from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama_cache import PanoramaCache
 from r3jax.scoring.simulated import simulate_view_near
 
@@ -74,11 +92,83 @@ class AheadConfig(PlannerConfig):
     def __post_init__(self) -> None:
         """Refuses values that would fail later, and says which."""
         super().__post_init__()
+        if self.refine:
+            raise ValueError("r3-ahead has no refinement: leave refine at 0, or take r3-pano")
         for name, least in (("horizon", 1), ("num_spread", 0), ("beam", 1), ("branching", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not (math.isfinite(self.view_seconds) and self.view_seconds >= 0.0):
             raise ValueError(f"view_seconds must be a finite number >= 0, got {self.view_seconds}")
+
+
+@dataclass(frozen=True)
+class OursAhead(GreedyPolicy):
+    """The first view of the best path of several, each as if those before it had been taken."""
+
+    config: AheadConfig = field(default_factory=AheadConfig)
+
+    name = "ours-ahead"
+    source = "look-ahead on Ours-Pano, this project"
+    Config = AheadConfig
+
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """Positions of Ours, and some spread over all reachable space; no directions yet."""
+        travel = situation.travel
+        num = self.config.num_candidates
+        # One at least is drawn as Ours draws it: settings with fewer would be refused.
+        num_spread = min(self.config.num_spread, num - 1)
+        num_own = num - num_spread
+        # The shares add up to what every policy scores: comparisons are at equal cost.
+        own = replace(
+            self.config,
+            num_candidates=num_own,
+            num_frontier=min(self.config.num_frontier, num_own),
+        )
+        positions, _ = draw_positions(travel, situation.scoring_grid, own, key=key)
+        stops = travel.stops(np.argwhere(travel.goals))
+        if len(positions) == 0 or len(stops) == 0:
+            return Drawn(candidates_at(stops[:0]), situation.memory)
+        wide = stops[spread(stops, num_spread)] if num_spread else stops[:0]
+        drawn = candidates_at(np.concatenate([positions, wide]))
+        return Drawn(drawn.padded(num), situation.memory)
+
+    def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
+        """Every position's best direction and its worth; `ahead`, the rate of its best path.
+
+        A position from which no path of the beam begins has no rate: -inf.
+        """
+        del key
+        scoring, travel = self.config.scoring, situation.travel
+        positions = candidates.position
+        places = jnp.asarray(positions, dtype=jnp.float32)
+        voxels, cells, _ = gather_in_range(
+            situation.map_state, situation.scoring_grid, places, scoring
+        )
+        allowed = situation.limits.allowed_axes(positions, scoring.panorama_bins)
+        start = (voxels, cells)
+        panorama, kept = cache_positions_near(*start, situation.camera, places, scoring, allowed)
+        turned, utility = best_views(candidates, panorama)
+        turned = situation.limits.project_to_feasible(turned)
+        problem = BeamProblem(
+            turned,
+            utility,
+            path_lengths(travel, turned),
+            lengths_between(travel, turned.position),
+            kept,
+            start,
+            situation.camera,
+            self.config,
+            situation.limits,
+        )
+        # Places where no path of the beam begins were beaten: they must not be chosen.
+        rate = np.full(len(positions), -np.inf)
+        for path in search(problem):
+            rate[path.places[0]] = max(rate[path.places[0]], path.rate)
+        return turned, {"utility": utility, "ahead": rate}
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """The rate of the best path: the path is in it."""
+        return utilities["ahead"]
 
 
 @dataclass(frozen=True)

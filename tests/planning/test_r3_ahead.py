@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from r3jax.planning.candidates import best_views, candidates_at, poses_along
-from r3jax.planning.policies.ahead import lookahead as real
+from r3jax.planning.policies import r3_ahead as real
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import Motion
 from r3jax.planning.robot.travel import plan_travel
@@ -63,7 +63,8 @@ def all_paths(problem: real.BeamProblem, horizon: int) -> dict[tuple[int, ...], 
     return rates
 
 
-def law_paths() -> None:
+@pytest.mark.full
+def test_a_beam_with_room_for_all_finds_the_best_path():
     """With room for all of them, the search finds the best path of three views."""
     problem = outlook_of(WIDE)
     found = real.search(problem)
@@ -74,11 +75,6 @@ def law_paths() -> None:
         assert path.rate == pytest.approx(rates[path.places], rel=1e-4)
     assert found[0].rate > 1.02 * rates[0, 0, 0]  # or it did not matter where it went
     assert [p.rate for p in found] == sorted((p.rate for p in found), reverse=True)
-
-
-@pytest.mark.full
-def test_a_beam_with_room_for_all_finds_the_best_path():
-    law_paths()
 
 
 @pytest.mark.full
@@ -94,7 +90,8 @@ def test_a_narrow_beam_keeps_its_promise():
     assert found[0].rate >= 0.9 * max(rates.values())
 
 
-def law_one_view() -> None:
+@pytest.mark.full
+def test_a_horizon_of_one_is_the_next_best_view():
     """A horizon of one is the next-best view, by gain over time."""
     problem = outlook_of(dataclasses.replace(WIDE, horizon=1), view_seconds=0.3)
     found = real.search(problem)
@@ -104,11 +101,7 @@ def law_one_view() -> None:
 
 
 @pytest.mark.full
-def test_a_horizon_of_one_is_the_next_best_view():
-    law_one_view()
-
-
-def law_motion() -> None:
+def test_a_carrier_takes_its_time():
     """A slow level camera: the seconds of every path by hand, and no view that it cannot take."""
     motion = Motion(elevations=(0.0, 0.0), speed=0.2, turn_rate=45.0)
     start = poses_along(PLACES[:1], np.array([[0.0, 1.0, 0.0]]))[0]
@@ -131,12 +124,7 @@ def law_motion() -> None:
         assert path.seconds == pytest.approx(seconds, abs=0.01)
 
 
-@pytest.mark.full
-def test_a_carrier_takes_its_time():
-    law_motion()
-
-
-def test_choices_lie_apart() -> None:
+def test_choices_lie_apart():
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[1, 0, 3] = 0.1  # as good as the first
     poses[2, 0, 3] = 0.75

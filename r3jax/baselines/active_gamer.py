@@ -1,4 +1,26 @@
-"""A pool of candidates on lattices, kept between decisions, for ActiveGAMER.
+"""ActiveGAMER on our map: a pool of lattice views, ranked by how many of their pixels are empty.
+
+Candidates are kept between decisions (`Pool`). Those of stage 0 lie on a 1 m lattice,
+1.75 m above the floor, with 5 directions each; those of stage 1 on a 0.5 m lattice, 1.0 and 2.5 m
+above it, with 15. With the gain g = share of the view's pixels in which the map shows nothing, at
+any distance, and the straight distance d to the candidate [m], over the candidates scored:
+
+    score = (1 - softmax(d)) g / sum(g)
+
+A candidate with g < 0.5 % leaves the pool for good. A stage ends for good when every candidate
+that its pool ever held has left.
+
+What the paper leaves to its scenes' settings or to its simulator is decided here:
+
+* Its candidates are free cells at a distance from matter; ours those in which the robot may stop.
+* It reads the true depth to leave out pixels that no view can fill, such as windows. Instead, a
+  view that was chosen leaves the pool: what it did not show then, it will never show.
+* It scores the whole pool at every decision. Here at most `num_candidates` are scored: those with
+  the greatest gain when last scored first, those never scored counting as wholly empty; ties
+  nearest first. Gains hardly ever rise, so that old ones bound new ones.
+* When no candidate of an open stage can be reached, and after the last stage, views are random.
+* Its robot takes a frame every 0.1 m and 10 degrees of its path, and maps them all; here that is
+  `capture_every`, for every policy.
 
 A candidate is a column of a stage's lattice, a level above the floor and a direction. It stands
 in the cell of the column in which the robot may stop that is nearest to the level, within 0.5 m:
@@ -21,10 +43,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from r3jax.baselines.pixels import PixelView, score_pixels
+from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.planning.candidates import Candidates, candidates_along
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import Candidates, candidates_along, draw_lots, free_views
+from r3jax.planning.decide import Drawn, GreedyPolicy, Scored
+from r3jax.planning.policy import Situation
 from r3jax.planning.robot.limits import UNBOUND, Limits
 from r3jax.planning.robot.travel import Travel
+from r3jax.scoring.config import ScoringConfig
 
 LEAST_GAIN = 0.005
 """Share of the pixels below which a view is not worth taking."""
@@ -220,3 +249,93 @@ def _best_remembered(
     lattice = fibonacci_lattice(STAGES[stage].num_directions)
     views = candidates_along(positions[order], lattice[direction])
     return Draw(stage, place, direction, views, distance[order])
+
+
+def empty_share(view: PixelView) -> Float[Array, ""]:
+    """The gain: share of the pixels in which the map shows nothing."""
+    return jnp.mean(~view.hit, dtype=jnp.float32)
+
+
+def score_of(gain: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(1 - softmax(d)) g / sum(g) of gains and distances [m], [C] each; 0 if all gains are 0."""
+    # Shifted by the largest: exp of a hundred meters would overflow.
+    far = np.exp(distance - distance.max())
+    return (1.0 - far / far.sum()) * gain / (gain.sum() or 1.0)
+
+
+@dataclass(frozen=True)
+class ActiveGamer(GreedyPolicy):
+    """The emptiest view of a pool of lattice views, the farthest ones marked down."""
+
+    name = "active-gamer"
+    source = "ActiveGAMER, Chen et al., CVPR 2025"
+
+    def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Pools:
+        """Empty pools."""
+        del camera
+        return empty_pools(grid.log_odds.shape, float(grid.cell_size))
+
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """The pool's candidates, noted where they stand in it; any nearby view if there is none."""
+        num = self.config.num_candidates
+        pools, found = draw_candidates(situation.memory, situation.travel, num, situation.limits)
+        if found is None:
+            return Drawn(free_views(situation.travel, num, self.config.radius, key=key), pools)
+        return Drawn(found.candidates.padded(num), pools, notes=found)
+
+    def score(
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+        """Gain and distance of the pool's candidates; lots for others."""
+        if situation.notes is None:
+            return candidates, draw_lots(len(candidates.valid), key=key)
+        gain = self._gain(situation.camera, situation.map_state, situation.grid, candidates)
+        # Padding must have no share in the sums of the score: no gain, and no distance.
+        distance = np.full(len(gain), -np.inf)
+        distance[candidates.valid] = situation.notes.distance
+        return candidates, {"utility": gain, "distance": distance}
+
+    def score_again(
+        self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
+    ) -> Scored:
+        """Their order stays: where they stand in the pool is not known any more."""
+        del situation, key
+        return candidates, {"lot": before}
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """The score of the paper, or the lots: the path itself costs nothing."""
+        if "lot" in utilities:
+            return utilities["lot"]
+        return score_of(utilities["utility"], utilities["distance"])
+
+    def conclude(
+        self,
+        situation: Situation,
+        candidates: Candidates,
+        utilities: dict[str, np.ndarray],
+        best: int,
+    ) -> Pools:
+        """The chosen candidate leaves the pool, and those that are worth nothing."""
+        pools, found = situation.memory, situation.notes
+        # Random views came from no pool, so that none can leave one.
+        if found is None:
+            return pools
+        of_stage = list(pools.of_stage)
+        # Padding comes last: without it `best` still counts the same rows.
+        gain = utilities["utility"][candidates.valid]
+        of_stage[found.stage] = dismiss(of_stage[found.stage], found, gain, best)
+        return replace(pools, of_stage=tuple(of_stage))
+
+    def scoring_for(self, grid: OccupancyGrid) -> ScoringConfig:
+        """The settings of the score: what the map holds counts at any distance within the box."""
+        # The diagonal of the box: nothing within it is out of range.
+        extent = np.linalg.norm(grid.log_odds.shape) * float(grid.cell_size)
+        return replace(self.config.scoring, max_range=extent)
+
+    def _gain(
+        self, camera: Camera, map_state: MapState, grid: OccupancyGrid, candidates: Candidates
+    ) -> np.ndarray:
+        """Share of empty pixels of each view [C]; 0 for padding."""
+        poses, scoring = candidates.poses_on_device(), self.scoring_for(grid)
+        gain = score_pixels(empty_share, map_state, grid, camera, poses, scoring)
+        return np.where(candidates.valid, np.asarray(gain, dtype=np.float64), 0.0)

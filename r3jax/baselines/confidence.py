@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from r3jax.baselines.active_gs.normals import pixel_normals
+from r3jax.baselines.normals import pixel_normals
 from r3jax.frame import Frame
 from r3jax.geometry.compaction import positions_of_set
 from r3jax.geometry.numerics import safe_norm

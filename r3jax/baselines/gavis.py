@@ -1,4 +1,16 @@
-"""What the rays of a view would tell: the entropy of their colors.
+"""GAVIS: views whose colors are least known, because no photo shows what they show from there.
+
+    utility = mean over the rays of a view of H(u)      (`unknown_share`, `unseen_share`)
+    total   = utility / sum of utilities - lambda2 * path / sum of paths
+
+The paper's: visibility that depends on the direction, from all photos and what hides what in them;
+particles that stand for unexplored space and were never seen; a view's worth is the information
+that it brings, which is the entropy of its rays, as the noise of any photo is alike.
+Our reading: surface elements are the map's voxels, opaque, and photos its direction bins; the
+particles are the unexplored cells of the coarse grid, of an opacity of their own in place of 0,
+by which a ray's color may come from them; colors that no photo shows are spread alike everywhere;
+kappa, that opacity and that spread, whose values we could not read; candidates, paths and their
+weight are those of Ours. No radiance field is kept.
 
 A ray passes unexplored cells, which hold matter that no photo shows with some probability each, and
 ends at a voxel, or nowhere. With k unexplored cells before its end, the color that is seen comes
@@ -13,21 +25,69 @@ mixture, over the noise's, is at most
 
 and equal to it but for what both parts have in common, which is next to nothing.
 
+The visibility of a voxel in a direction, from the photos that there are:
+
+    v_p(d) = T_p exp(kappa (<d, d_p> - 1))             what photo p says of direction d
+    V(d)   = 1 - prod over p of (1 - v_p(d))           at least one photo says something
+
+d_p is the direction from the voxel to photo p, and T_p is 1 if nothing hides the voxel there.
+
+The paper keeps the sum over p of v_p in spherical harmonics. From a sum the product is not to be
+had, only the bound V >= 1 - (1 - sum / |P|)^|P|, by which it decides. Here every voxel holds the
+directions themselves, as bits, so the product is exact but for the width of a bin; photos in the
+same bin count once. Unlike the bound, it never falls when a photo is added.
+
 Shape symbols: C views; h w rays of a view; X Y Z cells of the grid; W words of bins.
 """
 
+import math
+from dataclasses import dataclass, field
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
-from r3jax.baselines.gavis.visibility import unseen_share
+from r3jax.baselines.pixels import PixelView, score_pixels
 from r3jax.geometry.cameras import Camera, pixel_rays
 from r3jax.geometry.numerics import safe_norm
+from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid, world_to_cell
-from r3jax.scoring.pixels import PixelView
+from r3jax.planning.candidates import Candidates
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.decide import GreedyPolicy
+from r3jax.planning.policy import Situation
+from r3jax.visibility.views import pinhole_view
+
+
+def unseen_share(
+    visited: UInt32[Array, "W ..."],
+    direction: Float[Array, "3 ..."],
+    num_bins: int,
+    kappa: Float[Array, ""],
+) -> Float[Array, "..."]:
+    """1 - V: the product over the visited bins of 1 - exp(kappa (<q_k, d> - 1)), in [0, 1].
+
+    1 where no bin was visited, 0 at the direction of one that was.
+
+    Args:
+        visited: bit `k % 32` of word `k // 32` is set for each visited bin k.
+        direction: unit vectors from the voxels to the camera.
+        num_bins: number of bins.
+        kappa: how fast visibility falls with the angle; 0: not at all.
+    """
+    x, y, z = direction
+    share = jnp.ones_like(x)
+    # Python's floats: the lattice becomes literals of the program, and no gather is needed.
+    for k, (q_x, q_y, q_z) in enumerate(fibonacci_lattice(num_bins).astype("float32").tolist()):
+        is_visited = (visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
+        # Rounding may carry a cosine past 1, and the share below 0.
+        angle_term = jnp.minimum(q_x * x + q_y * y + q_z * z - 1.0, 0.0)
+        share = share * jnp.where(is_visited, 1.0 - jnp.exp(kappa * angle_term), 1.0)
+    return share
+
 
 STRIDE = 4
 """Every fourth pixel of every fourth row has a ray: an unexplored cell at the sensor's range is as
@@ -159,3 +219,68 @@ def unexplored_before(
     x, y, z = jnp.moveaxis(jnp.clip(cell, 0, size - 1), -1, 0)
     counts = unexplored[x, y, z] & is_inside & (at[None, None] < end[..., None])
     return jnp.sum(counts, axis=-1, dtype=jnp.float32)
+
+
+@dataclass(frozen=True)
+class GavisConfig(PlannerConfig):
+    """Settings of `gavis`; of the scoring it takes the range and the depth buffer."""
+
+    kappa: float = 4.0
+    """Fall of visibility with the angle to a photo's direction: 0.31 at 45 degrees, 0.02 at 90.
+    0: seen from one side, a voxel is known from all (the paper's isotropic ablation)."""
+
+    cell_opacity: float = 0.1
+    """Probability that an unexplored cell stops a ray; 0: unexplored space is empty (the paper's
+    ablation without virtual particles)."""
+
+    color_entropy: float = 6.9
+    """Entropy of a color that no photo shows, over that of a photo's noise [nats]: 3 ln 10, a
+    standard deviation ten times as large in each channel."""
+
+    def __post_init__(self) -> None:
+        """Refuses values that would fail later, and says which."""
+        super().__post_init__()
+        for name in ("kappa", "color_entropy"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} must be a finite number >= 0, got {value}")
+        if not 0.0 <= self.cell_opacity <= 1.0:
+            raise ValueError(f"cell_opacity must lie in [0, 1], got {self.cell_opacity}")
+
+    def beliefs(self) -> Beliefs:
+        """The three of them, traced, so that a sweep compiles once."""
+        numbers = (self.kappa, self.cell_opacity, self.color_entropy)
+        return Beliefs(*(jnp.asarray(number, dtype=jnp.float32) for number in numbers))
+
+
+@dataclass(frozen=True)
+class Gavis(GreedyPolicy):
+    """Views whose rays have the greatest entropy, by a visibility that depends on the direction."""
+
+    config: GavisConfig = field(default_factory=GavisConfig)
+
+    name = "gavis"
+    source = "GAVIS, CVPR 2026, arXiv 2605.30342"
+    Config = GavisConfig
+
+    def score(
+        self, situation: Situation, candidates: Candidates, *, key: Array
+    ) -> tuple[Candidates, dict[str, np.ndarray]]:
+        """The mean entropy of the rays of every view."""
+        del key
+        state, grid, scoring = situation.map_state, situation.scoring_grid, self.config.scoring
+        poses = candidates.poses_on_device()
+        ends = score_pixels(
+            ends_of_rays, state, grid, situation.camera, poses, scoring, state.visited
+        )
+        utility = entropy_of_views(
+            ends,
+            grid,
+            pinhole_view(situation.camera, poses[0], scoring).camera,
+            poses,
+            scoring.max_range,
+            self.config.beliefs(),
+            num_bins=state.num_bins,
+            num_steps=math.ceil(float(scoring.max_range) / float(grid.cell_size)),
+        )
+        return candidates, {"utility": np.asarray(utility, dtype=np.float64)}

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import r3jax
+from r3jax.baselines import pixels
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.scoring import pixels
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import view_utility
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from r3jax.planning.robot.shortest_paths import shortest_paths
+from r3jax.kernels.robot.shortest_paths import shortest_paths
 
 
 def random_space(seed, share, shape=(11, 9, 7)):

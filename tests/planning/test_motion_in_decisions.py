@@ -1,4 +1,4 @@
-"""What the planner does for a motion in one place each, and the faults that must be noticed."""
+"""What the planner does for a motion, in one place each."""
 
 from types import SimpleNamespace
 
@@ -6,13 +6,13 @@ import jax
 import numpy as np
 import pytest
 
-from r3jax.baselines.active_gamer import pool
+from r3jax.baselines import active_gamer
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.state import empty_map
-from r3jax.planning import decision
 from r3jax.planning.candidates import Candidates, candidates_along, poses_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.policies import frontier, random, renderability
+from r3jax.planning.decide import initial_state, look_round
+from r3jax.planning.policies import frontier, r3, random
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import MOTIONS, Motion
 from r3jax.planning.robot.travel import plan_travel
@@ -40,7 +40,7 @@ def decide(policy):
     return policy.decide(state, empty_map(64), GRID, level_start(), key=KEY)[0]
 
 
-def test_what_is_scored_is_what_is_taken() -> None:
+def test_what_is_scored_is_what_is_taken():
     """The scorer sees the candidates as the carrier would take them."""
     for name in CONSTRAINED:
         seen = []
@@ -50,12 +50,12 @@ def test_what_is_scored_is_what_is_taken() -> None:
             zeros = np.zeros(len(poses))
             return SimpleNamespace(exploration=zeros, rendering=zeros, total=zeros + 1.0)
 
-        answer = decide(renderability.Ours(config_of(name), score))
+        answer = decide(r3.Ours(config_of(name), score))
         np.testing.assert_allclose(seen[0], answer.candidates, atol=1e-6)
         assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
 
 
-def test_a_policy_that_turns_is_held() -> None:
+def test_a_policy_that_turns_is_held():
     """A panorama that answers with a direction off the limits is brought back within them."""
     for name in CONSTRAINED:
         allowed_axes = []
@@ -65,7 +65,7 @@ def test_a_policy_that_turns_is_held() -> None:
             axes = LATTICE[allowed.argmax(axis=1)]  # the highest that is allowed
             return SimpleNamespace(best_direction=axes, best_score=np.ones(NUM))
 
-        answer = decide(renderability.OursPano(config_of(name), score))
+        answer = decide(r3.OursPano(config_of(name), score))
         assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
         limits = Limits(MOTIONS[name], level_start())
         expected = limits.allowed_axes(answer.candidates[:, :3, 3], len(LATTICE))
@@ -73,7 +73,7 @@ def test_a_policy_that_turns_is_held() -> None:
         assert not expected.all()
 
 
-def test_turns_cost() -> None:
+def test_turns_cost():
     """Path and seconds of every candidate by hand: the way is a straight line here."""
     config = config_of("gimbal")
     answer = decide(random.Random(config))
@@ -88,23 +88,22 @@ def test_turns_cost() -> None:
     assert free.seconds is None
 
 
-def test_heights_count_from_the_first_view() -> None:
+def test_heights_count_from_the_first_view():
     """Not from the latest one: a hand that has come up does not come up from there again."""
     config, first = config_of("handheld"), level_start()
-    state = decision.initial_state(CAMERA, GRID, motion=config.motion)
+    state = initial_state(CAMERA, GRID, motion=config.motion)
     higher = first.copy()
     higher[2, 3] += 0.1
     for pose in (first, higher):
-        args = state, empty_map(64), GRID, pose, config
-        state, travel, _ = decision.prepare_decision(*args)
+        state, where = look_round(state, empty_map(64), GRID, pose, config)
         low, high = first[2, 3] - 0.6, first[2, 3] + 0.4
-        np.testing.assert_allclose(travel.heights, (low, high), atol=1e-6)
-    assert decision.initial_state(CAMERA, GRID).start_height is None
+        np.testing.assert_allclose(where.travel.heights, (low, high), atol=1e-6)
+    assert initial_state(CAMERA, GRID).start_height is None
     walker = random.Random(config).init(CAMERA, GRID, key=KEY)
     assert walker.start_height is not None
 
 
-def test_frontier_shows_its_target() -> None:
+def test_frontier_shows_its_target():
     """A level camera never walks to a target that it would look over."""
     free, _ = two_rooms()
     start = level_start()
@@ -122,15 +121,15 @@ def test_frontier_shows_its_target() -> None:
     assert len(anything) > len(places)
 
 
-def test_pool_waits_for_turns() -> None:
+def test_pool_waits_for_turns():
     """A hand takes of the pool what it can turn to on the way: its azimuth is never changed."""
     start, shape = level_start(), (25, 14, 10)
     travel = plan_travel(GRID, start[:3, 3])
     limits = Limits(MOTIONS["handheld"], start, travel.heights)
-    pools = pool.empty_pools(shape, CELL)
+    pools = active_gamer.empty_pools(shape, CELL)
     # Stage 1 needs stage 0 to be over.
-    _, every = pool.draw_candidates(pools, travel, 500)
-    _, some = pool.draw_candidates(pools, travel, 500, limits)
+    _, every = active_gamer.draw_candidates(pools, travel, 500)
+    _, some = active_gamer.draw_candidates(pools, travel, 500, limits)
     assert 0 < some.candidates.num_valid < every.candidates.num_valid
     assert not _is_cut_short(limits, some.candidates).any()
     left_out = np.array(sorted(_views(every.candidates) - _views(some.candidates)))
@@ -150,11 +149,13 @@ def _is_cut_short(limits: Limits, candidates: Candidates) -> np.ndarray:
     return gap.max(axis=1) > 1e-4
 
 
-def test_low_robots_have_candidates() -> None:
+def test_low_robots_have_candidates():
     """A robot below the levels of the lattice has its candidates at its own height."""
     start = pose_at(center(5, 6, 2))
     height = (float(start[2, 3]), float(start[2, 3]))
     travel = plan_travel(GRID, start[:3, 3], heights=height)
-    _, found = pool.draw_candidates(pool.empty_pools((25, 14, 10), CELL), travel, 500)
+    _, found = active_gamer.draw_candidates(
+        active_gamer.empty_pools((25, 14, 10), CELL), travel, 500
+    )
     assert found is not None
     assert np.all(found.candidates.position[:, 2] == start[2, 3])

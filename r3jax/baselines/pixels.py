@@ -21,6 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import Candidates
+from r3jax.planning.policy import Situation
 from r3jax.scoring.backend import rows_in_pixels, seen_in_view
 from r3jax.scoring.batch import map_over_devices
 from r3jax.scoring.cells import Cells
@@ -53,6 +55,28 @@ class PixelView(eqx.Module):
 
 Value = Callable[[PixelView], Any]
 """Scores one view; a module-level function, so that it compiles once."""
+
+
+def score_by_pixels(
+    situation: Situation,
+    value: Value,
+    candidates: Candidates,
+    scoring: ScoringConfig,
+    rows: Any = (),
+    reach: float | None = None,
+) -> list[np.ndarray]:
+    """`score_pixels` of a situation: each number that `value` gives of a view, [C] float64."""
+    numbers = score_pixels(
+        value,
+        situation.map_state,
+        situation.scoring_grid,
+        situation.camera,
+        candidates.poses_on_device(),
+        scoring,
+        rows,
+        reach,
+    )
+    return [np.asarray(number, dtype=np.float64) for number in numbers]
 
 
 def score_pixels(

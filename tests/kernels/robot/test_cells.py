@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from r3jax.planning.robot.cells import flood, nearest_in_ring
+from r3jax.kernels.robot.cells import flood, nearest_in_ring
 
 FACES = ndimage.generate_binary_structure(3, 1)
 

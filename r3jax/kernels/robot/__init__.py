@@ -1,0 +1,1 @@
+"""Lines, floods and shortest paths over the cells of a grid."""

@@ -1,0 +1,456 @@
+"""A decision in the order of time: look round, draw, make feasible, score, weigh, choose.
+
+A policy is how it draws and how it scores; all else of a decision is here, for every policy. What
+is drawn, and what scoring turns, becomes the nearest view that the robot may take: no policy has to
+know the robot.
+
+Shape symbols: X Y Z cells of the grid; C candidates; K waypoints.
+"""
+
+import functools
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import Candidates, candidates_along, path_lengths, random_views
+from r3jax.planning.config import PlannerConfig
+from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, Situation
+from r3jax.planning.robot.explorable import mask_unexplorable
+from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.motion import Motion
+from r3jax.planning.robot.travel import Travel, plan_travel
+from r3jax.scoring.explain import Explanation, explain_view
+from r3jax.scoring.utility import visible_unexplored
+
+MAX_FAILED_LOOKS = 3
+"""Views that should have shown a cell and left it unexplored, after which it is left alone: it lies
+behind a window, where the depth sensor fails, or where hits and passes cancel out."""
+
+RECONSIDERED = 8
+"""Candidates of an earlier decision that are scored again."""
+
+Scored = tuple[Candidates, dict[str, np.ndarray]]
+"""Candidates, turned if the policy turns them, and numbers of each [C]."""
+
+
+class PlannerState(eqx.Module):
+    """What a policy of this package remembers between decisions."""
+
+    camera: Camera
+    """The camera of every frame to come."""
+
+    trail: Bool[np.ndarray, "X Y Z"] = eqx.field(converter=np.asarray)
+    """Cells that the robot has come through: the path back if it finds itself shut in."""
+
+    looks: Int[np.ndarray, "X Y Z"] = eqx.field(converter=np.asarray)
+    """Views that should have shown each cell and left it unexplored."""
+
+    start_height: Float[Array, ""] | None = None
+    """Height of the first view [m], NaN before it; None for a motion whose heights do not count
+    from it."""
+
+    memory: Any = None
+    """Arrays that one policy keeps beside the map: a pytree of its own."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The candidates of one decision."""
+
+    candidates: Candidates
+    """Views on offer; none of them valid: there is nothing to choose from."""
+
+    memory: Any
+    """What the policy keeps beside the map, after drawing."""
+
+    notes: Any = None
+    """What `score`, `weigh` and `conclude` need of the candidates; not kept."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How a policy decides: what it offers, and how it compares."""
+
+    draw: Callable[..., Drawn]
+    """The candidates in a situation; takes a `key`."""
+
+    score: Callable[..., Scored]
+    """From a situation and candidates to those, turned or not, and numbers of each; takes a
+    `key`. None valid any more: the policy has seen enough."""
+
+    weigh: Callable[[dict[str, np.ndarray]], np.ndarray]
+    """From those numbers, and `path` [C], to the totals [C]."""
+
+    conclude: Callable[[Situation, Candidates, dict[str, np.ndarray], int], Any] = (
+        lambda situation, candidates, utilities, best: situation.memory
+    )
+    """The memory after a candidate was chosen."""
+
+
+@dataclass(frozen=True)
+class GreedyPolicy(ABC):
+    """Draws candidates, scores them, weighs the path, takes the best.
+
+    A policy says how it scores, and if need be how it draws, weighs and concludes.
+    """
+
+    config: PlannerConfig = field(default_factory=PlannerConfig)
+
+    name: ClassVar[str]
+    """As users write it."""
+
+    source: ClassVar[str]
+    """Where the rule comes from."""
+
+    Config: ClassVar[type[PlannerConfig]] = PlannerConfig
+    """Its settings."""
+
+    def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
+        """What the policy keeps beside the map, before the first frame: nothing."""
+        del camera, grid
+
+    def draw(self, situation: Situation, *, key: Array) -> Drawn:
+        """The candidates: those of R3, unless the policy has its own."""
+        travel, grid = situation.travel, situation.scoring_grid
+        return Drawn(random_views(travel, grid, self.config, key=key), situation.memory)
+
+    @abstractmethod
+    def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
+        """The candidates, turned if the policy turns them, and `utility` [C] among others."""
+
+    def score_again(
+        self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
+    ) -> Scored:
+        """`score` of candidates of an earlier decision, whose totals [C] were `before`."""
+        del before
+        return self.score(situation, candidates, key=key)
+
+    def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
+        """`total` of each candidate, from `utility` and `path` [C]: U_view."""
+        return net_utility(utilities["utility"], utilities["path"], self.config.lambda2)
+
+    def conclude(
+        self,
+        situation: Situation,
+        candidates: Candidates,
+        utilities: dict[str, np.ndarray],
+        best: int,
+    ) -> Any:
+        """The memory after candidate `best` was chosen."""
+        del candidates, utilities, best
+        return situation.memory
+
+    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
+        """The state before the first frame; nothing in it is random."""
+        del key
+        memory = self.first_memory(camera, grid)
+        return initial_state(camera, grid, memory, self.config.motion)
+
+    def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
+        """The map holds all that most policies need of a frame."""
+        del map_state, frame
+        return state
+
+    def decide(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
+        """The candidate with the greatest total, of those that the robot may take."""
+        rule = Rule(self.draw, self.score, self.weigh, self.conclude)
+        return decide(rule, (state, map_state, grid, T_world_camera), self.config, key=key)
+
+    def reconsider(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        planned: Decision,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, PlannerState, PlanInfo]:
+        """Decides again among the best candidates of a decision that was made on less.
+
+        None: no path leads to any of them.
+        """
+        views, before = best_of(planned)
+        rule = Rule(
+            lambda situation, *, key: Drawn(views, situation.memory),
+            functools.partial(self.score_again, before=before),
+            self.weigh,
+            self.conclude,
+        )
+        return decide(rule, (state, map_state, grid, T_world_camera), self.config, key=key)
+
+    def follow(
+        self,
+        state: PlannerState,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        waypoints: np.ndarray,
+    ) -> PlannerState:
+        """The cells on the path, and what the latest view failed to show."""
+        state, situation = look_round(state, map_state, grid, T_world_camera, self.config)
+        return with_path(state, situation.travel, waypoints)
+
+
+Known = tuple[PlannerState, MapState, OccupancyGrid, np.ndarray]
+"""The policy's memory, the map, the grid, and where the latest view was taken [4, 4]."""
+
+
+def decide(
+    rule: Rule, known: Known, config: PlannerConfig, *, key: Array
+) -> tuple[Decision | None, PlannerState, PlanInfo]:
+    """One decision, from drawing to choice.
+
+    Args:
+        rule: of the policy.
+        known: what it decides on.
+        config: its settings.
+        key: randomness of this decision.
+
+    Returns:
+        The decision, or None where no view can be reached; the memory, and what happened.
+    """
+    stopwatch = Stopwatch()
+    # Two keys: a policy that draws more must not change the random numbers of its scores.
+    draw_key, score_key = jax.random.split(key)
+    with stopwatch.part("travel"):
+        state, situation = look_round(*known, config)
+    limits, travel = situation.limits, situation.travel
+
+    with stopwatch.part("candidates"):
+        drawn = rule.draw(situation, key=draw_key)
+        situation = replace(situation, memory=drawn.memory, notes=drawn.notes)
+    # What drawing noted is kept in any case, so that a resumed run remembers the same.
+    state = replace(state, memory=drawn.memory)
+    # No view on offer is an outcome, not an error: the loop ends with the reason.
+    if not drawn.candidates.valid.any():
+        return None, state, _nothing_in_reach(travel, config, stopwatch)
+
+    with stopwatch.part("scoring"):
+        # Before scoring, so that what is scored is what is taken; after it, because a score may
+        # have turned the views.
+        feasible = limits.project_to_feasible(drawn.candidates)
+        candidates, utilities = rule.score(situation, feasible, key=score_key)
+        candidates = limits.project_to_feasible(candidates)
+    if not candidates.valid.any():  # the policy has seen enough
+        num = drawn.candidates.num_valid
+        info = PlanInfo(DecisionOutcome.NO_CANDIDATE, num, num, stopwatch.seconds)
+        return None, state, info
+
+    with stopwatch.part("travel"):
+        # After the projection, which may change heights: the paths lead to views on offer.
+        path = limits.path_costs(path_lengths(travel, candidates), candidates.direction)
+    # What was drawn is within reach; what was drawn before the last view may not be.
+    if not np.isfinite(path).any():
+        return None, state, _nothing_in_reach(travel, config, stopwatch)
+    utilities = utilities | {"path": path}
+    utilities = utilities | {"total": rule.weigh(utilities)}
+
+    with stopwatch.part("travel"):
+        # Padding has an infinite path too, so that it can never win.
+        best = int(np.argmax(np.where(np.isfinite(path), utilities["total"], -np.inf)))
+        decision = _decision_for(best, candidates, utilities, travel, limits)
+    memory = rule.conclude(situation, candidates, utilities, best)
+    state = with_path(replace(state, memory=memory), travel, decision.waypoints)
+    num_reachable = int(np.isfinite(path).sum())
+    moved = (DecisionOutcome.MOVED, candidates.num_valid, num_reachable, stopwatch.seconds)
+    return decision, state, PlanInfo(*moved)
+
+
+def look_round(
+    state: PlannerState,
+    map_state: MapState,
+    grid: OccupancyGrid,
+    T_world_camera: np.ndarray,
+    config: PlannerConfig,
+) -> tuple[PlannerState, Situation]:
+    """Finds where the robot can go, what it may do next, and which cells can be explored.
+
+    Args:
+        state: the policy's memory.
+        map_state: the map, the view from here included.
+        grid: the grid, the same.
+        T_world_camera: where the latest view was taken.
+        config: the safety margin, the robot, and how far it sees.
+
+    Returns:
+        The memory with the view from here counted in, and the situation. Cells that no robot can
+        look at, and those that several views left unexplored, do not count in its `scoring_grid`.
+    """
+    # float64: in float32 a robot on a border of cells could stand in either of them, and waypoints
+    # begin exactly where the robot is.
+    pose = np.asarray(T_world_camera, dtype=np.float64)
+    state = _with_start(state, pose[2, 3])
+    motion, start = config.motion, state.start_height
+    # Heights count from the first view, or a robot would creep up by its range each time.
+    heights = motion.heights_from(0.0 if start is None else float(start))
+    travel = plan_travel(grid, pose[:3, 3], config.safety_margin, state.trail, heights, motion.body)
+    # What this view should have shown: if it is still unexplored, the look has failed.
+    visible = visible_unexplored(
+        map_state, grid, state.camera, jnp.asarray(T_world_camera, jnp.float32), config.scoring
+    )
+    state = replace(state, looks=state.looks + np.asarray(visible, dtype=np.int32))
+    # After that many, more would not help, and the utility would call for them for ever.
+    is_exhausted = state.looks >= MAX_FAILED_LOOKS
+    scoring_grid = mask_unexplorable(grid, travel.reachable, is_exhausted)
+    limits = Limits(motion, pose, travel.heights)
+    return state, Situation(
+        map_state, grid, scoring_grid, travel, state.camera, state.memory, limits
+    )
+
+
+def explain_path(
+    state: PlannerState,
+    map_state: MapState,
+    grid: OccupancyGrid,
+    T_world_camera: np.ndarray,
+    T_chosen: np.ndarray,
+    waypoints: np.ndarray,
+    config: PlannerConfig,
+) -> tuple[PlannerState, Explanation]:
+    """Follows a path [K, 3], and explains the utility of the view at its end when it was chosen."""
+    state, situation = look_round(state, map_state, grid, T_world_camera, config)
+    pose = jnp.asarray(T_chosen, dtype=jnp.float32)
+    explanation = explain_view(
+        map_state, situation.scoring_grid, state.camera, pose, config.scoring
+    )
+    return with_path(state, situation.travel, waypoints), explanation
+
+
+def best_of(planned: Decision) -> tuple[Candidates, np.ndarray]:
+    """The best candidates of an earlier decision, and their totals; one shape, to compile once."""
+    finite = np.isfinite(planned.utilities["path"])
+    total = np.where(finite, planned.utilities["total"], -np.inf)
+    # A policy that ranks fewer (`r3-ahead`: where its best paths begin) fills up with the first
+    # that were drawn.
+    best = np.argsort(-total, kind="stable")[:RECONSIDERED]
+    poses = planned.candidates[best]
+    views = candidates_along(poses[:, :3, 3], poses[:, :3, 2]).padded(RECONSIDERED)
+    return views, np.resize(total[best], RECONSIDERED)
+
+
+def net_utility(
+    utility: np.ndarray,
+    path: np.ndarray,
+    lambda2: float,
+    among: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
+    """U_view of each candidate, from its utility and path length [C].
+
+    U_view = utility / sum(utility) - lambda2 * path / sum(path), both sums over the reachable
+    candidates; a sum of 0 leaves its term out. Unreachable: -inf. (Active-GS sums utilities over
+    all candidates, paths over the reachable ones.)
+
+    Args:
+        utility: of each candidate.
+        path: length of the path to it, or its cost; inf: unreachable.
+        lambda2: weight of the path.
+        among: utilities and paths of the candidates that the sums are over; None: these.
+    """
+    # Shares of sums: utility and path become comparable without units.
+    wholes = (utility, path) if among is None else among
+    counts, is_reachable = np.isfinite(wholes[1]), np.isfinite(path)
+    shares: list[np.ndarray] = []
+    for values, whole in zip((utility, path), wholes, strict=True):
+        values = np.where(is_reachable, np.asarray(values, dtype=np.float64), 0.0)
+        # One infinite path in the sum would take the share of every other to 0.
+        total = np.where(counts, np.asarray(whole, dtype=np.float64), 0.0).sum()
+        # A sum of 0 tells no candidate from another: its term is left out, not infinite.
+        shares.append(values / (total or 1.0))
+    return np.where(is_reachable, shares[0] - lambda2 * shares[1], -np.inf)
+
+
+def initial_state(
+    camera: Camera, grid: OccupancyGrid, memory: Any = None, motion: Motion | None = None
+) -> PlannerState:
+    """The memory of a robot that has not moved yet."""
+    nowhere = np.zeros(grid.log_odds.shape, dtype=bool)
+    looks = np.zeros(grid.log_odds.shape, dtype=np.int32)
+    is_relative = motion is not None and motion.is_relative
+    # NaN, not None, until the first view: the tree of arrays keeps its structure from there on.
+    start_height = jnp.asarray(jnp.nan, dtype=jnp.float32) if is_relative else None
+    return PlannerState(camera, nowhere, looks, start_height, memory)
+
+
+def with_path(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> PlannerState:
+    """Counts a path over waypoints [K, 3] [m] in."""
+    # All cells that the lines cross, not the waypoints alone: the path back must be connected.
+    return replace(state, trail=state.trail | travel.cells_along(waypoints))
+
+
+def _with_start(state: PlannerState, height: float) -> PlannerState:
+    """Notes the height [m] of the first view, if that has not been done."""
+    start = state.start_height
+    if start is None or not np.isnan(start):
+        return state
+    return replace(state, start_height=jnp.asarray(height, dtype=jnp.float32))
+
+
+def _decision_for(
+    best: int,
+    candidates: Candidates,
+    utilities: dict[str, np.ndarray],
+    travel: Travel,
+    limits: Limits,
+) -> Decision:
+    """Candidate `best`, the path to it, and what else was on offer."""
+    waypoints = travel.path(candidates.position[best])
+    # Measured again: shortcuts may have made the path shorter than the length that was weighed.
+    length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
+    # The edge: matrices for rendering and recording, without the padding.
+    poses, on_offer = candidates.T_world_camera, candidates.valid
+    return Decision(
+        T_world_camera=poses[best],
+        waypoints=waypoints,
+        length=length,
+        seconds=limits.seconds(length, candidates.direction[best]),
+        score=float(utilities["total"][best]),
+        candidates=poses[on_offer],
+        utilities={name: values[on_offer] for name, values in utilities.items()},
+    )
+
+
+def _nothing_in_reach(travel: Travel, config: PlannerConfig, stopwatch: "Stopwatch") -> PlanInfo:
+    """The answer where no candidate was found: safe places exist, or not even those."""
+    centers = travel.centers(np.argwhere(travel.safe))
+    # Safe places within the radius that no path leads to are told from none at all.
+    near = np.linalg.norm(centers - travel.start, axis=1) <= config.radius
+    reason = DecisionOutcome.NO_REACHABLE_CANDIDATE if near.any() else DecisionOutcome.NO_CANDIDATE
+    return PlanInfo(reason, num_candidates=int(near.sum()), stage_seconds=stopwatch.seconds)
+
+
+@dataclass
+class Stopwatch:
+    """Wall time of the parts of one decision."""
+
+    seconds: dict[str, float] = field(default_factory=dict[str, float])
+    """Per part [s]."""
+
+    @contextmanager
+    def part(self, name: str) -> Generator[None]:
+        """Adds the time spent in a `with` block to a part."""
+        begin = time.perf_counter()
+        yield
+        # Added, not set: travel is timed before the scores and once more after them.
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin

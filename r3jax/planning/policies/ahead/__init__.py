@@ -1,5 +1,0 @@
-"""Ours, several views ahead."""
-
-from r3jax.planning.policies.ahead.policy import OursAhead
-
-__all__ = ["OursAhead"]

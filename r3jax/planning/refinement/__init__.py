@@ -1,1 +1,0 @@
-"""The best candidates climb the slope of the utility."""

@@ -1,0 +1,194 @@
+"""A utility of a view that gradients can climb: smooth in position and direction.
+
+`view_utility` counts what is in the image and not hidden. Its derivative sees nothing enter or
+leave a view, nor kappa change between 1 and 2. Here, near the pose that it is made for,
+
+    U(c, R) = sum over points p of  n_p w_p(c) F_p(c, R) D_p(c)
+
+over the voxels and unexplored cells that nothing hides from that pose, c the camera's center and
+R its axes:
+
+- w_p: 1 - R_p(c) of a voxel, lambda1 of an unexplored cell;
+- F_p: the product of a sigmoid of the angle to each side of the image;
+- D_p: a sigmoid of the distance that is left to the end of the range;
+- n_p: how many points p stands for, where there are more than room.
+
+Frozen at the pose are occlusion and kappa. So it is no bound on the utility: what it leads to is
+scored exactly before it is taken (`planning.refine`).
+
+Shape symbols: m points, v of them voxels.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from r3jax.geometry.arguments import a_camera, a_pose, checked
+from r3jax.geometry.cameras import Camera, sound
+from r3jax.geometry.compaction import positions_of_set
+from r3jax.mapping.occupancy import OccupancyGrid, a_grid
+from r3jax.mapping.state import MapState, a_map
+from r3jax.scoring.backend import seen_in_view
+from r3jax.scoring.cells import Cells, cells_of
+from r3jax.scoring.config import ScoringConfig, scoring_settings
+from r3jax.scoring.terms import score_voxels
+from r3jax.visibility.views import pinhole_view
+
+MAX_VOXELS, MAX_CELLS = 1 << 12, 1 << 10
+"""Points of each kind that are summed over; an even sample where more are visible."""
+
+SOFTNESS = 0.04
+"""Angle inside the image at which a point counts 73 % [rad]."""
+
+_MARGIN = math.radians(25.0)
+"""Points are collected so far beyond the image on each side [rad]."""
+
+_WIDEST = math.radians(75.0)
+"""Half the field of view in which they are collected, at most [rad]: a plane cannot show 90."""
+
+_RANGE_MARGIN = 1.2
+"""Points are collected up to so many times the range."""
+
+
+class SoftUtility(eqx.Module):
+    """The smooth utility of views near one pose; `soft_utility` makes it. A function of a pose."""
+
+    points: Float[Array, "3 m"]
+    """Centers of voxels, then of cells [m]."""
+
+    count: Float[Array, " m"]
+    """Points that each stands for; 0: padding."""
+
+    voxels: MapState
+    """Rows of the voxels."""
+
+    kappa_is_one: Bool[Array, " v"]
+    """Of the voxels, seen from the pose."""
+
+    camera: Camera
+    """Of the views."""
+
+    config: ScoringConfig
+    """Settings of the utility."""
+
+    softness: Float[Array, ""]
+    """Of the image's sides [rad], and of the range as a share of it."""
+
+    def __call__(self, T_world_camera: Float[Array, "4 4"]) -> Float[Array, ""]:
+        """The soft utility of a view."""
+        R, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
+        # Products and sums, not a matrix product: on some devices those round to ten bits.
+        offset = self.points - position[:, None]
+        x, y, z = (jnp.sum(R[:, j, None] * offset, axis=0) for j in range(3))
+        # Added under the root: at the camera itself the gradient stays finite.
+        distance = jnp.sqrt(x * x + y * y + z * z + 1e-6)
+        left = (1.0 - distance / self.config.max_range) / self.softness
+        visible = self.count * jax.nn.sigmoid(left)
+        camera = self.camera
+        for along, focal, center, size in (
+            (x, camera.fx, camera.cx, camera.width),
+            (y, camera.fy, camera.cy, camera.height),
+        ):
+            for side, k in ((1.0, -center / focal), (-1.0, (size - center) / focal)):
+                # Distance to the side's plane over that to the camera: a sine, smooth across it.
+                sine = side * (along - k * z) / (distance * jnp.sqrt(1.0 + k * k))
+                visible = visible * jax.nn.sigmoid(sine / self.softness)
+        forms = self.config.forms
+        terms = score_voxels(self.voxels, position, camera.focal, forms, self.kappa_is_one)
+        of_cells = jnp.broadcast_to(self.config.lambda1, x.shape[0] - terms.value.shape[0])
+        return jnp.sum(visible * jnp.concatenate([1.0 - terms.value, of_cells]))
+
+
+@checked(state=a_map, grid=a_grid, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@jax.jit
+def soft_utility(
+    state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig | None = None,
+    softness: Float[Array, ""] | float = SOFTNESS,
+) -> SoftUtility:
+    """Makes a smooth stand-in for `view_utility` round a pose, as a function of the pose.
+
+        utility = r3jax.soft_utility(m, grid, camera, r3jax.pose_along(position, direction))
+        slope = jax.grad(lambda p, d: utility(r3jax.pose_along(p, d)), argnums=(0, 1))
+        along_position, along_direction = slope(position, direction)
+
+    What hides what, and kappa, stay as they are at `T_world_camera`; what enters and leaves the
+    image and the sensor's range does so gradually, up to 25 degrees beyond the image. Beyond that
+    make another.
+
+    Args:
+        state: the map.
+        grid: whose unexplored cells count.
+        camera: of the views.
+        T_world_camera: where occlusion is determined.
+        config: settings of the utility.
+        softness: angle at the image's sides within which points enter [rad]; the smaller, the
+            closer to the exact utility, and the rougher.
+    """
+    config = ScoringConfig() if config is None else config
+    made = soft_utility_near(state, cells_of(grid), camera, T_world_camera, config, softness)
+    factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
+    return eqx.tree_at(lambda u: u.count, made, factor * made.count)
+
+
+def soft_utility_near(
+    voxels: MapState,
+    cells: Cells,
+    camera: Camera,
+    T_world_camera: Float[Array, "4 4"],
+    config: ScoringConfig,
+    softness: Float[Array, ""] | float = SOFTNESS,
+) -> SoftUtility:
+    """`soft_utility` of voxels and cells that are already at hand."""
+    farther = eqx.tree_at(lambda c: c.max_range, config, _RANGE_MARGIN * config.max_range)
+    view = pinhole_view(_widened(camera), T_world_camera, farther)
+    seen, unexplored = seen_in_view(voxels, cells, view, farther)
+    row, num_each = _sample(seen, MAX_VOXELS)
+    cell, num_each_cell = _sample(unexplored, MAX_CELLS)
+    part, center = voxels.take(row, num_each > 0.0), voxels.center_of(row)
+    terms = score_voxels(part, T_world_camera[:3, 3], camera.focal, config.forms)
+    return SoftUtility(
+        points=jnp.stack(
+            [jnp.concatenate([center[i], (cells.x, cells.y, cells.z)[i][cell]]) for i in range(3)]
+        ),
+        count=jnp.concatenate([num_each, num_each_cell]),
+        voxels=part,
+        kappa_is_one=terms.kappa == 1.0,
+        camera=camera,
+        config=config,
+        softness=jnp.asarray(softness, dtype=jnp.float32),
+    )
+
+
+def _widened(camera: Camera) -> Camera:
+    """A camera of as many pixels that sees `_MARGIN` more on every side."""
+
+    def lens(focal: Array, center: Array, size: int) -> tuple[Array, float]:
+        # Even about the axis: as much on each side as on the wider one.
+        half = jnp.arctan(jnp.maximum(center, size - center) / focal)
+        return 0.5 * size / jnp.tan(jnp.minimum(half + _MARGIN, _WIDEST)), 0.5 * size
+
+    fx, cx = lens(camera.fx, camera.cx, camera.width)
+    fy, cy = lens(camera.fy, camera.cy, camera.height)
+    return Camera(camera.width, camera.height, fx, fy, cx, cy)
+
+
+def _sample(chosen: Bool[Array, " n"], most: int) -> tuple[Int[Array, " m"], Float[Array, " m"]]:
+    """Numbers of at most `most` of the chosen, evenly, and how many each stands for; 0: padding.
+
+    Voxels lie in the order of a hash table: a sample by number is one by chance.
+    """
+    num = chosen.shape[0]
+    order = positions_of_set(chosen, num)
+    count = jnp.sum(chosen, dtype=jnp.float32)
+    each = jnp.maximum(count / most, 1.0)
+    number = jnp.arange(min(most, num), dtype=jnp.float32)
+    index = order[jnp.minimum((number * each).astype(jnp.int32), num - 1)]
+    is_chosen = (number * each < count) & (index < num)
+    return jnp.minimum(index, num - 1), jnp.where(is_chosen, each, 0.0)
