@@ -7,7 +7,7 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 """Addresses that no other machine can reach."""
 
 
-def who_sees(host: str, what: str = "sees the page") -> str | None:
+def exposure_warning(host: str, what: str = "sees the page") -> str | None:
     """Warns of what listens for other machines; None where it does not.
 
     Args:

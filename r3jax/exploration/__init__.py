@@ -2,7 +2,7 @@
 
 import lazy_loader
 
-# Budgets and settings are asked for where JAX shall not be waited for.
+# Lazy: budgets and settings are read without loading JAX.
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__, submod_attrs={"loop": ["Result", "explore"]}
 )

@@ -1,4 +1,4 @@
-"""The frames of one path: those captured on the way, and the view that was chosen, the last one.
+"""The frames of one path: those captured while moving, and the last one, the view that was chosen.
 
 A path is cut into equal pieces, with a frame at the end of each. The flight takes as long as the
 decision says, with or without captures: the camera turns while it moves, never so far that it would
@@ -34,21 +34,21 @@ from r3jax.scoring.config import ScoringConfig
 
 
 @dataclass(frozen=True)
-class Rules:
-    """What decides on the frames of all paths of a run."""
+class CaptureSettings:
+    """Everything that is fixed during a run and determines the frames along paths."""
 
     config: ExplorationConfig
     """How long pieces are, and where to look."""
 
     motion: Motion
-    """What carries the camera."""
+    """The robot."""
 
     camera: Camera
     """Camera of the frames."""
 
     @property
     def scoring(self) -> ScoringConfig:
-        """Settings of the utility of a look on the way."""
+        """Settings of the utility of a frame captured while moving."""
         return scoring_on_the_way(self.config)
 
     @property
@@ -69,7 +69,7 @@ class Rules:
 
 
 def scoring_on_the_way(config: ExplorationConfig) -> ScoringConfig:
-    """Settings of the utility of a look on the way: the same for every policy."""
+    """Settings of the utility of a frame captured while moving: the same for every policy."""
     return ScoringConfig(max_range=jnp.asarray(config.max_range, jnp.float32))
 
 
@@ -119,10 +119,12 @@ class Leg:
         return None if self.is_last else replace(self, taken=self.taken + 1)
 
 
-def begin_leg(decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: Rules) -> Leg:
+def begin_leg(
+    decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: CaptureSettings
+) -> Leg:
     """Cuts the path of a decision into pieces.
 
-    A path no longer than a piece, or too short for its turn, has no frame on the way.
+    A path no longer than a piece, or too short for its turn, has no frame before its end.
 
     Args:
         decision: where to.
@@ -148,7 +150,7 @@ def begin_leg(decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, ru
 
 
 def _in_pieces(
-    num: int, decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: Rules
+    num: int, decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: CaptureSettings
 ) -> Leg:
     """The leg of a path in `num` pieces, two or more."""
     places = points_along(decision.waypoints, num)
@@ -163,7 +165,7 @@ def _in_pieces(
     return Leg(decision, info, places, np.full(num, decision.length / num), seconds, turning)
 
 
-def allowed_turns(stops: np.ndarray, seconds: np.ndarray, rules: Rules) -> np.ndarray:
+def allowed_turns(stops: np.ndarray, seconds: np.ndarray, rules: CaptureSettings) -> np.ndarray:
     """Largest turn on each piece of a path, [n] [rad]; inf: any.
 
     Args:
@@ -197,8 +199,10 @@ def points_along(waypoints: np.ndarray, num: int) -> np.ndarray:
     return np.stack([np.interp(at, done, waypoints[:, axis]) for axis in range(3)], axis=1)
 
 
-def aim(leg: Leg, T_world_camera: np.ndarray, planner: Planner, rules: Rules) -> np.ndarray:
-    """Finds the pose of the next frame on the way, [4, 4] float64.
+def aim(
+    leg: Leg, T_world_camera: np.ndarray, planner: Planner, rules: CaptureSettings
+) -> np.ndarray:
+    """Finds the pose of the next frame captured while moving, [4, 4] float64.
 
     Args:
         leg: which frame it is.
@@ -218,9 +222,17 @@ def aim(leg: Leg, T_world_camera: np.ndarray, planner: Planner, rules: Rules) ->
     return pose_towards(place, turning.nearest(piece, now, wanted))
 
 
-def observe_on_the_way(planner: Planner, frame: Frame, rules: Rules) -> Planner:
-    """`observe` of a frame that no decision follows: what it failed to show is counted here."""
+def observe_view(
+    planner: Planner, frame: Frame, rules: CaptureSettings, *, captured: bool
+) -> Planner:
+    """`observe` of a frame of the loop.
+
+    No decision follows a frame that was captured while moving: the cells that it failed to show
+    are counted here.
+    """
     planner = observe(planner, frame)
+    if not captured:
+        return planner
     state = count_look(
         planner.policy_state,
         planner.map_state,

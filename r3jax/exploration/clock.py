@@ -42,7 +42,7 @@ class ModelClock:
     """Charges a fixed cost per stage, so that the same run twice is the same run."""
 
     costs: dict[str, float]
-    """Seconds per call, by stage; `reconsidering` a decision that was made on the way, `gaze` per
+    """Seconds per call, by stage; `reconsidering` a decision that was made while moving, `gaze` per
     frame that is captured while moving."""
 
     measures: bool = False
@@ -98,13 +98,13 @@ def timed(
     Args:
         function: a pure function of its arguments.
         *args: handed to it.
-        repeat_compiled: False where nobody needs the exact time.
+        repeat_compiled: False where the exact time is not needed.
         **kwargs: handed to it.
 
     Returns:
         The result, ready, and the seconds it took.
     """
-    # Events, not a warm-up call: a table of the map that grows compiles anew in mid-mission.
+    # Events, not a warm-up call: a table of the map that grows compiles again in mid-mission.
     before = compilations.count
     result, seconds = _measure(function, *args, **kwargs)
     if repeat_compiled and compilations.count > before:

@@ -10,7 +10,7 @@ from r3jax.planning.robot.motion import LEAST_RATE
 ClockName = Literal["wall", "model"]
 
 GazeName = Literal["ahead", "panorama"]
-"""Where the camera looks on the way; `planning.turning` says how each finds its directions."""
+"""Where the camera looks while moving; `planning.turning` says how each finds its directions."""
 
 RETIRED_GAZES = {
     "blend": "it lost 1.8 dB against panorama; commit fb13156 has it",
@@ -19,7 +19,7 @@ RETIRED_GAZES = {
 """Gazes that recorded runs may name: the reason, and where their code is."""
 
 LEAST_PIECE = 0.05
-"""Frames that are captured on the way lie at least so far apart [m]: the edge of a voxel."""
+"""Least distance between frames that are captured while moving [m]: the edge of a voxel."""
 
 DEPTH_STEPS_PER_METRE = 5000
 """Recorded depth is in steps of 0.2 mm (TUM's scale)."""
@@ -65,10 +65,10 @@ class Budget:
     @property
     def shown(self) -> str:
         """As a user writes it."""
-        return as_written(str(self))
+        return format_budget(str(self))
 
 
-def as_written(text: str) -> str:
+def format_budget(text: str) -> str:
     """Spells meters in a text as users do, where files spell them otherwise."""
     return text.replace("metres", "meters")
 
@@ -79,7 +79,9 @@ def parse_budget(text: str) -> Budget:
     Raises:
         ValueError: anything else, an amount that is not positive, views or frames not whole.
     """
-    example = "use views:100, seconds:300 or meters:25; frames:100 counts those on the way as well"
+    example = (
+        "use views:100, seconds:300 or meters:25; frames:100 counts those captured while moving"
+    )
     unit, separator, amount_text = text.strip().partition(":")
     if unit == "meters":
         unit = "metres"  # as recorded runs and submissions spell it
@@ -136,7 +138,7 @@ class ExplorationConfig(MappingConfig):
     """Views between two stored states of the loop; the last one is always stored."""
 
     max_still_views: int = 100
-    """So many views in a row without moving end the run: the policy is stuck."""
+    """Views in a row without moving that end the run: the policy is stuck."""
 
     until: str | None = None
     """Stop before the budget is spent, when the forecast of the image quality says that the views
@@ -144,7 +146,7 @@ class ExplorationConfig(MappingConfig):
     tenth."""
 
     until_every: int = 5
-    """Views from one look at the forecast to the next; it takes most of a second."""
+    """Views between two forecasts; each takes most of a second."""
 
     capture_every: float | None = None
     """Capture frames while moving from view to view, at most this far apart [m]; by default
@@ -170,7 +172,7 @@ class ExplorationConfig(MappingConfig):
 
     @property
     def captures(self) -> bool:
-        """True if frames are captured on the way."""
+        """True if frames are captured while moving."""
         return self.capture_every is not None or self.capture_rate is not None
 
     def piece_at(self, speed: float) -> float:

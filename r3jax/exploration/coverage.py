@@ -67,7 +67,7 @@ def probe_poses(grid: OccupancyGrid, num: int) -> np.ndarray:
     Returns:
         `T_world_camera`, [P, 4, 4] float32, P <= num.
     """
-    # On the host: the number of free probes changes with every view, and would compile anew.
+    # On the host: the number of free probes changes with every view, and would compile again.
     origin, size = np.asarray(grid.origin, np.float64), float(grid.cell_size)
     shape = np.asarray(grid.log_odds.shape)
     positions, directions = _probe_sequence(tuple(origin), tuple(origin + shape * size))

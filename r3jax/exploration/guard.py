@@ -83,7 +83,7 @@ def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-siz
 
 
 class OracleReadError(RuntimeError):
-    """An image was asked for from where the camera is not."""
+    """An image was requested from where the camera is not."""
 
 
 class GuardedSimulator:
@@ -101,13 +101,13 @@ class GuardedSimulator:
 
         def render_committed(T_world_camera: np.ndarray) -> Frame:
             self._check(T_world_camera)
-            # Spent before the world is asked: an image that fails is not asked for again, either.
+            # Spent before the world renders: an image that fails is not requested again, either.
             self._pose = None
             self.views += 1
             return render(T_world_camera)
 
         self._render = render_committed
-        # Copies, here and below: nobody who holds such an array can move the box or the start.
+        # Copies, here and below: who holds such an array cannot move the box or the start.
         self._camera, self._bounds = simulator.camera, np.array(simulator.bounds)
         self._start_pose = np.array(simulator.start_pose)
         self._pose: np.ndarray | None = None
@@ -141,7 +141,7 @@ class GuardedSimulator:
         if view != self.views:
             raise OracleReadError(
                 f"view {view} comes next, but {self.views} pictures were taken: something beside "
-                "the loop asked the simulator"
+                "the loop used the simulator"
             )
         self._pose = np.array(T_world_camera, dtype=np.float64)
 
@@ -157,13 +157,13 @@ class GuardedSimulator:
         pose = np.asarray(T_world_camera, dtype=np.float64)
         if self._pose is None:
             raise OracleReadError(
-                f"a picture from {_place(pose)} was asked for while the camera is under way: only "
+                f"a picture from {_place(pose)} was requested while the camera is under way: only "
                 "the loop looks, once from each pose that was decided on"
             )
         # Exact: the loop renders the array it committed; a tolerance would let peeks through.
         if not np.array_equal(pose, self._pose):
             raise OracleReadError(
-                f"a picture from {_place(pose)} was asked for, but the camera is at "
+                f"a picture from {_place(pose)} was requested, but the camera is at "
                 f"{_place(self._pose)}"
             )
 

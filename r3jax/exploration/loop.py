@@ -13,7 +13,14 @@ import jax
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.state import LoopState, Mission, RecordingStopped, Stop, StopReason, in_words
+from r3jax.exploration.state import (
+    LoopState,
+    Mission,
+    RecordingStopped,
+    Stop,
+    StopReason,
+    describe_counts,
+)
 from r3jax.exploration.step import relive, start_state, step
 from r3jax.exploration.taken_views import StepRow, TakenView
 from r3jax.frame import Frame
@@ -84,7 +91,7 @@ def explore(
     """Explores an unknown scene until the budget is spent or no view is left.
 
     Args:
-        simulator: the world; all that is asked of it is the image where the camera is.
+        simulator: the world; it renders images from where the camera is, and nothing else.
         policy: chooses the views.
         budget: a limit, or its text such as `views:100`.
         seed: all randomness follows from it: step k uses `fold_in(key, k)`.
@@ -93,8 +100,8 @@ def explore(
         resume: what was recorded of this run before it was cut off; None for a new run. Under
             the model clock the result is the one of a run that was never cut off, bit for bit.
         decided_from: the first of the recorded views that this policy chose. Of those before it
-            is shown the frames, but not asked what it would have decided.
-        is_enough: asked every `config.until_every` views; the reason why no further view is needed
+            is shown the frames, but makes no decision.
+        is_enough: called every `config.until_every` views; the reason why no further view is needed
             ends the run, None lets it go on. Must come with `config.until`, which records it.
         on_view: called with every view once it is recorded, and with the planner that has seen it;
             both may be kept, as they never change.
@@ -109,7 +116,7 @@ def explore(
             config without an `is_enough` that judges it.
         RunError: a recorded frame that is needed to go on is missing or broken.
         PolicyError: a program that chooses the views has died, hangs, or answers nonsense.
-        OracleReadError: something beside the loop asked the simulator for an image.
+        OracleReadError: something beside the loop took an image from the simulator.
     """
     config = config or ExplorationConfig()
     # run.json records the goal as text: a rule without it could not be repeated by a resume.
@@ -196,7 +203,9 @@ def _go(
             on_view(output, state.planner)
     # The view under way is dropped; if its row is on the disk already, a resume finds it there.
     except KeyboardInterrupt:
-        stop = Stop(StopReason.INTERRUPTED, f"interrupted by the user after {in_words(rows)}")
+        stop = Stop(
+            StopReason.INTERRUPTED, f"interrupted by the user after {describe_counts(rows)}"
+        )
     # Before `Exception`, of which it is one: a full disk ends a run without being its failure.
     except RecordingStopped as error:
         stop = Stop(StopReason.RECORDING_STOPPED, str(error))

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from r3jax.exploration.captures import Leg, Rules
+from r3jax.exploration.captures import CaptureSettings, Leg
 from r3jax.exploration.clock import Clock
 from r3jax.exploration.config import Budget, ExplorationConfig
 from r3jax.exploration.guard import GuardedSimulator
@@ -31,10 +31,10 @@ class StopReason(enum.Enum):
     """The views are enough: the forecast has reached the goal."""
 
     NO_CANDIDATE = "no-candidate"
-    """The policy found no place to look from."""
+    """The policy found no candidate."""
 
     NO_REACHABLE_CANDIDATE = "no-reachable-candidate"
-    """The policy found places, but no safe way to any of them."""
+    """The policy found candidates, but no safe path to any of them."""
 
     STUCK = "stuck"
     """The policy has not moved for many views."""
@@ -71,14 +71,14 @@ class RecordingStopped(ValueError):
         self.reason = reason
 
 
-def in_words(rows: Sequence[StepRow]) -> str:
-    """Says how many views and frames on the way the rows of a run hold."""
+def describe_counts(rows: Sequence[StepRow]) -> str:
+    """Says how many views and how many frames captured while moving the rows of a run hold."""
     captured = sum(row.captured for row in rows)
-    return _in_words(len(rows) - captured, captured)
+    return _counts_of(len(rows) - captured, captured)
 
 
-def _in_words(chosen: int, captured: int) -> str:
-    return f"{chosen} views" + (f" and {captured} frames on the way" if captured else "")
+def _counts_of(chosen: int, captured: int) -> str:
+    return f"{chosen} views" + (f" and {captured} frames captured while moving" if captured else "")
 
 
 @dataclass(frozen=True)
@@ -126,13 +126,13 @@ class LoopState:
     """Views in a row that were taken without moving."""
 
     captured: int = 0
-    """Frames in the map that were captured on the way."""
+    """Frames in the map that were captured while moving."""
 
     leg: Leg | None = None
     """The path under way; None where a decision comes next."""
 
     planned: PlannedAhead | None = None
-    """The decision that comes next, as far as it was made on the way."""
+    """The decision that comes next, as far as it was made while moving."""
 
     @property
     def chosen(self) -> int:
@@ -140,9 +140,9 @@ class LoopState:
         return self.views - self.captured
 
     @property
-    def in_words(self) -> str:
-        """Views, and frames on the way where there are any."""
-        return _in_words(self.chosen, self.captured)
+    def counts(self) -> str:
+        """Number of views, and of frames captured while moving where there are any, in words."""
+        return _counts_of(self.chosen, self.captured)
 
     @property
     def map_state(self) -> MapState:
@@ -181,12 +181,12 @@ class Mission:
     config: ExplorationConfig
     clock: Clock
     is_enough: Callable[[LoopState], str | None] | None = None
-    """Asked every `config.until_every` views: why no further view is needed, or None."""
+    """Called every `config.until_every` views: why no further view is needed, or None."""
 
     on_stage: Callable[[str], None] = lambda stage: None
     """Told what happens next: `forecast`, `plan`, `gaze`, `render`, `map`, `measure`, `record`."""
 
     @property
-    def rules(self) -> Rules:
+    def rules(self) -> CaptureSettings:
         """What decides on the frames of a path."""
-        return Rules(self.config, motion_of(self.policy), self.simulator.camera)
+        return CaptureSettings(self.config, motion_of(self.policy), self.simulator.camera)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from r3jax.exploration.captures import Leg, Rules, aim, begin_leg, observe_on_the_way
+from r3jax.exploration.captures import Leg, aim, begin_leg, observe_view
 from r3jax.exploration.clock import timed
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.guard import first_pose
@@ -32,7 +32,6 @@ from r3jax.planning.planner import (
     decide,
     decide_ahead,
     follow,
-    observe,
     reconsider,
     start,
 )
@@ -75,9 +74,9 @@ def step(
 
     Args:
         state: before the frame.
-        mission: what the run is asked for.
-        exchange: seconds on the mission clock that went into hearing from others since the last
-            view.
+        mission: settings of the run.
+        exchange: seconds on the mission clock that receiving frames of others took since the
+            last view.
 
     Returns:
         The state after the view and what to record; or, if the run ends here, the state as it
@@ -85,7 +84,7 @@ def step(
     """
     charged = {"exchange": exchange} if exchange else {}
     if state.views == 0:
-        # Free of charge: the camera stands there already, and nobody chose the view.
+        # Free of charge: the camera stands there already, and no policy chose the view.
         here = state.T_world_camera
         return _look(state, mission, here, None, {}, {"planning": 0.0} | charged)
     if state.leg is not None:
@@ -100,13 +99,8 @@ def step(
     chosen = _choose(state, mission)
     if chosen.decision is None:
         return replace(state, planner=chosen.planner), _no_decision(state, mission, chosen.info)
-    leg = begin_leg(chosen.decision, chosen.info, state.T_world_camera, mission.rules)
-    leg = replace(leg, hidden=chosen.hidden)
-    state = replace(state, planner=chosen.planner, planned=None)
-    if mission.config.plan_while_moving:
-        state, seconds = _plan_ahead(state, mission, leg)
-        chosen.stages["plan ahead"] = seconds
-    return _next_frame(state, mission, leg, chosen.stages, {"planning": chosen.charge} | charged)
+    state, leg, stages = _depart(state, mission, chosen.decision, chosen)
+    return _next_frame(state, mission, leg, stages, {"planning": chosen.charge} | charged)
 
 
 class _Chosen(NamedTuple):
@@ -124,7 +118,7 @@ class _Chosen(NamedTuple):
 
 
 def _choose(state: LoopState, mission: Mission) -> _Chosen:
-    """Decides where to go; what was decided on the way is only reconsidered, if it still holds."""
+    """Decides where to go; what was decided while moving is reconsidered."""
     mission.on_stage("plan")
     clock, planned = mission.clock, state.planned
     # By the number of the view, so that a resumed run draws what it would have drawn.
@@ -147,11 +141,28 @@ def _choose(state: LoopState, mission: Mission) -> _Chosen:
     return _Chosen(decision, planner, info, charge, hidden, stages)
 
 
+def _depart(
+    state: LoopState, mission: Mission, decision: Decision, chosen: _Chosen
+) -> tuple[LoopState, Leg, dict[str, float]]:
+    """Begins the path of a decision; with planning while moving, the next decision is made, too.
+
+    Returns:
+        The state, the path, and the seconds that stages took so far.
+    """
+    leg = begin_leg(decision, chosen.info, state.T_world_camera, mission.rules)
+    leg = replace(leg, hidden=chosen.hidden)
+    state = replace(state, planner=chosen.planner, planned=None)
+    if not mission.config.plan_while_moving:
+        return state, leg, chosen.stages
+    state, seconds = _plan_ahead(state, mission, leg)
+    return state, leg, chosen.stages | {"plan ahead": seconds}
+
+
 def _plan_ahead(state: LoopState, mission: Mission, leg: Leg) -> tuple[LoopState, float]:
     """The state with the decision for when the camera has flown a path, and the seconds it took.
 
-    The decision takes the view at the end of the path as taken, and nothing of those on the way:
-    where the camera looks there is found on the way.
+    The decision takes the view at the end of the path as taken, and nothing of those captured
+    while moving: their directions are found later, from frame to frame.
     """
     mission.on_stage("plan ahead")
     rules, clock = mission.rules, mission.clock
@@ -184,7 +195,7 @@ def _next_frame(
 
     Args:
         state: before the frame.
-        mission: what the run is asked for.
+        mission: settings of the run.
         leg: the path.
         stages: seconds that stages took so far.
         before: what is charged for the time until the camera begins to fly [s].
@@ -211,15 +222,15 @@ def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
     """The policy's reason, in words."""
     return Stop(
         StopReason(info.outcome.value),
-        f"after {state.in_words} the policy {state.planner.policy.name!r} drew "
+        f"after {state.counts} the policy {state.planner.policy.name!r} drew "
         f"{info.num_candidates} candidates, {info.num_reachable} of them reachable through "
         "known free space",
     )
 
 
 def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float) -> Stop | None:
-    """Why a view that costs so much more must not be taken: it must arrive within the budget."""
-    spent = f"{state.in_words}, {state.seconds:.1f} s, {state.metres:.1f} m"
+    """Returns the stop reason if a view at this additional cost would exceed the budget."""
+    spent = f"{state.counts}, {state.seconds:.1f} s, {state.metres:.1f} m"
     if not mission.budget.allows(
         views=state.chosen + 1,
         frames=state.views + 1,
@@ -238,7 +249,7 @@ def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float)
 
 
 def _good_enough(state: LoopState, mission: Mission) -> Stop | None:
-    """Why no further view is needed; asked beside the mission, not on its clock."""
+    """Returns the stop reason if the goal is reached; the mission clock does not count it."""
     if mission.is_enough is None or state.chosen % mission.config.until_every:
         return None
     mission.on_stage("forecast")
@@ -277,7 +288,7 @@ def _look(
 
     mission.on_stage("map")
     planner, measured = timed(
-        _observe,
+        observe_view,
         state.planner,
         frame,
         mission.rules,
@@ -321,7 +332,7 @@ def _render(mission: Mission, view: int, T_world_camera: np.ndarray) -> Frame:
     # Rounded as the trace has it: the image is taken from the very pose that is recorded, so that
     # poses alone give the images again.
     pose = np.asarray(T_world_camera, dtype=np.float32).astype(np.float64)
-    # Announced first, so that an image that nobody chose is noticed.
+    # Announced first, so that an image that the loop did not choose is noticed.
     mission.simulator.commit(view, pose)
     # Rounded as it will be on disk before the map sees it: a replay integrates the same bits.
     return stored_form(mission.simulator.render(pose))
@@ -334,15 +345,15 @@ def relive(
 
     Args:
         state: before the frame.
-        mission: what the run was asked for.
+        mission: settings of the run.
         row: what the trace says of it.
         frame: its frame, read back.
         decides: ask the policy again, for what it remembers of its decision. Policies are pure:
             the same state and key give the same decision. False for a policy that did not
-            choose this view: it is told the path.
+            choose this view: it is given the path.
 
     Returns:
-        The state after the frame, and what the policy decided, where it was asked.
+        The state after the frame, and the policy's decision where it made one.
     """
     leg, decision = state.leg, None
     if row.choice is not None:
@@ -351,12 +362,14 @@ def relive(
             # that is timed again would put other seconds on the mission clock.
             chosen = _choose(state, mission)
             decision = chosen.decision
-            state = replace(state, planner=chosen.planner, planned=None)
-            state, leg = _leg_again(state, mission, chosen)
+            if decision is None:
+                state, leg = replace(state, planner=chosen.planner, planned=None), None
+            else:
+                state, leg, _ = _depart(state, mission, decision, chosen)
         else:
             planner = follow(state.planner, state.T_world_camera, row.choice.waypoints)
             state, leg = replace(state, planner=planner, planned=None), None
-    planner = _observe(state.planner, frame, mission.rules, captured=row.captured)
+    planner = observe_view(state.planner, frame, mission.rules, captured=row.captured)
     length, metres = row.metres - state.metres, row.metres
     if row.choice is not None and not row.captured:  # a whole path
         length = row.choice.length
@@ -365,23 +378,6 @@ def relive(
     # A path ends with the view that was chosen, whatever became of it.
     leg = leg.after if leg is not None and row.captured else None
     return replace(state, metres=metres, leg=leg), decision
-
-
-def _leg_again(state: LoopState, mission: Mission, chosen: _Chosen) -> tuple[LoopState, Leg | None]:
-    """The path of a decision that was made again, and what was decided on that path."""
-    if chosen.decision is None:
-        return state, None
-    leg = begin_leg(chosen.decision, chosen.info, state.T_world_camera, mission.rules)
-    if mission.config.plan_while_moving:
-        state, _ = _plan_ahead(state, mission, leg)
-    return state, leg
-
-
-def _observe(planner: Planner, frame: Frame, rules: Rules, *, captured: bool) -> Planner:
-    """The planner with one frame more."""
-    if captured:
-        return observe_on_the_way(planner, frame, rules)
-    return observe(planner, frame)
 
 
 def _arrive(

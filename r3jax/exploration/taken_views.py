@@ -94,7 +94,7 @@ class StepRow:
     """Hash of the stored pixels."""
 
     choice: Choice | None
-    """How the view was chosen; None for the start pose. Where frames are captured on the way, the
+    """How the view was chosen; None for the start pose. Where frames are captured while moving, the
     decision stands in the first row of its path: what comes before a row is what was known when it
     was made."""
 
@@ -109,12 +109,12 @@ class StepRow:
 
     charged: dict[str, float]
     """What this view added to the mission clock: `planning`, `mapping`, `flight`, `gaze` where it
-    was captured on the way, and `exchange` where others told what they had seen [s]."""
+    was captured while moving, and `exchange` where others told what they had seen [s]."""
 
     coverage: Coverage
 
     captured: bool = False
-    """True if the frame was captured on the way to a view, and not chosen itself."""
+    """True if the frame was captured while moving to a view, and not chosen itself."""
 
     hidden: float = 0.0
     """Planning of this row's decision that the flight before it hid: not on the clock [s]."""
@@ -127,7 +127,7 @@ class StepRow:
 
 
 def unit_of(rows: Iterable[StepRow]) -> str:
-    """Names what rows count: views, or frames where some were captured on the way."""
+    """Names what rows count: views, or frames where some were captured while moving."""
     return "frames" if any(row.captured for row in rows) else "views"
 
 

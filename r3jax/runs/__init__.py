@@ -14,6 +14,6 @@ What is read back is checked: rows and run.json end with a seal, the SHA-256 of 
 row has the hash of its view's pixels; `sha256.json` in a checkpoint has those of its files, the
 header of a model that of its numbers. What an earlier version wrote without is read unchecked.
 
-`runs.jsonl` holds nothing that depends on the machine unless the mission clock does: under
+`trace.jsonl` holds nothing that depends on the machine unless the mission clock does: under
 the model clock two equal runs write equal bytes.
 """

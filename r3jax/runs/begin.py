@@ -99,7 +99,7 @@ def fork_run(
     Args:
         run: the other one.
         at: how many of its views are taken over.
-        settings: what is asked of the fork, by `settings_of_run` and then changed.
+        settings: of the fork: those of `settings_of_run`, changed.
         path: folder of the fork.
         overwrite: replace the run that is there.
 
@@ -154,7 +154,7 @@ def _refuse_half_a_fork(run: Run) -> None:
 
 
 def _as_flown(rows: Sequence[StepRow]) -> list[StepRow]:
-    """The rows; where a path was left on the way, with no more of it than was flown.
+    """The rows; a path that was left before its end is cut to what was flown.
 
     Who takes over is told the path, and must not take for visited what lies ahead.
     """

@@ -55,7 +55,7 @@ class RunError(ValueError):
 
 @dataclass(frozen=True)
 class RunHeader:
-    """What was asked for, in which world, by which software."""
+    """Settings, scene and software of a run."""
 
     scene: dict[str, Any]
     """`name` as given, `hash` of the world's content, and how it was opened."""
@@ -158,7 +158,7 @@ def settings_of(policy: object) -> dict[str, Any]:
 
 def package_versions() -> dict[str, str]:
     """Versions of what shapes the result on this machine."""
-    import jax  # only here is a device asked for
+    import jax  # only here is a device needed
 
     versions: dict[str, str] = {
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""Reads a run folder: settings and rows at once, images when asked for."""
+"""Reads a run folder: settings and rows at once, images on demand."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,11 +16,10 @@ from r3jax.mapping.state import MapState
 from r3jax.runs.header import RunError, RunHeader, read_header
 from r3jax.runs.rows import EndRow, from_json
 from r3jax.runs.stored_states import (
-    belongs_to,
     checkpoint_steps,
     load_checkpoint,
+    newest_state,
     read_checkpoint,
-    state_of,
 )
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import read_bytes
@@ -112,24 +111,8 @@ class Run:
         return load_checkpoint(self.path / "checkpoints", step)
 
     def newest_state(self, start: LoopState) -> LoopState:
-        """The newest stored state of the loop that can be used; the start if there is none.
-
-        Args:
-            start: the state before the first view; everything but the arrays is taken from it.
-        """
-        # Newest first: every view after a checkpoint costs one more mapping and decision.
-        for step in reversed(self.checkpoint_steps()):
-            # The trace was cut before it: its map holds views that the run no longer has. Or a
-            # path is under way: it is decided again, from where it begins.
-            if step >= len(self.rows) or self.rows[step].captured:
-                continue
-            try:
-                state = state_of(self.load_checkpoint(step), start)
-            except ValueError:
-                continue  # an older one, or the frames, will do
-            if belongs_to(state, self.rows[step]):
-                return state
-        return start
+        """The newest stored state of the loop that can be used; `start`, the first, if none is."""
+        return newest_state(self.path / "checkpoints", self.rows, start)
 
 
 def read_run(path: Path | str) -> Run:

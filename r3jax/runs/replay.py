@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from r3jax.frame import Frame
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.planner import add_frame, first_grid
@@ -37,22 +36,65 @@ def rebuild(
 
     Args:
         runs: of one scene: the same box, cells, voxels and range.
-        views: of each run at most so many; None: all.
+        views: first views of each run; None: all.
         on_frame: called after every frame that has entered the map.
 
     Raises:
         RunError: the runs do not fit together, or a frame is missing or broken.
     """
-    # Before the first frame: mapping takes minutes, and a misfit is told at once.
+    return _last(runs, ((run, row.step) for run in runs for row in run.rows[:views]), on_frame)
+
+
+def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
+    """The map and the grid of a team after its last meeting: all frames, in the clock's order.
+
+    Raises:
+        RunError: the runs do not fit together, or a frame is missing or broken.
+    """
+    # The order in which the team shared them, ties by number: another one gives other bits.
+    steps = sorted((row.seconds, n, row.step) for n, run in enumerate(runs) for row in run.rows)
+    return _last(runs, ((runs[number], step) for _, number, step in steps))
+
+
+def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
+    """The map and the grid after each view of a run, in order, lazily.
+
+    Raises:
+        RunError: no view, settings that cannot work, or a frame that is missing or broken.
+    """
+    return _states([run], ((run, row.step) for row in run.rows))
+
+
+def _last(
+    runs: Sequence[Run],
+    frames: Iterable[tuple[Run, int]],
+    on_frame: Callable[[], None] = lambda: None,
+) -> tuple[MapState, OccupancyGrid]:
+    """The map and the grid after all frames of several runs, each given by its run and number."""
+    # Before the first frame: mapping takes minutes, and a misfit is reported at once.
     for run in runs[1:]:
         check_alike(runs[0], run)
+    state = _first(runs)
+    for after in _states(runs, frames):
+        state = after
+        on_frame()
+    return state
+
+
+def _states(
+    runs: Sequence[Run], frames: Iterable[tuple[Run, int]]
+) -> Iterator[tuple[MapState, OccupancyGrid]]:
+    """The map and the grid of several runs after each frame."""
+    config, state = config_of(runs[0]), _first(runs)
+    for run, step in frames:
+        state = add_frame(*state, run.frame(step), config)
+        yield state
+
+
+def _first(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
+    """The map and the grid before the first view of runs in one scene."""
     config = config_of(runs[0])
-    map_state, grid = _nothing_known(runs)
-    for run in runs:
-        for frame in _frames(run, views):
-            map_state, grid = add_frame(map_state, grid, frame, config)
-            on_frame()
-    return map_state, grid
+    return empty_map(config.capacity, config.voxel_size, config.num_bins), grid_before(runs)
 
 
 def team_of(run: Run) -> list[Run]:
@@ -74,36 +116,6 @@ def team_of(run: Run) -> list[Run]:
                 f"{run.path.parent}`",
             )
     return team
-
-
-def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    """The map and the grid of a team after its last meeting: all frames, in the clock's order.
-
-    Raises:
-        RunError: the runs do not fit together, or a frame is missing or broken.
-    """
-    for run in runs[1:]:
-        check_alike(runs[0], run)
-    config = config_of(runs[0])
-    map_state, grid = _nothing_known(runs)
-    # The order in which the team shared them, ties by number: another one gives other bits.
-    steps = [(row.seconds, n, row.step) for n, run in enumerate(runs) for row in run.rows]
-    for _, number, step in sorted(steps):
-        map_state, grid = add_frame(map_state, grid, runs[number].frame(step), config)
-    return map_state, grid
-
-
-def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
-    """The map and the grid after each view of a run, in order; each when it is asked for.
-
-    Raises:
-        RunError: no view, settings that cannot work, or a frame that is missing or broken.
-    """
-    config = config_of(run)
-    map_state, grid = _nothing_known([run])
-    for frame in _frames(run, None):
-        map_state, grid = add_frame(map_state, grid, frame, config)
-        yield map_state, grid
 
 
 def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
@@ -136,11 +148,6 @@ def check_decided_alone(run: Run) -> None:
 def is_decided_apart(run: Run) -> bool:
     """True for a fork of which some views were decided on another map than its frames give."""
     return bool((run.header.parent or {}).get("decided_apart", False))
-
-
-def _nothing_known(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    config = config_of(runs[0])
-    return empty_map(config.capacity, config.voxel_size, config.num_bins), grid_before(runs)
 
 
 def differences(
@@ -202,10 +209,6 @@ def starts_of(run: Run) -> list[np.ndarray]:
     # The last part begins no other: its sum would be one past the last row.
     begins = itertools.accumulate(parts_of(run)[:-1], initial=0)
     return [np.asarray(run.rows[step].pose, dtype=np.float64) for step in begins]
-
-
-def _frames(run: Run, views: int | None) -> Iterable[Frame]:
-    return (run.frame(row.step) for row in run.rows[:views])
 
 
 def check_alike(first: Run, other: Run) -> None:

@@ -38,7 +38,7 @@ def to_json(row: StepRow | EndRow) -> str:
     if not plain.get("captured", True):
         del plain["captured"]  # as rows were before there were captures
     if not plain.get("hidden", True):
-        del plain["hidden"]  # nor was there planning on the way
+        del plain["hidden"]  # nor was there planning while moving
     # No blanks and a fixed order: under the model clock equal runs are equal bytes.
     return json.dumps(sealed(plain), allow_nan=False, separators=(",", ":"))
 

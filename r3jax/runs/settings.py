@@ -1,4 +1,4 @@
-"""What an exploration needs, for a new run or from the header of a recorded one."""
+"""Settings of a run: of the loop, the policy and the scene, new or from a recorded header."""
 
 import dataclasses
 from dataclasses import dataclass, fields
@@ -22,7 +22,7 @@ from r3jax.simulators.scenes.registry import open_scene, scene_hash
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What is asked of an exploration, before its scene is opened."""
+    """Settings of an exploration, before its scene is opened."""
 
     budget: Budget
     config: ExplorationConfig
@@ -94,7 +94,7 @@ def planner_config_of(run: Run) -> PlannerConfig:
 
 
 def settings_of_run(run: Run) -> RunSettings:
-    """Reads what a recorded run was asked for.
+    """Reads the settings of a recorded run.
 
     Raises:
         RunError: a policy or a setting that this version does not know.
@@ -201,7 +201,7 @@ def new_header(settings: RunSettings, scene: SceneSettings, simulator: Simulator
     """Makes the header of a new run: all that fixes it.
 
     Args:
-        settings: what is asked for.
+        settings: of the run.
         scene: how the scene was opened.
         simulator: the scene, opened.
     """

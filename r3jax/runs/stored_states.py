@@ -7,7 +7,7 @@ package hold `map` and `grid` only.
 
 import contextlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
@@ -70,7 +70,7 @@ class CheckpointWriter:
 
         Args:
             step: number of the view.
-            tables: the state; nobody may write into its arrays.
+            tables: the state; its arrays must not be written afterwards.
             wait: True waits for the one before, and for this one.
 
         Returns:
@@ -96,7 +96,7 @@ class CheckpointWriter:
         Raises:
             OSError: it could not be written.
         """
-        # Forgotten before it is asked: one failure is told once, not at every view that follows.
+        # Cleared before its result is read, so that a failed write is reported once.
         under_way, self._under_way = self._under_way, None
         if under_way is not None:
             under_way.result()
@@ -133,7 +133,7 @@ def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]
     except (OSError, ForeignFileError) as error:
         raise RunError(
             path,
-            f"the checkpoint cannot be read ({error}); resuming the run makes it anew",
+            f"the checkpoint cannot be read ({error}); resuming the run rebuilds it",
         ) from None
     # Orbax restores any tree; only two levels are tables of arrays.
     if not all(isinstance(table, dict) for table in tables.values()):
@@ -196,6 +196,35 @@ def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
     return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in _LOOP}}
 
 
+def newest_state(folder: Path, rows: Sequence[StepRow], start: LoopState) -> LoopState:
+    """The newest stored state that can be used; the start if there is none.
+
+    Args:
+        folder: of the checkpoints.
+        rows: of the run, which may have been cut off anywhere.
+        start: the state before the first view; everything but the arrays is taken from it.
+    """
+    # Newest first: every view after a checkpoint costs one more mapping and decision.
+    for step in reversed(checkpoint_steps(folder)):
+        # The trace was cut before it: its map holds views that the run no longer has. Or a path is
+        # under way: it is decided again, from where it begins.
+        if step >= len(rows) or rows[step].captured:
+            continue
+        try:
+            state = state_of(load_checkpoint(folder, step), start)
+        except ValueError:
+            continue  # an older one, or the frames, will do
+        row = rows[step]
+        # Exact: JSON and checkpoints hold every float as it is, so any difference is a mismatch.
+        if (
+            state.views == row.step + 1
+            and np.array_equal(np.asarray(state.T_world_camera, np.float32), row.pose)
+            and (state.seconds, state.metres) == (row.seconds, row.metres)
+        ):
+            return state
+    return start
+
+
 def state_of(tables: Tables, like: LoopState) -> LoopState:
     """Inverse of `state_tables`.
 
@@ -224,16 +253,6 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
         policy_state=fill(like.policy_state, tables.get("policy", {})),
     )
     return LoopState(planner=planner, **fill(rest, _LATER | dict(tables["loop"])))
-
-
-def belongs_to(state: LoopState, row: StepRow) -> bool:
-    """Whether a stored state is that after the view of a row of the trace."""
-    # Exact: JSON and checkpoints hold every float as it is, so any difference is a mismatch.
-    return (
-        state.views == row.step + 1
-        and np.array_equal(np.asarray(state.T_world_camera, np.float32), row.pose)
-        and (state.seconds, state.metres) == (row.seconds, row.metres)
-    )
 
 
 def named_arrays(tree: Any) -> dict[str, np.ndarray]:

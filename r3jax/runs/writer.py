@@ -7,10 +7,10 @@ import io
 import json
 import os
 import time
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -100,7 +100,7 @@ class RunWriter:
                 written by another process, or cannot be made.
         """
         self.path = Path(path)
-        try:
+        with _named(self.path, "cannot make the run folder"):
             _check_free(self.path, overwrite=overwrite)  # nothing is written where no run may be
             own_folder(self.path, "run")
             with self._locked():
@@ -113,10 +113,6 @@ class RunWriter:
                 write_atomic(self.path / "run.json", header_to_json(header).encode())
                 self._checkpoints = CheckpointWriter(self.path / "checkpoints")
                 self._begin(header, views=0)
-        except NotOursError as error:
-            raise RunError(error.path, error.reason) from error
-        except OSError as error:
-            raise RunError(self.path, f"cannot make the run folder ({error.strerror})") from error
 
     @classmethod
     def resume(cls, path: Path | str, header: RunHeader | None = None) -> tuple["RunWriter", Run]:
@@ -139,24 +135,17 @@ class RunWriter:
         writer = cls.__new__(cls)
         writer.path = Path(path)
         read_header(writer.path / "run.json")  # says what is wrong before anything is touched
-        try:
-            with writer._locked():
-                # Read under the lock: until now another process may have added views.
-                run = read_run(writer.path)
-                own_folder(writer.path, "run")
-                for name in ("frames", "report", "exports"):  # refused now, not after an hour
-                    make_folder(writer.path / name)
-                writer._checkpoints = CheckpointWriter(writer.path / "checkpoints")
-                _mend(writer.path)  # after the read, which refuses a trace that cannot be mended
-                if header is not None:
-                    write_atomic(writer.path / "run.json", header_to_json(header).encode())
-                writer._begin(header or run.header, views=len(run.rows))
-        except NotOursError as error:
-            raise RunError(error.path, error.reason) from error
-        except OSError as error:
-            raise RunError(
-                writer.path, f"cannot go on with the run ({error.strerror or error})"
-            ) from error
+        with _named(writer.path, "cannot go on with the run"), writer._locked():
+            # Read under the lock: until now another process may have added views.
+            run = read_run(writer.path)
+            own_folder(writer.path, "run")
+            for name in ("frames", "report", "exports"):  # refused now, not after an hour
+                make_folder(writer.path / name)
+            writer._checkpoints = CheckpointWriter(writer.path / "checkpoints")
+            _mend(writer.path)  # after the read, which refuses a trace that cannot be mended
+            if header is not None:
+                write_atomic(writer.path / "run.json", header_to_json(header).encode())
+            writer._begin(header or run.header, views=len(run.rows))
         # It has not ended any more.
         return writer, replace(run, header=header or run.header, end=None)
 
@@ -322,7 +311,7 @@ class RunWriter:
         try:
             # Before the lock goes: a thread that still writes would meet the next process.
             self._checkpoints.close()
-            # A disk that has become read-only refuses this; the run is whole all the same.
+            # A disk that has become read-only refuses this; the run is complete nevertheless.
             with contextlib.suppress(OSError):
                 remove(self.path / _ROOM)
         finally:
@@ -332,14 +321,20 @@ class RunWriter:
         """The writer itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Frees the lock, whatever happened."""
         self.close()
+
+
+@contextlib.contextmanager
+def _named(path: Path, what: str) -> Generator[None]:
+    """Says of a run what the system refuses."""
+    try:
+        yield
+    except NotOursError as error:
+        raise RunError(error.path, error.reason) from error
+    except OSError as error:
+        raise RunError(path, f"{what} ({error.strerror or error})") from error
 
 
 def encode_png(image: np.ndarray) -> bytes:

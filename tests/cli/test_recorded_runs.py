@@ -259,7 +259,7 @@ def test_views_and_frames_on_the_way_are_counted_apart(room, tmp_path, capsys):
         assert explore(room, tmp_path, *words) == 0
     captured = [len(read_run(tmp_path / name).rows) - 3 for name in ("a", "b")]
     assert min(captured) > 0
-    counts = [f"3 views and {num} frames on the way" for num in captured]
+    counts = [f"3 views and {num} frames captured while moving" for num in captured]
     capsys.readouterr()
     assert main_without_report(["explore", "--resume", str(tmp_path / "a")]) == 0
     assert counts[0] in capsys.readouterr().err

@@ -7,6 +7,7 @@ import numpy as np
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
+from tests.exploration.toys import rays_of, wavy_frame
 
 PITCH = 6.0
 """Distance between pillars, along x and y [m]."""
@@ -32,12 +33,7 @@ class Hall:
         return np.asarray(pose_along(start, jnp.asarray([1.0, 1.0, 0.0])), np.float64)
 
     def render(self, T_world_camera: np.ndarray) -> Frame:
-        cam, position = self.camera, T_world_camera[:3, 3]
-        u = (np.arange(cam.width) + 0.5 - float(cam.cx)) / float(cam.fx)
-        v = (np.arange(cam.height) + 0.5 - float(cam.cy)) / float(cam.fy)
-        rays = np.stack([*np.meshgrid(u, v), np.ones((cam.height, cam.width))], axis=-1)
-        rays = rays @ T_world_camera[:3, :3].T
-        rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
+        rays, position = rays_of(self.camera, T_world_camera), T_world_camera[:3, 3]
         upper = np.asarray(self.size)
         depth = np.where(rays > 0, (upper - position) / rays, -position / rays).min(-1)
         for center in self._pillars_near(position[:2]):
@@ -46,14 +42,7 @@ class Hall:
             enter = np.minimum(low, high).max(-1)
             leave = np.maximum(low, high).min(-1)
             depth = np.where((enter < leave) & (enter > 0.0), np.minimum(depth, enter), depth)
-        points = position + rays * depth[..., None]
-        rgb = 0.5 + 0.4 * np.sin(3.0 * points + np.array([0.0, 1.0, 2.0]))
-        return Frame(
-            rgb=jnp.asarray(rgb, dtype=jnp.float32),
-            depth=jnp.asarray(depth, dtype=jnp.float32),
-            T_world_camera=jnp.asarray(T_world_camera, dtype=jnp.float32),
-            camera=cam,
-        )
+        return wavy_frame(self.camera, T_world_camera, rays, depth)
 
     def _pillars_near(self, place: np.ndarray, reach: float = 9.0) -> np.ndarray:
         """Centers [n, 2] of the pillars that a sensor of 5 m may see."""

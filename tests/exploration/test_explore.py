@@ -122,6 +122,8 @@ def test_the_same_run_twice_writes_the_same_bytes(recorded, tmp_path):
 
 IMAGES = (".png", ".depth.png")
 
+NO_TIMES = (-0.1, float("nan"), float("inf"))
+
 
 @pytest.mark.parametrize("budget", ["seconds:2.5", "meters:1.0"])
 def test_the_last_view_arrives_within_the_budget(budget):
@@ -143,15 +145,6 @@ def test_only_planning_mapping_and_flight_are_on_the_wall_clock(monkeypatch):
     # Every timed call lasts one tick: one for planning, one for mapping.
     expected = 4 * 1.0 + 3 * 1.0 + result.state.metres / config.speed
     assert result.state.seconds == pytest.approx(expected)
-
-
-def test_a_clock_that_jumps_back_does_not_touch_the_mission(monkeypatch, tmp_path):
-    ticks = itertools.count(start=2e9, step=-3600.0)
-    monkeypatch.setattr(clock.time, "time", lambda: next(ticks))
-    result = run_in(tmp_path / "run", budget="views:4", config=replace(CONFIG, clock="wall"))
-    assert all(row.charged[part] >= 0.0 for row in result.rows for part in row.charged)
-    assert np.all(np.diff([row.seconds for row in result.rows]) > 0.0)
-    assert len(read_run(tmp_path / "run").rows) == 4
 
 
 def test_no_reachable_candidate_ends_the_run_with_the_reason(tmp_path):
@@ -258,7 +251,7 @@ def test_a_table_that_may_not_grow_counts_what_it_loses(tmp_path):
 def test_a_start_outside_the_box_is_refused():
     simulator = BoxRoom()
     simulator.start_pose[:3, 3] = UPPER + 1.0
-    with pytest.raises(ValueError, match="outside the scene's box"):
+    with pytest.raises(ValueError, match="box"):
         explore(simulator, Wander(), budget="views:2", config=CONFIG)
 
 
@@ -269,9 +262,18 @@ def test_a_start_outside_the_box_is_refused():
         {"max_range": float("nan")},
         {"cell_size": float("inf")},
         {"speed": -1.0},
+        {"speed": 1e-310},
         {"num_probes": 0},
         {"checkpoint_every": 0},
         {"capacity": 1000},
+        {"capture_every": 0.01},
+        {"capture_every": 0.3, "capture_rate": 5.0},
+        {"capture_rate": 0.0},
+        {"exposure": -1.0},
+        {"blur": 0.0},
+        {"gaze": "blend"},
+        {"gaze": "planned"},
+        *({name: value} for name in ("planning_seconds", "mapping_seconds") for value in NO_TIMES),
     ],
 )
 def test_settings_that_cannot_work_are_refused(wrong):

@@ -16,8 +16,8 @@ from r3jax.exploration.state import StopReason
 from r3jax.geometry.cameras import pose_along
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import MOTIONS, Motion, motion_of_record
-from r3jax.runs.explain import explain_run
 from r3jax.runs.reader import read_run
+from r3jax.runs.reasons import explain_run
 from tests.cli.small_runs import main_without_report
 from tests.exploration.toys import BoxRoom
 
@@ -66,7 +66,7 @@ def test_the_first_view_is_one_that_the_carrier_can_take():
         assert np.degrees(np.arcsin(row.pose[2, 2])) == pytest.approx(-15.0, abs=1e-3)
         assert row.pose[2, 3] == rows[0].pose[2, 3]
     low = Motion(heights=(0.2, 0.5), heights_above="world")
-    with pytest.raises(ValueError, match=r"height of 1.300 m, but its motion's heights are 0.200"):
+    with pytest.raises(ValueError, match=r"1\.300 m.*0\.200"):
         mission(low, "views:2")
 
 
@@ -125,10 +125,10 @@ def test_resume_and_fork_keep_the_motion(ground_run):
 def test_the_command_line_says_what_cannot_work(tmp_path, capsys):
     words = ["explore", "--scene", "flat", "--resolution", "32", "--out", str(tmp_path)]
     for wrong, says in (
-        (["--heights", "0.2", "0.5"], "leave out the start itself"),
-        (["--turn-rate", "30"], "turn_rate weighs turns against ways: give the speed"),
-        (["--heights", "0.2", "0.5", "--heights-above", "world"], "at a height of 1.300 m"),
-        (["--elevations", "-95", "0"], "elevations must lie between -90"),
+        (["--heights", "0.2", "0.5"], "heights"),
+        (["--turn-rate", "30"], "speed"),
+        (["--heights", "0.2", "0.5", "--heights-above", "world"], "1.300 m"),
+        (["--elevations", "-95", "0"], "elevations"),
     ):
         assert main([*words, *wrong]) == 2
         assert says in " ".join(capsys.readouterr().err.split())

@@ -14,6 +14,25 @@ from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 LOWER, UPPER = np.zeros(3), np.array([4.0, 3.0, 2.4])
 
 
+def rays_of(camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:
+    """Ray of every pixel in the world, [H, W, 3], with depth 1; no component is zero."""
+    u = (np.arange(camera.width) + 0.5 - float(camera.cx)) / float(camera.fx)
+    v = (np.arange(camera.height) + 0.5 - float(camera.cy)) / float(camera.fy)
+    rays = np.stack([*np.meshgrid(u, v), np.ones((camera.height, camera.width))], axis=-1)
+    rays = rays @ T_world_camera[:3, :3].T
+    return np.where(np.abs(rays) < 1e-9, 1e-9, rays)
+
+
+def wavy_frame(
+    camera: Camera, T_world_camera: np.ndarray, rays: np.ndarray, depth: np.ndarray
+) -> Frame:
+    """The frame of surfaces that carry waves of color."""
+    points = T_world_camera[:3, 3] + rays * depth[..., None]
+    rgb = 0.5 + 0.4 * np.sin(3.0 * points + np.array([0.0, 1.0, 2.0]))
+    images = (jnp.asarray(x, jnp.float32) for x in (rgb, depth, T_world_camera))
+    return Frame(*images, camera)
+
+
 @dataclass
 class BoxRoom:
     """An empty room with wavy walls, seen by an exact ray caster in NumPy."""
@@ -30,22 +49,9 @@ class BoxRoom:
 
     def render(self, T_world_camera: np.ndarray) -> Frame:
         self.rendered.append(T_world_camera)
-        cam = self.camera
-        u = (np.arange(cam.width) + 0.5 - float(cam.cx)) / float(cam.fx)
-        v = (np.arange(cam.height) + 0.5 - float(cam.cy)) / float(cam.fy)
-        rays = np.stack([*np.meshgrid(u, v), np.ones((cam.height, cam.width))], axis=-1)
-        rays = rays @ T_world_camera[:3, :3].T
-        position = T_world_camera[:3, 3]
-        safe = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
-        depth = np.where(rays > 0, (UPPER - position) / safe, (LOWER - position) / safe).min(-1)
-        points = position + rays * depth[..., None]
-        rgb = 0.5 + 0.4 * np.sin(3.0 * points + np.array([0.0, 1.0, 2.0]))
-        return Frame(
-            rgb=jnp.asarray(rgb, dtype=jnp.float32),
-            depth=jnp.asarray(depth, dtype=jnp.float32),
-            T_world_camera=jnp.asarray(T_world_camera, dtype=jnp.float32),
-            camera=cam,
-        )
+        rays, position = rays_of(self.camera, T_world_camera), T_world_camera[:3, 3]
+        depth = np.where(rays > 0, (UPPER - position) / rays, (LOWER - position) / rays).min(-1)
+        return wavy_frame(self.camera, T_world_camera, rays, depth)
 
 
 @dataclass

@@ -13,7 +13,7 @@ import numpy as np
 from r3jax.apps.benchmark.cells import OWN_OF_LOOP, Cell, Conditions
 from r3jax.apps.benchmark.plan import Request, prepare_scene
 from r3jax.exploration.clock import model_clock
-from r3jax.exploration.config import ExplorationConfig, as_written, parse_budget
+from r3jax.exploration.config import ExplorationConfig, format_budget, parse_budget
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.guard import check_world
 from r3jax.exploration.taken_views import Choice, StepRow, frame_hash, stored_form
@@ -160,7 +160,7 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
         spent = {"views": views + 1, "frames": frame.frame + 1, "seconds": arrival, "metres": flown}
         if not budget.allows(**spent):  # pyright: ignore[reportArgumentType]
             told = f"it takes {spent[budget.unit]:g} {budget.unit}, beyond the budget {budget}"
-            problems.append(Problem(frame.frame, as_written(f"{told}: end before it")))
+            problems.append(Problem(frame.frame, format_budget(f"{told}: end before it")))
         before, metres, views = frame, flown, views + (not frame.captured)
     return sorted(problems, key=lambda problem: problem.frame or 0)
 

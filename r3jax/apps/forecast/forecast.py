@@ -191,7 +191,7 @@ def stopping_rule(
             return None
         low, high = forecast.interval(goal.statistic)
         return (
-            f"{state.in_words}: the forecast of the PSNR of free-space views "
+            f"{state.counts}: the forecast of the PSNR of free-space views "
             f"({goal.statistic}) is {forecast.value(goal.statistic):.1f} dB, "
             f"{low:.1f} to {high:.1f} in four of five places; {goal} was asked for"
         )

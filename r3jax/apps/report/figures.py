@@ -15,8 +15,8 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture
-from r3jax.runs.explain import explain_run
 from r3jax.runs.reader import Run
+from r3jax.runs.reasons import explain_run
 from r3jax.runs.rows import paths_to
 from r3jax.scoring.explain import CAUSES
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.exploration.config import as_written
+from r3jax.exploration.config import format_budget
 from r3jax.runs.reader import Run
 
 STAGES = {
@@ -82,7 +82,7 @@ def summary(run: Run) -> dict[str, str]:
     texts = {
         "scene": str(header.scene.get("name", "?")),
         "policy": str(header.policy.get("name", "?")),
-        "budget": as_written(header.budget),
+        "budget": format_budget(header.budget),
         "seed": str(header.seed),
         "outcome": run.outcome,
         "views": count_of_views(run),

@@ -18,7 +18,8 @@ from r3jax.files import (
     own_folder,
     write_atomic,
 )
-from r3jax.formats.nerfstudio import write_team_transforms, write_transforms
+from r3jax.formats.exports import write_data_set
+from r3jax.formats.nerfstudio import write_team_transforms
 from r3jax.formats.points import voxel_points, write_points
 from r3jax.planning.robot.motion import motion_of
 from r3jax.runs.reader import Run, read_run
@@ -64,7 +65,7 @@ def begin_team(
     """Opens the scene for every camera and makes the folders, in this order.
 
     Args:
-        settings: what is asked of each camera.
+        settings: of each camera.
         scenes: how each camera sees the scene; all but the first start beside the first.
         folder: the team's folder.
         stack: closes the recorders and frees the team's lock.
@@ -198,12 +199,10 @@ def write_team_data(
     lines = "".join(json.dumps(dataclasses.asdict(view)) + "\n" for view in result.views)
     write_atomic(folder / "coverage.jsonl", lines.encode())
     runs = [read_run(folder / str(number)) for number in range(len(result.members))]
-    points = voxel_points(result.map_state)
-    for place in (folder, *(run.path for run in runs)):
-        make_folder(place / "exports")
-        write_points(place / "exports" / "points.ply", *points)
     for run in runs:
-        write_transforms(run, "exports/points.ply")
+        write_data_set(run, result.map_state)
         on_run(run)
+    make_folder(folder / "exports")
+    write_points(folder / "exports" / "points.ply", *voxel_points(result.map_state))
     write_team_transforms(folder, runs, "exports/points.ply")
     return runs

@@ -1,4 +1,4 @@
-"""Several cameras in one scene: each flies its own mission, and they tell each other what they saw.
+"""Several cameras in one scene: each flies its own mission, and they share the frames.
 
 They fly at the same time. Every member has its own lens, policy, map and mission clock; the one
 whose clock is behind steps next, so a mission lasts as long as its longest clock. At a meeting
@@ -6,8 +6,13 @@ all learn the frames that were taken until then; in between each has its own fra
 it decides, it takes the views that the others were heading for at the last meeting as taken,
 and leaves to them what lies nearer to them (`apps.team.reserved_views`).
 
-Nobody knows anything before it happened: a frame is told once it is taken, and a member hears of
-it at the first meeting after that. Members that decide at the same time decide in turn.
+No frame is known before it is taken: it is shared from then on, and a member receives it
+at the first meeting after that. Members that decide at the same time decide in turn.
+
+Members share frames, not maps. Maps of their own would not merge into the map of one camera: a
+frame also marks what it saw of the voxels that others had put there, and the grid clips its
+log-odds. Frames in the order of the clock do: two members that received the same frames have the
+same map, bit for bit.
 """
 
 import math
@@ -73,7 +78,7 @@ class TeamResult:
     """Each one's own rows; the map and the grid of each last state are the common ones."""
 
     views: tuple[TeamView, ...]
-    """All views in the order of the clock, and what was known after each by whoever knew all."""
+    """All views in the order of the clock, and what all knew together after each."""
 
     map_state: MapState
     """Map of all frames, in that order."""
@@ -87,7 +92,7 @@ class TeamResult:
 
 
 @dataclass(frozen=True)
-class Sight:
+class Observation:
     """A frame that a member has taken."""
 
     seconds: float
@@ -99,32 +104,29 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class Told:
-    """A frame that has become common, and what all know since."""
+class SharedFrame:
+    """A frame that all members know."""
 
-    sight: Sight
+    frame: Frame
 
     mapping: float
     """Seconds that it took to join the common map."""
 
-    voxels: int
-    """Occupied voxels of that map."""
-
-    known_share: float
-    """Known cells over all cells of the scene's box."""
+    view: TeamView
+    """Who took it, and what all know since."""
 
 
 @dataclass(frozen=True)
 class Common:
-    """What all have told each other, and what they have not yet."""
+    """The map of all frames that were shared, and the frames that were not yet."""
 
     map_state: MapState
-    """Map of the frames that were told."""
+    """Of the frames that were shared."""
 
     grid: OccupancyGrid
 
-    waiting: tuple[Sight, ...] = ()
-    """Taken and not told yet."""
+    waiting: tuple[Observation, ...] = ()
+    """Taken and not shared yet."""
 
 
 def last_meeting(seconds: float, meet_every: float) -> float:
@@ -132,37 +134,40 @@ def last_meeting(seconds: float, meet_every: float) -> float:
     return math.floor(seconds / meet_every) * meet_every if meet_every > 0.0 else seconds
 
 
-def in_order(sights: tuple[Sight, ...]) -> list[Sight]:
+def in_order(observations: tuple[Observation, ...]) -> list[Observation]:
     """By the clock; of two at the same time, the first member's comes first."""
-    return sorted(sights, key=attrgetter("seconds", "member"))
+    return sorted(observations, key=attrgetter("seconds", "member"))
 
 
-def tell(
+def share(
     common: Common, until: float, config: ExplorationConfig, *, repeat_compiled: bool
-) -> tuple[Common, list[Told]]:
+) -> tuple[Common, list[SharedFrame]]:
     """A meeting: all frames up to a time join the common map.
 
     Args:
         common: before.
-        until: mission clock [s]. No frame up to then may be told of later.
+        until: mission clock [s]. Later calls share no frame from before it.
         config: of the maps.
-        repeat_compiled: False where nobody needs the exact time.
+        repeat_compiled: False where the exact time is not needed.
 
     Returns:
         What is common now, and the frames that have become so, in order.
     """
-    told: list[Told] = []
+    shared: list[SharedFrame] = []
     map_state, grid = common.map_state, common.grid
-    for sight in in_order(common.waiting):
-        if sight.seconds > until:
+    for observation in in_order(common.waiting):
+        if observation.seconds > until:
             continue
         (map_state, grid), seconds = timed(
-            add_frame, map_state, grid, sight.frame, config, repeat_compiled=repeat_compiled
+            add_frame, map_state, grid, observation.frame, config, repeat_compiled=repeat_compiled
         )
         known_share = 1.0 - float(np.mean(np.asarray(grid.unexplored)))
-        told.append(Told(sight, seconds, int(map_state.num_occupied), known_share))
-    waiting = tuple(sight for sight in common.waiting if sight.seconds > until)
-    return Common(map_state, grid, waiting), told
+        view = TeamView(
+            observation.seconds, observation.member, int(map_state.num_occupied), known_share
+        )
+        shared.append(SharedFrame(observation.frame, seconds, view))
+    waiting = tuple(observation for observation in common.waiting if observation.seconds > until)
+    return Common(map_state, grid, waiting), shared
 
 
 @dataclass(frozen=True)
@@ -176,8 +181,8 @@ class _Flying:
     recorder: RunWriter | None = None
     rows: tuple[StepRow, ...] = ()
 
-    heard: tuple[Told, ...] = ()
-    """What was told since it last took anything over."""
+    received: tuple[SharedFrame, ...] = ()
+    """Frames that were shared since it last took any over."""
 
     owed: float = 0.0
     """Seconds that taking over took, and that no row has been charged for."""
@@ -222,7 +227,7 @@ def explore_team(
             negative interval, a start outside the scene's box.
         RunError: a recorded frame is missing or broken.
         PolicyError: a program that chooses views has died, hangs, or answers nonsense.
-        OracleReadError: something beside the loop asked a simulator for an image.
+        OracleReadError: something beside the loop took an image from a simulator.
     """
     config = config or ExplorationConfig()
     budget = parse_budget(budget) if isinstance(budget, str) else budget
@@ -231,7 +236,7 @@ def explore_team(
         flying = [
             _Flying(
                 number,
-                *_set_out(number, members, budget, seed, config, on_stage, recorded),
+                *_start(number, members, budget, seed, config, on_stage, recorded),
                 recorded=recorded,
                 recorder=None if recorders is None else recorders[number],
             )
@@ -263,7 +268,7 @@ def _check(members: Sequence[Member], meet_every: float) -> None:
             )
 
 
-def _set_out(
+def _start(
     number: int,
     members: Sequence[Member],
     budget: Budget,
@@ -292,7 +297,7 @@ def _set_out(
 def _fly(
     flying: list[_Flying], meet_every: float, on_row: Callable[[int, StepRow], None]
 ) -> TeamResult:
-    """Steps until nobody flies any more, and lets all meet at the end."""
+    """Steps until no member flies any more, and lets all meet at the end."""
     first = flying[0]
     config = first.mission.config
     common = Common(
@@ -306,10 +311,10 @@ def _fly(
             until = last_meeting(me.state.seconds, meet_every)
             common = _meet(flying, common, until, views)
             me = _take_over(flying[me.number], common)
-            me, sight = _step(me, _promised_to(me, common))
+            me, observation = _step(me, _promised_to(me, common))
             flying[me.number] = me
-            if sight is not None:
-                common = replace(common, waiting=(*common.waiting, sight))
+            if observation is not None:
+                common = replace(common, waiting=(*common.waiting, observation))
                 on_row(me.number, me.rows[-1])
     except KeyboardInterrupt:
         _stop_all(flying, StopReason.INTERRUPTED, "interrupted by the user")
@@ -318,48 +323,53 @@ def _fly(
     except Exception as error:
         _stop_all(flying, StopReason.FAILED, f"{type(error).__name__}: {error}")
         for me in flying:
-            _land(me, me.state)
+            _finish(me, me.state)
         raise
     common = _meet(flying, common, math.inf, views)
-    results = tuple(_land(me, _with_common(me.state, common)) for me in flying)
+    results = tuple(_finish(me, _with_common(me.state, common)) for me in flying)
     return TeamResult(results, tuple(views), common.map_state, common.grid)
 
 
 def _meet(flying: list[_Flying], common: Common, until: float, views: list[TeamView]) -> Common:
-    """All frames up to a time become common; notes who has heard what, and what all know."""
+    """All frames up to a time become common; every member receives them; adds to `views`."""
     mission = flying[0].mission
-    common, told = tell(common, until, mission.config, repeat_compiled=mission.clock.measures)
+    common, shared = share(common, until, mission.config, repeat_compiled=mission.clock.measures)
     for me in flying:
-        if told and me.stop is None:
-            flying[me.number] = replace(me, heard=(*me.heard, *told))
-    views += [TeamView(t.sight.seconds, t.sight.member, t.voxels, t.known_share) for t in told]
+        if shared and me.stop is None:
+            flying[me.number] = replace(me, received=(*me.received, *shared))
+    views += [frame.view for frame in shared]
     return common
 
 
 def _take_over(me: _Flying, common: Common) -> _Flying:
-    """The common map becomes one's own, with the frames on top that were not told yet."""
-    heard = me.heard
-    if all(told.sight.member == me.number for told in heard):
-        return replace(me, heard=())  # one's own map is just that already
+    """The common map becomes one's own, with the frames on top that were not shared yet."""
+    received = me.received
+    if all(shared.view.member == me.number for shared in received):
+        return replace(me, received=())  # one's own map is just that already
     me.mission.on_stage("map")
     clock, config = me.mission.clock, me.mission.config
     map_state, grid = common.map_state, common.grid
     owed = me.owed
-    for sight in in_order(common.waiting):
-        if sight.member == me.number:
+    for observation in in_order(common.waiting):
+        if observation.member == me.number:
             (map_state, grid), seconds = timed(
-                add_frame, map_state, grid, sight.frame, config, repeat_compiled=clock.measures
+                add_frame,
+                map_state,
+                grid,
+                observation.frame,
+                config,
+                repeat_compiled=clock.measures,
             )
             owed += clock.charge("mapping", seconds)
     planner = replace(me.state.planner, map_state=map_state, grid=grid)
-    for told in heard:
+    for shared in received:
         seconds = 0.0
-        if told.sight.member != me.number:
+        if shared.view.member != me.number:
             planner, seconds = timed(
-                tell_policy, planner, told.sight.frame, repeat_compiled=clock.measures
+                tell_policy, planner, shared.frame, repeat_compiled=clock.measures
             )
-        owed += clock.charge("mapping", told.mapping + seconds)
-    return replace(me, state=replace(me.state, planner=planner), heard=(), owed=owed)
+        owed += clock.charge("mapping", shared.mapping + seconds)
+    return replace(me, state=replace(me.state, planner=planner), received=(), owed=owed)
 
 
 def _with_common(state: LoopState, common: Common) -> LoopState:
@@ -370,16 +380,16 @@ def _with_common(state: LoopState, common: Common) -> LoopState:
 
 def _promised_to(me: _Flying, common: Common) -> tuple[PromisedView, ...]:
     """The views that the others were heading for at the last meeting."""
-    first: dict[int, Sight] = {}
-    for sight in in_order(common.waiting):
-        if sight.member != me.number:
-            first.setdefault(sight.member, sight)
+    first: dict[int, Observation] = {}
+    for observation in in_order(common.waiting):
+        if observation.member != me.number:
+            first.setdefault(observation.member, observation)
     return tuple(
         PromisedView(s.frame.camera, np.asarray(s.frame.T_world_camera)) for s in first.values()
     )
 
 
-def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Sight | None]:
+def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Observation | None]:
     """One view of one member, or its end; a view that was recorded is lived through again."""
     mission, state = me.mission, me.state
     if promised:
@@ -400,7 +410,7 @@ def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Sig
             mission.on_stage("record")
             me.recorder.record_view(output, after, mission.config)
     me = replace(me, state=after, rows=(*me.rows, row), owed=0.0)
-    return me, Sight(after.seconds, me.number, frame)
+    return me, Observation(after.seconds, me.number, frame)
 
 
 def _decided_by(state: LoopState, policy: Policy) -> LoopState:
@@ -411,11 +421,11 @@ def _decided_by(state: LoopState, policy: Policy) -> LoopState:
 def _stop_all(flying: list[_Flying], reason: StopReason, why: str) -> None:
     for me in flying:
         if me.stop is None:
-            message = f"{why}, after {me.state.in_words}"
+            message = f"{why}, after {me.state.counts}"
             flying[me.number] = replace(me, stop=Stop(reason, message))
 
 
-def _land(me: _Flying, state: LoopState) -> Result:
+def _finish(me: _Flying, state: LoopState) -> Result:
     """Records how a member ended."""
     assert me.stop is not None
     stop = me.stop if me.recorder is None else me.recorder.record_end(state, me.stop)

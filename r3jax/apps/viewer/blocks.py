@@ -29,8 +29,8 @@ from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import INDEX_LIMIT, unpack
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.runs.explain import Reason
 from r3jax.runs.header import RunHeader
+from r3jax.runs.reasons import Reason
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.explain import CAUSES
 from r3jax.scoring.terms import score_voxels

@@ -21,7 +21,7 @@ from r3jax.exploration.taken_views import Choice, StepRow
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.plots import style
 from r3jax.plots.page import data_url, render_macro
-from r3jax.runs.explain import Reason
+from r3jax.runs.reasons import Reason
 from r3jax.scoring.explain import CAUSES
 
 HINTS = {

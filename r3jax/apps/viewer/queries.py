@@ -49,8 +49,8 @@ from r3jax.apps.viewer.preview import (
 )
 from r3jax.apps.viewer.story import Moment, Offer, Story, offer_segments
 from r3jax.geometry.cameras import Camera
-from r3jax.runs.explain import Reason
 from r3jax.runs.header import RunError
+from r3jax.runs.reasons import Reason
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import fitted_size

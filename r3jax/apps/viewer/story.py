@@ -31,9 +31,9 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.planner import Planner, add_frame
 from r3jax.planning.policy import Decision, Policy
-from r3jax.runs.explain import Reason, explain_run
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run
+from r3jax.runs.reasons import Reason, explain_run
 from r3jax.runs.replay import check_decided_alone, grid_before
 from r3jax.runs.settings import config_of
 

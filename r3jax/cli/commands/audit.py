@@ -23,7 +23,7 @@ from r3jax.files import check_own, own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.bags import parse_topics
 from r3jax.interrupts import settle_interrupt
-from r3jax.network import who_sees
+from r3jax.network import exposure_warning
 
 _SHOWN = 5
 """Regions that the console lists."""
@@ -57,7 +57,7 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         UserError: nothing came in.
         ValueError, OSError: as `follow`, `open_guide` and `_audit`.
     """
-    if warning := who_sees(options.guide.host):
+    if warning := exposure_warning(options.guide.host):
         progress.say(warning, style="yellow")
     with open_guide(options.guide.host, options.guide.port) as page:
         progress.say(f"guide     {page.url}")

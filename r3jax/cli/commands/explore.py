@@ -15,7 +15,7 @@ from r3jax.cli.parsing import settings_for
 from r3jax.cli.progress import RunProgress, Stages
 from r3jax.exploration.config import parse_budget
 from r3jax.exploration.loop import Result, explore
-from r3jax.exploration.state import StopReason, in_words
+from r3jax.exploration.state import StopReason, describe_counts
 from r3jax.exploration.taken_views import TakenView
 from r3jax.formats.exports import write_data_set
 from r3jax.geometry.cameras import Camera
@@ -128,7 +128,7 @@ def _expedition(options: ExploreOptions, console: Console) -> Expedition:
         warn_of_versions(console, expedition.recorded)
         rows = expedition.recorded.rows
         captures = any(row.captured for row in rows)
-        behind = in_words(rows) if captures else f"view {len(rows)}"
+        behind = describe_counts(rows) if captures else f"view {len(rows)}"
         console.say(f"resuming {earlier.resume} after {behind}")
         return expedition
     if earlier.fork is not None:
@@ -241,7 +241,7 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
         return
     last, state = result.rows[-1], result.state
     console.say(
-        f"{state.in_words}, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
+        f"{state.counts}, {last.metres:.1f} m, {last.seconds:.1f} s on the clock; "
         f"{100 * last.coverage.known_share:.0f} % of the box explored, mean renderability "
         f"{last.coverage.mean_renderability:.2f}",
     )

@@ -3,7 +3,7 @@
 from r3jax.cli.console import Console
 from r3jax.cli.options.runs import MergeOptions
 from r3jax.cli.progress import Stages
-from r3jax.exploration.state import in_words
+from r3jax.exploration.state import describe_counts
 from r3jax.formats.exports import write_data_set
 from r3jax.runs.begin import merge_runs
 from r3jax.runs.reader import read_run
@@ -26,7 +26,7 @@ def run_merge(options: MergeOptions) -> int:
             runs, out, overwrite=options.overwrite, on_frame=lambda: stages.on_progress("", 1)
         )
         write_data_set(read_run(out), map_state)
-    views = " + ".join(in_words(run.rows) for run in runs)
+    views = " + ".join(describe_counts(run.rows) for run in runs)
     console.say(f"{views}, {int(map_state.num_occupied)} voxels")
     console.say(f"merged    {out}")
     console.next("train", out)

@@ -10,7 +10,7 @@ from r3jax.cli.errors import UserError, check_viser
 from r3jax.cli.options.runs import ViewOptions
 from r3jax.cli.progress import Stages
 from r3jax.interrupts import deferred_interrupt, end_process
-from r3jax.network import who_sees
+from r3jax.network import exposure_warning
 from r3jax.runs.reader import Run, read_run
 from r3jax.runs.settings import config_of
 
@@ -44,7 +44,7 @@ def _show(options: ViewOptions, run: Run, console: Console) -> None:
     check_viser()
     from r3jax.apps.viewer.recorded import open_run_page  # needs viser
 
-    if warning := who_sees(options.host, "sees the page, and can use it"):
+    if warning := exposure_warning(options.host, "sees the page, and can use it"):
         console.say(warning, style="yellow")
     with contextlib.ExitStack() as stack:
         page = open_run_page(

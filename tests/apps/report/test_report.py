@@ -30,9 +30,9 @@ from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture, panorama_picture
-from r3jax.runs.explain import explain_run
 from r3jax.runs.header import RunError, camera_fields
 from r3jax.runs.reader import read_run
+from r3jax.runs.reasons import explain_run
 from r3jax.runs.writer import RunWriter
 from r3jax.scoring.explain import CAUSES
 from tests.exploration.toys import BoxRoom, Wander

@@ -5,18 +5,19 @@ Oracles: brute force over the cells of two small rooms, and what the same view i
 
 from dataclasses import dataclass, field
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r3jax.apps.team import reserved_views
-from r3jax.apps.team.reserved_views import PromisedView
+from r3jax.apps.team.reserved_views import PromisedView, ReservedViews, without_yielded
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.scoring import simulated
-from r3jax.scoring.simulated import simulate_view
+from r3jax.planning.policy import DecisionOutcome, PlanInfo
+from r3jax.scoring.simulated import imagine_view, simulate_view
 from r3jax.scoring.utility import view_utility
+from tests.exploration.toys import Wander
 from tests.planning.rooms import center, grid_of, pose_at, two_rooms
 from tests.scoring.test_simulated import CAMERA, CONFIG, poses_of, seen_map
 
@@ -38,10 +39,10 @@ def half_explored() -> tuple[np.ndarray, OccupancyGrid]:
     return free & ~hidden, grid_of(free & ~hidden, occupied & ~hidden)
 
 
-def law_yielded(here=(9, 6, 4), others=((15, 6, 4),)) -> None:
+def assert_nearer_are_yielded(here, others) -> None:
     free, grid = half_explored()
     places = np.array([center(*cell) for cell in others])
-    own = reserved_views.without_yielded(
+    own = without_yielded(
         grid, jnp.asarray(center(*here), jnp.float32), jnp.asarray(places, jnp.float32)
     )
     np.testing.assert_array_equal(own.log_odds, grid.log_odds)
@@ -60,28 +61,27 @@ cells = st.tuples(st.integers(6, 11), st.integers(1, 12), st.integers(1, 8))
 @settings(max_examples=10)
 @given(cells, st.tuples(st.integers(13, 18), st.integers(1, 12), st.integers(1, 8)))
 def test_what_is_nearer_to_others_is_theirs(here, other):
-    law_yielded(here, (other,))
+    assert_nearer_are_yielded(here, (other,))
 
 
 def test_of_several_others_the_nearest_counts():
-    law_yielded((9, 6, 4), ((15, 6, 4), (7, 11, 2)))
+    assert_nearer_are_yielded((9, 6, 4), ((15, 6, 4), (7, 11, 2)))
 
 
-def test_whoever_has_nothing_left_leaves_nothing() -> None:
-    """Whoever would have nothing to explore leaves nothing to others."""
+def test_a_camera_that_has_nothing_left_yields_nothing():
     free, occupied = two_rooms()
     hidden = np.zeros_like(free)
     hidden[20:24] = True
     grid = grid_of(free & ~hidden, occupied & ~hidden)
     here, other = (jnp.asarray(center(*cell), jnp.float32) for cell in ((5, 6, 4), (17, 6, 4)))
-    after = reserved_views.without_yielded(grid, here, other[None])
+    after = without_yielded(grid, here, other[None])
     np.testing.assert_array_equal(after.unexplored, grid.unexplored)
 
 
-def test_a_promised_view_has_nothing_more_to_explore() -> None:
+def test_a_promised_view_has_nothing_more_to_explore():
     """The same view explores nothing any more; the map is the foreseen one, and nothing else."""
     state, (pose, _) = seen_map(), poses_of(3)
-    after, dark = simulated.imagine_view(state, WORLD, CAMERA, pose, CONFIG)
+    after, dark = imagine_view(state, WORLD, CAMERA, pose, CONFIG)
     first = view_utility(state, WORLD, CAMERA, pose, CONFIG)
     again = view_utility(after, dark, CAMERA, pose, CONFIG)
     assert first.exploration > 100.0
@@ -95,35 +95,39 @@ def test_a_promised_view_has_nothing_more_to_explore() -> None:
     assert changed.sum() == float(first.exploration)
 
 
+INFO = PlanInfo(DecisionOutcome.NO_CANDIDATE, 0, 0)
+KEY = jax.random.key(0)
+
+
 @dataclass
-class Listener:
+class Listener(Wander):
     """Keeps what it was asked to decide on."""
 
     name: str = "listener"
     config: str = "settings"
-    heard: list = field(default_factory=list)
+    received: list = field(default_factory=list)
 
     def decide(self, state, map_state, grid, T_world_camera, *, key):
-        self.heard.append((state, map_state, grid, T_world_camera, key))
-        return "decision", "state", "info"
+        self.received.append((state, map_state, grid, T_world_camera, key))
+        return None, "state", INFO
 
 
-def test_a_policy_decides_on_what_others_leave() -> None:
+def test_a_policy_decides_on_what_others_leave():
     """The policy decides where the camera is, on every promise, and on what is left to it."""
     listener = Listener()
     state, poses, pose = seen_map(), poses_of(3), pose_at(np.array([-0.5, -1.0, 0.0]))
     views = tuple(PromisedView(CAMERA, np.asarray(T, np.float64)) for T in poses)
-    policy = reserved_views.ReservedViews(listener, views, CONFIG)
+    policy = ReservedViews(listener, views, CONFIG)
     assert (policy.name, policy.config) == ("listener", "settings")
-    answer = policy.decide("memory", state, WORLD, pose, key="key")
-    assert answer == ("decision", "state", "info")
-    ((memory, map_state, grid, T, key),) = listener.heard
-    assert (memory, key) == ("memory", "key")
+    answer = policy.decide("memory", state, WORLD, pose, key=KEY)
+    assert answer == (None, "state", INFO)
+    ((memory, map_state, grid, T, key),) = listener.received
+    assert (memory, key) == ("memory", KEY)
     np.testing.assert_array_equal(T, pose)
     after, dark = state, WORLD
     for view in poses:
-        after, dark = simulated.imagine_view(after, dark, CAMERA, view, CONFIG)
+        after, dark = imagine_view(after, dark, CAMERA, view, CONFIG)
     others = jnp.stack([view[:3, 3] for view in poses])
-    left = reserved_views.without_yielded(dark, jnp.asarray(pose[:3, 3], jnp.float32), others)
+    left = without_yielded(dark, jnp.asarray(pose[:3, 3], jnp.float32), others)
     np.testing.assert_array_equal(map_state.visited, after.visited)
     np.testing.assert_array_equal(grid.unexplored, left.unexplored)

@@ -12,7 +12,7 @@ from r3jax.apps.viewer.blocks import CAUSE
 from r3jax.apps.viewer.color_maps import CAUSE_COLORS, UNSEEN
 from r3jax.apps.viewer.facts import LAYERS
 from r3jax.apps.viewer.recorded import open_run_page
-from r3jax.runs.explain import explain_run
+from r3jax.runs.reasons import explain_run
 from tests.apps.viewer.conftest import VIEWS
 
 pytestmark = pytest.mark.full

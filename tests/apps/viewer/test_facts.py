@@ -30,7 +30,7 @@ from r3jax.apps.viewer.facts import (
 )
 from r3jax.exploration.taken_views import Choice, Coverage, StepRow
 from r3jax.plots.style import CAUSE_COLORS
-from r3jax.runs.explain import Reason
+from r3jax.runs.reasons import Reason
 from r3jax.scoring.explain import CAUSES
 
 TOP = {

@@ -13,10 +13,9 @@ from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.frame import Frame
 from r3jax.planning.registry import make_policy
-from r3jax.runs import explain
-from r3jax.runs.explain import explain_run
 from r3jax.runs.header import RunError, camera_fields, plain_settings
 from r3jax.runs.reader import read_run
+from r3jax.runs.reasons import explain_run
 from r3jax.runs.replay import rebuild, states_of
 from r3jax.runs.settings import planner_config_of
 from r3jax.runs.writer import RunWriter
@@ -64,9 +63,9 @@ def states(run):
     return list(states_of(run))
 
 
-def test_reasons_are_the_utilities_of_the_trace(run, states) -> None:
+def test_reasons_are_the_utilities_of_the_trace(run, states):
     """The unexplored cells and the sum of 1 - R are those that the trace says were weighed."""
-    reasons = list(explain.explain_run(run, states))
+    reasons = list(explain_run(run, states))
     assert len(reasons) == VIEWS
     assert reasons[0] is None
     for row, reason in zip(run.rows[1:], reasons[1:], strict=True):

@@ -1,4 +1,4 @@
-"""Why each view of a recorded run was worth taking, on what was known before it was taken.
+"""Why each view of a recorded run was chosen, by what was known before it was taken.
 
 What a planner knew is rebuilt from the frames: the map, the grid, and which unexplored cells it had
 given up. So runs of any policy are explained, those without a utility of their own too: by
@@ -67,22 +67,22 @@ def reason_of(explanation: Explanation, grid: OccupancyGrid) -> Reason:
 def explain_run(
     run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
 ) -> Iterator[Reason | None]:
-    """Why each view of a run was worth taking, in order; takes as long as mapping took.
+    """Explains why each view of a run was chosen, in order; takes as long as mapping took.
 
     Args:
         run: not a merged one: each of its runs decided on a map of its own.
         states: the map and the grid after each view, in order; by default rebuilt from the frames.
-            That after a view is asked for when the reason of the next one is.
+            The state after a view is read with the reason of the next one.
 
     Yields:
-        The reason of each view; None for the first, which nobody chose. Where frames were captured
-        on the way, it stands in the first row of the path, as the choice does.
+        The reason of each view; None for the first, which was not chosen. Where frames were
+        captured while moving, it stands in the first row of the path, as the choice does.
 
     Raises:
         RunError: the run was merged, or is a fork of one that was or that flew in a team; a
             setting of it is not known, a frame is missing or broken.
     """
-    # First: rebuilding the map takes minutes, and would show a map nobody decided on.
+    # First: rebuilding the map takes minutes, and would show a map on which no view was decided.
     check_decided_alone(run)
     if is_decided_apart(run):
         raise RunError(
