@@ -23,7 +23,7 @@ EXCEPTIONS = {
     "cli/main.py": {"open"},
     # A scratch folder of the system's, and links in it to the frames of a capture that grows.
     "cli/commands/audit.py": {"TemporaryDirectory"},
-    "apps/audit/live/staging.py": {"mkdir", "write_text", "symlink_to", "unlink"},
+    "apps/audit/live/growing.py": {"mkdir", "write_text", "symlink_to", "unlink"},
 }
 """Files that may do more than call `r3jax.files`, and what."""
 

@@ -178,15 +178,9 @@ CASES: dict[str, Case] = {
         Place(ROOM, FURNITURE), _axes_in_turn(draw)),
     "a phone turned from landscape to portrait": lambda draw: (
         Place(ROOM, FURNITURE), _wander(draw, -8, lambda i: 0.0 if i < 10 else 90.0)),
-    "a phone held upright": lambda draw: (
-        Place(ROOM, FURNITURE), _wander(draw, -8, lambda i: 90.0)),
     "down at a desk": lambda draw: (
         Place(ROOM, [*FURNITURE, box([2.2, 2.1, 0.75], [2.9, 2.2, 1.2], 15)]),
         _over_desk(draw, -48)),
-    "hardly turned, always down": lambda draw: (
-        Place(ROOM, FURNITURE),
-        [held_pose([2.5 + 0.1 * i, 1, 1.4], 150 + 2 * i, -25 + 2 * draw.normal())
-         for i in range(15)]),
     "under a sloped roof": lambda draw: (
         Place(room(5, 4, 3.0, roof=draw.uniform(35, 50)), [box([2, 2, 0], [3, 3, 0.5])]),
         _wander(draw, -5, lambda i: 0.0)),

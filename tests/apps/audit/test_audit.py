@@ -1,6 +1,5 @@
 """Whole audits of a room in which it is known what is wrong."""
 
-import dataclasses
 import json
 import re
 from dataclasses import replace
@@ -12,12 +11,17 @@ from r3jax.apps.audit import capture_maps
 from r3jax.apps.audit.alignment import Alignment
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.audit_page import picture_faults
-from r3jax.apps.audit.bad_regions import bad_regions, unseen_edges, unseen_regions
 from r3jax.apps.audit.camera_paths import CameraPath
 from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
 from r3jax.apps.audit.ground_plan import _value_picture
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
-from r3jax.apps.audit.sentences import CONTRADICTED, directions, method, verdict
+from r3jax.apps.audit.sentences import (
+    CONTRADICTED,
+    directions,
+    method,
+    saturation,
+    verdict,
+)
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import Source, source_of
 from r3jax.apps.audit.survey import MARGIN, survey_of
@@ -38,12 +42,10 @@ from tests.apps.audit.room import (
     write_recording,
 )
 
-pytestmark = pytest.mark.full
-
 VOXEL = 0.15
 SETTINGS = AuditSettings(voxel_size=VOXEL, views=3, folds=4, num_places=16, num_standpoints=8)
-FEW_VIEWS = dataclasses.replace(SETTINGS, voxel_size=None, views=2)
-NO_VIEWS = dataclasses.replace(SETTINGS, views=0)
+FEW_VIEWS = replace(SETTINGS, voxel_size=None, views=2)
+NO_VIEWS = replace(SETTINGS, views=0)
 
 
 def corner_poses() -> np.ndarray:
@@ -80,7 +82,7 @@ def cloud(folder) -> Audit:
 def test_an_audit_in_coordinates_of_utm_says_so_and_comes_back_in_them(folder, tmp_path):
     far = np.array([500_000.0, 4_600_000.0, 100.0])
     recording = read_recording(write_far_recording(folder / "far", corner_poses(), far), "z")
-    found = audit(source_of(recording, "far"), dataclasses.replace(SETTINGS, views=1))
+    found = audit(source_of(recording, "far"), replace(SETTINGS, views=1))
     assert "was subtracted" in " ".join(method(found))
     written = write_outputs(found, tmp_path, tmp_path / "capture")
     points, _ = read_points(written["causes"])
@@ -132,14 +134,28 @@ def test_suggested_views_are_in_the_open_and_promise_more_than_random_ones(corne
         assert view.gain >= 1
 
 
-def test_where_everything_was_seen_well_views_are_not_ranked(corner):
-    said = {}
-    for value in (0.95, 0.6):
+def changed(found: Audit, **of_survey) -> Audit:
+    return replace(found, survey=replace(found.survey, **of_survey))
+
+
+def test_the_verdict_says_what_speaks_against_the_numbers(corner, cloud):
+    """What is not known, or not to be believed, is told with its number and what helps."""
+    tilted = changed(cloud, up=Vertical(np.array([0.6, 0.0, 0.8]), 12.4))
+    for sentences in (verdict, method):
+        assert "12 degrees" in " ".join(sentences(tilted))
+        assert "--up=0.60,0.00,0.80" in " ".join(sentences(tilted))
+    one_place = changed(corner, span=0.05 * corner.survey.median_depth)
+    assert record_of(one_place)["taken_from_one_place"]
+    assert not any("%" in text for text in verdict(one_place))
+    contradicted = replace(corner, faults=replace(corner.faults, findings=(), fits=False))
+    assert CONTRADICTED in verdict(contradicted)
+    assert picture_faults(contradicted)["remarks"] == [CONTRADICTED]
+    remark = "2 of 3 pictures have a pose."
+    assert verdict(replace(cloud, source=replace(cloud.source, remark=remark)))[0] == remark
+    for value, is_saturated in ((0.95, True), (0.6, False)):
         frames = [replace(f, score=replace(f.score, renderability=value)) for f in corner.frames]
-        said[value] = " ".join(verdict(replace(corner, frames=tuple(frames))))
-    assert "pictures are not ranked" in said[0.95]
-    assert "the worst" not in said[0.95]
-    assert "the worst" in said[0.6]
+        said = " ".join(verdict(replace(corner, frames=tuple(frames))))
+        assert (saturation() in said) == is_saturated
 
 
 def test_a_gain_is_what_all_surfaces_gain_together(corner):
@@ -170,15 +186,6 @@ def test_regions_hold_bad_voxels_and_do_not_overlap(corner):
     assert losses == sorted(losses, reverse=True)
 
 
-def test_nothing_bad_makes_no_region(corner):
-    found = corner.diagnosis
-    perfect = dataclasses.replace(found, value=np.ones_like(found.value))
-    assert bad_regions(corner.seen.state, perfect) == []
-    none = np.zeros(corner.seen.grid.log_odds.shape, bool)
-    assert unseen_regions(corner.seen.grid, none) == []
-    assert not unseen_edges(corner.seen.grid, none).any()
-
-
 def test_own_frames_are_judged_without_themselves(corner):
     poses = corner.source.poses
     path = CameraPath(poses, (LENS,) * len(poses))
@@ -199,7 +206,7 @@ def test_colors_that_contradict_are_noise(corner):
         rgb, depth = corner.source.read(index)
         return np.clip(rgb * gains[index], 0, 255).astype(np.uint8), depth
 
-    changed = dataclasses.replace(corner.source, read=flickering)
+    changed = replace(corner.source, read=flickering)
     found = audit(changed, NO_VIEWS)
     assert found.diagnosis.noise[found.diagnosis.is_seen].mean() < 0.9
     calm = corner.diagnosis.noise[corner.diagnosis.is_seen].mean()
@@ -226,7 +233,7 @@ def test_units_and_axes_of_a_capture_change_nothing_but_the_coordinates(cloud, f
         rgb, depth = cloud.source.read(index)
         return rgb, depth * 25.0
 
-    turned = dataclasses.replace(cloud.source, poses=poses, read=read)
+    turned = replace(cloud.source, poses=poses, read=read)
     other = audit(turned, FEW_VIEWS)
     assert other.survey.unit == "u"
     assert other.survey.median_depth == pytest.approx(25 * cloud.survey.median_depth, rel=1e-5)
@@ -256,7 +263,7 @@ def test_tracks_of_a_model_are_as_good_as_a_cloud(folder, cloud):
     images = read_colmap(write_colmap(folder / "model", round_poses()))
     source = source_of(images, "model")
     assert (source.kind, source.is_metric, source.has_images) == ("tracks", False, True)
-    found = audit(source, dataclasses.replace(FEW_VIEWS, views=0))
+    found = audit(source, replace(FEW_VIEWS, views=0))
     np.testing.assert_allclose(found.renderability, cloud.renderability, atol=0.15)
     assert found.diagnosis.fine_share > 0.3
 
@@ -279,8 +286,8 @@ def test_without_depth_images_what_no_point_shows_is_not_known(cloud, corner):
 
 
 def test_pictures_without_a_point_are_not_known_either(cloud):
-    blank = dataclasses.replace(cloud.faults, without_depth=(3, 5, 7, 9))
-    fewer = dataclasses.replace(cloud, faults=blank)
+    blank = replace(cloud.faults, without_depth=(3, 5, 7, 9))
+    fewer = replace(cloud, faults=blank)
     known = 1.0 - cloud.shares["unseen"]
     assert 1.0 - fewer.shares["unseen"] == pytest.approx(known * 16 / 20)
     assert sum(fewer.shares.values()) == pytest.approx(1.0)
@@ -297,9 +304,9 @@ def test_what_cannot_be_read_and_what_has_no_depth_is_left_out_and_said(folder):
     assert found.survey.chosen.tolist() == [0, 1, 3, 4, 5, 6, 7]
     assert len(found.frames) == 7
     first, second, *_ = verdict(found)
-    assert first.startswith("1 of the 12 pictures is left out")
-    assert "002.png: the file is missing" in first
-    assert second.startswith("4 of the 11 pictures have no depth")
+    for fact in ("1 of the 12", "002.png"):
+        assert fact in first
+    assert "4 of the 11" in second
     record = record_of(found)
     assert [entry["index"] for entry in record["pictures_left_out"]] == [2]
     assert record["pictures_without_depth"] == [8, 9, 10, 11]
@@ -311,7 +318,7 @@ def test_a_model_without_images_is_audited_by_its_points(folder):
         image.unlink()
     source = source_of(read_colmap(path), "bare")
     assert not source.has_images
-    found = audit(source, dataclasses.replace(FEW_VIEWS, views=0))
+    found = audit(source, replace(FEW_VIEWS, views=0))
     assert found.diagnosis.share("noise") == 0.0
     assert "nothing can be said about noise" in method(found)[-1]
     assert verdict(found)[0].startswith("None of the 8 pictures is there")
@@ -336,31 +343,6 @@ def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
     assert len(record["path"]["frames"]) == 16
     assert record["surfaces"]["share"].keys() == set(CAUSES)
     assert record["up"] == [0.0, 0.0, 1.0]
-    for text in (*verdict(cloud), *method(cloud)):
-        assert text[0].isupper() or text[0].isdigit()
-        assert text.endswith(".")
-
-
-def test_a_guess_of_up_says_how_far_off_it_may_be_and_how_to_give_it(cloud):
-    def said(sentences, within: float | None) -> str:
-        up = Vertical(np.array([0.6, 0.0, 0.8]), within)
-        survey = dataclasses.replace(cloud.survey, up=up)
-        return " ".join(sentences(dataclasses.replace(cloud, survey=survey)))
-
-    for sentences in (verdict, method):
-        assert "within 12 degrees" in said(sentences, 12.4)
-        assert "--up=0.60,0.00,0.80" in said(sentences, 12.4)
-        assert "guess" not in said(sentences, None)
-    assert "guess" not in said(verdict, 3.0)  # told in the method alone
-
-
-def test_one_view_is_spoken_of_as_one(cloud):
-    assert len(cloud.plan.views) > 1
-    alone = dataclasses.replace(cloud.plan, views=cloud.plan.views[:1])
-    said = verdict(dataclasses.replace(cloud, plan=alone))[-1]
-    assert said.startswith("One further view would")
-    assert "; one at a random place 0." in said
-    assert verdict(cloud)[-1].startswith(f"{len(cloud.plan.views)} further views would")
 
 
 @pytest.mark.parametrize("tilt", [0.0, 30.0, -90.0])  # of the picture [degrees]
@@ -378,46 +360,22 @@ def test_directions_lead_from_a_picture_to_the_view(corner, tilt):
     looks = np.array([np.cos(turned), np.sin(turned), -np.tan(np.radians(10.0))])
     left = np.array([-forward[1], forward[0], 0.0])
     place = eye + 1.2 * forward - 0.4 * left + [0.0, 0.0, 0.3]
-    view = dataclasses.replace(corner.plan.views[0], pose=pose_at(place, place + looks))
+    view = replace(corner.plan.views[0], pose=pose_at(place, place + looks))
     back = np.stack([here] * len(corner.source.poses))
-    source = dataclasses.replace(corner.source, poses=back)
+    source = replace(corner.source, poses=back)
     as_it_is = Alignment(np.eye(3), 1.0, np.zeros(3))
-    survey = dataclasses.replace(corner.survey, alignment=as_it_is)
-    audit = dataclasses.replace(corner, source=source, survey=survey)
+    survey = replace(corner.survey, alignment=as_it_is)
+    audit = replace(corner, source=source, survey=survey)
     assert directions(audit, view, 2) == (
         f"Stand where {source.labels[2]} was taken, go 1.2 m forward and 0.4 m to the right, hold "
         "the camera 0.3 m higher, turn 40° left and look 10° down."
     )
 
 
-def test_what_points_leave_out_is_said(cloud, corner):
-    told = [any("plain walls" in text for text in verdict(found)) for found in (cloud, corner)]
-    assert told == [True, False]
-    remark = "2 of 3 pictures have a pose."
-    partial = dataclasses.replace(cloud, source=dataclasses.replace(cloud.source, remark=remark))
-    assert verdict(partial)[0] == remark
-
-
 def one_picture(depth: np.ndarray) -> Source:
     rgb = np.zeros((36, 48, 3), np.uint8)
     return Source("one", np.eye(4)[None], (LENS,), ("a",), "depth", True, None, 1,
                   lambda index: (rgb, depth))  # fmt: skip
-
-
-def test_of_pictures_from_one_place_no_share_is_said(corner):
-    survey = replace(corner.survey, span=0.05 * corner.survey.median_depth)
-    said = verdict(replace(corner, survey=survey))
-    assert "taken from one place" in said[0]
-    assert not any("%" in text or "renderability of" in text for text in said)
-    assert record_of(replace(corner, survey=survey))["taken_from_one_place"]
-    assert not corner.survey.is_one_place
-
-
-def test_where_nothing_fits_no_verdict_on_pictures_follows(corner):
-    faults = replace(corner.faults, findings=(), fits=False)
-    found = replace(corner, faults=faults)
-    assert any("not known" in text for text in verdict(found))
-    assert picture_faults(found)["remarks"] == [CONTRADICTED]
 
 
 def test_a_raster_does_not_grow_with_the_place(corner):
@@ -445,35 +403,33 @@ def test_a_capture_of_a_rooms_size_stays_as_it_is_and_others_are_scaled(depth, r
     assert survey.length(survey.voxel_size) >= 0.01 * range_in_meters
 
 
-def test_a_median_depth_that_no_room_has_is_refused_unless_it_is_meant():
-    millimeters = one_picture(np.full((36, 48), 2000.0, np.float32))
-    with pytest.raises(ValueError, match=r"median depth is 2000 m: is its unit right"):
-        survey_of(millimeters, AuditSettings())
-    assert survey_of(millimeters, AuditSettings(up="-y", trust_depth=True)).median_depth == 2000.0
-    assert "unit" in str(survey_of(millimeters, AuditSettings(up="-y", trust_depth=True)).doubt)
-
-
-def test_meters_read_as_millimeters_are_refused_with_the_factor():
-    with pytest.raises(ValueError, match=r"--depth-scale 1000 ") as refusal:
-        survey_of(one_picture(np.full((36, 48), 0.002, np.float32)), AuditSettings())
-    assert "depth_unit_scale_factor" in str(refusal.value)
+@pytest.mark.parametrize(("depth", "factor"), [(2000.0, "0.001"), (0.002, "1000")])
+def test_a_median_depth_that_no_room_has_is_refused_with_the_factor_unless_it_is_meant(
+    depth, factor
+):
+    source = one_picture(np.full((36, 48), depth, np.float32))
+    with pytest.raises(ValueError, match=rf"--depth-scale {factor} "):
+        survey_of(source, AuditSettings())
+    survey = survey_of(source, AuditSettings(up="-y", trust_depth=True))
+    assert survey.median_depth == pytest.approx(depth)
+    assert survey.doubt is not None
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("settings", "named"),
     [
-        ({"voxel_size": 0.0}, "--voxel-size must be positive"),
-        ({"max_range": float("nan")}, "--max-range must be positive"),
-        ({"max_range": 5000.0}, "--max-range 5000 is far beyond what the pictures show"),
-        ({"voxel_size": 5.0}, "larger than a fifth of the range"),
-        ({"views": -1}, "--views must be at least 0"),
-        ({"views": 10**9}, "--views must be at most"),
-        ({"folds": 1}, "--folds must be at least 2"),
-        ({"max_frames": 0}, "--max-frames must be at least 2"),
-        ({"seed": -1}, "--seed must be at least 0"),
-        ({"up": "w"}, "up must be one of"),
+        ({"voxel_size": 0.0}, "--voxel-size"),
+        ({"voxel_size": 5.0}, "--voxel-size"),
+        ({"max_range": float("nan")}, "--max-range"),
+        ({"max_range": 5000.0}, "--max-range 5000"),
+        ({"views": -1}, "--views"),
+        ({"views": 10**9}, "--views"),
+        ({"folds": 1}, "--folds .* 2"),
+        ({"max_frames": 0}, "--max-frames .* 2"),
+        ({"seed": -1}, "--seed"),
+        ({"up": "w"}, "--up"),
     ],
 )
-def test_wishes_without_sense_are_named(settings, message):
-    with pytest.raises(ValueError, match=message):
+def test_wishes_without_sense_are_named(settings, named):
+    with pytest.raises(ValueError, match=named):
         survey_of(one_picture(np.ones((36, 48), np.float32)), AuditSettings(**settings))

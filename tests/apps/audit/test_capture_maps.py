@@ -18,8 +18,6 @@ from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate
 from tests.apps.audit.room import round_poses, write_recording
 
-pytestmark = pytest.mark.full
-
 SETTINGS = AuditSettings(voxel_size=0.1, folds=4)
 NUM = 8
 

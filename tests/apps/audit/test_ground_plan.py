@@ -1,14 +1,11 @@
 """The map from above: numbers that do not cover each other."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from r3jax.apps.audit.ground_plan import apart
-
-pytestmark = pytest.mark.full
 
 places = hnp.arrays(np.float64, st.tuples(st.integers(1, 8), st.just(2)), elements=st.floats(-3, 3))
 

@@ -4,8 +4,6 @@ import pytest
 
 from r3jax.apps.audit.sentences import two_digits
 
-pytestmark = pytest.mark.full
-
 
 @pytest.mark.parametrize(
     ("value", "said"),

@@ -113,9 +113,6 @@ def test_where_nothing_can_be_compared_nothing_is_said():
 
 
 def test_a_real_recording_fits_and_five_times_its_depth_does_not():
-    from r3jax.apps.audit.source import source_of
-    from r3jax.formats.recordings import read_recording
-
     source = source_of(read_recording(shared_path("recordings", "hololens_lounge"), "z"), "lounge")
     indices = np.linspace(0, len(source) - 1, 16).astype(int).tolist()
     real = [DepthImage(source.read(i)[1], source.camera(i), source.poses[i]) for i in indices]

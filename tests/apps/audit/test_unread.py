@@ -25,10 +25,10 @@ def cut(path):
 
 
 BREAK = {
-    "missing": (lambda path: path.unlink(), "missing"),
-    "cut off": (cut, "truncated"),
-    "empty": (lambda path: path.write_bytes(b""), "empty"),
-    "no image": (lambda path: path.write_text("<html>"), "web page"),
+    "missing": lambda path: path.unlink(),
+    "cut off": cut,
+    "empty": lambda path: path.write_bytes(b""),
+    "no image": lambda path: path.write_text("<html>"),
 }
 
 
@@ -44,26 +44,15 @@ def opened(path):
 @pytest.mark.parametrize("how", BREAK)
 @pytest.mark.parametrize("what", ["images", "depth"])
 def test_a_picture_that_cannot_be_read_is_left_out_and_named(capture, how, what):
-    break_it, why = BREAK[how]
     for number in (0, 4):
-        break_it(capture / what / f"{number:03d}.png")
+        BREAK[how](capture / what / f"{number:03d}.png")
     source = opened(capture)
     assert survey_of(source, AuditSettings()).median_depth > 0.5
     found = find_faults(source, np.arange(6))
     assert set(found.left_out) == {0, 4}
     assert found.left_out[4].startswith("004.png: ")
-    assert why in found.left_out[4]
     assert found.looked_at == 4
     assert found.record["pictures"] == [1, 2, 3, 5]
-
-
-def test_a_model_of_which_some_images_are_gone_is_audited_by_the_others(tmp_path):
-    path = write_colmap(tmp_path / "scan", POSES)
-    for number in (0, 3):
-        (path / "images" / f"{number:03d}.png").unlink()
-    source = source_of(read_colmap(path), "scan")
-    assert source.has_images
-    assert set(find_faults(source, np.arange(6)).left_out) == {0, 3}
 
 
 def test_the_size_of_an_image_that_is_gone_is_that_of_the_others(capture):

@@ -37,14 +37,12 @@ def known():
     return room.camera, {views: found[views] for views in (1, 4, 12)}
 
 
-@pytest.mark.full
 def test_more_views_promise_more(known):
     camera, states = known
     values = [real.forecast_map(*states[views], camera).value("mean") for views in (1, 4, 12)]
     assert values[0] + 2.0 < values[1] < values[2]
 
 
-@pytest.mark.full
 def test_a_forecast_is_the_mixture_of_its_views(known):
     """Its views one by one: R and coverage of each, and the mixture of all that show something."""
     camera, states = known
@@ -99,7 +97,6 @@ def test_nothing_known_forecasts_nothing():
     assert forecast_map(state, grid, room.camera).value("mean") == -np.inf
 
 
-@pytest.mark.full
 def test_a_sweep_of_places_compiles_once(known):
     camera, states = known
     forecast_map(*states[4], camera)

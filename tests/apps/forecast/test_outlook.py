@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.forecast import forecast as real
-from r3jax.apps.forecast.forecast import Outlook, forecast_map, stopping_rule
+from r3jax.apps.forecast.forecast import Outlook, forecast_map, more_views, stopping_rule
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import StopReason
@@ -21,34 +20,26 @@ from tests.exploration.toys import BoxRoom
 from tests.runs.runs import make_header
 
 
-def law_of_doubling(slope: float = 3.0, views: int = 40) -> None:
+@given(st.floats(0.2, 20.0), st.integers(2, 40))
+def test_more_views_follow_the_doubling(slope, eighth):
     """Where every doubling adds `slope` dB, so does the next: by the formula, and walked there."""
-    taken = np.arange(views // 8, views + 1, views // 8)
+    taken = np.arange(1, 9) * eighth
     curve = lambda n: 12.0 + slope * np.log2(n)
-    more = real.more_views(taken, curve(taken), 1.0)
+    more = more_views(taken, curve(taken), 1.0)
     assert curve(taken[-1] + more) >= curve(taken[-1]) + 1.0 - 1e-6
     assert curve(taken[-1] + more - 1) < curve(taken[-1]) + 1.0 + 1e-6
     # What came before the second half does not matter.
     early = np.where(2 * taken < taken[-1], 0.0, curve(taken))
-    assert real.more_views(taken, early, 1.0) == more
+    assert more_views(taken, early, 1.0) == more
 
 
-@given(st.floats(0.2, 20.0), st.integers(2, 40))
-def test_more_views_follow_the_doubling(slope, eighth):
-    law_of_doubling(slope, 8 * eighth)
-
-
-def test_no_gain_is_no_number() -> None:
+def test_no_gain_is_no_number():
     views = np.array([10, 20, 30, 40])
-    more = real.more_views
-    assert more(views, np.array([20.0, 25.0, 25.0, 25.0])) is None
-    assert more(views, np.array([20.0, 25.0, 25.03, 25.05])) is None  # not worth a count
-    assert more(views, np.array([20.0, 26.0, 25.5, 25.0])) is None  # it fell
-    assert more(views, np.array([-np.inf, -np.inf, -np.inf, 25.0])) is None
-    assert more(views[:0], np.zeros(0)) is None
-    assert more(views, np.array([0.0, 24.0, 25.0, 26.0]), 0.5) < more(
-        views, np.array([0.0, 24.0, 25.0, 26.0]), 1.0
-    )
+    for late in ([25.0, 25.0, 25.0], [25.0, 25.03, 25.05], [26.0, 25.5, 25.0], [-np.inf] * 3):
+        assert more_views(views, np.array([20.0, *late])) is None
+    assert more_views(views[:0], np.zeros(0)) is None
+    rising = np.array([0.0, 24.0, 25.0, 26.0])
+    assert more_views(views, rising, 0.5) < more_views(views, rising, 1.0)
 
 
 def go(path, views: int, config: ExplorationConfig, resume: bool = False):
@@ -84,7 +75,6 @@ def reached(whole):
     return [forecast_map(*state, run.camera).value("mean") for state in states_of(run)]
 
 
-@pytest.mark.full
 def test_a_run_ends_when_its_forecast_says_so(whole, reached, tmp_path):
     """It is asked every third view; the views before are those of the run without a goal."""
     goal = reached[5] - 0.01
@@ -102,7 +92,6 @@ def test_a_run_ends_when_its_forecast_says_so(whole, reached, tmp_path):
     assert read_run(tmp_path / "run").end.outcome == "forecast"
 
 
-@pytest.mark.full
 def test_a_run_that_was_cut_off_ends_at_the_same_view(whole, reached, tmp_path):
     config = dataclasses.replace(CONFIG, until=f"psnr:{reached[5] - 0.01}", until_every=3)
     go(tmp_path / "run", 4, config)
@@ -111,14 +100,12 @@ def test_a_run_that_was_cut_off_ends_at_the_same_view(whole, reached, tmp_path):
     assert [row.sha256 for row in result.rows] == [row.sha256 for row in whole[0].rows[:6]]
 
 
-@pytest.mark.full
 def test_a_goal_too_high_leaves_the_budget_in_charge(whole, tmp_path):
     result = go(tmp_path / "run", 4, dataclasses.replace(CONFIG, until="psnr:99", until_every=1))
     assert result.reason is StopReason.BUDGET
     assert [row.sha256 for row in result.rows] == [row.sha256 for row in whole[0].rows[:4]]
 
 
-@pytest.mark.full
 def test_an_outlook_watches_a_replay(whole, reached):
     """Three forecasts of nine views; every state is passed on."""
     run = read_run(whole[1])
@@ -131,7 +118,6 @@ def test_an_outlook_watches_a_replay(whole, reached):
     assert outlook.views == [3, 6, 9]
 
 
-@pytest.mark.full
 def test_frames_on_the_way_are_no_views(whole):
     """Of nine frames four were captured, the last one too: the first, 4th, 5th, 7th, 8th chose."""
     run = read_run(whole[1])

@@ -6,8 +6,6 @@ import json
 import re
 import shutil
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
@@ -24,12 +22,9 @@ from r3jax.apps.report.report import write_report
 from r3jax.apps.report.summary import map_row_bytes, stage_times, summary
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.mapping.occupancy import empty_grid
 from r3jax.mapping.state import empty_map
-from r3jax.mapping.update import integrate_points
 from r3jax.plots import style
-from r3jax.plots.pictures import floor_picture, panorama_picture
 from r3jax.runs.header import RunError, camera_fields
 from r3jax.runs.reader import read_run
 from r3jax.runs.reasons import explain_run
@@ -67,7 +62,6 @@ def reported(tmp_path_factory):
     return run, result, page
 
 
-@pytest.mark.full
 def test_the_page_stands_alone(reported):
     run, _, page = reported
     text = page.read_text()
@@ -103,7 +97,6 @@ def test_the_path_from_above_is_as_long_as_flown(reported):
         assert np.linalg.norm(steps, axis=1).sum() == pytest.approx(rows[-1].metres, rel=1e-5)
 
 
-@pytest.mark.full
 def test_the_page_tells_the_runs_own_numbers(reported):
     run, _, page = reported
     text = page.read_text()
@@ -117,7 +110,6 @@ def test_the_page_tells_the_runs_own_numbers(reported):
     assert "<box>" not in text
 
 
-@pytest.mark.full
 def test_the_page_forecasts_what_a_model_would_be_worth(reported):
     """The last of the curve's points is a forecast of the map that the run ended with."""
     run, result, page = reported
@@ -127,7 +119,6 @@ def test_the_page_forecasts_what_a_model_would_be_worth(reported):
     assert said in page.read_text()
 
 
-@pytest.mark.full
 def test_views_are_explained_as_they_were_chosen(reported):
     """Wander decides by chance: what counts is what the views that it chose promised."""
     run, _, page = reported
@@ -165,7 +156,6 @@ def test_the_bars_of_a_view_are_its_shares():
     style.to_png(reasons_figure(utility[:1]))  # the start alone can be drawn
 
 
-@pytest.mark.full
 def test_a_run_that_cannot_be_explained_has_a_report_all_the_same(reported, tmp_path):
     run, result, _ = reported
     shutil.copytree(run.path, tmp_path / "merged")
@@ -186,7 +176,6 @@ def test_a_run_without_views_has_no_report(tmp_path):
     assert summary(run)["views"] == "0"
 
 
-@pytest.mark.full
 def test_a_run_that_was_cut_off_can_be_reported(reported, tmp_path):
     run, result, _ = reported
     rows = (run.path / "trace.jsonl").read_text().splitlines(keepends=True)
@@ -221,64 +210,6 @@ def test_timings_that_are_damaged_do_not_hurt(tmp_path):
     assert [stage.total for stage in stage_times(read_run(tmp_path / "run"))] == [2.0]
 
 
-@pytest.mark.full
 def test_memory_is_counted_as_the_map_counts_it(reported):
     run, result, _ = reported
     assert map_row_bytes(run) == result.state.map_state.bytes_per_row
-
-
-def paint(points, colors):
-    state = empty_map(1 << 10, voxel_size=0.1)
-    return integrate_points(state, jnp.asarray(points), jnp.asarray(colors), jnp.array([5.0] * 3))
-
-
-def test_the_floor_picture_puts_colors_where_they_are():
-    grid = empty_grid(np.array([[0.0, 0.0, 0.0], [2.0, 1.0, 2.0]]), 0.2)
-    free = np.zeros(grid.log_odds.shape, np.float32)
-    free[: free.shape[0] // 2] = -4.0
-    grid = eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(free))
-    red, green, blue = np.eye(3, dtype=np.float32)
-    points = np.array([[1.55, 0.25, 0.15], [1.55, 0.25, 0.75], [0.45, 0.65, 1.95]], np.float32)
-    picture, extent = floor_picture(paint(points, np.stack([red, green, blue])), grid, 1.0)
-    left, right, bottom, top = extent
-    assert (left, bottom) == pytest.approx((-0.2, -0.2))
-    assert picture.shape == (round((top - bottom) / 0.1), round((right - left) / 0.1), 3)
-    at = lambda x, y: picture[int((y - bottom) / 0.1), int((x - left) / 0.1)]
-    np.testing.assert_allclose(at(1.55, 0.25), green, atol=1e-6)  # the higher one hides the lower
-    assert at(0.45, 0.65).min() > 0.95  # the ceiling is cut away; free space is white
-    assert at(1.95, 0.85).max() < 0.92  # unexplored is gray
-
-
-def test_the_panorama_picture_shows_directions():
-    angles = np.deg2rad([0.0, 90.0, 180.0, -90.0])
-    around = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1) * 2.0
-    grid = np.stack(np.meshgrid(*[np.arange(-2, 3) * 0.1] * 3), -1).reshape(-1, 3)
-    points = (around[:, None] + grid[None]).reshape(-1, 3).astype(np.float32)
-    colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], np.float32)
-    state = paint(points, colors.repeat(len(grid), axis=0))
-    pose = np.asarray(pose_along(jnp.zeros(3), jnp.array([0.0, 1.0, 0.0])))
-    # Known to be free but for a slab overhead: 1 m up begins what was never seen.
-    space = empty_grid(np.array([[-6.0] * 3, [6.0] * 3]), 0.2)
-    heights = np.asarray(space.origin)[2] + 0.2 * np.arange(space.log_odds.shape[2])
-    odds = np.broadcast_to(np.where(heights < 1.0, -4.5, 0.0), space.log_odds.shape)
-    space = eqx.tree_at(lambda g: g.log_odds, space, jnp.asarray(odds, jnp.float32))
-    picture = panorama_picture(state, space, Camera.from_fov(64, 64), pose, 5.0)
-    height, width = picture.value.shape
-    column = {angle: int((180.0 - angle) / 360.0 * width) for angle in (0, 90, -90)}
-    for angle, color in ((0, colors[0]), (90, colors[1]), (-90, colors[3])):
-        np.testing.assert_allclose(picture.rgb[height // 2, column[angle]], color, atol=1e-6)
-    np.testing.assert_allclose(picture.rgb[height // 2, 2], colors[2], atol=1e-6)
-    assert np.isnan(picture.value[5, 5])  # nothing overhead
-    assert not picture.beyond[5, 5]  # nor is that known to be free
-    assert picture.beyond[height // 2, column[0] + 30]  # free space up to the range
-    assert not picture.beyond[height // 2, column[0]]  # a voxel
-    assert 0.0 <= picture.value[height // 2, column[0]] <= 1.0
-    assert picture.azimuth == pytest.approx(np.pi / 2)
-    assert picture.elevation == pytest.approx(0.0)
-
-
-def test_the_floor_picture_of_huge_cells_stays_small():
-    grid = empty_grid(np.array([[0.0] * 3, [3000.0] * 3]), 1000.0)
-    picture, extent = floor_picture(empty_map(64, voxel_size=0.05), grid, 1.0)
-    assert max(picture.shape) <= 2048
-    assert extent[1] - extent[0] >= 3000.0

@@ -39,7 +39,6 @@ def share_seen_before(recording) -> np.ndarray:
     return np.asarray(shares)
 
 
-@pytest.mark.full
 def test_renderability_rises_where_the_path_returns_to_seen_places(lounge):
     recording, reports, _ = lounge
     before = np.array([report.renderability for report in reports])
@@ -56,7 +55,6 @@ def test_renderability_rises_where_the_path_returns_to_seen_places(lounge):
     assert before[familiar].mean() > before[strange].mean() + 0.15
 
 
-@pytest.mark.full
 def test_voxels_add_up(lounge):
     recording, reports, state = lounge
     assert len(reports) == len(recording) == 48
@@ -67,7 +65,6 @@ def test_voxels_add_up(lounge):
     assert reports[-1].metres == pytest.approx(length)
 
 
-@pytest.mark.full
 def test_the_figure_is_a_picture(lounge):
     recording, reports, _ = lounge
     assert to_png(revisit_figure(recording, reports)).startswith(b"\x89PNG")

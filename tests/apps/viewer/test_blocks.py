@@ -27,8 +27,6 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.visibility.depth_buffer import candidates_of, depth_buffer, visible_voxels
 from r3jax.visibility.views import panorama_view
 
-pytestmark = pytest.mark.full
-
 FIELDS = ("value", "bias", "noise", "resolution")
 
 
@@ -74,12 +72,6 @@ def test_two_positions_give_the_mean_over_those_that_see(moment, run, places):
         total = sum(np.asarray(getattr(t, name)) * np.asarray(t.sightings) for t in (first, second))
         mean = total / np.maximum(count, 1.0)
         np.testing.assert_allclose(np.asarray(getattr(both, name)), mean, atol=1e-6)
-
-
-def test_no_position_sees_nothing(moment, run):
-    terms = surface_terms(moment.map_state, run.camera, np.zeros((0, 3)), ScoringConfig(), pad_to=2)
-    assert (np.asarray(terms.sightings) == 0.0).all()
-    assert (np.asarray(terms.value) == 0.0).all()
 
 
 def test_probes_stand_in_known_free_space(moment):
@@ -195,11 +187,6 @@ def test_every_quantity_has_a_color_for_every_block():
     seen = block_colors(blocks, state, None, "color")
     expected = np.rint(np.asarray(state.mean).T[blocks.rows] * 255.0)
     np.testing.assert_array_equal(seen[blocks.block_of], expected)
-
-
-def test_a_budget_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="at least 1 block"):
-        blocks_of(map_of([(0, 0, 0)]), 0)
 
 
 def test_an_empty_map_has_no_block():

@@ -15,8 +15,6 @@ from r3jax.apps.viewer.recorded import open_run_page
 from r3jax.runs.reasons import explain_run
 from tests.apps.viewer.conftest import VIEWS
 
-pytestmark = pytest.mark.full
-
 PATIENCE = 240.0  # seconds; of a machine with other work, that compiles
 STEP = VIEWS - 1
 CAUSES_SHOWN = next(layer.name for layer in LAYERS if layer.quantity == CAUSE)

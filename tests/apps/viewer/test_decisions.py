@@ -10,8 +10,6 @@ from r3jax.planning.registry import make_policy
 from r3jax.runs.header import RunError
 from r3jax.runs.settings import settings_of_run
 
-pytestmark = pytest.mark.full
-
 
 @pytest.fixture(scope="module")
 def plan(run):

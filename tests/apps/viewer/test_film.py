@@ -12,8 +12,6 @@ from r3jax.runs.header import RunError
 from r3jax.runs.reader import read_run
 from tests.apps.viewer.conftest import VIEWS
 
-pytestmark = pytest.mark.full
-
 
 @pytest.fixture(scope="module")
 def exported(run, tmp_path_factory):

@@ -1,6 +1,5 @@
 """The GLB of a world, read back by trimesh: the same triangles in the same colors."""
 
-import dataclasses
 import io
 
 import numpy as np
@@ -83,10 +82,3 @@ def test_too_many_triangles_are_refused(monkeypatch):
     monkeypatch.setattr(glb, "MAX_FACES", 2)
     with pytest.raises(ValueError, match="3 triangles, more than the 2"):
         world_glb(make_world())
-
-
-def test_the_file_is_as_long_as_it_says():
-    data = world_glb(dataclasses.replace(make_world(), name="other"))
-    assert data[:4] == b"glTF"
-    assert int.from_bytes(data[8:12], "little") == len(data)
-    assert len(data) % 4 == 0

@@ -7,19 +7,15 @@ import pytest
 
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 
-import r3jax.apps.viewer.live as live
 from r3jax.apps.viewer.live import open_live
 from r3jax.apps.viewer.server import close_server, open_server
 from r3jax.apps.viewer.story import LiveStory
 from r3jax.exploration.loop import explore
-from r3jax.runs.reader import read_run
 from r3jax.runs.settings import open_run_scene, settings_of_run
 from tests.apps.viewer.conftest import VIEWS
 from tests.box_room import write_room
 from tests.cli.small_runs import explore as explore_by_words
 from tests.cli.small_runs import main_without_report
-
-pytestmark = pytest.mark.full
 
 PATIENCE = 60.0
 
@@ -36,47 +32,41 @@ def server():
     close_server(server)
 
 
+def opened(world, server, **more):
+    plan, simulator = world
+    words = {"title": "live", "subtitle": "here"}
+    return open_live(server, simulator.camera, simulator.bounds, plan.config, **words, **more)
+
+
 def go(world, on_view):
     plan, simulator = world
     return explore(simulator, plan.policy, budget=plan.budget, config=plan.config, on_view=on_view)
 
 
-def test_a_watched_run_is_the_run_that_nobody_watched(run, world, server):
-    plan, simulator = world
-    words = {"title": "live", "subtitle": "here"}
-    with open_live(server, simulator.camera, simulator.bounds, plan.config, **words) as feed:
+def test_a_watched_run_is_the_run_that_nobody_watched_and_ends_on_the_page(run, world, server):
+    with opened(world, server) as feed:
         result = go(world, feed.on_view)
-    assert [row.sha256 for row in result.rows] == [row.sha256 for row in run.rows]
-    for mine, recorded in zip(result.rows, run.rows, strict=True):
-        assert mine.coverage == recorded.coverage
-        assert mine.seconds == recorded.seconds
-        np.testing.assert_array_equal(mine.pose, recorded.pose)
-
-
-def test_the_page_ends_with_the_last_view_and_its_map(run, world, server):
-    plan, simulator = world
-    words = {"title": "live", "subtitle": "here"}
-    with open_live(server, simulator.camera, simulator.bounds, plan.config, **words) as feed:
-        result = go(world, feed.on_view)
+        assert [row.sha256 for row in result.rows] == [row.sha256 for row in run.rows]
+        for mine, recorded in zip(result.rows, run.rows, strict=True):
+            assert mine.coverage == recorded.coverage
+            assert mine.seconds == recorded.seconds
+            np.testing.assert_array_equal(mine.pose, recorded.pose)
         feed.settle(PATIENCE)
-        app = feed.app
+        app, last = feed.app, VIEWS - 1
         assert len(app.story.rows) == VIEWS
-        assert app.controls.settings.step == VIEWS - 1
-        moment = app.story.moment(VIEWS - 1)
+        assert app.controls.settings.step == last
+        moment, offer = app.story.moment(last), app.story.offer(last)
         np.testing.assert_array_equal(moment.map_state.key, result.state.map_state.key)
         np.testing.assert_array_equal(moment.grid.log_odds, result.state.grid.log_odds)
-        offer = app.story.offer(VIEWS - 1)
-        assert offer is not None
-        last = run.rows[-1].choice
-        np.testing.assert_allclose(offer.poses[offer.chosen], last.pose, atol=1e-5)
-        assert server.scene.get_handle_by_name("/map") is not None
-        assert server.scene.get_handle_by_name(f"/views/{VIEWS - 1:06d}") is not None
+        chosen = run.rows[-1].choice
+        np.testing.assert_allclose(offer.poses[offer.chosen], chosen.pose, atol=1e-5)
+        for name in ("/map", f"/views/{last:06d}"):
+            assert server.scene.get_handle_by_name(name) is not None
         view = server.scene.get_handle_by_name("/view")
         np.testing.assert_allclose(view.position, run.rows[-1].pose[:3, 3], atol=1e-5)
 
 
 def test_the_loop_does_not_wait_for_the_page(world, server, monkeypatch):
-    plan, simulator = world
     gate, stuck = threading.Event(), threading.Event()
     add = LiveStory.add
 
@@ -86,8 +76,7 @@ def test_the_loop_does_not_wait_for_the_page(world, server, monkeypatch):
         add(self, view, planner)
 
     monkeypatch.setattr(LiveStory, "add", slow_add)
-    words = {"title": "live", "subtitle": "here"}
-    with open_live(server, simulator.camera, simulator.bounds, plan.config, **words) as feed:
+    with opened(world, server) as feed:
         result = go(world, feed.on_view)
         assert len(result.rows) == VIEWS  # the run is over, and the page has shown nothing yet
         assert stuck.wait(PATIENCE)
@@ -112,16 +101,10 @@ def test_the_command_writes_the_same_bytes_live_and_goes_on_live(run, tmp_path, 
 
 
 def test_a_run_that_is_gone_on_with_shows_its_earlier_views(run, world, server):
-    plan, simulator = world
-    words = {"title": "live", "subtitle": "here"}
-    with open_live(
-        server, simulator.camera, simulator.bounds, plan.config, earlier=run, **words
-    ) as feed:
+    with opened(world, server, earlier=run) as feed:
         assert [row.step for row in feed.app.story.rows] == list(range(VIEWS))
         np.testing.assert_array_equal(
             feed.app.story.image(2), (np.asarray(run.frame(2).rgb) * 255).round().astype(np.uint8)
         )
         with pytest.raises(LookupError, match="no view yet"):
             feed.app.story.moment(2)
-    assert live.LiveFeed is type(feed)
-    assert len(read_run(run.path).rows) == VIEWS

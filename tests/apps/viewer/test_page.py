@@ -24,8 +24,6 @@ from r3jax.apps.viewer.queries import Query
 from r3jax.apps.viewer.recorded import open_run_page
 from tests.apps.viewer.conftest import VIEWS
 
-pytestmark = pytest.mark.full
-
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 FLAGS = (
     "--no-sandbox",

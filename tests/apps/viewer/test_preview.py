@@ -19,8 +19,6 @@ from r3jax.apps.viewer.story import Timeline
 from r3jax.geometry.cameras import pose_along
 from r3jax.splatting.scene import GaussianScene
 
-pytestmark = pytest.mark.full
-
 
 @pytest.fixture(scope="module")
 def around(run):
@@ -85,11 +83,6 @@ def test_a_view_of_nothing_known_has_no_renderability(around, pose):
     glance = quick_preview_from(around, away)
     assert (glance.renderability, glance.seen) == (0.0, 0.0)
     assert np.isnan(glance.images["bias"]).all()
-
-
-def test_without_model_and_scene_there_are_no_pictures(look):
-    assert look.splats is None
-    assert look.truth is None
 
 
 def test_splats_are_of_the_same_pose_and_compared_with_the_true_image(around, pose):

@@ -12,8 +12,6 @@ from r3jax.plots import style
 from r3jax.runs.reasons import Reason, explain_run
 from tests.apps.viewer.conftest import VIEWS
 
-pytestmark = pytest.mark.full
-
 CAPACITY = 16
 
 

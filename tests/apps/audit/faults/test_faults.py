@@ -1,7 +1,5 @@
 """Findings on single frames: a rendered walk, the same damaged, and a real recording."""
 
-import re
-
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -79,15 +77,12 @@ def test_a_frame_that_a_known_motion_blurred_is_found_alone(axis, pixels):
     rgb = to_bytes(ndimage.uniform_filter1d(own_rgb(), pixels, axis=axis))
     (finding,) = damaged(rgb).findings
     assert (finding.kind, finding.frames) == ("blur", (DAMAGED,))
-    assert "slowly" in finding.todo
 
 
-def test_a_frame_out_of_focus_is_told_from_one_that_moved():
-    rgb = to_bytes(ndimage.gaussian_filter(own_rgb(), (2.0, 2.0, 0.0)))
-    (finding,) = damaged(rgb).findings
+def test_a_frame_out_of_focus_is_found():
+    (finding,) = damaged(to_bytes(ndimage.gaussian_filter(own_rgb(), (2.0, 2.0, 0.0)))).findings
     assert finding.frames == (DAMAGED,)
     assert finding.kind in ("focus", "blur")
-    assert finding.value < 0.1
 
 
 @pytest.mark.parametrize("gain", [1.16, 0.84, 1.07])
@@ -126,14 +121,6 @@ def test_a_pose_that_is_off_by_5_cm_is_found_and_measured(axis):
     assert finding.value == pytest.approx(0.05, abs=0.01)
 
 
-@pytest.mark.parametrize("factor", [0.9, 1.06])
-def test_a_wrong_scale_of_all_depths_is_found_and_measured(factor):
-    found = faults([(rgb, factor * depth, pose) for rgb, depth, pose in walk()])
-    (finding,) = [finding for finding in found.findings if finding.kind == "scale"]
-    assert finding.value == pytest.approx(1.0 / factor, rel=0.01)
-    assert ("short" if factor < 1.0 else "long") in finding.what
-
-
 def seen_through(fx: float, dx: float = 0.0) -> Faults:
     """The walk, said to be of a camera with another focal length or principal point."""
     c = CAMERA
@@ -142,18 +129,31 @@ def seen_through(fx: float, dx: float = 0.0) -> Faults:
     return faults_of(images, np.arange(VIEWS), NAMES)
 
 
-def test_a_wrong_focal_length_is_no_wrong_scale():
-    found = seen_through(1.06)
-    (finding,) = [f for f in found.findings if f.kind in ("scale", "camera", "ray")]
-    assert finding.kind == "camera"
-    assert finding.value == pytest.approx(1.0 / 1.06, rel=0.015)
-    assert "fl_x" in finding.todo
+def scaled(factor: float) -> Faults:
+    return faults([(rgb, factor * depth, pose) for rgb, depth, pose in walk()])
 
 
-def test_a_shifted_principal_point_is_named():
-    found = seen_through(1.0, 0.05 * float(CAMERA.fx))
-    (finding,) = [f for f in found.findings if f.kind in ("scale", "camera", "ray")]
-    assert (finding.kind, finding.value) == ("camera", pytest.approx(-0.05, abs=0.01))
+@pytest.mark.parametrize(
+    ("found", "kind", "value"),
+    [
+        (lambda: scaled(0.9), "scale", 1.0 / 0.9),
+        (lambda: scaled(1.06), "scale", 1.0 / 1.06),
+        (lambda: seen_through(1.06), "camera", 1.0 / 1.06),
+        (lambda: seen_through(1.0, 0.05 * float(CAMERA.fx)), "camera", -0.05),
+    ],
+)
+def test_an_error_of_all_frames_is_named_and_measured(found, kind, value):
+    (finding,) = [f for f in found().findings if f.kind in ("scale", "camera", "ray")]
+    assert (finding.kind, finding.value) == (kind, pytest.approx(value, abs=0.015))
+
+
+def test_frames_that_repeat_each_other_are_found_with_what_they_repeat():
+    pictures = list(walk())
+    pictures[8:10] = [pictures[7]] * 2
+    (finding,) = faults(pictures).findings
+    assert (finding.kind, finding.frames, finding.value) == ("repeat", (7, 8, 9), 2.0)
+    pictures[8:10] = [(pictures[3][0], *pictures[7][1:])] * 2  # the same pose, another picture
+    assert 7 not in [f for x in faults(pictures).findings if x.kind == "repeat" for f in x.frames]
 
 
 def test_nothing_is_said_of_pictures_where_depth_and_cameras_contradict_each_other():
@@ -164,30 +164,6 @@ def test_nothing_is_said_of_pictures_where_depth_and_cameras_contradict_each_oth
         assert not found.fits
         assert {f.kind for f in found.findings} <= {"scale", "camera", "ray", "repeat"}
         assert "detail" not in found.record
-
-
-def test_the_largest_change_is_never_below_the_typical_one():
-    gains = (1.3, 1.0, 0.8)
-    pictures = [
-        (to_bytes(gain * rgb.astype(np.float64)), depth, pose)
-        for gain, (rgb, depth, pose) in zip(gains, walk()[:3], strict=True)
-    ]
-    (finding,) = [f for f in faults(pictures).findings if f.kind == "brightness"]
-    most, half = (float(x) for x in re.findall(r"(\d+) %", finding.what))
-    assert most >= half
-
-
-def test_frames_that_repeat_each_other_are_found_with_what_they_repeat():
-    pictures = list(walk())
-    pictures[8:10] = [pictures[7]] * 2
-    (finding,) = faults(pictures).findings
-    assert (finding.kind, finding.frames, finding.value) == ("repeat", (7, 8, 9), 2.0)
-
-
-def test_the_same_pose_with_another_picture_is_no_repetition():
-    pictures = list(walk())
-    pictures[8] = (pictures[3][0], *pictures[7][1:])
-    assert "repeat" not in {finding.kind for finding in faults(pictures).findings}
 
 
 def test_where_no_other_frame_shows_the_same_nothing_is_said():

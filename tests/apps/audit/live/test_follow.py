@@ -16,8 +16,6 @@ from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.guide_page import mean_value, open_guide
 from tests.apps.audit.room import LENS, SIZE, picture, round_poses, write_recording
 
-pytestmark = pytest.mark.full
-
 POSES = round_poses(10)
 BOUNDS = np.stack([np.zeros(3), SIZE])
 

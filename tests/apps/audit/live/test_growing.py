@@ -5,14 +5,13 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from r3jax.apps.audit.live import growing
-from r3jax.apps.audit.live.growing import GrowingCapture, complete_lines
+from r3jax.apps.audit.live.growing import GrowingCapture
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from tests.apps.audit.room import picture, round_poses, write_nerfstudio, write_recording
 from tests.formats.bags import camera_poses, write_bag
-
-pytestmark = pytest.mark.full
 
 POSES = round_poses(6)
 
@@ -153,8 +152,6 @@ def test_numbered_frames_come_in_as_they_are_whole(tmp_path):
     path = tmp_path / "growing"
     path.mkdir()
     capture = GrowingCapture(path, tmp_path / "scratch")
-    from PIL import Image
-
     for number in (0, 2, 1):
         base = path / f"frame-{number:06d}"
         rgb = np.full((480, 640, 3), 10 * number, np.uint8)
@@ -169,16 +166,6 @@ def test_without_depth_images_there_is_no_guidance(tmp_path):
     path = write_nerfstudio(tmp_path / "bare", POSES, depth=False)
     with pytest.raises(ValueError, match="needs depth images"):
         GrowingCapture(path, tmp_path / "scratch").look()
-
-
-def test_a_line_counts_once_it_has_an_end(tmp_path):
-    path = tmp_path / "poses.txt"
-    row = " ".join(map(str, range(16)))
-    path.write_text(f"{row}\n{row}")
-    assert complete_lines(path) == [row]
-    path.write_text(f"{row}\n\n1 2 3\n{row}\n")
-    assert complete_lines(path) == [row, row]
-    assert complete_lines(tmp_path / "none") == []
 
 
 def test_a_bag_that_is_recorded_comes_in_by_and_by(tmp_path, monkeypatch):

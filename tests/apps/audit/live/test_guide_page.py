@@ -13,8 +13,6 @@ from tests.apps.audit.room import LENS, SIZE, picture, round_poses
 pytest.importorskip("playwright.sync_api", reason="the page is tested with playwright")
 from playwright import sync_api
 
-pytestmark = pytest.mark.full
-
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 
 
