@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from r3jax.apps.audit.alignment import evenly_spaced
 from r3jax.apps.audit.source import ray_lengths, taken, thinned
 from r3jax.geometry.cameras import Camera
 
@@ -27,11 +28,11 @@ _POINTS, _PICTURES, _SIDE = 100, 24, 160
 _FEWEST_POINTS = 400
 """Fewer comparisons say nothing: the images hardly overlap."""
 
-_THROUGH = 0.8
+_SEE_THROUGH_RATIO = 0.8
 """Points that others look through, for each that they see: 0.01 to 0.03 in good captures, 0.4 if
 the poses are off by 5 cm, 1 and more if the poses belong to other images."""
 
-_SURE, _GAIN, _EXPLAINED = 0.3, 0.1, 0.25
+_MIN_SCORE, _GAIN, _EXPLAINED = 0.3, 0.1, 0.25
 """Score that undoing a mistake must reach, what it must add, and the share of what was missing that
 this must be. Where the cameras are right no mistake adds more than 0.03, with noise of 1 % of the
 depth, 5 mm and 0.3 degrees; a focal length 1.25 times too long takes 0.2 to 0.4 of 0.65 to 0.94."""
@@ -94,9 +95,8 @@ def _points(depth: np.ndarray, lens: np.ndarray, most: int, rng: np.random.Gener
 
 def _coarser(images: Sequence[DepthImage]) -> list[_Image]:
     """Some of the images, with fewer pixels."""
-    chosen = np.unique(np.linspace(0, len(images) - 1, _PICTURES).round().astype(int))
     out: list[_Image] = []
-    for image in (images[i] for i in chosen):
+    for image in (images[i] for i in evenly_spaced(len(images), _PICTURES)):
         stride = max(1, -(-max(image.depth.shape) // _SIDE))
         rows, columns = (taken(side, stride) for side in image.depth.shape)
         depth = image.depth[rows[:, None], columns].astype(np.float64)
@@ -284,7 +284,7 @@ def check_agreement(images: Sequence[DepthImage]) -> None:
             f"{mistake.fits.format(*size)}: {mistake.todo.format(*size)}; --trust-depth audits "
             "it as it is"
         )
-    if found.compared >= _FEWEST_POINTS and found.through > _THROUGH * found.there:
+    if found.compared >= _FEWEST_POINTS and found.through > _SEE_THROUGH_RATIO * found.there:
         raise ValueError(
             f"the frames contradict each other: {100 * found.through:.0f} % of what one shows is "
             f"where others look through, and {100 * found.there:.0f} % where others see it: are "
@@ -302,7 +302,7 @@ def _explained(
     score = found.score if overlaps else 0.0
     if score > 1.0 - _GAIN:
         return None
-    reached = max(_SURE, score + max(_GAIN, _EXPLAINED * (1.0 - score)))
+    reached = max(_MIN_SCORE, score + max(_GAIN, _EXPLAINED * (1.0 - score)))
     for mistake in MISTAKES if overlaps else MISTAKES[:1]:
         # Without the unit's mistake as many points are compared; else what agrees may be chance.
         least = (

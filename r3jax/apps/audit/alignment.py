@@ -53,9 +53,10 @@ class Alignment:
         moved[:, :3, 3] = self.points_back(moved[:, :3, 3])
         return moved
 
-    def directions_back(self, directions_audit: np.ndarray) -> np.ndarray:
-        """Directions [n, 3] of the audit, in the capture."""
-        return directions_audit.astype(np.float64) @ self.rotation
+
+def evenly_spaced(count: int, most: int) -> np.ndarray:
+    """At most so many indices of a sequence, from its first to its last, ascending."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def up_of(name: str) -> np.ndarray:

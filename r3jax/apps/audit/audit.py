@@ -36,7 +36,7 @@ from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
 
-_WORTH_OF_UNSEEN = 0.05
+_UNSEEN_WEIGHT = 0.05
 """A cell at the edge of the known counts as this share of the voxels that it may hide: who audits a
 capture wants it to render well first, and larger second."""
 
@@ -44,7 +44,7 @@ SATURATED = 0.9
 """Mean renderability of frames from which on it ranks none of them: of a kitchen of 250 pictures,
 each held out once, it was 0.96, and its rank correlation with PSNR -0.00."""
 
-_IN_VAIN = 3
+_MAX_FAILED_LOOKS = 3
 """Unexplored cells that so many images looked at in vain (glass, black) are left alone."""
 
 
@@ -183,7 +183,7 @@ def audit(
         )
     on_progress("mapping", 2 * len(survey.chosen))
     seen = see(source, survey, settings.folds, step)
-    unit = _WORTH_OF_UNSEEN * (survey.cell_size / survey.voxel_size) ** 2
+    unit = _UNSEEN_WEIGHT * (survey.cell_size / survey.voxel_size) ** 2
     config = ScoringConfig(lambda1=unit, max_range=RANGE)
     lens = Counter(source.lenses).most_common(1)[0][0]
     camera = thinned(lens.camera, source.stride)
@@ -283,6 +283,6 @@ def _open_grid(
     for index, pose in zip(survey.chosen.tolist(), poses, strict=True):
         T = jnp.asarray(pose, dtype=jnp.float32)
         looks += np.asarray(visible_unexplored(seen.state, grid, source.camera(index), T, config))
-    explorable = np.asarray(mask_unexplorable(grid, reached, looks >= _IN_VAIN).unexplored)
+    explorable = np.asarray(mask_unexplorable(grid, reached, looks >= _MAX_FAILED_LOOKS).unexplored)
     edges = unseen_edges(grid, explorable)
     return grid.ignoring(~edges)

@@ -10,7 +10,8 @@ from matplotlib.patches import Circle
 
 from r3jax.apps.audit.audit import Audit, EvaluatedFrame
 from r3jax.apps.audit.bad_regions import BLOCK, Region
-from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, letter
+from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, region_label
+from r3jax.apps.audit.source import projected
 from r3jax.apps.audit.suggest import Suggestion
 from r3jax.mapping.state import MapState
 from r3jax.plots import style
@@ -24,6 +25,9 @@ _FINE_BUFFER = 320
 
 _SAMPLED = 500
 """Voxels of a view that are looked for in other images."""
+
+_NEAREST = 0.1
+"""What is nearer to a camera is not in its image [audit units]."""
 
 _EMPTY = 0.93
 """Gray of pixels that show no voxel."""
@@ -170,13 +174,8 @@ def likest_picture(audit: Audit, view: Suggestion) -> tuple[int, float]:
     centers = centers[:: max(1, len(centers) // _SAMPLED)]
     shares: list[float] = []
     for index, pose in zip(audit.survey.chosen.tolist(), poses, strict=True):
-        camera = audit.source.camera(index)
-        x, y, z = ((centers - pose[:3, 3]) @ pose[:3, :3]).T
-        z_safe = np.where(z > 0.05, z, np.inf)
-        column = float(camera.fx) * x / z_safe + float(camera.cx)
-        row = float(camera.fy) * y / z_safe + float(camera.cy)
-        is_in = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        shares.append(float((is_in & (z > 0.05)).mean()) if len(centers) else 0.0)
+        found = projected(audit.source.camera(index), pose, centers, _NEAREST)
+        shares.append(float(found.is_in.mean()) if len(centers) else 0.0)
     best = int(np.argmax(np.asarray(shares) - 0.1 * (distance + angle)))
     return int(audit.survey.chosen[best]), float(distance[best])
 
@@ -227,7 +226,7 @@ _PER_LINE = 5
 
 
 @dataclass(frozen=True)
-class Finding:
+class _Shown:
     """An image that shows a region."""
 
     index: int
@@ -243,26 +242,22 @@ class Finding:
     """Radius of the region [px]."""
 
 
-def best_picture(audit: Audit, region: Region) -> Finding | None:
+def best_picture(audit: Audit, region: Region) -> _Shown | None:
     """The image with the region near its middle, at a good distance, and not hidden.
 
     Only depth images tell what is hidden. None: no image has the region's middle in it.
     """
     poses = audit.survey.alignment.poses(audit.source.poses[audit.survey.chosen])
-    local = np.einsum("nji,nj->ni", poses[:, :3, :3], region.center - poses[:, :3, 3])
-    found: list[tuple[float, float, Finding]] = []
-    for index, (x, y, z) in zip(audit.survey.chosen.tolist(), local, strict=True):
-        if z < 0.1:
-            continue
+    found: list[tuple[float, float, _Shown]] = []
+    for index, pose in zip(audit.survey.chosen.tolist(), poses, strict=True):
         camera = audit.source.camera(index)
-        column = float(camera.fx) * x / z + float(camera.cx)
-        row = float(camera.fy) * y / z + float(camera.cy)
-        if not (0.0 <= column < camera.width and 0.0 <= row < camera.height):
+        (column,), (row,), (z,), (is_in,) = projected(camera, pose, region.center[None], _NEAREST)
+        if not is_in:
             continue
         aside = np.hypot(column / camera.width - 0.5, row / camera.height - 0.5)
         penalty = float(aside + 0.3 * abs(np.log(z / _BEST_DISTANCE)))
         radius = 0.5 * BLOCK * float(camera.focal) / z
-        found.append((penalty, float(z), Finding(index, column, row, radius)))
+        found.append((penalty, float(z), _Shown(index, column, row, radius)))
     found.sort(key=lambda entry: entry[0])
     for _, z, finding in found[:_TRIED]:
         if _shows(audit, finding, z):
@@ -270,7 +265,7 @@ def best_picture(audit: Audit, region: Region) -> Finding | None:
     return None
 
 
-def _shows(audit: Audit, finding: Finding, z: float) -> bool:
+def _shows(audit: Audit, finding: _Shown, z: float) -> bool:
     """False where something else is measured there."""
     if not audit.source.is_dense:
         return True
@@ -306,7 +301,7 @@ def region_figure(audit: Audit) -> Figure | None:
         axes.set_xlim(0, photo.shape[1])
         axes.set_ylim(photo.shape[0], 0)
         axes.set_title(
-            f"{letter(number)}: {region.cause}", fontsize=9, color=color, loc="left", pad=2,
+            f"{region_label(number)}: {region.cause}", fontsize=9, color=color, loc="left", pad=2,
             fontweight="bold",
         )  # fmt: skip
     return figure

@@ -10,7 +10,7 @@ from r3jax.apps.audit import audit_figures, sentences
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import Region
 from r3jax.apps.audit.faults.faults import Finding
-from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, letter, plan_figure
+from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, plan_figure, region_label
 from r3jax.apps.audit.outputs import suggested_poses
 from r3jax.apps.audit.suggest import Suggestion
 from r3jax.files import write_atomic
@@ -210,7 +210,7 @@ def _regions(audit: Audit) -> list[dict[str, Any]]:
         center = audit.survey.alignment.points_back(region.center[None])[0]
         rows.append(
             {
-                "letter": letter(number),
+                "letter": region_label(number),
                 "cause": region.cause,
                 "area": sentences.area(audit, region.area),
                 "share": "" if is_unseen else f"{100 * region.bad_share:.0f} %",
@@ -235,7 +235,7 @@ def _views(audit: Audit) -> list[dict[str, Any]]:
     regions = (*audit.regions, *audit.unseen)
     for view, pose, figure in zip(audit.plan.views, suggested_poses(audit), figures, strict=True):
         like, gap = audit_figures.likest_picture(audit, view)
-        letters = [letter(i) for i, region in enumerate(regions) if _shows(view, region)]
+        letters = [region_label(i) for i, region in enumerate(regions) if _shows(view, region)]
         described.append(
             {
                 "directions": sentences.directions(audit, view, like),

@@ -73,7 +73,7 @@ _PALE = 0.55
 """How much white covers the colors below marks."""
 
 
-def letter(number: int) -> str:
+def region_label(number: int) -> str:
     """A, B, ... of the regions."""
     return chr(ord("A") + number) if number < 26 else str(number + 1)
 
@@ -222,10 +222,10 @@ def _labels(regions: tuple[Region, ...]) -> list[tuple[np.ndarray, str, str]]:
         center = region.center[:2]
         for i, (place, names, color) in enumerate(places):
             if np.linalg.norm(place - center) < _TOO_NEAR:
-                places[i] = place, f"{names} {letter(number)}", color
+                places[i] = place, f"{names} {region_label(number)}", color
                 break
         else:
-            places.append((center, letter(number), COLOR_OF_CAUSE[region.cause]))
+            places.append((center, region_label(number), COLOR_OF_CAUSE[region.cause]))
     return places
 
 

@@ -139,6 +139,42 @@ def distorted(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.
     )
 
 
+class Projected(NamedTuple):
+    """Where points lie in an image, [m] each."""
+
+    column: np.ndarray
+    """[px], of any value."""
+
+    row: np.ndarray
+    """[px], of any value."""
+
+    z: np.ndarray
+    """Along the camera's axis, in the points' unit."""
+
+    is_in: np.ndarray
+    """True within the image and before the camera; False where a point is NaN."""
+
+
+def projected(
+    camera: Camera, pose: np.ndarray, points: np.ndarray, nearest: float = 0.0
+) -> Projected:
+    """Projects points into an image, hidden or not.
+
+    Args:
+        camera: its pinhole.
+        pose: `T_world_camera`, [4, 4].
+        points: [m, 3] in the same world.
+        nearest: z from which on a point is before the camera.
+    """
+    x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
+    is_ahead = z > nearest
+    safe = np.where(is_ahead, z, 1.0)
+    column = float(camera.fx) * x / safe + float(camera.cx)
+    row = float(camera.fy) * y / safe + float(camera.cy)
+    is_in = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return Projected(column, row, z, is_ahead & is_in)
+
+
 _BLOCKS_ACROSS = 80
 """Blocks per row of an image, in which the nearest point of a cloud hides the others."""
 
@@ -163,12 +199,7 @@ def sparse_depth(
     """
     shape = (camera.height, camera.width)
     depth, colors = np.full(shape, np.inf, np.float32), np.zeros((*shape, 3), np.uint8)
-    local = (xyz - pose[:3, 3]) @ pose[:3, :3]
-    z = local[:, 2]
-    z_safe = np.where(z > 0.0, z, 1.0)
-    column = np.floor(float(camera.fx) * local[:, 0] / z_safe + float(camera.cx))
-    row = np.floor(float(camera.fy) * local[:, 1] / z_safe + float(camera.cy))
-    is_in = (z > 0.0) & (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    column, row, z, is_in = projected(camera, pose, xyz)
     kept = np.flatnonzero(is_in)
     row, column, z = row[kept].astype(np.int64), column[kept].astype(np.int64), z[kept]
     if hides and len(kept):

@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from r3jax.apps.audit.agreement import DepthImage, check_agreement
-from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
+from r3jax.apps.audit.alignment import Alignment, evenly_spaced, rotation_to_z, up_of
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.source import Source
 from r3jax.apps.audit.vertical import Vertical, block_normals, estimated_up
@@ -71,7 +71,7 @@ def strays(cameras: np.ndarray, depth: float, points_of: Callable[[int], np.ndar
     if 2 * sizes[main] <= len(cameras) or not len(alone):
         return alone[:0]
     others = np.flatnonzero(group == main)
-    others = others[np.unique(np.linspace(0, len(others) - 1, _COMPARED).astype(np.int64))]
+    others = others[evenly_spaced(len(others), _COMPARED)]
     shown = np.concatenate([points_of(i) for i in others.tolist()])
     tree = KDTree(shown)
     shares = [_shares(cameras[i], points_of(i), tree) for i in alone.tolist()]
@@ -201,8 +201,7 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
         ValueError: a setting that makes no sense; depth images that contradict the poses.
         FormatError: no image has any depth; or a file is missing or broken.
     """
-    count = min(len(source), settings.max_frames)
-    chosen = np.unique(np.linspace(0, len(source) - 1, count).round().astype(np.int64))
+    chosen = evenly_spaced(len(source), settings.max_frames)
     images = _depth_images(source, chosen)
     depths, points = _measured(source, images)
     if len(left_out := _strays(source, chosen, float(np.median(depths)))):
@@ -249,7 +248,7 @@ def survey_of(source: Source, settings: AuditSettings) -> Survey:
 
 
 def _depth_images(source: Source, chosen: np.ndarray) -> list[DepthImage]:
-    looked = chosen[np.unique(np.linspace(0, len(chosen) - 1, _SURVEYED).round().astype(int))]
+    looked = chosen[evenly_spaced(len(chosen), _SURVEYED)]
     images: list[DepthImage] = []
     for i in looked.tolist():
         with suppress(FormatError):  # what cannot be read is named once all have been tried

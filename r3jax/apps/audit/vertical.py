@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from r3jax.apps.audit.alignment import evenly_spaced
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 
@@ -30,7 +31,7 @@ _BLOCKS = 32
 _MEASURED = 0.6
 """Share of a block's pixels that must be measured."""
 
-_FLAT, _SURE = 0.02, np.radians(6.0)
+_FLAT, _MAX_ERROR = 0.02, np.radians(6.0)
 """Blocks with larger residuals (of their depth) or errors of their normal are left out."""
 
 _ALIKE = 3.0
@@ -137,7 +138,7 @@ def block_normals(depth: np.ndarray, camera: Camera, rotation: np.ndarray) -> No
     slope = np.sqrt(np.maximum(inverse[:, 0, 0], inverse[:, 1, 1]))
     error = _ALIKE * spread * slope / np.maximum(length, 1e-300)
     mean = nearness.sum(axis=1) / count
-    is_plane = (length > 0.0) & (error < _SURE) & (spread < _FLAT * mean)
+    is_plane = (length > 0.0) & (error < _MAX_ERROR) & (spread < _FLAT * mean)
     normal = -plane / np.maximum(length, 1e-300)[:, None]
     ray = A.sum(axis=1) / count[:, None]
     facing = np.abs((normal * ray).sum(axis=1)) / np.linalg.norm(ray, axis=1)
@@ -152,7 +153,7 @@ def estimated_up(poses: np.ndarray, seen: Sequence[Normals] = ()) -> Vertical:
         poses: `T_world_camera`, [n, 4, 4], n >= 1.
         seen: normals of its surfaces, of each depth image.
     """
-    rotations = poses[_spaced(len(poses), _USED_POSES), :3, :3]
+    rotations = poses[evenly_spaced(len(poses), _USED_POSES), :3, :3]
     normals = _thinned(seen)
 
     def log_posterior(up: np.ndarray) -> np.ndarray:
@@ -184,11 +185,6 @@ def estimated_up(poses: np.ndarray, seen: Sequence[Normals] = ()) -> Vertical:
 
 def _degrees(cosine: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def _spaced(count: int, most: int) -> np.ndarray:
-    """Returns a limited number of indices of a sequence, evenly spaced."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def _thinned(seen: Sequence[Normals]) -> Normals:

@@ -162,10 +162,6 @@ class Canvas:
         self.hide_suggestion()
         self._body.color, self._body.image = _STALE_COLOR, None
 
-    def clients(self) -> list[viser.ClientHandle]:
-        """Whoever looks at the page."""
-        return list(self._server.get_clients().values())
-
     def add_view(
         self,
         step: int,
@@ -221,11 +217,6 @@ class Canvas:
             cast_shadow=False,
             receive_shadow=False,
         )
-
-    def view_position(self) -> np.ndarray:
-        """Where the view on the slider stands [m], [3]; where no view is shown, NaN."""
-        handle = self._server.scene.get_handle_by_name("/view")
-        return np.full(3, np.nan) if handle is None else np.array(handle.position)
 
     def show_lines(
         self, name: str, segments: np.ndarray, colors: np.ndarray, thickness: float

@@ -168,26 +168,30 @@ def view_html(row: StepRow, num_views: int, image: np.ndarray, reason: Reason | 
         image: the photo, [H, W, 3] uint8.
         reason: what the view promised, or why that is not known.
     """
-    coverage = row.coverage
     return _part(
         "view",
         view_number=row.step + 1,
         num_views=num_views,
         photo=_picture(image),
-        facts={
-            "mission clock": f"{row.seconds:.1f} s",
-            "this view cost": f"{sum(row.charged.values()):.1f} s",
-            "path": f"{row.metres:.1f} m",
-            "explored": f"{100 * coverage.known_share:.0f} %",
-            "mean renderability": f"{coverage.mean_renderability:.2f}",
-            "R before this view": f"{coverage.arrival_renderability:.2f}",
-        },
+        facts=facts_of_view(row),
         costs=" + ".join(f"{name} {seconds:.1f} s" for name, seconds in row.charged.items()),
         choice=row.choice,
         why_not=None if row.choice else why_no_choice(row),
         best=best_candidates(row.choice) if row.choice else [],
         promise=promise_of(reason),
     )
+
+
+def facts_of_view(row: StepRow) -> dict[str, str]:
+    """What the trace says of a view."""
+    return {
+        "mission clock": f"{row.seconds:.1f} s",
+        "this view cost": f"{sum(row.charged.values()):.1f} s",
+        "path": f"{row.metres:.1f} m",
+        "explored": f"{100 * row.coverage.known_share:.0f} %",
+        "mean renderability": f"{row.coverage.mean_renderability:.2f}",
+        "R before this view": f"{row.coverage.arrival_renderability:.2f}",
+    }
 
 
 def best_candidates(choice: Choice) -> list[dict[str, Any]]:

@@ -28,6 +28,7 @@ from r3jax.apps.viewer.blocks import (
     title_of,
 )
 from r3jax.apps.viewer.color_maps import SCORES, UNSEEN, css_color
+from r3jax.apps.viewer.facts import facts_of_view
 from r3jax.apps.viewer.overlays import frustum_segments, path_segments
 from r3jax.apps.viewer.story import Timeline
 from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic
@@ -169,19 +170,12 @@ class Film:
 
     def _draw_column(self, figure: Figure, step: int) -> None:
         """The photo of a view, its numbers, and mean renderability over the views so far."""
-        run, row = self.run, self.run.rows[step]
+        run = self.run
         photo = style.blank(figure.add_axes((_RIGHT, 0.56, _SIDE, 0.40)))
         photo.imshow(run.images(step)[0])
-        facts = {
-            "view": f"{step + 1} of {len(run.rows)}",
-            "mission clock": f"{row.seconds:.1f} s",
-            "path": f"{row.metres:.1f} m",
-            "explored": f"{100 * row.coverage.known_share:.0f} %",
-            "mean renderability": f"{row.coverage.mean_renderability:.2f}",
-            "R before this view": f"{row.coverage.arrival_renderability:.2f}",
-        }
+        facts = {"view": f"{step + 1} of {len(run.rows)}", **facts_of_view(run.rows[step])}
         for line, (name, value) in enumerate(facts.items()):
-            y = 0.52 - 0.034 * line
+            y = 0.52 - 0.031 * line
             figure.text(_RIGHT, y, name, fontsize=10, color=style.MUTED)
             figure.text(_RIGHT + _SIDE, y, value, fontsize=10, color=style.INK, ha="right")
         curve = style.dress(figure.add_axes((_RIGHT + 0.02, 0.07, _SIDE - 0.02, 0.21)))

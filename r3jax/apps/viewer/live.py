@@ -68,9 +68,7 @@ class LiveFeed:
         self.url = url_of(server)
         """Where the page is."""
         self.app, self._story = app, story
-        self._queue: queue.SimpleQueue[tuple[TakenView, Planner] | threading.Event | None] = (
-            queue.SimpleQueue()
-        )
+        self._queue: queue.SimpleQueue[_Item] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self._thread.start()
 

@@ -31,7 +31,7 @@ TERMS = ("renderability", "bias", "noise", "resolution")
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Context:
     """What a look needs beside the pose."""
 
     map_state: MapState
@@ -102,7 +102,7 @@ class CameraPreview:
     """The true picture, RGB in [0, 1], [H, W, 3], where it was asked for."""
 
 
-def quick_preview_from(around: Surroundings, T_world_camera: np.ndarray) -> QuickPreview:
+def quick_preview_from(around: Context, T_world_camera: np.ndarray) -> QuickPreview:
     """R and its terms in the view at one pose [4, 4]."""
     pose = jnp.asarray(T_world_camera, dtype=jnp.float32)
     shown = term_images(around.map_state, around.camera, pose, around.config)
@@ -117,7 +117,7 @@ def quick_preview_from(around: Surroundings, T_world_camera: np.ndarray) -> Quic
 
 
 def preview_from(
-    around: Surroundings, T_world_camera: np.ndarray, glance: QuickPreview | None = None
+    around: Context, T_world_camera: np.ndarray, glance: QuickPreview | None = None
 ) -> CameraPreview:
     """Everything about the view at one pose.
 
@@ -142,7 +142,7 @@ def preview_from(
     )
 
 
-def _splats(around: Surroundings, pose: Float[Array, "4 4"]) -> np.ndarray | None:
+def _splats(around: Context, pose: Float[Array, "4 4"]) -> np.ndarray | None:
     if around.model is None:
         return None
     camera = around.picture_camera or around.camera

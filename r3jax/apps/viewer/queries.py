@@ -39,8 +39,8 @@ from r3jax.apps.viewer.overlays import path_segments, splat_arrays
 from r3jax.apps.viewer.panel import Controls, DisplaySettings
 from r3jax.apps.viewer.preview import (
     CameraPreview,
+    Context,
     QuickPreview,
-    Surroundings,
     panorama_image,
     preview_from,
     preview_pictures,
@@ -490,8 +490,8 @@ class QueryHandler:
 
         return show
 
-    def _around(self, moment: Moment) -> Surroundings:
-        return Surroundings(
+    def _around(self, moment: Moment) -> Context:
+        return Context(
             moment.map_state,
             moment.grid,
             self._story.camera,

@@ -8,7 +8,7 @@ from r3jax.apps.audit import sentences
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.audit_page import write_report
 from r3jax.apps.audit.camera_paths import CameraPath, path_of
-from r3jax.apps.audit.ground_plan import letter
+from r3jax.apps.audit.ground_plan import region_label
 from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.guide_page import open_guide
 from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_outputs
@@ -132,7 +132,7 @@ def _regions(found: Audit) -> Table:
     for number, region in enumerate(found.regions[:_SHOWN]):
         center = found.survey.alignment.points_back(region.center[None])[0]
         table.add_row(
-            letter(number),
+            region_label(number),
             region.cause,
             sentences.area(found, region.area),
             f"{region.renderability:.2f}",

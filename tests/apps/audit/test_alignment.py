@@ -19,7 +19,7 @@ def random_alignment(seed: int, kind: type[Alignment] = Alignment) -> Alignment:
 
 
 @given(seeds)
-def test_points_poses_and_directions_come_back(seed):
+def test_points_and_poses_come_back(seed):
     found = random_alignment(seed, real.Alignment)
     rng = np.random.default_rng(seed)
     points = rng.normal(0.0, 20.0, (5, 3))
@@ -29,8 +29,6 @@ def test_points_poses_and_directions_come_back(seed):
     for pose in moved:
         assert rigid_error(pose) is None
     np.testing.assert_allclose(found.poses_back(moved), poses, atol=1e-9)
-    ahead = found.directions_back(moved[:, :3, 2])
-    np.testing.assert_allclose(ahead, poses[:, :3, 2], atol=1e-9)
 
 
 @given(seeds)

@@ -96,6 +96,15 @@ def answer_at(viewer) -> float:
     return float(r3jax.renderability(moment.map_state, app.story.camera, T))
 
 
+def client_of(viewer):
+    return next(iter(viewer.app.canvas._server.get_clients().values()))
+
+
+def view_position(viewer) -> np.ndarray:
+    """Where the view on the slider stands [m]."""
+    return np.array(viewer.app.canvas._server.scene.get_handle_by_name("/view").position)
+
+
 def settle(page, viewer) -> float:
     """Waits for all answers on both sides; the number on the page."""
     assert viewer.app.worker.wait(PATIENCE)
@@ -120,14 +129,14 @@ def test_the_scene_is_beside_the_panel(page):
 
 def test_the_slider_moves_the_camera(page, viewer, run):
     thumb = page.locator('[role="slider"]').nth(1)  # below that of the cut
-    before = viewer.app.canvas.view_position()
+    before = view_position(viewer)
     thumb.focus()
     thumb.press("ArrowLeft")
     thumb.press("ArrowLeft")
     wait_until(page, lambda: page.inner_text("#r3jax-view") == str(VIEWS - 2))
     assert viewer.app.controls.settings.step == VIEWS - 3
     assert viewer.app.worker.wait(PATIENCE)
-    after = viewer.app.canvas.view_position()
+    after = view_position(viewer)
     np.testing.assert_allclose(after, run.rows[VIEWS - 3].pose[:3, 3], atol=1e-5)
     assert np.abs(after - before).max() > 0.01
     settle(page, viewer)  # the number is that of the earlier map
@@ -151,7 +160,7 @@ def look_at_the_gizmo(page, viewer) -> np.ndarray:
     pose[:3, 3] = (-0.5, -0.3, 0.1)
     app.canvas.place_camera(pose)
     app.ask()
-    client = next(iter(app.canvas.clients()))
+    client = client_of(viewer)
     client.camera.position = pose[:3, 3] + np.array([0.3, -2.2, 0.9])
     client.camera.look_at = pose[:3, 3]
     eye = client.camera.position.copy()
@@ -163,7 +172,7 @@ def look_at_the_gizmo(page, viewer) -> np.ndarray:
 def test_a_dragged_camera_is_answered(page, viewer):
     origin = look_at_the_gizmo(page, viewer)
     before = settle(page, viewer)
-    client = next(iter(viewer.app.canvas.clients()))
+    client = client_of(viewer)
     box = page.locator("canvas").first.bounding_box()
     start = viewer.app.canvas.pose
 

@@ -10,7 +10,7 @@ import r3jax
 from r3jax.apps.viewer.color_maps import paint
 from r3jax.apps.viewer.preview import (
     TERMS,
-    Surroundings,
+    Context,
     preview_from,
     preview_pictures,
     quick_preview_from,
@@ -23,7 +23,7 @@ from r3jax.splatting.scene import GaussianScene
 @pytest.fixture(scope="module")
 def around(run):
     moment = Timeline(run).at(len(run.rows) - 1)
-    return Surroundings(moment.map_state, moment.grid, run.camera)
+    return Context(moment.map_state, moment.grid, run.camera)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_splats_are_of_the_same_pose_and_compared_with_the_true_image(around, po
         sh=jnp.full((1, 1, 3), 1.0),
     )
     camera = around.camera.resized(16, 16)
-    more = Surroundings(
+    more = Context(
         around.map_state,
         around.grid,
         around.camera,

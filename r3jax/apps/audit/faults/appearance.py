@@ -16,7 +16,7 @@ Frames repeat each other if they have nearly the same pose and nearly the same p
 Shape symbols: n frames; k pairs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -71,15 +71,9 @@ class Sharpness:
 
 def sharpness(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Sharpness:
     """Compares the detail of all frames."""
-    count = len(images)
-    found = [(o.first, o.second, *_detail_ratios(images, o)) for o in pairs]
-    found = [row for row in found if np.isfinite(row[2]).all()]
-    linked = np.array([row[:2] for row in found], dtype=np.int64).reshape(-1, 2)
-    ratios = np.array([row[2] for row in found]).reshape(-1, 1 + len(DIRECTIONS))
-    weight = np.sqrt(np.array([row[3] for row in found], dtype=np.float64))
-    level = np.stack([levels(count, linked, column, weight) for column in ratios.T], axis=1)
+    linked, _, level = _leveled(images, pairs, _detail_ratios, 1 + len(DIRECTIONS))
     relative = np.full(level.shape, np.nan)
-    for i, near in enumerate(neighbors_of(count, linked)):
+    for i, near in enumerate(neighbors_of(len(images), linked)):
         if len(near) >= _WITNESSES:
             relative[i] = level[i] - np.percentile(level[near], _SHARP, axis=0)
     along = relative[:, 1:]
@@ -88,6 +82,24 @@ def sharpness(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Sharpne
         lost_along=np.exp(along.min(axis=1) - along.max(axis=1)),
         direction=np.argmin(np.nan_to_num(along), axis=1),
     )
+
+
+_Ratios = Callable[[Sequence[BlockImage], Overlap], tuple[np.ndarray, int]]
+"""Median log-ratios of a pair of frames, [c], NaN where too few blocks can be compared; and of how
+many blocks."""
+
+
+def _leveled(
+    images: Sequence[BlockImage], pairs: Sequence[Overlap], ratios_of: _Ratios, columns: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs that could be compared [k, 2], in how many blocks [k]; levels of every frame [n, c]."""
+    found = [(o.first, o.second, *ratios_of(images, o)) for o in pairs]
+    found = [row for row in found if np.isfinite(row[2]).all()]
+    linked = np.array([row[:2] for row in found], dtype=np.int64).reshape(-1, 2)
+    ratios = np.array([row[2] for row in found]).reshape(-1, columns)
+    shared = np.array([row[3] for row in found], dtype=np.float64)
+    level = [levels(len(images), linked, column, np.sqrt(shared)) for column in ratios.T]
+    return linked, shared, np.stack(level, axis=1)
 
 
 def _detail_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndarray, int]:
@@ -173,15 +185,8 @@ class Light:
 
 def light(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Light:
     """Compares the colors of all frames."""
-    count = len(images)
-    found = [(o.first, o.second, *_light_ratios(images, o)) for o in pairs]
-    found = [row for row in found if np.isfinite(row[2]).all()]
-    linked = np.array([row[:2] for row in found], dtype=np.int64).reshape(-1, 2)
-    ratios = np.array([row[2] for row in found]).reshape(-1, 3)
-    shared = np.array([row[3] for row in found], dtype=np.float64)
-    columns = [levels(count, linked, column, np.sqrt(shared)) for column in ratios.T]
-    level = np.stack(columns, axis=1)
-    level[~np.isin(np.arange(count), linked)] = np.nan
+    linked, shared, level = _leveled(images, pairs, _light_ratios, 3)
+    level[~np.isin(np.arange(len(images)), linked)] = np.nan
     return Light(linked, shared, level[:, 0], level[:, 1:])
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from r3jax.apps.audit.source import projected
 from r3jax.geometry.cameras import Camera
 
 _ACROSS = 80
@@ -224,17 +225,11 @@ def neighbor_pairs(images: Sequence[BlockImage]) -> np.ndarray:
 def overlap(images: Sequence[BlockImage], first: int, second: int) -> Overlap:
     """Looks the blocks of one frame up in another one."""
     seen = images[second]
-    local = (images[first].points - seen.pose[:3, 3]) @ seen.pose[:3, :3]
-    z = local[:, 2]
-    is_ahead = z > 0.0  # NaN is not
-    safe = np.where(is_ahead, z, 1.0)
-    column = np.floor(float(seen.camera.fx) * local[:, 0] / safe + float(seen.camera.cx))
-    row = np.floor(float(seen.camera.fy) * local[:, 1] / safe + float(seen.camera.cy))
-    height, width = seen.shape
-    is_in = is_ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    own = np.flatnonzero(is_in)
-    other = (row[own] * width + column[own]).astype(np.int64)
-    ratio = z[own] / seen.depth[other]
+    found = projected(seen.camera, seen.pose, images[first].points)
+    own = np.flatnonzero(found.is_in)
+    row, column = (side[own].astype(np.int64) for side in (found.row, found.column))
+    other = row * seen.camera.width + column
+    ratio = found.z[own] / seen.depth[other]
     known = np.isfinite(ratio)
     return Overlap(first, second, own[known], other[known], ratio[known])
 

@@ -82,7 +82,7 @@ SYSTEMATIC = ("scale", "focal", "across", "down", "ray")
 _NAMED_FROM = {"scale": 0.03, "focal": 0.03, "across": 0.02, "down": 0.02, "ray": 0.5}
 """Smaller ones are not named."""
 
-_SURE = 1.0 / 3.0
+_MAX_RELATIVE_DEVIATION = 1.0 / 3.0
 """Nor are those whose standard deviation is larger than this share of it."""
 
 
@@ -258,7 +258,7 @@ def _systematic(matches: list[_Matches]) -> Systematic | None:
     best = int(np.argmin(left))
     kind, (size, deviation) = SYSTEMATIC[best], fits[best]
     large = size if kind == "ray" else abs(size)
-    if large < _NAMED_FROM[kind] or deviation > _SURE * _NAMED_FROM[kind]:
+    if large < _NAMED_FROM[kind] or deviation > _MAX_RELATIVE_DEVIATION * _NAMED_FROM[kind]:
         return None
     return Systematic(kind, float(np.exp(size)) if kind in ("scale", "focal") else size)
 

@@ -26,6 +26,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from matplotlib import colormaps
 
+from r3jax.apps.audit.alignment import evenly_spaced
 from r3jax.apps.audit.diagnosis import FINE
 from r3jax.apps.audit.sentences import steps_between
 from r3jax.frame import Frame
@@ -281,10 +282,9 @@ def mean_value(state: MapState, camera: Camera, places: np.ndarray) -> np.ndarra
 
     Whether something stands between is not asked: that would take a depth buffer for each place.
     """
-    spread = np.unique(np.linspace(0, len(places) - 1, _PLACES).round().astype(int))
     center = np.asarray(state.center, np.float32).T
     total, count = np.zeros(len(center)), np.zeros(len(center))
-    for place in places[spread].astype(np.float32):
+    for place in places[evenly_spaced(len(places), _PLACES)].astype(np.float32):
         near = np.sum((center - place) ** 2, axis=1) < _FARTHEST**2
         total += near * np.asarray(voxel_renderability(state, place, camera.focal).value)
         count += near
