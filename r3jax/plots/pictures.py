@@ -204,14 +204,11 @@ def panorama_figure(picture: PanoramaPicture) -> Figure:
         axes.set_yticks(range(-90, 91, 45))
     upper.imshow(picture.rgb, extent=extent)
     image = show_renderability(lower, picture, extent)
-    bar = figure.colorbar(image, ax=[upper, lower], shrink=0.4, pad=0.01, anchor=(0.0, 0.0))
-    bar.outline.set_visible(False)
-    bar.set_label("renderability R", fontsize=9, color=style.MUTED)
+    style.color_bar(figure, image, [upper, lower], "renderability R", shrink=0.4, anchor=(0.0, 0.0))
     lower.legend(
         handles=empty_directions(), fontsize=8, frameon=False, ncols=2,
         loc="upper right", bbox_to_anchor=(1.0, -0.1),
     )  # fmt: skip
-    bar.ax.tick_params(labelsize=8, colors=style.MUTED)
     for axes in (upper, lower):
         axes.plot(
             np.rad2deg(picture.azimuth),

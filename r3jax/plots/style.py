@@ -1,9 +1,12 @@
 """The look that all figures share: light, few colors, nothing global."""
 
 import io
+from collections.abc import Sequence
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Tick
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -69,6 +72,48 @@ def blank(axes: Axes, title: str = "") -> Axes:
     for spine in axes.spines.values():
         spine.set_visible(False)
     return axes
+
+
+def picture_grid(
+    lines: int, columns: int, aspect: float, space: float
+) -> tuple[Figure, np.ndarray]:
+    """A figure 10 inches wide for images of one shape.
+
+    Args:
+        lines: of images.
+        columns: of images.
+        aspect: height of an image over its width.
+        space: for the caption above each [inch].
+
+    Returns:
+        The figure, and its axes [lines, columns], blank.
+    """
+    figure = new_figure(10.0, lines * (10.0 / columns * aspect + space))
+    grid = np.asarray(figure.subplots(lines, columns, squeeze=False))
+    for axes in grid.flat:
+        blank(axes)
+    return figure, grid
+
+
+def caption(axes: Axes, text: str, color: str = MUTED) -> None:
+    """Writes a small line above an image."""
+    axes.set_title(text, fontsize=8, color=color, loc="left", pad=2)
+
+
+def color_bar(
+    figure: Figure,
+    image: ScalarMappable,
+    axes: Axes | Sequence[Axes] | np.ndarray,
+    label: str = "",
+    *,
+    shrink: float = 0.5,
+    anchor: tuple[float, float] = (0.0, 0.5),
+) -> None:
+    """Draws the scale of an image beside axes."""
+    bar = figure.colorbar(image, ax=axes, shrink=shrink, pad=0.01, anchor=anchor)
+    bar.set_label(label, fontsize=9, color=MUTED)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=8, colors=MUTED)
 
 
 PNG_MARK = b"tEXtSoftware\x00r3jax"

@@ -96,9 +96,7 @@ def panorama_strip(audit: Audit, count: int = 3) -> Figure:
         line[0].imshow(picture.rgb)
         image = show_renderability(line[1], picture)
     if image is not None:
-        bar = figure.colorbar(image, ax=grid, shrink=0.4, pad=0.01)
-        bar.outline.set_visible(False)
-        bar.ax.tick_params(labelsize=8, colors=style.MUTED)
+        style.color_bar(figure, image, grid, shrink=0.4)
         figure.legend(handles=empty_directions(), fontsize=8, frameon=False, ncols=2,
                       loc="outside lower center")  # fmt: skip
     return figure
@@ -145,19 +143,13 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
         shown = audit.source.read(frame.index)[0] if audit.is_own_path else colors
         pictures.append((shown, value))
     aspect = audit.camera.height / audit.camera.width
-    figure = style.new_figure(10.0, 2.0 * (10.0 / count * aspect + 0.16))
-    grid = figure.subplots(2, count, squeeze=False)
-    for axes in grid.flat:
-        style.blank(axes)
+    figure, grid = style.picture_grid(2, count, aspect, 0.16)
     for (upper, lower), frame, (shown, value) in zip(grid.T, frames, pictures, strict=False):
         upper.imshow(shown)
-        upper.set_title(_short(frame.label), fontsize=8, color=style.MUTED, loc="left", pad=2)
+        style.caption(upper, _short(frame.label))
         lower.set_facecolor("#e5e7eb")
         lower.imshow(value, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
-        lower.set_title(
-            f"R {frame.score.renderability:.2f}, {frame.score.cause}", fontsize=8,
-            color=style.INK, loc="left", pad=2,
-        )  # fmt: skip
+        style.caption(lower, f"R {frame.score.renderability:.2f}, {frame.score.cause}", style.INK)
     return figure
 
 
@@ -194,12 +186,10 @@ def _pictures(
 
 def _row(*pictures: tuple[str, np.ndarray]) -> Figure:
     """Images side by side, each under its name; those without colors are renderability."""
-    heights = [picture.shape[0] / picture.shape[1] for _, picture in pictures]
-    figure = style.new_figure(10.0, 10.0 / len(pictures) * max(heights) + 0.25)
-    line = np.atleast_1d(np.asarray(figure.subplots(1, len(pictures))))
+    aspect = max(picture.shape[0] / picture.shape[1] for _, picture in pictures)
+    figure, (line,) = style.picture_grid(1, len(pictures), aspect, 0.25)
     for axes, (name, picture) in zip(line, pictures, strict=True):
-        style.blank(axes)
-        axes.set_title(name, fontsize=8, color=style.MUTED, loc="left", pad=2)
+        style.caption(axes, name)
         if picture.ndim == 2:
             axes.set_facecolor("#e5e7eb")
             axes.imshow(picture, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
@@ -284,10 +274,7 @@ def region_figure(audit: Audit) -> Figure | None:
         return None
     lines = -(-len(shown) // _PER_LINE)
     aspect = audit.camera.height / audit.camera.width
-    figure = style.new_figure(10.0, lines * (10.0 / _PER_LINE * aspect + 0.22))
-    grid = figure.subplots(lines, _PER_LINE, squeeze=False)
-    for axes in grid.flat:
-        style.blank(axes)
+    figure, grid = style.picture_grid(lines, _PER_LINE, aspect, 0.22)
     for axes, (number, region, finding) in zip(grid.flat, shown, strict=False):
         photo, _ = audit.source.read(finding.index)
         axes.imshow(photo)

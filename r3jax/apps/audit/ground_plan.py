@@ -113,10 +113,7 @@ def plan_figure(audit: Audit) -> Figure:
         values.T, origin="lower", extent=[unit * v for v in where], cmap=style.SCORE_MAP, vmin=0,
         vmax=1, interpolation="nearest",
     )  # fmt: skip
-    bar = figure.colorbar(image, ax=panels, shrink=0.5, pad=0.01)
-    bar.set_label("renderability R", fontsize=9, color=style.MUTED)
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=8, colors=style.MUTED)
+    style.color_bar(figure, image, panels, "renderability R")
     return figure
 
 

@@ -86,10 +86,7 @@ def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
             color=style.INK,
             bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0},
         )
-    bar = figure.colorbar(dots, ax=axes, shrink=0.6, pad=0.01)
-    bar.set_label("order of acquisition", fontsize=9, color=style.MUTED)
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=8, colors=style.MUTED)
+    style.color_bar(figure, dots, axes, "order of acquisition", shrink=0.6)
     return figure
 
 
@@ -181,17 +178,13 @@ def strip_figure(run: Run, count: int = 12) -> Figure:
     steps = np.unique(np.linspace(0, len(run.rows) - 1, count).round().astype(int))
     columns = min(6, len(steps))
     lines = -(-len(steps) // columns)
-    camera = run.camera
-    shape = camera.height / camera.width
-    figure = style.new_figure(10.0, lines * (10.0 / columns * shape + 0.25))
-    grid = figure.subplots(lines, columns, squeeze=False)
-    for axes in grid.flat:
-        style.blank(axes)
+    aspect = run.camera.height / run.camera.width
+    figure, grid = style.picture_grid(lines, columns, aspect, 0.25)
     for axes, step in zip(grid.flat, steps, strict=False):
         image = Image.fromarray(run.images(int(step))[0])
         image.thumbnail((256, 256))
         axes.imshow(np.asarray(image))
-        axes.set_title(f"view {step + 1}", fontsize=8, color=style.MUTED, loc="left", pad=2)
+        style.caption(axes, f"view {step + 1}")
     return figure
 
 

@@ -101,8 +101,5 @@ def revisit_figure(recording: PosedImages, reports: list[FrameReport]) -> Figure
         zorder=2,
     )
     right.annotate("start", path[0, :2], xytext=(6, 6), textcoords="offset points", fontsize=9)
-    bar = figure.colorbar(dots, ax=right, shrink=0.8, pad=0.01)
-    bar.outline.set_visible(False)
-    bar.set_label("renderability", fontsize=9, color=style.MUTED)
-    bar.ax.tick_params(labelsize=8, colors=style.MUTED)
+    style.color_bar(figure, dots, right, "renderability", shrink=0.8)
     return figure
