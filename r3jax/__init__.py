@@ -16,8 +16,17 @@ Where to look next, beside a robot or a SLAM system:
 
 import lazy_loader
 
+from r3jax.extras import naming_extras
+
 # The names and their homes stand in `__init__.pyi`, where type checkers find them too. They load
 # when first used, so that `r3jax --help` does not wait for JAX.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    """Loads a public name; names the extra where it needs a package that is not installed."""
+    with naming_extras():
+        return _load(name)
+
 
 __version__ = "0.1.0"

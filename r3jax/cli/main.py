@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from r3jax.cli.errors import UserError, one_line, printable
+from r3jax.extras import naming_extras
 from r3jax.interrupts import (
     INTERRUPTED,
     caught_interrupts,
@@ -48,7 +49,8 @@ def _main(args: Sequence[str] | None) -> int:
         # Imported here: the imports of a command take a second, in which Ctrl-C works, too.
         from r3jax.cli.command_line import run_command
 
-        code = run_command(sys.argv[1:] if args is None else args)
+        with naming_extras():
+            code = run_command(sys.argv[1:] if args is None else args)
         return INTERRUPTED if code == 0 and is_interrupted() else code
     except BrokenPipeError:
         # Python would fail once more when it flushes at its end.

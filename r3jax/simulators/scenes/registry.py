@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from r3jax.extras import naming_extras
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.native.ahead import compile_ahead
 from r3jax.kernels.native.platform import is_cpu_only, missing_for_machine_code
@@ -40,6 +41,7 @@ def describe(name: str) -> str:
     return f"{OUTSIDE[kind][0]} {rest}" if kind in OUTSIDE else procedural.describe(name)
 
 
+@naming_extras()
 def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> World:
     """The triangles and materials behind a scene's name.
 
@@ -66,6 +68,7 @@ def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> Wo
     return procedural.build(spec)
 
 
+@naming_extras()
 def open_scene(
     spec: str,
     *,
@@ -96,7 +99,8 @@ def open_scene(
 
     Raises:
         ValueError: see `open_world`, `RaycastSimulator` and `HabitatSimulator`.
-        ImportError: Numba cannot be used; or a Habitat scene, and Habitat-Sim is not installed.
+        ImportError: Numba cannot be used; the extra `sim`, or Habitat-Sim for a Habitat scene, is
+            not installed.
     """
     kind, rest = split_name(spec)
     if is_cpu_only():
