@@ -3,51 +3,54 @@
 python -m tests.mutants [WORD ...]: those whose file, test or fault contains one of the words.
 """
 
-import contextlib
-import io
-import multiprocessing
 import os
 import shutil
-import signal
+import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-
-import pytest
 
 from tests.mutants import Mutant, geometry, mapping, scoring, splatting
 
 ROOT = Path(__file__).resolve().parents[2]
 MUTANTS = [*geometry.MUTANTS, *mapping.MUTANTS, *scoring.MUTANTS, *splatting.MUTANTS]
-PROCESSES = 2
-_QUIET = "filterwarnings=ignore::pytest.PytestAssertRewriteWarning"
+PROCESSES = int(os.environ.get("R3JAX_MUTANT_PROCESSES", "2"))
 SECONDS = 300
 """After which a test with a fault counts as failed: some faults make a loop endless."""
+
+_CAUGHT = 1
+"""Pytest's exit status if a test failed; 0: it passed; others: pytest could not run it."""
+
+_PYTEST = (
+    "import sys, r3jax, pytest; assert r3jax.__file__.startswith(sys.argv[1]), r3jax.__file__; "
+    "sys.exit(pytest.main(sys.argv[2:]))"
+)
+"""Imports the copy first: pytest would put the repository before it."""
 
 
 def main(words: list[str]) -> int:
     """Prints a line for each mutant that is stale or survives; returns the exit status."""
     chosen = [m for m in MUTANTS if not words or any(word in " ".join(m) for word in words)]
-    stale = [mutant for mutant in chosen if count_in_source(mutant) != 1]
-    for mutant in stale:
-        print(f"stale: {describe(mutant)} occurs {count_in_source(mutant)} times, not once")
-    tests = sorted({mutant.test for mutant in chosen if mutant not in stale})
-    # Preloading what every test imports saves seconds each; the package itself must be the copy.
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["jax", "numba", "numpy", "scipy", "equinox", "pytest"])
-    survivors = []
-    with context.Pool(PROCESSES, maxtasksperchild=1) as pool:
-        sound = pool.map_async(run_without_fault, tests, chunksize=1)
-        verdicts = pool.imap(run, [m for m in chosen if m not in stale], chunksize=1)
-        failing = [test for test, code in zip(tests, sound.get(), strict=True) if code != 0]
-        for test in failing:
-            print(f"fails without a fault: {test}", flush=True)
-        for mutant, code in zip([m for m in chosen if m not in stale], verdicts, strict=True):
-            if code != 1:  # 0: all tests passed; others: pytest could not run them
-                survivors.append(mutant)
+    fresh = [mutant for mutant in chosen if count_in_source(mutant) == 1]
+    for mutant in chosen:
+        if mutant not in fresh:
+            print(f"stale ({count_in_source(mutant)} times, not once): {describe(mutant)}")
+    no_fault = [Mutant("r3jax/__init__.py", "", "", m.test) for m in fresh]
+    sound = list(dict.fromkeys(no_fault))
+    failing, survivors = 0, 0
+    with ThreadPoolExecutor(PROCESSES) as pool:
+        for mutant, code in zip(sound, pool.map(run, sound), strict=True):
+            if code != 0:
+                failing += 1
+                print(f"fails without a fault (pytest: {code}): {mutant.test}", flush=True)
+        for mutant, code in zip(fresh, pool.map(run, fresh), strict=True):
+            if code != _CAUGHT:
+                survivors += 1
                 print(f"survives (pytest: {code}): {describe(mutant)}", flush=True)
-    print(f"{len(chosen)} mutants, {len(stale)} stale, {len(survivors)} survive")
-    return int(bool(stale or survivors or failing))
+    num_stale = len(chosen) - len(fresh)
+    print(f"{len(chosen)} mutants, {num_stale} stale, {survivors} survive, {failing} tests fail")
+    return int(bool(num_stale or survivors or failing))
 
 
 def describe(mutant: Mutant) -> str:
@@ -61,50 +64,21 @@ def count_in_source(mutant: Mutant) -> int:
     return path.read_text(encoding="utf-8").count(mutant.original) if path.exists() else 0
 
 
-def run_without_fault(test: str) -> int:
-    """Returns pytest's exit status with the package as it is."""
-    return run(Mutant("r3jax/__init__.py", "", "", test))
-
-
 def run(mutant: Mutant) -> int:
-    """Returns pytest's exit status with the fault, in a process of its own."""
+    """Returns pytest's exit status with the fault."""
     with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "r3jax"
-        shutil.copytree(ROOT / "r3jax", copy)
+        shutil.copytree(ROOT / "r3jax", Path(folder) / "r3jax")
         path = Path(folder) / mutant.file
         source = path.read_text(encoding="utf-8")
         path.write_text(source.replace(mutant.original, mutant.mutated, 1), encoding="utf-8")
-        return _pytest_with(folder, mutant.test)
-
-
-def _pytest_with(folder: str, test: str) -> int:
-    """Runs one test in this process, which must not have imported the package before."""
-    os.chdir(ROOT)
-    sys.path.insert(0, folder)
-    import r3jax
-
-    assert str(r3jax.__file__).startswith(folder), r3jax.__file__
-    signal.signal(signal.SIGALRM, _fail)
-    signal.alarm(SECONDS)
-    options = [
-        "-x",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:xdist",
-        "-o",
-        "addopts=",
-        "-o",
-        _QUIET,
-    ]
-    silence = io.StringIO()
-    with contextlib.redirect_stdout(silence), contextlib.redirect_stderr(silence):
-        return int(pytest.main([*options, test]))
-
-
-def _fail(*_: object) -> None:
-    pytest.exit("too slow", returncode=1)
+        options = ["-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", f"--rootdir={ROOT}"]
+        words = [sys.executable, "-c", _PYTEST, folder, *options, str(ROOT / mutant.test)]
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join((folder, str(ROOT)))}
+        try:
+            done = subprocess.run(words, cwd=folder, env=env, capture_output=True, timeout=SECONDS)
+        except subprocess.TimeoutExpired:
+            return _CAUGHT
+        return done.returncode
 
 
 if __name__ == "__main__":
