@@ -65,7 +65,7 @@ class NextViewNode(Node):
         get = lambda name, default: self.declare_parameter(name, default).value
         self.world, self.base = get("world_frame", "map"), get("base_frame", "base_link")
         self.bounds = np.reshape(get("bounds", [-5.0, -5.0, 0.0, 5.0, 5.0, 2.5]), (2, 3))
-        self.policy, self.motion = get("policy", "ours-pano"), get("motion", "ground")
+        self.policy, self.motion = get("policy", "r3-pano"), get("motion", "ground")
         self.candidates, self.stride = get("candidates", 100), get("stride", 2)
         self.period, self.patience = 1.0 / get("frame_rate", 2.0), get("patience", 60.0)
         self.arrived, self.max_range = get("arrived", 0.3), get("max_range", 5.0)

@@ -33,7 +33,7 @@ def slam(world) -> Generator[tuple[Array, Array, list[Array]], Array, None]:
 def main(views: int = 8, size: int = 128) -> list[r3jax.Frame]:
     """Explores the flat together with a SLAM system; returns the frames that are in the map."""
     world = r3jax.open_scene("flat", camera=r3jax.Camera.from_fov(size, size))
-    policy = r3jax.make_policy("ours-pano", num_candidates=40, num_frontier=12)
+    policy = r3jax.make_policy("r3-pano", num_candidates=40, num_frontier=12)
     config = r3jax.MappingConfig(capacity=1 << 14)  # the table grows by itself
     begin = lambda: r3jax.start(
         world.camera, world.bounds, policy, starts=[world.start_pose], config=config

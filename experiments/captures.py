@@ -84,10 +84,10 @@ class Row:
 REFERENCE = "active-gs"
 """As published: key frames only."""
 
-OURS = "ours-ahead, captures, plans on the way"
+OURS = "r3-ahead, captures, plans on the way"
 """With all that looks on the way."""
 
-POLICIES = (REFERENCE, "r3con", "ours-pano", "ours-ahead", "frontier", "random")
+POLICIES = (REFERENCE, "r3con", "r3-pano", "r3-ahead", "frontier", "random")
 
 CAPTURES: dict[str, Any] = {"capture_every": 0.3}
 ON_THE_WAY: dict[str, Any] = {"capture_every": 0.3, "plan_while_moving": True}
@@ -126,7 +126,7 @@ TABLES: dict[TableName, dict[str, Row]] = {
     # Rivals, most with a map of their own: at what it costs here with `--clock wall`, else as if
     # it took no longer than ours.
     "rivals": {
-        OURS: Row("ours-ahead", loop=ON_THE_WAY, training=LONG),
+        OURS: Row("r3-ahead", loop=ON_THE_WAY, training=LONG),
         **{
             policy + mode: Row(policy, OURS, loop=loop, training=LONG)
             for policy in (REFERENCE, "gavis", "active-gs-online", "fisherrf", "gauss-mi")
@@ -135,7 +135,7 @@ TABLES: dict[TableName, dict[str, Row]] = {
     },
     # Where the camera looks on the way.
     "gaze": {
-        gaze: Row("ours-ahead", "panorama", loop=ON_THE_WAY | {"gaze": gaze})
+        gaze: Row("r3-ahead", "panorama", loop=ON_THE_WAY | {"gaze": gaze})
         for gaze in ("panorama", "ahead")
     },
     # How often it looks, for ours and for the rival; more frames need longer trainings.
@@ -143,13 +143,13 @@ TABLES: dict[TableName, dict[str, Row]] = {
         REFERENCE: Row(REFERENCE, training=LONG),
         **{
             f"{policy}, a frame every {meters} m": Row(policy, REFERENCE, loop=loop, training=LONG)
-            for policy in (REFERENCE, "ours-ahead")
+            for policy in (REFERENCE, "r3-ahead")
             for meters, loop in ((0.3, ON_THE_WAY), (0.15, CLOSE))
         },
     },
-    # How many views `ours-ahead` plans: one, its four, or as many as MAGICIAN (2603.22650).
+    # How many views `r3-ahead` plans: one, its four, or as many as MAGICIAN (2603.22650).
     "horizon": {
-        label: Row("ours-ahead", "4 views, a beam of 4", planner, CLOSE, LONG)
+        label: Row("r3-ahead", "4 views, a beam of 4", planner, CLOSE, LONG)
         for label, planner in {
             "1 view": {"horizon": 1},
             "4 views, a beam of 4": {},  # as it is
@@ -158,30 +158,28 @@ TABLES: dict[TableName, dict[str, Row]] = {
     },
     # Scored by one of so many voxels, the time of a decision as it was.
     "sample": {
-        OURS: Row("ours-ahead", loop=ON_THE_WAY, training=LONG),
-        f"{OURS}, one of 4 voxels": Row(
-            "ours-ahead", OURS, {"scoring.sample": 4}, ON_THE_WAY, LONG
-        ),
+        OURS: Row("r3-ahead", loop=ON_THE_WAY, training=LONG),
+        f"{OURS}, one of 4 voxels": Row("r3-ahead", OURS, {"scoring.sample": 4}, ON_THE_WAY, LONG),
     },
     # A camera that turns at most 90 degrees a second, instead of in no time.
     "turning": {
         policy + mode: Row(
             policy, REFERENCE, {"motion": {"speed": 1.0, "turn_rate": 90.0}}, MODES[mode], LONG
         )
-        for policy in (REFERENCE, "ours-ahead")
+        for policy in (REFERENCE, "r3-ahead")
         for mode in ("", ", captures, plans on the way")
     },
-    # The rule of the paper's own code, and each of its parts exchanged for that of `ours-pano`.
+    # The rule of the paper's own code, and each of its parts exchanged for that of `r3-pano`.
     "r3con": {
-        "r3con": Row("r3con", "ours-pano"),
+        "r3con": Row("r3con", "r3-pano"),
         "r3con, 16 for a cell instead of 1000": Row("r3con", "r3con", {"cell_weight": 16.0}),
         "r3con, path weight 0.5 instead of adaptive": Row("r3con", "r3con", {"path_weight": 0.5}),
         "r3con, utility of the view instead of all round": Row(
             "r3con", "r3con", {"all_round": False}
         ),
-        "ours-pano": Row("ours-pano"),
-        "ours-pano, candidates of r3con": Row(
-            "ours-pano", "ours-pano", {"num_candidates": 50, "radius": 2.0, "num_frontier": 0}
+        "r3-pano": Row("r3-pano"),
+        "r3-pano, candidates of r3con": Row(
+            "r3-pano", "r3-pano", {"num_candidates": 50, "radius": 2.0, "num_frontier": 0}
         ),
     },
     # The same flights, trained for longer.
@@ -190,7 +188,7 @@ TABLES: dict[TableName, dict[str, Row]] = {
             policy, f"{REFERENCE}, {length}", loop=MODES[mode], training=training
         )
         for length, training in LENGTHS.items()
-        for policy, mode in ((REFERENCE, ""), ("ours-ahead", ", captures, plans on the way"))
+        for policy, mode in ((REFERENCE, ""), ("r3-ahead", ", captures, plans on the way"))
     },
 }
 

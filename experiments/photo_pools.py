@@ -65,7 +65,7 @@ class Options:
     size: SizeName = "smoke"
     """How much is done."""
 
-    choosers: tuple[str, ...] = ("ours", "cover", "gavis", "fisherrf", "random")
+    choosers: tuple[str, ...] = ("r3", "cover", "gavis", "fisherrf", "random")
     """Who chooses."""
 
     seeds: tuple[int, ...] = ()

@@ -3,7 +3,7 @@
     python -m experiments.planner_work --size smoke
 
 The map is that of an apartment after so many views from the middles of its rooms; a decision of
-`ours-pano` is made on it again and again, from where the last view was taken. Run it on an idle
+`r3-pano` is made on it again and again, from where the last view was taken. Run it on an idle
 machine.
 """
 
@@ -32,7 +32,7 @@ from experiments.planner_runs import process_memory
 from r3jax.apps.benchmark.record import machine, source_commit
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.planning.planner import Planner, decide, observe, start
-from r3jax.planning.policies.r3 import OursPano
+from r3jax.planning.policies.r3 import R3Pano
 from r3jax.plots import style
 from r3jax.simulators.scenes import procedural
 from r3jax.simulators.scenes.registry import open_scene
@@ -131,11 +131,11 @@ def measured(
         numba.set_num_threads(workers)
         jax.clear_caches()  # programs know the number of threads that they were made for
         for num in size.candidates:
-            base = OursPano()
+            base = R3Pano()
             settings = dataclasses.replace(
                 base.config, num_candidates=num, num_frontier=min(base.config.num_frontier, num)
             )
-            asked = dataclasses.replace(planner, policy=OursPano(config=settings))
+            asked = dataclasses.replace(planner, policy=R3Pano(config=settings))
             seconds, scoring = [], []
             for _ in range(size.repeats + 1):  # the first one compiles
                 begin = time.perf_counter()
@@ -163,7 +163,7 @@ def work_figure(rows: Rows) -> Figure:
         ("candidates", "Candidates", [r for r in rows if r["in_range"] == largest]),
     ]
     for axes, (key, label, chosen) in zip(figure.subplots(1, 2), panels, strict=True):
-        style.dress(axes, "A decision of ours-pano", label, "Time [ms]")
+        style.dress(axes, "A decision of r3-pano", label, "Time [ms]")
         for workers in sorted({row["threads"] for row in chosen}):
             curve = sorted((r[key], r["decision_ms"]) for r in chosen if r["threads"] == workers)
             axes.plot(*zip(*curve, strict=True), marker="o", label=f"threads: {workers}")
@@ -177,7 +177,7 @@ def page(rows: Rows, size: str) -> list[str]:
     """The table and the figure."""
     return [
         f"# What a decision costs against its work ({size})",
-        "Median milliseconds of a decision of `ours-pano`, and of its scoring alone; megabytes of "
+        "Median milliseconds of a decision of `r3-pano`, and of its scoring alone; megabytes of "
         "the map's table, and what the process has taken since its start, programs and scene "
         "included.",
         markdown_table(rows),

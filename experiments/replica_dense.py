@@ -13,7 +13,7 @@ from r3jax.apps.benchmark.tables import Table, quality_table
 from r3jax.evaluation.comparison import methods_of, snapshots_of
 from r3jax.files import write_atomic
 
-REFERENCE = "ours-pano"
+REFERENCE = "r3-pano"
 """The method that the others are compared with on the same views."""
 
 

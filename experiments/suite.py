@@ -70,7 +70,7 @@ class _Size:
 _SIZES = {
     "smoke": _Size(
         scenes=("flat",),
-        policies=("random", "active-gs", "ours", "ours-pano"),
+        policies=("random", "active-gs", "r3", "r3-pano"),
         seeds=(0,),
         max_test_views=30,
         conditions=Conditions(

@@ -57,7 +57,7 @@ class Options:
     seed: int = 0
     """Seed of the random points."""
 
-    policy: str = "ours-pano"
+    policy: str = "r3-pano"
     """Who chooses the views."""
 
     scenes: tuple[str, ...] = ()

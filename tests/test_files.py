@@ -154,8 +154,8 @@ def test_a_lock_neither_follows_a_link_nor_changes_a_file(tmp_path, make):
 
 @pytest.fixture
 def ours(tmp_path):
-    own_folder(tmp_path / "ours", "run")
-    return tmp_path / "ours"
+    own_folder(tmp_path / "r3", "run")
+    return tmp_path / "r3"
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """The moving picture of the front page: a map turns green, then becomes splats.
 
-    r3jax explore --scene flat --policy ours-pano --budget views:48 --resolution 256 --name film
+    r3jax explore --scene flat --policy r3-pano --budget views:48 --resolution 256 --name film
     r3jax train runs/film --resolution 192 --gaussians 60000 --iterations 1200 --hold-out 0
     python -m docs.figures.film runs/film docs/images/film.webp
 

@@ -47,9 +47,9 @@ class PolicyStyle:
 
 
 _POLICIES = {
-    "ours-pano": ("#D55E00", "o", "-"),
-    "ours": ("#E69F00", "s", "-"),
-    "ours-ahead": ("#8f2d00", ">", "-"),
+    "r3-pano": ("#D55E00", "o", "-"),
+    "r3": ("#E69F00", "s", "-"),
+    "r3-ahead": ("#8f2d00", ">", "-"),
     "active-gs": ("#0072B2", "^", "-"),
     "active-gs-online": ("#0072B2", "8", ":"),
     "fisherrf": ("#009E73", "H", "-."),
@@ -85,7 +85,7 @@ def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
         fill = "full"
         if variant:
             dashes, fill = _VARIANTS[(variant - 1) % len(_VARIANTS)]
-        width, order = (2.6, 4.0) if policy.startswith("ours") else (1.5, 3.0)
+        width, order = (2.6, 4.0) if policy in ("r3", "r3-pano", "r3-ahead") else (1.5, 3.0)
         styles[method] = PolicyStyle(color, marker, dashes, width, order, fill)
     return styles
 

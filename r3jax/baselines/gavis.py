@@ -10,7 +10,7 @@ Our reading: surface elements are the map's voxels, opaque, and photos its direc
 particles are the unexplored cells of the coarse grid, of an opacity of their own in place of 0,
 by which a ray's color may come from them; colors that no photo shows are spread alike everywhere;
 kappa, that opacity and that spread, whose values we could not read; candidates, paths and their
-weight are those of Ours. No radiance field is kept.
+weight are those of `r3`. No radiance field is kept.
 
 A ray passes unexplored cells, which hold matter that no photo shows with some probability each, and
 ends at a voxel, or nowhere. With k unexplored cells before its end, the color that is seen comes

@@ -15,7 +15,7 @@ Cell = Mapping[str, Any]
 
 POLICIES = (
     "random", "frontier", "cover", "gavis", "active-gamer", "gauss-mi", "fisherrf", "active-gs",
-    "active-gs-online", "r3con", "ours", "ours-pano", "ours-ahead",
+    "active-gs-online", "r3con", "r3", "r3-pano", "r3-ahead",
 )  # fmt: skip
 """Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""
 

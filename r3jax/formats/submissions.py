@@ -27,7 +27,7 @@ from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
 from r3jax.geometry.cameras import Camera
-from r3jax.planning.policies import HOMES
+from r3jax.planning.policies import HOMES, current_name
 from r3jax.planning.robot.motion import Motion, motion_of_record
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run
@@ -200,7 +200,7 @@ def submission_of_run(run: Run) -> Submission:
         )
     given = dataclasses.asdict(config_of(run))
     default = dataclasses.asdict(ExplorationConfig())
-    own = header.policy["name"] in HOMES
+    own = current_name(header.policy["name"]) in HOMES
     # Of the record itself: the policy may be of a package that is not installed here.
     motion = header.policy.get("settings", {}).get("motion")
     opened: dict[str, Any] = {"up": None, "scale": 1.0, "cull_backfaces": False} | header.scene

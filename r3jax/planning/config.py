@@ -45,7 +45,7 @@ class PlannerConfig:
     """A path keeps its cells' centers this far from anything not known to be free [m]."""
 
     refine: int = 0
-    """How many of the best candidates of `ours` and `ours-pano` ascend the gradient of the smooth
+    """How many of the best candidates of `r3` and `r3-pano` ascend the gradient of the smooth
     utility (`planning.refine`); 0: none."""
 
     refine_radius: float = 0.4

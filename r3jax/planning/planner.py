@@ -1,6 +1,6 @@
 """The three verbs of a plug-in: start a planner, let it observe frames, let it decide.
 
-    planner = r3jax.start(camera, bounds, "ours-pano")
+    planner = r3jax.start(camera, bounds, "r3-pano")
     planner = r3jax.observe(planner, frame)
     decision, planner, info = r3jax.decide(planner, frame.T_world_camera, key)
 
@@ -65,7 +65,7 @@ a_planner = one(Planner, "r3jax.start makes one")
 def start(
     camera: Camera,
     bounds: ArrayLike,
-    policy: Policy | str = "ours-pano",
+    policy: Policy | str = "r3-pano",
     *,
     starts: Iterable[ArrayLike] = (),
     config: MappingConfig | None = None,

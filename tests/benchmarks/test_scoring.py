@@ -124,8 +124,8 @@ AFTER = [(6, 96), *(pytest.param(n, 256, marks=pytest.mark.measured) for n in (6
 
 @pytest.mark.parametrize(("views", "edge"), AFTER)
 def test_a_decision(benchmark, views, edge):
-    """Target: 100 ms after 60 views, 150 ms after 120, of `ours-pano` among 100 candidates."""
-    explored, policy = apartment_after(views, edge), make_policy("ours-pano")
+    """Target: 100 ms after 60 views, 150 ms after 120, of `r3-pano` among 100 candidates."""
+    explored, policy = apartment_after(views, edge), make_policy("r3-pano")
     state = policy.init(explored.camera, explored.grid, key=jax.random.key(0))
     for frame in explored.frames:
         state = policy.observe(state, explored.map, frame)
@@ -138,10 +138,10 @@ def test_a_decision(benchmark, views, edge):
 
 
 FLOWN = [
-    ("ours-pano", 2, 96, 1),
+    ("r3-pano", 2, 96, 1),
     *(
         pytest.param(policy, views, 256, sample, marks=pytest.mark.measured)
-        for policy in ("ours-pano", "ours-ahead")
+        for policy in ("r3-pano", "r3-ahead")
         for views in (4, 40)
         for sample in (1, 4)
     ),
@@ -150,7 +150,7 @@ FLOWN = [
 
 @pytest.mark.parametrize(("policy", "views", "edge", "sample"), FLOWN)
 def test_a_decision_on_its_own_way(benchmark, policy, views, edge, sample):
-    """Target: 200 ms of `ours-ahead`, after so many views of the flat that it chose itself."""
+    """Target: 200 ms of `r3-ahead`, after so many views of the flat that it chose itself."""
     policy = make_policy(policy, scoring=r3jax.ScoringConfig(sample=sample))
     world = r3jax.open_scene("flat", camera=r3jax.Camera.from_fov(edge, edge))
     pose = world.start_pose

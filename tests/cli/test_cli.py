@@ -95,7 +95,7 @@ def test_a_capture_that_is_not_there_is_called_what_it_would_be(tmp_path, name, 
 def test_info_lists_what_there_is(capsys):
     assert main(["info"]) == 0
     text = capsys.readouterr().out
-    for name in ("flat", "mesh:<file>", "ours-pano", "frontier", "jax", "device"):
+    for name in ("flat", "mesh:<file>", "r3-pano", "frontier", "jax", "device"):
         assert name in text
 
 
@@ -194,7 +194,7 @@ def test_the_demo_overwrites_its_own_folder_only(tmp_path):
     words = [word for name, value in short.items() for word in (f"--{name}", str(value))]
     assert main(["demo", "--out", str(tmp_path), *words]) == 0
     demo = read_run(tmp_path / "demo")
-    assert (demo.header.scene["name"], demo.header.policy["name"]) == ("flat", "ours-pano")
+    assert (demo.header.scene["name"], demo.header.policy["name"]) == ("flat", "r3-pano")
     assert sum(not row.captured for row in demo.rows) == 4
     assert demo.header.config["capture_every"] == 0.3
     assert "PSNR" in (tmp_path / "demo" / "report" / "report.html").read_text()

@@ -18,6 +18,6 @@ from r3jax.cli.options.explore import ExploreOptions, MotionOptions
 def test_default_names(scene, expected, monkeypatch):
     monkeypatch.setattr("r3jax.cli.options.explore.check_scene", lambda *_: None)
     options = ExploreOptions(scene=scene, seed=3)
-    assert options.path("ours").name == f"{expected}-ours-seed3"
+    assert options.path("r3").name == f"{expected}-r3-seed3"
     options = ExploreOptions(scene=scene, seed=3, robot=MotionOptions(motion="ground"))
-    assert options.path("ours").name == f"{expected}-ours-ground-seed3"
+    assert options.path("r3").name == f"{expected}-r3-ground-seed3"

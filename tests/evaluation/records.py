@@ -6,13 +6,13 @@ import numpy as np
 
 SKILL = {
     "random": 17.5, "frontier": 20.5, "cover": 21.0, "active-gamer": 22.0, "active-gs": 25.0,
-    "ours": 26.0, "ours-pano": 26.3,
+    "r3": 26.0, "r3-pano": 26.3,
 }  # fmt: skip
 """PSNR that a policy ends with [dB]."""
 
 
 def record(
-    policy="ours", scene="flat", seed=0, snapshot=30, *, budget=60, views=12, psnr=None, **changes
+    policy="r3", scene="flat", seed=0, snapshot=30, *, budget=60, views=12, psnr=None, **changes
 ):
     """One record; `psnr` fixes the views' values, `changes` replace top-level fields."""
     digits = [ord(letter) for letter in f"{policy}{scene}{seed}{snapshot}"]
@@ -23,7 +23,7 @@ def record(
         psnr = np.clip(center + hard + rng.normal(0.0, 1.0, views), 4.0, 45.0)
     psnr = np.asarray(psnr, float)
     ssim = 1.0 - 1.2 * np.exp(-psnr / 12.0)
-    pace = {"ours": 1.2, "ours-pano": 1.0}.get(policy, 1.6)
+    pace = {"r3": 1.2, "r3-pano": 1.0}.get(policy, 1.6)
     fields = {
         "format": 1, "scene": scene, "scene_hash": f"hash of {scene}", "policy": policy,
         "settings": {}, "seed": seed, "budget": f"views:{budget}", "snapshot": f"views:{snapshot}",

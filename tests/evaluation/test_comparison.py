@@ -39,7 +39,7 @@ DIFFERENCES = [
 
 @pytest.mark.parametrize(("path", "value", "message"), DIFFERENCES)
 def test_unequal_terms_are_refused(path, value, message):
-    cells = benchmark(("active-gs", "ours"))
+    cells = benchmark(("active-gs", "r3"))
     check_equal_terms(cells)
     place = cells[-1]
     for name in path[:-1]:
@@ -47,7 +47,7 @@ def test_unequal_terms_are_refused(path, value, message):
     place[path[-1]] = value
     with pytest.raises(ValueError, match=message) as caught:
         check_equal_terms(cells)
-    assert "house, ours, seed 2" in str(caught.value)
+    assert "house, r3, seed 2" in str(caught.value)
 
 
 def test_what_may_differ():
@@ -61,7 +61,7 @@ def test_what_may_differ():
 
 
 def test_records_that_occur_twice_or_not_at_all():
-    with pytest.raises(ValueError, match="flat, ours, seed 0, views:30 occurs twice"):
+    with pytest.raises(ValueError, match="flat, r3, seed 0, views:30 occurs twice"):
         check_equal_terms([record(), record(seed=1), record() | {"budget": "views:30"}])
     with pytest.raises(ValueError, match="no records"):
         check_equal_terms([])
@@ -69,11 +69,11 @@ def test_records_that_occur_twice_or_not_at_all():
 
 def test_names_and_orders_do_not_depend_on_the_order_of_records():
     cells = [
-        record("ours-pano"), record("ours", settings={"pool": 9, "bins": 2}), record("ours"),
+        record("r3-pano"), record("r3", settings={"pool": 9, "bins": 2}), record("r3"),
         record("active-gs", "a"), record("random"), {**record(), "policy": "mine"},
     ]  # fmt: skip
-    assert method_name(cells[1]) == "ours (bins=2, pool=9)"
-    order = ["mine", "random", "active-gs", "ours", "ours (bins=2, pool=9)", "ours-pano"]
+    assert method_name(cells[1]) == "r3 (bins=2, pool=9)"
+    order = ["mine", "random", "active-gs", "r3", "r3 (bins=2, pool=9)", "r3-pano"]
     assert methods_of(cells) == methods_of(cells[::-1]) == order
     assert scenes_of(cells) == ["a", "flat"]
     sizes = ["views:100", "views:30", "seconds:20.5", "views:9"]
@@ -82,9 +82,9 @@ def test_names_and_orders_do_not_depend_on_the_order_of_records():
 
 
 def test_what_is_said_of_a_policy_in_brackets_stands_behind_it():
-    names = ["ours (submitted)", "r3con (captures)", "ours", "theirs (submitted)", "r3con"]
+    names = ["r3 (submitted)", "r3con (captures)", "r3", "theirs (submitted)", "r3con"]
     assert methods_of([record() | {"policy": name} for name in names]) == [
-        "theirs (submitted)", "r3con", "r3con (captures)", "ours", "ours (submitted)",
+        "theirs (submitted)", "r3con", "r3con (captures)", "r3", "r3 (submitted)",
     ]  # fmt: skip
 
 
@@ -98,10 +98,10 @@ def test_scores_are_seeds_by_views():
     cells[2]["views"]["ssim"] = [None, 0.5]
     cells[2]["views"]["psnr_measured"] = [None, None]
     found = scores_by_method(cells, "psnr")
-    np.testing.assert_array_equal(found["ours"]["flat"], [[1.0, 2.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(found["r3"]["flat"], [[1.0, 2.0], [3.0, 4.0]])
     np.testing.assert_array_equal(found["random"]["flat"], [[5.0, 6.0]])
-    assert set(scores_by_method(cells, "lpips")) == {"ours"}
-    assert set(scores_by_method(cells, "psnr_measured")) == {"ours"}
+    assert set(scores_by_method(cells, "lpips")) == {"r3"}
+    assert set(scores_by_method(cells, "psnr_measured")) == {"r3"}
     np.testing.assert_array_equal(
         scores_by_method(cells, "ssim")["random"]["flat"], [[np.nan, 0.5]]
     )
@@ -113,19 +113,19 @@ def test_seeds_tell_what_is_missing():
     cells = [record(seed=1), record(seed=0), record("random", "house"), record(snapshot=60)]
     assert seeds_by_method(cells) == {
         "random": {"flat": [], "house": [0]},
-        "ours": {"flat": [0, 1], "house": []},
+        "r3": {"flat": [0, 1], "house": []},
     }
 
 
 def test_names_are_as_short_as_the_set_allows():
     cells = [
-        record("ours", "mesh:/a/room.ply", settings={"pool": 9, "bins": 2}),
-        record("ours", "mesh:/b/hall.obj", settings={"pool": 9, "bins": 4}),
+        record("r3", "mesh:/a/room.ply", settings={"pool": 9, "bins": 2}),
+        record("r3", "mesh:/b/hall.obj", settings={"pool": 9, "bins": 4}),
         record("random", settings={"pool": 9}),
     ]
     assert shared_settings(cells) == {"pool": 9}
     short = with_short_names(cells)
-    assert methods_of(short) == ["random", "ours (bins=2)", "ours (bins=4)"]
+    assert methods_of(short) == ["random", "r3 (bins=2)", "r3 (bins=4)"]
     assert [cell["scene"] for cell in short] == ["room", "hall", "flat"]
     assert [cell["views"] for cell in short] == [cell["views"] for cell in cells]
     assert cells[0]["settings"] == {"pool": 9, "bins": 2}  # the given records stay as they are
@@ -133,4 +133,4 @@ def test_names_are_as_short_as_the_set_allows():
     assert scenes_of(same) == ["mesh:/a/room.ply", "mesh:/b/room.ply"]
     other = [record(settings={"pool": 9}), record("random", settings={"pool": 8}), record("cover")]
     assert shared_settings(other) == {}
-    assert methods_of(with_short_names(other)) == ["random (pool=8)", "cover", "ours (pool=9)"]
+    assert methods_of(with_short_names(other)) == ["random (pool=8)", "cover", "r3 (pool=9)"]

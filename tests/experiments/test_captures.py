@@ -55,13 +55,13 @@ def test_rows_are_chosen_by_name_and_by_policy():
 
 
 def test_the_cells_of_ours_pano_are_the_weight_that_its_swap_takes_over():
-    """The part that `r3con` is measured without is the one that `ours-pano` has."""
+    """The part that `r3con` is measured without is the one that `r3-pano` has."""
     swapped = TABLES["r3con"]["r3con, 16 for a cell instead of 1000"].planner["cell_weight"]
-    assert swapped == float(make_policy("ours-pano").config.scoring.lambda1)
+    assert swapped == float(make_policy("r3-pano").config.scoring.lambda1)
     fixed = TABLES["r3con"]["r3con, path weight 0.5 instead of adaptive"].planner["path_weight"]
-    assert fixed == make_policy("ours-pano").config.lambda2
+    assert fixed == make_policy("r3-pano").config.lambda2
     theirs = make_policy("r3con").config
-    candidates = TABLES["r3con"]["ours-pano, candidates of r3con"].planner
+    candidates = TABLES["r3con"]["r3-pano, candidates of r3con"].planner
     assert candidates == {name: getattr(theirs, name) for name in candidates}
 
 
@@ -103,7 +103,7 @@ def test_what_rows_differ_in_on_purpose_is_no_unequal_term():
 
 def test_what_differs_in_its_training_only_takes_over_the_flight(tmp_path, monkeypatch):
     short, long, other = (
-        Cell("flat", "a", "ours", seed, Conditions(iterations=iterations), "b", 9)
+        Cell("flat", "a", "r3", seed, Conditions(iterations=iterations), "b", 9)
         for seed, iterations in ((0, 1500), (0, 6000), (1, 1500))
     )
     flown = []
@@ -127,7 +127,7 @@ def test_what_differs_in_its_training_only_takes_over_the_flight(tmp_path, monke
 def test_a_table_holds_the_times_that_were_asked_for(tmp_path, monkeypatch):
     """Another table may have asked for more of the same cell."""
     conditions = Conditions(budget="seconds:60", snapshots=("seconds:60",))
-    cell = Cell("flat", "a", "ours-ahead", 0, conditions, "b", 9)
+    cell = Cell("flat", "a", "r3-ahead", 0, conditions, "b", 9)
     found = [
         record("", 0, [1.0], 1, snapshot=snapshot, sensing={}, training={})
         for snapshot in ("seconds:30", "seconds:60")
@@ -247,11 +247,9 @@ def test_costs_are_medians_over_all_flights_of_a_row(tmp_path, monkeypatch):
     monkeypatch.setattr(captures, "read_run", runs.get)
     cells = {
         "seeing": [
-            flown("ours", 0, [step(None, 0, 0.10), step(0.3, 0, 0.20), step(None, 0, 0.30, 0.01)]),
-            flown(
-                "ours", 1, [step(None, 0, 0.40), step(0.1, 0.8, 0.5, 0.03), step(0.2, 0.1, 0.66)]
-            ),
-            flown("ours", 2, []),  # flown on another machine
+            flown("r3", 0, [step(None, 0, 0.10), step(0.3, 0, 0.20), step(None, 0, 0.30, 0.01)]),
+            flown("r3", 1, [step(None, 0, 0.40), step(0.1, 0.8, 0.5, 0.03), step(0.2, 0.1, 0.66)]),
+            flown("r3", 2, []),  # flown on another machine
         ],
         "at once": [flown("random", 0, [step(None, 0, 0.05)])],
     }

@@ -65,7 +65,7 @@ def test_the_page_and_the_calibration(known, tmp_path):
 def test_the_views_are_those_of_the_table(tmp_path):
     path = tmp_path / "views.csv"
     rows = [
-        {"scene": "flat", "method": "ours", "seed": 0, "snapshot": "views:30", "view": view,
+        {"scene": "flat", "method": "r3", "seed": 0, "snapshot": "views:30", "view": view,
          "coverage": 0.5, "R": 0.25, "psnr": 20 + view}
         for view in range(3)
     ]  # fmt: skip
@@ -76,7 +76,7 @@ def test_the_views_are_those_of_the_table(tmp_path):
         writer.writerows(rows)
     known = read_views(path)
     np.testing.assert_array_equal(known.psnr, [20.0, 21.0, 22.0])
-    assert known.models == ["flat ours 0 views:30"] * 3
+    assert known.models == ["flat r3 0 views:30"] * 3
     with pytest.raises(SystemExit, match="run experiments"):
         read_views(tmp_path / "missing.csv")
 

@@ -115,7 +115,7 @@ def test_bytes_of_a_state():
 
 def test_an_unknown_policy_is_named():
     with pytest.raises(ValueError, match="unknown best"):
-        Options(policies=("ours", "best"))
+        Options(policies=("r3", "best"))
 
 
 @pytest.fixture

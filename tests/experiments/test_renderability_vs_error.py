@@ -31,7 +31,7 @@ def predicted(rng, coverage, quality_on_seen, noise_on_seen):
     return columns | {COVERAGE: coverage, "seen_share": coverage}
 
 
-def disguised(scene="flat", seed=0, snapshot=30, policy="ours"):
+def disguised(scene="flat", seed=0, snapshot=30, policy="r3"):
     """One model: holes are black, and seen pixels are as good as their directions."""
     rng = np.random.default_rng([seed, snapshot, len(scene), len(policy)])
     coverage = rng.uniform(0.3, 1.0, VIEWS)
@@ -111,7 +111,7 @@ def test_models_are_never_pooled():
         found, columns = disguised(snapshot=snapshot)
         order = np.linspace(0.0, 0.1, VIEWS)
         columns["R"] = 0.2 + 0.5 * k + order
-        found = record("ours", "flat", 0, snapshot, psnr=15.0 + 10.0 * k - 10.0 * order)
+        found = record("r3", "flat", 0, snapshot, psnr=15.0 + 10.0 * k - 10.0 * order)
         pairs.append((found, columns))
     both = models_of(pairs)
     assert both.estimate("spearman", "R", "psnr").value == pytest.approx(-1.0)
@@ -184,7 +184,7 @@ def test_the_page_shows_its_pictures(written):
             assert SOURCE.commit in picture.info["Description"]
             assert min(picture.size) > 200
     assert "differs by more than 0 " in page
-    assert "Models of ours. Trained briefly." in page
+    assert "Models of r3. Trained briefly." in page
     assert SOURCE.commit in page
 
 

@@ -20,7 +20,7 @@ from tests.box_room import write_room
 from tests.planning.rooms import center, grid_of, pose_at
 
 KNOWN = known_settings(Conditions())
-CELL = Cell("flat", "a" * 64, "ours", 0, CONDITIONS, "b" * 64, 100)
+CELL = Cell("flat", "a" * 64, "r3", 0, CONDITIONS, "b" * 64, 100)
 
 ODD = {
     "policy.kappa": "one", "policy.delta": "pairwise", "training.strategy": "mcmc",
@@ -49,9 +49,9 @@ def test_every_setting_makes_another_cell_and_its_default_the_same(name):
     assert find_setting(name, KNOWN) == KNOWN[name]
     cell = CELL
     if here.field in OF_AHEAD:
-        with pytest.raises(ValueError, match=f"policy 'ours' has no setting {here.field}"):
+        with pytest.raises(ValueError, match=f"policy 'r3' has no setting {here.field}"):
             with_settings(CELL, {name: changed(here)})
-        cell = dataclasses.replace(CELL, policy="ours-ahead")
+        cell = dataclasses.replace(CELL, policy="r3-ahead")
     other = with_settings(cell, {name: changed(here)})
     assert other.name != cell.name
     assert with_settings(cell, {name: here.default}).name == cell.name
@@ -108,7 +108,7 @@ def test_settings_are_in_the_map_in_the_run_and_in_the_record(tmp_path):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["ours", "ours-pano"])
+@pytest.mark.parametrize("name", ["r3", "r3-pano"])
 def test_a_sweep_over_numbers_compiles_once(name):
     free = np.zeros((12, 12, 10), dtype=bool)
     free[2:10, 2:10, 2:8] = True

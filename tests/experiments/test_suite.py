@@ -21,7 +21,7 @@ from tests.runs.runs import make_header, make_view
 
 SOURCE = Origin("python -m experiments.some", "a machine", "abc")
 ROOT = Path(__file__).parents[2]
-POLICIES = ("random", "active-gs", "ours", "ours-pano")
+POLICIES = ("random", "active-gs", "r3", "r3-pano")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def data_of(path):
 def test_every_size_is_a_benchmark_that_can_run(size, unit):
     request = request_of(Options(size=size), unit)
     assert set(request.policies) <= set(policy_names())
-    assert {"ours", "ours-pano", "active-gs", "random"} <= set(request.policies)
+    assert {"r3", "r3-pano", "active-gs", "random"} <= set(request.policies)
     conditions = request.conditions
     assert conditions.budget == conditions.snapshots[-1]
     assert conditions.budget.startswith(unit)
@@ -66,7 +66,7 @@ def test_a_table_of_equal_views_keeps_its_records_and_poses(tmp_path, monkeypatc
     """Flights are called as their policy; those of another machine come from beside its table."""
     cells = [
         Cell(scene, "a", policy, 0, Conditions(), "b", 9)
-        for policy in ("ours", "random")
+        for policy in ("r3", "random")
         for scene in ("flat", "office")
     ]
     made = [record(cell.policy, cell.scene, 0, 30) for cell in cells]
@@ -87,11 +87,11 @@ def test_a_table_of_equal_views_keeps_its_records_and_poses(tmp_path, monkeypatc
 def test_records_of_other_terms_find_no_place(tmp_path):
     """What a cell lacks is taken over from a file; what it has stays, and others change nothing."""
     conditions = Conditions(snapshots=("views:30", "views:60"))
-    cells = [Cell("flat", "a", "ours", seed, conditions, "b", 9) for seed in (0, 1)]
+    cells = [Cell("flat", "a", "r3", seed, conditions, "b", 9) for seed in (0, 1)]
 
     def made(cell, snapshot, psnr):
         run = paths_of(tmp_path, cell).run.relative_to(tmp_path).as_posix()
-        return record("ours", "flat", cell.seed, snapshot, psnr=psnr) | {"run": run}
+        return record("r3", "flat", cell.seed, snapshot, psnr=psnr) | {"run": run}
 
     longer = replace(cells[1], conditions=replace(conditions, iterations=9))
     elsewhere = [made(cells[0], 30, [1.0]), made(cells[0], 60, [2.0]), made(longer, 30, [3.0])]
@@ -110,11 +110,11 @@ def test_tables_hold_the_last_snapshot(records, tmp_path):
     for kind in ("quality", "tails", "differences"):
         assert "\\toprule" in (tmp_path / f"{kind}.tex").read_text()
     rows = data_of(tmp_path / "quality.csv")
-    chosen = [r for r in records if r["policy"] == "ours" and r["snapshot"] == "views:60"]
+    chosen = [r for r in records if r["policy"] == "r3" and r["snapshot"] == "views:60"]
     expected = np.mean([r["views"]["psnr"] for r in chosen if r["scene"] == "flat"])
-    (found,) = [r for r in rows if r["method"] == "ours" and r["metric"].startswith("PSNR")]
+    (found,) = [r for r in rows if r["method"] == "r3" and r["metric"].startswith("PSNR")]
     assert float(found["flat"]) == pytest.approx(expected, abs=1e-6)
-    without = [r for r in records if r["policy"] != "ours-pano"]
+    without = [r for r in records if r["policy"] != "r3-pano"]
     assert "differences" not in replica_dense.tables_of(without[1::2])
 
 

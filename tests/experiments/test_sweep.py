@@ -36,7 +36,7 @@ def trial(value, level, seeds=(0, 1), scenes=("loft", "kitchen")):
     rng = np.random.default_rng(5)
     hard = rng.normal(0.0, 2.0, 12)
     records = [
-        record("ours", scene, seed, 30, budget=30, psnr=20.0 + levels[scene] + hard + 0.1 * seed)
+        record("r3", scene, seed, 30, budget=30, psnr=20.0 + levels[scene] + hard + 0.1 * seed)
         for scene in scenes
         for seed in seeds
     ]
@@ -74,7 +74,7 @@ def test_a_gain_that_may_be_chance_is_not_chosen():
     noise = np.random.default_rng(0).normal(0.0, 3.0, 12)
     noise += 0.1 - noise.mean()
     views = np.array(base.records[0]["views"]["psnr"]) + noise
-    other = Trial({LAMBDA1.name: 4.0}, [record("ours", "loft", 0, 30, budget=30, psnr=views)])
+    other = Trial({LAMBDA1.name: 4.0}, [record("r3", "loft", 0, 30, budget=30, psnr=views)])
     choice = choose([base, other], DEFAULT)
     assert choice.best == 1
     assert abs(choice.gains[1].value - 0.1) < 1e-9
@@ -110,7 +110,7 @@ def test_a_default_that_was_not_tried_is_refused():
 
 
 def page_of(tmp_path, trials, setting=(LAMBDA1,), reported=("flat", "mesh:a/house.glb")):
-    write_page(tmp_path, Sweep("ours", setting, tuple(trials)), reported, SOURCE)
+    write_page(tmp_path, Sweep("r3", setting, tuple(trials)), reported, SOURCE)
     return (tmp_path / "sweep.md").read_text()
 
 
@@ -146,14 +146,14 @@ def test_the_page_warns_of_scenes_that_tables_report(tmp_path):
 def test_the_page_keeps_the_default_where_nothing_is_told_apart(tmp_path):
     noise = np.random.default_rng(0).normal(0.0, 3.0, 12)
     views = 20.0 + noise - noise.mean()
-    base = [record("ours", "loft", 0, 30, budget=30, psnr=np.full(12, 19.9))]
-    other = [record("ours", "loft", 0, 30, budget=30, psnr=views)]
+    base = [record("r3", "loft", 0, 30, budget=30, psnr=np.full(12, 19.9))]
+    other = [record("r3", "loft", 0, 30, budget=30, psnr=views)]
     trials = [Trial({LAMBDA1.name: 16.0}, base), Trial({LAMBDA1.name: 8.0}, other)]
     page = page_of(tmp_path, trials)
     assert "Best is **lambda1 = 8**" in page
     assert "the difference, view by view, is +0.10 [" in page
     assert "do not tell them apart, and the default stays." in page
-    sweep_of = Sweep("ours", (LAMBDA1,), tuple(trials))
+    sweep_of = Sweep("r3", (LAMBDA1,), tuple(trials))
     (axes,) = setting_figure(sweep_of, LAMBDA1, choose(trials, DEFAULT)).axes
     assert axes.get_title(loc="right") == "chosen: policy.lambda1 = 16"
 

@@ -213,12 +213,12 @@ def cut_off(path, num):
 
 RUNS = {
     "wander": (Wander(reach=1.2), AHEAD, "frames:12"),
-    "ours-pano": (small_policy("ours-pano"), PANORAMA, "frames:14"),
+    "r3-pano": (small_policy("r3-pano"), PANORAMA, "frames:14"),
     "r3con": (small_policy("r3con"), PANORAMA, "frames:14"),
 }
 
 
-@pytest.mark.parametrize("name", quick_and_full(RUNS, ["wander", "ours-pano"], slow=["r3con"]))
+@pytest.mark.parametrize("name", quick_and_full(RUNS, ["wander", "r3-pano"], slow=["r3con"]))
 def test_a_run_that_is_cut_off_on_the_way_goes_on_as_if_it_had_not_been(tmp_path, name):
     policy, config, budget = RUNS[name]
     whole, _ = record(tmp_path / "whole", policy, config, budget)
@@ -239,7 +239,7 @@ def test_a_run_that_is_cut_off_on_the_way_goes_on_as_if_it_had_not_been(tmp_path
 
 
 def test_a_replayed_run_is_the_recorded_one_and_can_be_explained(tmp_path):
-    policy = small_policy("ours")
+    policy = small_policy("r3")
     result, _ = record(tmp_path / "run", policy, PANORAMA, "frames:9")
     run = read_run(tmp_path / "run")
     assert differences(run) == (9, [])

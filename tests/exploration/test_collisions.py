@@ -36,7 +36,7 @@ def assert_no_collision(world, segments) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("scene", "policy"), [("flat", "ours-pano")])
+@pytest.mark.parametrize(("scene", "policy"), [("flat", "r3-pano")])
 def test_no_run_touches_the_mesh(scene, policy):
     world, segments, result = fly(scene, policy, views=16)
     assert len(result.rows) == 16

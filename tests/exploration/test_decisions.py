@@ -21,7 +21,7 @@ from r3jax.simulators.scenes.registry import open_scene
 
 GOLDENS = Path(__file__).with_name("decisions.npz")
 SCENES = ("flat", "apartment")
-POLICIES = ("ours", "ours-pano", "ours-ahead", "active-gs", "frontier")
+POLICIES = ("r3", "r3-pano", "r3-ahead", "active-gs", "frontier")
 VIEWS = 25
 
 

@@ -84,9 +84,8 @@ class Watched:
     "name",
     quick_and_full(
         policy_names(),
-        ["ours-pano"],
-        slow=set(policy_names())
-        - {"ours-pano", "ours-ahead", "active-gs", "active-gamer", "cover"},
+        ["r3-pano"],
+        slow=set(policy_names()) - {"r3-pano", "r3-ahead", "active-gs", "active-gamer", "cover"},
     ),
 )
 def test_no_policy_holds_the_simulator(name):

@@ -117,7 +117,7 @@ def test_the_hall_has_walls_and_pillars():
 @pytest.mark.full
 def test_a_short_run_in_a_small_hall(tmp_path):
     """The same code at a size for every day; memory still settles, so it is not asked."""
-    policy = small_policy("ours-pano")
+    policy = small_policy("r3-pano")
     hall = Hall((4.0, 3.0, 2.4), Camera.from_fov(48, 48, 90.0))
     watch = long_run(tmp_path / "run", hall, policy, CONFIG, 6)
     assert len(watch.memory) == 6
@@ -132,7 +132,7 @@ def test_a_thousand_views_of_a_hall_of_sixty_meters(tmp_path, capsys):
         settings = " ".join(f"{name}={value}" for name, value in ALLOCATOR.items())
         pytest.fail(f"start pytest with {settings}: see the head of this file")
     scoring = ScoringConfig(zbuffer_size=64, panorama_size=64)
-    policy = make_policy("ours-pano", num_candidates=12, num_frontier=6, scoring=scoring)
+    policy = make_policy("r3-pano", num_candidates=12, num_frontier=6, scoring=scoring)
     # Room for 5.9 million voxels, 70 % of the rows: a table that doubles on the way, as one of
     # 4 million rows does at view 700, is more memory and no leak.
     # Few probes: the coverage numbers are beside the mission, and not what is watched here.

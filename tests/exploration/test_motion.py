@@ -79,7 +79,7 @@ def ground_run(tmp_path_factory):
         main_without_report(["explore", *words.split(), "--budget", "views:8", "--out", str(out)])
         == 0
     )
-    return out / "flat-ours-pano-ground-seed0"
+    return out / "flat-r3-pano-ground-seed0"
 
 
 @pytest.mark.full

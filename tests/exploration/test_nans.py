@@ -20,7 +20,7 @@ class HoleyRoom(BoxRoom):
         return type(frame)(frame.rgb, depth, frame.T_world_camera, frame.camera)
 
 
-SCORERS = ("ours", "ours-pano", "active-gs", "cover")
+SCORERS = ("r3", "r3-pano", "active-gs", "cover")
 """One of each way to score; the others score like one of these, and run outside the gate."""
 
 OTHERS = [name for name in policy_names() if name not in SCORERS]

@@ -26,7 +26,7 @@ SEEN = replace(MOVING, capture_every=0.2)
 KEY = jax.random.key(7)
 
 
-def planner_after(views: int, name: str = "ours"):
+def planner_after(views: int, name: str = "r3"):
     """A planner that has seen some views of the room, and where the camera is."""
     simulator = BoxRoom()
     result = explore(simulator, small_policy(name), budget=f"views:{views}", config=CONFIG)
@@ -35,7 +35,7 @@ def planner_after(views: int, name: str = "ours"):
 
 def test_the_clock_is_charged_for_what_the_flight_does_not_hide():
     """0.3 s of planning, 0.05 s on arrival: all but what the flight before took."""
-    rows = explore(BoxRoom(), small_policy("ours"), budget="views:7", config=MOVING).rows
+    rows = explore(BoxRoom(), small_policy("r3"), budget="views:7", config=MOVING).rows
     assert rows[1].charged["planning"] == 0.3  # nothing was flown before
     assert rows[1].hidden == 0.0
     for before, row in pairwise(rows[1:]):
@@ -48,7 +48,7 @@ def test_the_clock_is_charged_for_what_the_flight_does_not_hide():
 
 
 def test_a_flight_with_captures_hides_as_much_as_it_takes_in_all():
-    rows = explore(BoxRoom(), small_policy("ours-pano"), budget="views:5", config=SEEN).rows
+    rows = explore(BoxRoom(), small_policy("r3-pano"), budget="views:5", config=SEEN).rows
     ends = [i for i, row in enumerate(rows) if not row.captured]
     for a, b in pairwise(ends[1:]):
         leg, first = rows[ends[ends.index(a) - 1] + 1 : a + 1], rows[a + 1]
@@ -115,7 +115,7 @@ def test_what_no_path_leads_to_any_more_is_decided_anew():
     assert decision is None
 
 
-@pytest.mark.parametrize("name", quick_and_full(["frontier", "active-gamer", "ours-ahead"], []))
+@pytest.mark.parametrize("name", quick_and_full(["frontier", "active-gamer", "r3-ahead"], []))
 def test_every_policy_can_plan_on_the_way(name):
     rows = explore(BoxRoom(), small_policy(name), budget="views:6", config=MOVING).rows
     assert len(rows) == 6
@@ -134,7 +134,7 @@ RUNS = {"blind": (MOVING, "views:7"), "captures": (SEEN, "frames:14")}
 @pytest.mark.parametrize("name", quick_and_full(RUNS, ["captures"]))
 def test_a_run_that_is_cut_off_goes_on_as_if_it_had_not_been(tmp_path, name):
     config, budget = RUNS[name]
-    policy = small_policy("ours-pano")
+    policy = small_policy("r3-pano")
     whole, _ = record(tmp_path / "whole", policy, config, budget)
     cut = len(whole.rows) // 2
     for how in ("stopped", "killed"):

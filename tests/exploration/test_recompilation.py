@@ -35,7 +35,7 @@ class Compilations:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("policy", ["ours", "ours-pano", "ours-ahead"])
+@pytest.mark.parametrize("policy", ["r3", "r3-pano", "r3-ahead"])
 def test_nothing_is_compiled_after_the_tenth_decision(policy):
     jax.clear_caches()  # as in a process of its own: programs of other tests would hide its own
     seen = Compilations()

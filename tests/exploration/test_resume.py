@@ -87,7 +87,7 @@ def whole(tmp_path_factory):
     "name",
     quick_and_full(
         [
-            "wander", "ours-pano", "active-gs", "gavis", "frontier",
+            "wander", "r3-pano", "active-gs", "gavis", "frontier",
             "active-gs-online", "fisherrf", "gauss-mi",
         ],
         ["wander"],
@@ -106,7 +106,7 @@ def test_a_run_in_two_parts_is_the_run_in_one(tmp_path, whole, name):
 
 @pytest.mark.full
 def test_who_takes_over_knows_the_way_that_another_policy_came(tmp_path, whole):
-    shutil.copytree(whole("ours-pano"), tmp_path / "run")
+    shutil.copytree(whole("r3-pano"), tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints")
     run = read_run(tmp_path / "run")
     result = explore(
@@ -118,7 +118,7 @@ def test_who_takes_over_knows_the_way_that_another_policy_came(tmp_path, whole):
         decided_from=VIEWS,
     )
     taken_over = result.state.policy_state
-    own = read_run(whole("ours-pano")).load_checkpoint(VIEWS - 1)["policy"]
+    own = read_run(whole("r3-pano")).load_checkpoint(VIEWS - 1)["policy"]
     assert own["trail"].any()
     assert own["looks"].any()
     np.testing.assert_array_equal(np.asarray(taken_over.trail), own["trail"])
@@ -184,7 +184,7 @@ def test_damage_costs_time_and_nothing_else(tmp_path, whole, how):
 @pytest.mark.full
 def test_a_state_comes_back_from_its_tables(whole):
     """What is not an array comes from the first state, arrays keep shape and type."""
-    for name in ("ours-pano", "active-gs", "active-gamer", "frontier", "wander"):
+    for name in ("r3-pano", "active-gs", "active-gamer", "frontier", "wander"):
         simulator, policy = BoxRoom(), policy_of(name)
         state = explore(simulator, policy, budget="views:2", config=CONFIG).state
         first = explore(simulator, policy, budget="views:1", config=CONFIG).state
@@ -304,8 +304,8 @@ def _kill_at_random_moments(path, views, name, kills, span, rng):
     ("views", "name", "kills", "span"),
     [
         (6, "frontier", 1, 1.5),
-        pytest.param(8, "ours-pano", 3, 1.5, marks=pytest.mark.slow),
-        pytest.param(40, "ours-pano", 30, 2.5, marks=pytest.mark.slow),
+        pytest.param(8, "r3-pano", 3, 1.5, marks=pytest.mark.slow),
+        pytest.param(40, "r3-pano", 30, 2.5, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_survives_kills_at_random_moments(tmp_path, views, name, kills, span):

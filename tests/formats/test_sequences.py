@@ -148,5 +148,5 @@ def test_up_is_z_unless_the_world_is_the_first_cameras(tmp_path, kind):
     }[kind]
     lines = files[name].decode().splitlines()
     files[name] = "\n".join(still(line) for line in lines if line[0] != "#").encode()
-    lay_out(tmp_path / "ours", files)
-    assert read(tmp_path / "ours").up is None
+    lay_out(tmp_path / "r3", files)
+    assert read(tmp_path / "r3").up is None

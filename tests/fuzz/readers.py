@@ -459,7 +459,7 @@ def read_splats(folder: Path) -> None:
 
 def records() -> list[Files]:
     files = {}
-    for policy, snapshot in (("ours", 30), ("ours", 60), ("random", 60)):
+    for policy, snapshot in (("r3", 30), ("r3", 60), ("random", 60)):
         plain = record(policy, snapshot=snapshot)
         path = f"cells/flat-{policy}-seed0/snapshot-views-{snapshot}.json"
         files[path] = json.dumps(plain, separators=(",", ":")).encode() + b"\n"

@@ -80,7 +80,7 @@ def test_a_record_reads_back_as_it_was(name):
 
 
 def test_a_record_without_refinement_reads_as_it_always_did():
-    plain, refined = (settings_of(make_policy("ours", refine=num)) for num in (0, 4))
+    plain, refined = (settings_of(make_policy("r3", refine=num)) for num in (0, 4))
     assert not {"refine", "refine_radius"} & set(plain)
     assert refined["refine"] == 4
     assert PlannerConfig(refine_radius=refined["refine_radius"]).refine == 0
@@ -88,7 +88,7 @@ def test_a_record_without_refinement_reads_as_it_always_did():
 
 def test_a_record_without_a_sample_reads_as_it_always_did():
     plain, sampled = (
-        settings_of(make_policy("ours-pano", scoring=ScoringConfig(sample=num))) for num in (1, 4)
+        settings_of(make_policy("r3-pano", scoring=ScoringConfig(sample=num))) for num in (1, 4)
     )
     assert "sample" not in plain["scoring"]
     assert sampled["scoring"] == plain["scoring"] | {"sample": 4}

@@ -50,7 +50,7 @@ def test_what_is_scored_is_what_is_taken():
             zeros = np.zeros(len(poses))
             return SimpleNamespace(exploration=zeros, rendering=zeros, total=zeros + 1.0)
 
-        answer = decide(r3.Ours(config_of(name), score))
+        answer = decide(r3.R3(config_of(name), score))
         np.testing.assert_allclose(seen[0], answer.candidates, atol=1e-6)
         assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
 
@@ -65,7 +65,7 @@ def test_a_policy_that_turns_is_held():
             axes = LATTICE[allowed.argmax(axis=1)]  # the highest that is allowed
             return SimpleNamespace(best_direction=axes, best_score=np.ones(NUM))
 
-        answer = decide(r3.OursPano(config_of(name), score))
+        answer = decide(r3.R3Pano(config_of(name), score))
         assert_obeys(MOTIONS[name], level_start(), level_start(), answer, GRID)
         limits = Limits(MOTIONS[name], level_start())
         expected = limits.allowed_axes(answer.candidates[:, :3, 3], len(LATTICE))

@@ -130,10 +130,10 @@ def test_walks_from_anywhere_keep_to_the_limits(world, seed, name):
 
 
 def test_a_panorama_serves_every_motion_without_compiling_again(world):
-    walk(policy_of("ours-pano", MOTIONS["free"]), world, seed=3, num_decisions=1)
+    walk(policy_of("r3-pano", MOTIONS["free"]), world, seed=3, num_decisions=1)
     before = batch._score_positions._cache_size()
     for motion_name in CONSTRAINED:
-        walk(policy_of("ours-pano", MOTIONS[motion_name]), world, seed=3, num_decisions=1)
+        walk(policy_of("r3-pano", MOTIONS[motion_name]), world, seed=3, num_decisions=1)
     assert batch._score_positions._cache_size() == before
 
 

@@ -17,7 +17,7 @@ from r3jax.planning.candidates import poses_along
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decide import MAX_FAILED_LOOKS, initial_state, look_round, net_utility
 from r3jax.planning.policies.frontier import Frontier
-from r3jax.planning.policies.r3 import Ours, OursPano
+from r3jax.planning.policies.r3 import R3, R3Pano
 from r3jax.planning.policies.random import Random
 from r3jax.planning.policy import DecisionOutcome, Policy
 from r3jax.planning.registry import describe, make_policy, policy_names, source_of
@@ -59,8 +59,8 @@ def look_down(map_state, grid, camera, positions, config, allowed):
 
 def policies() -> list:
     return [
-        Ours(CONFIG, prefer_high_x),
-        OursPano(CONFIG, look_down),
+        R3(CONFIG, prefer_high_x),
+        R3Pano(CONFIG, look_down),
         Frontier(CONFIG),
         Random(CONFIG),
     ]
@@ -134,20 +134,20 @@ def test_utility_and_path_are_shares_of_their_sums():
 
 
 def test_ours_weighs_what_the_scorer_says(world):
-    decision, _, info = decide(Ours(CONFIG, prefer_high_x), world, center(6, 6, 4))
+    decision, _, info = decide(R3(CONFIG, prefer_high_x), world, center(6, 6, 4))
     u = decision.utilities
     np.testing.assert_array_equal(u["utility"], u["rendering"] + u["exploration"])
     expected = u["utility"] / u["utility"].sum() - 0.5 * u["path"] / u["path"].sum()
     np.testing.assert_allclose(u["total"], expected, rtol=1e-12)
     assert len(np.unique(u["path"])) > 10
     assert "scoring" in info.stage_seconds
-    greedy = Ours(PlannerConfig(num_candidates=NUM, num_frontier=12, lambda2=0.0), prefer_high_x)
+    greedy = R3(PlannerConfig(num_candidates=NUM, num_frontier=12, lambda2=0.0), prefer_high_x)
     farther, _, _ = decide(greedy, world, center(6, 6, 4))
     assert farther.T_world_camera[0, 3] == farther.candidates[:, 0, 3].max()
 
 
 def test_ours_mixes_local_views_with_views_of_the_frontier(world):
-    decision, _, _ = decide(Ours(CONFIG, prefer_high_x), world, center(6, 6, 4))
+    decision, _, _ = decide(R3(CONFIG, prefer_high_x), world, center(6, 6, 4))
     positions = decision.candidates[:, :3, 3]
     is_local = np.linalg.norm(positions - center(6, 6, 4), axis=1) <= 0.5
     assert NUM - 12 <= is_local.sum() < NUM
@@ -156,21 +156,21 @@ def test_ours_mixes_local_views_with_views_of_the_frontier(world):
     away = ~is_local
     assert np.all(np.abs(positions[away, 0] - edge) < 2.1)
     assert np.mean(decision.candidates[away, 0, 2] > 0) == 1.0
-    local_only = Ours(PlannerConfig(num_candidates=NUM, num_frontier=0), prefer_high_x)
+    local_only = R3(PlannerConfig(num_candidates=NUM, num_frontier=0), prefer_high_x)
     decision, _, _ = decide(local_only, world, center(6, 6, 4))
     offset = decision.candidates[:, :3, 3] - center(6, 6, 4)
     assert np.linalg.norm(offset, axis=1).max() <= 0.5
 
 
 def test_pano_takes_the_direction_from_the_panorama(world):
-    decision, _, _ = decide(OursPano(CONFIG, look_down), world, center(6, 6, 4))
+    decision, _, _ = decide(R3Pano(CONFIG, look_down), world, center(6, 6, 4))
     np.testing.assert_allclose(decision.T_world_camera[:3, 2], [0, 0, -1], atol=1e-6)
     np.testing.assert_allclose(
         decision.utilities["utility"], decision.candidates[:, 2, 3] ** 2, rtol=1e-5
     )
 
 
-@pytest.mark.parametrize("policy_class", [Ours, OursPano])
+@pytest.mark.parametrize("policy_class", [R3, R3Pano])
 def test_the_scorer_never_sees_hopeless_cells(policy_class):
     free, occupied = two_rooms()
     occupied[12] = True  # the door is shut: the second room cannot be entered
@@ -181,7 +181,7 @@ def test_the_scorer_never_sees_hopeless_cells(policy_class):
 
     def spy(map_state, grid, camera, views, config, *more, **asked):
         grids.append(grid)
-        stand_in = prefer_high_x if policy_class is Ours else look_down
+        stand_in = prefer_high_x if policy_class is R3 else look_down
         return stand_in(map_state, grid, camera, views, config, *more, **asked)
 
     grid = grid_of(free, occupied)
@@ -228,7 +228,7 @@ def test_random_draws_another_view_with_another_key(world):
 
 
 def test_the_trail_follows_the_robot(world):
-    policy = Ours(CONFIG, prefer_high_x)
+    policy = R3(CONFIG, prefer_high_x)
     _, state, _ = decide(policy, world, center(6, 6, 4))
     _, later, _ = decide(policy, world, center(3, 4, 4), state)
     before, after = np.asarray(state.trail), np.asarray(later.trail)
@@ -240,8 +240,8 @@ def test_the_trail_follows_the_robot(world):
 
 def test_the_registry_makes_what_it_names():
     known = {
-        "ours",
-        "ours-pano",
+        "r3",
+        "r3-pano",
         "cover",
         "frontier",
     }
@@ -251,19 +251,19 @@ def test_the_registry_makes_what_it_names():
         assert policy.name == name
         assert 20 < len(describe(name)) < 100
         assert 10 < len(source_of(name)) < 80
-    assert make_policy("ours", lambda2=0.1).config.lambda2 == 0.1
+    assert make_policy("r3", lambda2=0.1).config.lambda2 == 0.1
 
 
 def test_an_unknown_name_lists_the_known_ones():
     for call in (make_policy, describe, source_of):
-        with pytest.raises(ValueError, match=r"'best'.*ours, ours-pano, .*random"):
+        with pytest.raises(ValueError, match=r"'best'.*r3, r3-pano, .*random"):
             call("best")
         with pytest.raises(ValueError, match=r"'ours-demand' has left the package: .* e43d800"):
             call("ours-demand")
         with pytest.raises(ValueError, match=r"'uniform' has left the package: .* fb13156"):
             call("uniform")
     with pytest.raises(ValueError, match=r"no setting speed; known: num_candidates"):
-        make_policy("ours", speed=1.0)
+        make_policy("r3", speed=1.0)
 
 
 @pytest.mark.parametrize(
@@ -282,7 +282,7 @@ def test_an_unknown_name_lists_the_known_ones():
 )
 def test_impossible_settings_are_named(setting, value):
     with pytest.raises(ValueError, match=setting):
-        make_policy("ours", **{setting: value})
+        make_policy("r3", **{setting: value})
 
 
 def test_cells_looked_at_in_vain_are_left_alone():

@@ -202,7 +202,7 @@ def test_a_climb_comes_near_the_best_of_a_dense_grid():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["ours", "ours-pano"])
+@pytest.mark.parametrize("name", ["r3", "r3-pano"])
 def test_decisions_with_refinement(name):
     """The choice is one of the candidates, and what it was worth before is no more than after."""
     state, grid = known_flat()
@@ -219,7 +219,7 @@ def test_decisions_with_refinement(name):
     is_new = np.any(plain.candidates != better.candidates, axis=(1, 2))
     assert 0 < is_new.sum() <= REFINED
     assert np.all((better.utilities["utility"] > plain.utilities["utility"]) == is_new)
-    if name == "ours":
+    if name == "r3":
         parts = better.utilities["exploration"] * float(SCORING.lambda1)
         np.testing.assert_allclose(
             parts + better.utilities["rendering"], better.utilities["utility"], rtol=1e-5
@@ -237,7 +237,7 @@ def test_where_nothing_can_be_reached_nothing_climbs():
 
 def test_a_search_of_paths_has_no_refinement():
     with pytest.raises(ValueError, match="refine"):
-        make_policy("ours-ahead", refine=1)
+        make_policy("r3-ahead", refine=1)
 
 
 def cluttered(seed: int) -> tuple[Travel, np.ndarray]:

@@ -127,10 +127,18 @@ def test_a_registered_policy_has_settings_of_its_own(empty):
 
 
 def test_names_are_not_taken_twice(empty):
-    class Ours(r3jax.GreedyPolicy):
-        name = "ours"
+    class R3(r3jax.GreedyPolicy):
+        name = "r3"
 
-    with pytest.raises(ValueError, match="a policy of this package is called 'ours'"):
-        r3jax.register_policy(Ours)
+    with pytest.raises(ValueError, match="a policy of this package is called 'r3'"):
+        r3jax.register_policy(R3)
     with pytest.raises(ValueError, match="needs a class attribute `name`"):
         r3jax.register_policy(dict)
+
+
+@pytest.mark.parametrize("former", ["ours", "ours-pano", "ours-ahead"])
+def test_a_former_name_means_the_same_policy(former):
+    name = former.replace("ours", "r3")
+    assert type(registry.make_policy(former)) is type(registry.make_policy(name))
+    assert registry.make_policy(former).name == name
+    assert former not in registry.policy_names()

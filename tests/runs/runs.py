@@ -18,7 +18,7 @@ CAMERA = Camera.from_fov(8, 6, 70.0)
 def make_header(**changes) -> RunHeader:
     fields = {
         "scene": {"name": "toy", "hash": "abc"},
-        "policy": {"name": "ours", "settings": {"num_candidates": 7}},
+        "policy": {"name": "r3", "settings": {"num_candidates": 7}},
         "budget": "views:4",
         "seed": 3,
         "config": {"voxel_size": 0.05, "max_range": 5.0},

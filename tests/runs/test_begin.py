@@ -25,7 +25,7 @@ def runs(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs")
     room = write_room(tmp_path_factory.mktemp("mesh") / "room.ply")
     for seed in ("0", "1"):
-        words = ["--name", seed, "--seed", seed, "--policy", "ours", "--gaze", "ahead"]
+        words = ["--name", seed, "--seed", seed, "--policy", "r3", "--gaze", "ahead"]
         words += ["--capture-every", "0.1", "--budget", "frames:7"]
         assert small_runs.explore(room, out, *words) == 0
     both = [read_run(out / seed) for seed in ("0", "1")]

@@ -43,12 +43,12 @@ class GlassRoom(BoxRoom):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A short run of Ours, whose trace tells U_G and U_R of every view."""
+    """A short run of `r3`, whose trace tells U_G and U_R of every view."""
     path, room = tmp_path_factory.mktemp("hindsight") / "run", GlassRoom()
     settings = {"num_candidates": 12, "num_frontier": 4}
-    policy = make_policy("ours", scoring=r3jax.ScoringConfig(lambda1=3.0), **settings)
+    policy = make_policy("r3", scoring=r3jax.ScoringConfig(lambda1=3.0), **settings)
     header = make_header(
-        policy={"name": "ours", "settings": plain_settings(policy.config)},
+        policy={"name": "r3", "settings": plain_settings(policy.config)},
         config=dataclasses.asdict(CONFIG),
         camera=camera_fields(room.camera),
         bounds=room.bounds.tolist(),
@@ -116,7 +116,7 @@ def test_settings_are_the_runs_own(run):
     config = planner_config_of(run)
     assert float(config.scoring.lambda1) == 3.0
     assert (config.num_candidates, config.num_frontier) == (12, 4)
-    header = dataclasses.replace(run.header, policy={"name": "ours", "settings": {"novel": 1}})
+    header = dataclasses.replace(run.header, policy={"name": "r3", "settings": {"novel": 1}})
     with pytest.raises(RunError, match=r"setting of the policy: .*novel"):
         planner_config_of(dataclasses.replace(run, header=header))
 

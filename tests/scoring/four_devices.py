@@ -121,7 +121,7 @@ def test_scores_compile_once_for_all_maps_and_settings():
     assert traces == [{"name": center}]
 
 
-@pytest.mark.parametrize("name", ["ours", "ours-pano", "active-gs"])
+@pytest.mark.parametrize("name", ["r3", "r3-pano", "active-gs"])
 def test_a_decision_is_that_of_one_device(name, one_device, monkeypatch):
     used = []
     kept = batch.score_on_devices

@@ -15,6 +15,7 @@ from r3jax.apps.benchmark.cells import Cell, paths_of, snapshot_order
 from r3jax.evaluation.scores import METRICS, ViewRow, summarize
 from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic
+from r3jax.planning.policies import current_name
 from r3jax.runs.header import package_versions, plain_settings
 from r3jax.validation.errors import ForeignFileError, VersionError, check_version
 from r3jax.validation.files import read_bytes
@@ -209,7 +210,7 @@ def _parse_record(text: bytes) -> dict[str, Any]:
     lengths = {len(column) for column in record["views"].values() if column is not None}
     if len(lengths) != 1:
         raise ForeignFileError(f"the columns of `views` differ in length: {sorted(lengths)}")
-    return record
+    return record | {"policy": current_name(record["policy"])}
 
 
 def collect(root: Path) -> Path:

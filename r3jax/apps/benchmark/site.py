@@ -28,7 +28,7 @@ from r3jax.runs.writer import encode_png
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.render import render
 
-PAPER_LEAD = ("ours-pano", "active-gs", "views:300", 2.9, "arXiv 2601.07484")
+PAPER_LEAD = ("r3-pano", "active-gs", "views:300", 2.9, "arXiv 2601.07484")
 """What the paper reports of one method minus another at a budget, mean PSNR [dB], and its source;
 docs/results/views.md has it beside ours."""
 

@@ -13,7 +13,7 @@ from r3jax.cli.parsing import settings_for
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.files import own_folder
 
-DEFAULT_POLICIES = ("ours", "cover", "gavis", "random")
+DEFAULT_POLICIES = ("r3", "cover", "gavis", "random")
 
 
 def run_photos_of(console: Console, options: BenchmarkOptions) -> int:

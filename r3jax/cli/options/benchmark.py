@@ -175,7 +175,7 @@ class PhotoOptions:
 
     photos: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
     """Choose among the photos of these captures with depth, while a model trains on those chosen;
-    every eighth photo judges. Policies by default: ours,cover,gavis,random; --iterations count
+    every eighth photo judges. Policies by default: r3,cover,gavis,random; --iterations count
     after the last photo."""
 
     choose: int = 20
@@ -201,7 +201,7 @@ class BenchmarkOptions:
     """Compare policies on equal terms: explore, train and judge scenes x policies x seeds.
 
     For example
-        r3jax benchmark --scenes flat,office --policies ours,random --seeds 0,1
+        r3jax benchmark --scenes flat,office --policies r3,random --seeds 0,1
         r3jax benchmark --budget views:60 --snapshots views:30,views:60 --jobs 2
         r3jax benchmark --submission theirs.jsonl --check
         r3jax benchmark --photos captures/lounge --choose 12 --seeds 0,1,2
@@ -211,7 +211,7 @@ class BenchmarkOptions:
     """Comma-separated scenes: embedded ones by name, `mesh:<file>`, `replica:<name>`,
     `habitat:<file>`."""
 
-    policies: Annotated[str, arg(metavar="A,B")] = "ours,ours-pano,frontier,random"
+    policies: Annotated[str, arg(metavar="A,B")] = "r3,r3-pano,frontier,random"
     """Comma-separated policies: names, `module:Class`, `exec:COMMAND`."""
 
     seeds: Annotated[str, arg(metavar="0,1")] = "0"

@@ -23,7 +23,7 @@ from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig, parse_budge
 from r3jax.planning.policies.foreign.commands import short_name
 from r3jax.planning.robot.motion import Motion, make_motion
 
-DEFAULT_POLICY = "ours-pano"
+DEFAULT_POLICY = "r3-pano"
 
 _WITH_RESUME = ("resume", "budget", "until", "live", "port")
 _WITH_FORK = (
@@ -178,7 +178,7 @@ class ExploreOptions:
     For example
         r3jax explore --scene flat --budget views:50
         r3jax explore --scene mesh:house.glb --policy frontier --live
-        r3jax explore --resume runs/flat-ours-pano-seed0 --budget views:100
+        r3jax explore --resume runs/flat-r3-pano-seed0 --budget views:100
     """
 
     scene: Annotated[str | None, arg(metavar="SCENE")] = None
@@ -186,7 +186,7 @@ class ExploreOptions:
     `replica:<name>`, or `habitat:<file>` (GLB, PLY, stage config)."""
 
     policy: Annotated[str | None, arg(metavar="POLICY")] = None
-    """Policy that chooses the views: `ours-pano` by default; `r3jax policies` lists them. A class
+    """Policy that chooses the views: `r3-pano` by default; `r3jax policies` lists them. A class
     of yours is `module:Class`, a program in any language `exec:COMMAND`."""
 
     budget: Annotated[str | None, arg(metavar="BUDGET")] = None

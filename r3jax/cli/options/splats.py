@@ -49,8 +49,8 @@ class TrainOptions:
     """Train 3D Gaussian splatting from scratch on a run or a recording.
 
     For example
-        r3jax train runs/flat-ours-pano-seed0
-        r3jax train runs/flat-ours-pano-seed0 --iterations 30000 --name long
+        r3jax train runs/flat-r3-pano-seed0
+        r3jax train runs/flat-r3-pano-seed0 --iterations 30000 --name long
     """
 
     path: Annotated[Path, Positional, arg(metavar="RUN")]
@@ -106,8 +106,8 @@ class EvaluateOptions:
     """Evaluate a model on test views: PSNR, SSIM and LPIPS, their tails, and the worst views.
 
     For example
-        r3jax evaluate runs/flat-ours-pano-seed0
-        r3jax evaluate runs/flat-ours-pano-seed0 --views runs/flat-random-seed0
+        r3jax evaluate runs/flat-r3-pano-seed0
+        r3jax evaluate runs/flat-r3-pano-seed0 --views runs/flat-random-seed0
     """
 
     path: Annotated[Path, Positional, arg(metavar="RUN")]

@@ -19,9 +19,9 @@ GROUP = "r3jax.policies"
 HOMES = {
     name: f"r3jax.{home}"
     for name, home in {
-        "ours": "planning.policies.r3:Ours",
-        "ours-pano": "planning.policies.r3:OursPano",
-        "ours-ahead": "planning.policies.r3_ahead:OursAhead",
+        "r3": "planning.policies.r3:R3",
+        "r3-pano": "planning.policies.r3:R3Pano",
+        "r3-ahead": "planning.policies.r3_ahead:R3Ahead",
         "r3con": "baselines.r3con:R3con",
         "active-gs": "baselines.active_gs:ActiveGS",
         "active-gs-online": "baselines.active_gs_online:ActiveGSOnline",
@@ -36,14 +36,14 @@ HOMES = {
 }
 """Module and class of every policy of this package."""
 
-ALIASES = {"r3": "ours", "r3-pano": "ours-pano", "r3-ahead": "ours-ahead"}
-"""Other names of policies."""
+ALIASES = {"ours": "r3", "ours-pano": "r3-pano", "ours-ahead": "r3-ahead"}
+"""Former names of policies, in recorded runs, submissions and records."""
 
 FOREIGN = "r3jax.planning.policies.foreign.foreign:Foreign"
 """Module and class of the policy that asks a program."""
 
 RETIRED = {
-    "ours-demand": "it lost 0.74 dB against ours-pano; commit e43d800 has it",
+    "ours-demand": "it lost 0.74 dB against r3-pano; commit e43d800 has it",
     "fisherrf-d-opt": "use fisherrf with the settings criterion=d-opt, quirk=False",
 } | dict.fromkeys(
     ("active-gs-no-depth", "unseen", "unseen-depth", "uniform"),
@@ -70,6 +70,11 @@ def known_names() -> tuple[str, ...]:
     return tuple(dict.fromkeys([*HOMES, *plugins(), *REGISTERED]))
 
 
+def current_name(name: str) -> str:
+    """Translates a former name of a policy, as older runs and records have it."""
+    return ALIASES.get(name, name)
+
+
 def home_of(name: str) -> str:
     """Finds the `package.module:Class` of a policy that is not registered in this process.
 
@@ -82,7 +87,7 @@ def home_of(name: str) -> str:
     if name in RETIRED:
         raise ValueError(f"policy {name!r} has left the package: {RETIRED[name]}")
     # Before plug-ins: in recorded runs these names mean policies of this package.
-    name = ALIASES.get(name, name)
+    name = current_name(name)
     if name in HOMES:
         return HOMES[name]
     if name in plugins():

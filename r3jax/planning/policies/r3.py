@@ -24,13 +24,13 @@ from r3jax.scoring.batch import score_positions, score_views
 
 
 @dataclass(frozen=True)
-class Ours(GreedyPolicy):
+class R3(GreedyPolicy):
     """Random nearby and frontier views, scored by renderability and unexplored space in view."""
 
     score_all: Callable[..., Any] = score_views
     """Scores poses [C, 4, 4]."""
 
-    name = "ours"
+    name = "r3"
     source = "Ours, arXiv 2601.07484"
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
@@ -53,13 +53,13 @@ class Ours(GreedyPolicy):
 
 
 @dataclass(frozen=True)
-class OursPano(GreedyPolicy):
+class R3Pano(GreedyPolicy):
     """Random nearby and frontier positions; each looks where its panorama needs views most."""
 
     score_all: Callable[..., Any] = score_positions
     """Scores positions [C, 3]."""
 
-    name = "ours-pano"
+    name = "r3-pano"
     source = "Ours-Pano, arXiv 2601.07484"
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:

@@ -71,7 +71,7 @@ _TURNED = 0.5
 
 @dataclass(frozen=True)
 class AheadConfig(PlannerConfig):
-    """How far `ours-ahead` looks, beside what all policies share."""
+    """How far `r3-ahead` looks, beside what all policies share."""
 
     horizon: int = 4
     """Views of the paths that are compared."""
@@ -102,20 +102,20 @@ class AheadConfig(PlannerConfig):
 
 
 @dataclass(frozen=True)
-class OursAhead(GreedyPolicy):
+class R3Ahead(GreedyPolicy):
     """The first view of the best path of several, each as if those before it had been taken."""
 
     config: AheadConfig = field(default_factory=AheadConfig)
 
-    name = "ours-ahead"
-    source = "look-ahead on Ours-Pano, this project"
+    name = "r3-ahead"
+    source = "look-ahead on r3-pano, this project"
     Config = AheadConfig
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Positions of Ours, and some spread over all reachable space; no directions yet."""
+        """Positions of `r3`, and some spread over all reachable space; no directions yet."""
         travel = situation.travel
         num = self.config.num_candidates
-        # One at least is drawn as Ours draws it: settings with fewer would be refused.
+        # One at least is drawn as `r3` draws it: settings with fewer would be refused.
         num_spread = min(self.config.num_spread, num - 1)
         num_own = num - num_spread
         # The shares add up to what every policy scores: comparisons are at equal cost.

@@ -12,7 +12,7 @@ from r3jax.planning.policy import Situation
 
 @dataclass(frozen=True)
 class Random(GreedyPolicy):
-    """A random nearby view: the candidates of `ours` (without the frontier's), no score."""
+    """A random nearby view: the candidates of `r3` (without the frontier's), no score."""
 
     name = "random"
     source = "the floor of every comparison"

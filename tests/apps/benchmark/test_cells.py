@@ -24,11 +24,11 @@ from r3jax.planning.registry import policy_names
 from r3jax.planning.robot.motion import MOTIONS, Motion
 from tests.apps.benchmark.tiny import CONDITIONS, SETTINGS
 
-CELL = Cell("flat", "a" * 64, "ours", 0, CONDITIONS, "b" * 64, 100, SETTINGS)
+CELL = Cell("flat", "a" * 64, "r3", 0, CONDITIONS, "b" * 64, 100, SETTINGS)
 
 CHANGES = {
     "scene_hash": "c" * 64,
-    "policy": "ours-pano",
+    "policy": "r3-pano",
     "seed": 1,
     "test_views_hash": "d" * 64,
     "num_test_views": 99,
@@ -91,7 +91,7 @@ def test_the_identity_holds_every_setting_of_the_policy():
 def test_where_a_mesh_lies_and_which_snapshots_are_asked_for_do_not_matter():
     moved = dataclasses.replace(CELL, scene="mesh:/somewhere/house.glb", up="z")
     assert moved.identity_hash == CELL.identity_hash
-    assert moved.name.startswith("house-ours-seed0-")
+    assert moved.name.startswith("house-r3-seed0-")
     asked = dataclasses.replace(CONDITIONS, snapshots=("views:1",))
     assert dataclasses.replace(CELL, conditions=asked).name == CELL.name
 
@@ -145,7 +145,7 @@ def test_conditions_that_cannot_work_are_refused(changes, message):
 @pytest.mark.parametrize("settings", [{"scoring.lambda9": 1}, {"scoring": 1}, {"lambda9": 1}])
 def test_settings_that_nobody_knows_are_refused(settings):
     with pytest.raises(ValueError, match=r"lambda9|scoring\.NAME"):
-        CONDITIONS.policy("ours", settings)
+        CONDITIONS.policy("r3", settings)
 
 
 def test_further_settings_reach_the_loop_and_the_trainer():

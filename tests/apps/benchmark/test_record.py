@@ -8,7 +8,7 @@ from tests.evaluation.records import record
 
 def test_records_come_back_in_their_order(tmp_path):
     path = tmp_path / "records.jsonl"
-    records = [record(policy, seed=seed) for policy in ("ours", "random") for seed in (2, 0)]
+    records = [record(policy, seed=seed) for policy in ("r3", "random") for seed in (2, 0)]
     write_records(path, records)
     assert read_lines(path) == records
 

@@ -55,7 +55,7 @@ def test_a_page_has_every_snapshot_and_the_worst_views(finished, tmp_path):
 
 
 def test_records_that_lie_alone_make_a_page_without_pictures(tmp_path):
-    records = benchmark(("ours-pano", "active-gs"), views=6)
+    records = benchmark(("r3-pano", "active-gs"), views=6)
     odd = record("random", views=6) | {"policy": "<script>alert(1)</script>"}
     page = write_site(written(tmp_path / "out", [*records, odd]), tmp_path / "site")
     text = page.read_text()
@@ -63,11 +63,11 @@ def test_records_that_lie_alone_make_a_page_without_pictures(tmp_path):
     assert "&lt;script&gt;" in text
     assert "its model or image is gone" in text
     chosen = scores_by_method(records, "psnr")
-    lead = paired_difference(chosen["ours-pano"], chosen["active-gs"])
+    lead = paired_difference(chosen["r3-pano"], chosen["active-gs"])
     assert f"{lead.value:+.2f} [{lead.low:+.2f}, {lead.high:+.2f}]" in text
     assert "arXiv 2601.07484" in text
     for metric in METRICS:
-        found = mean_over_scenes(scores_by_method(records, metric.name)["ours-pano"])
+        found = mean_over_scenes(scores_by_method(records, metric.name)["r3-pano"])
         assert full_title(metric) in text
         low, high = (f"{end:.{metric.decimals}f}" for end in (found.low, found.high))
         assert f"{found.value:.{metric.decimals}f} [{low}, {high}]" in text

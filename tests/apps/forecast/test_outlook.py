@@ -56,7 +56,7 @@ def go(path, views: int, config: ExplorationConfig, resume: bool = False):
         recorder = RunWriter(path, header)
     with recorder:
         return explore(
-            room, small_policy("ours-pano"), budget=f"views:{views}", config=config,
+            room, small_policy("r3-pano"), budget=f"views:{views}", config=config,
             recorder=recorder, resume=run, is_enough=stopping_rule(config, room.camera),
         )  # fmt: skip
 

@@ -79,7 +79,7 @@ def of_one_camera(members, frames):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["wander", "ours-pano"])
+@pytest.mark.parametrize("name", ["wander", "r3-pano"])
 def test_a_team_of_one_is_the_camera_alone(name):
     policy = Wander() if name == "wander" else small_policy(name)
     alone = explore(BoxRoom(), policy, budget=f"views:{VIEWS}", seed=3, config=CONFIG)

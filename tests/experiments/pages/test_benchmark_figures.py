@@ -64,12 +64,12 @@ def assert_drawn_inside(figure):
 
 
 def test_curves_are_means_over_seeds_with_their_range():
-    cells = benchmark(("random", "ours"), snapshots=SNAPSHOTS)
+    cells = benchmark(("random", "r3"), snapshots=SNAPSHOTS)
     figure = curve_figure(cells[::-1])
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["flat", "house"]
     for axes, scene in zip(figure.axes, ("flat", "house"), strict=True):
         drawn = lines_of(axes)
-        assert list(drawn) == ["random", "ours"]
+        assert list(drawn) == ["random", "r3"]
         assert len(axes.collections) == 2  # bands only: seeds have the same numbers of views
         for i, policy in enumerate(drawn):
             means = np.array([
@@ -80,15 +80,15 @@ def test_curves_are_means_over_seeds_with_their_range():
             np.testing.assert_allclose(drawn[policy][1], means.mean(axis=0))
             for j, n in enumerate(SNAPSHOTS):
                 assert band_of(axes, i)[n] == pytest.approx((means[:, j].min(), means[:, j].max()))
-    assert legend_of(figure) == ["random", "ours"]
+    assert legend_of(figure) == ["random", "r3"]
     assert_drawn_inside(figure)
 
 
 def test_seeds_are_points_where_their_seconds_differ():
-    cells = benchmark(("ours",), ("flat",), snapshots=SNAPSHOTS)
+    cells = benchmark(("r3",), ("flat",), snapshots=SNAPSHOTS)
     axes = curve_figure(cells, "seconds", "views").axes[0]
     seconds = np.array([c["exploration"]["seconds"] for c in cells]).reshape(3, 3)
-    np.testing.assert_allclose(lines_of(axes)["ours"], [seconds.mean(axis=0), SNAPSHOTS])
+    np.testing.assert_allclose(lines_of(axes)["r3"], [seconds.mean(axis=0), SNAPSHOTS])
     points = axes.collections[0].get_offsets()
     assert sorted(map(tuple, np.asarray(points))) == sorted(
         zip(seconds.ravel(), np.tile(SNAPSHOTS, 3), strict=True)
@@ -97,13 +97,13 @@ def test_seeds_are_points_where_their_seconds_differ():
 
 
 def test_a_line_ends_where_a_seed_is_missing():
-    cells = benchmark(("random", "ours"), ("flat",), snapshots=SNAPSHOTS)
-    cells = [c for c in cells if (c["policy"], c["seed"], c["snapshot"]) != ("ours", 1, "views:60")]
+    cells = benchmark(("random", "r3"), ("flat",), snapshots=SNAPSHOTS)
+    cells = [c for c in cells if (c["policy"], c["seed"], c["snapshot"]) != ("r3", 1, "views:60")]
     axes = curve_figure(cells).axes[0]
-    np.testing.assert_array_equal(lines_of(axes)["ours"][0], [10, 30])
+    np.testing.assert_array_equal(lines_of(axes)["r3"][0], [10, 30])
     np.testing.assert_array_equal(lines_of(axes)["random"][0], SNAPSHOTS)
     cells = [
-        c for c in cells if (c["policy"], c["seed"]) != ("ours", 0) or c["snapshot"] == "views:60"
+        c for c in cells if (c["policy"], c["seed"]) != ("r3", 0) or c["snapshot"] == "views:60"
     ]
     figure = curve_figure(cells)  # now no snapshot has all seeds of ours: points only
     assert list(lines_of(figure.axes[0])) == legend_of(figure) == ["random"]
@@ -111,24 +111,25 @@ def test_a_line_ends_where_a_seed_is_missing():
 
 
 def test_a_metric_that_some_lack():
-    cells = benchmark(("random", "ours"), ("flat",), snapshots=SNAPSHOTS)
+    cells = benchmark(("random", "r3"), ("flat",), snapshots=SNAPSHOTS)
     for cell in cells:
         if cell["policy"] == "random":
             cell["views"]["lpips"] = None
-    assert list(lines_of(curve_figure(cells, y="lpips").axes[0])) == ["ours"]
+    assert list(lines_of(curve_figure(cells, y="lpips").axes[0])) == ["r3"]
 
 
 def test_every_method_has_its_own_look():
-    variants = ["ours", "ours (bins=32)", "ours (bins=8)"]
+    variants = ["r3", "r3 (bins=32)", "r3 (bins=8)"]
     looks = styles_of([*SKILL, *variants[1:], "mine"])
     assert len({(look.color, str(look.dashes)) for look in looks.values()}) == len(SKILL) + 3
     # Nor do points without a line look the same.
     assert len({(look.color, look.marker, look.fill) for look in looks.values()}) == len(SKILL) + 3
     assert len({look.color for name, look in looks.items() if name in variants}) == 1
     assert len({looks[name].marker for name in SKILL}) == len(SKILL)
-    assert styles_of(["ours"])["ours"] == looks["ours"]  # whoever else is drawn
-    floor = max(look.width for name, look in looks.items() if not name.startswith("ours"))
-    assert min(looks["ours"].width, looks["ours-pano"].width) > floor
+    assert styles_of(["r3"])["r3"] == looks["r3"]  # whoever else is drawn
+    own = ("r3", "r3-pano")
+    floor = max(look.width for name, look in looks.items() if name.split()[0] not in own)
+    assert min(looks["r3"].width, looks["r3-pano"].width) > floor
 
 
 def seen_by(eye, color):
@@ -183,9 +184,9 @@ def test_a_sweep_of_names_places_them_side_by_side():
 
 def test_latency_shows_its_percentiles():
     frames, rng = np.arange(1, 40, 5), np.random.default_rng(0)
-    given = {m: (frames, rng.lognormal(2.0, 0.3, (len(frames), 50))) for m in ("random", "ours")}
+    given = {m: (frames, rng.lognormal(2.0, 0.3, (len(frames), 50))) for m in ("random", "r3")}
     figure = latency_figure(given, "a machine")
-    assert [axes.get_title(loc="left") for axes in figure.axes] == ["random", "ours"]
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["random", "r3"]
     for axes, (_, samples) in zip(figure.axes, given.values(), strict=True):
         p50, p95, p99 = np.percentile(samples, [50, 95, 99], axis=1)
         np.testing.assert_allclose(lines_of(axes)["p50"], [frames, p50])
@@ -202,20 +203,20 @@ def test_latency_shows_its_percentiles():
 
 def test_latency_of_fewer_repeats():
     samples = np.array([[1.0, 3.0, np.nan], [1.0, 2.0, 9.0]])
-    axes = latency_figure({"ours": (np.array([5, 15]), samples)}).axes[0]
+    axes = latency_figure({"r3": (np.array([5, 15]), samples)}).axes[0]
     np.testing.assert_allclose(lines_of(axes)["p50"], [[5, 15], [2.0, 2.0]])
     assert axes.texts[0].get_text().startswith("all: p50 2, ")
 
 
 def test_memory_is_in_megabytes_from_zero():
     frames = np.arange(5)
-    figure = memory_figure({"ours": (frames, 1e6 * frames)}, "device memory", limit=300e6)
+    figure = memory_figure({"r3": (frames, 1e6 * frames)}, "device memory", limit=300e6)
     axes = figure.axes[0]
-    np.testing.assert_allclose(lines_of(axes)["ours"], [frames, frames])
+    np.testing.assert_allclose(lines_of(axes)["r3"], [frames, frames])
     assert axes.get_ylim()[0] == 0.0
     assert axes.get_ylim()[1] > 300.0
     assert axes.texts[0].get_text() == "300 MB"
-    assert to_hex(axes.lines[0].get_color()) == styles_of(["ours"])["ours"].color.lower()
+    assert to_hex(axes.lines[0].get_color()) == styles_of(["r3"])["r3"].color.lower()
     assert_drawn_inside(figure)
 
 

@@ -33,13 +33,13 @@ def ridges(axes):
 
 
 def test_a_ridge_for_every_method_and_snapshot():
-    cells = benchmark(("random", "active-gs", "ours"), snapshots=(30, 60))
+    cells = benchmark(("random", "active-gs", "r3"), snapshots=(30, 60))
     cells = [c for c in cells if (c["policy"], c["snapshot"]) != ("random", "views:30")]
     figure = ridge_figure(cells)
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["views:30", "views:60"]
     assert [len(ridges(axes)) for axes in figure.axes] == [2, 3]
     names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert names == ["ours", "active-gs", "random"]  # from below
+    assert names == ["r3", "active-gs", "random"]  # from below
     for axes, snapshot in zip(figure.axes, ("views:30", "views:60"), strict=True):
         dots = {int(line.get_ydata()[0]): line.get_xdata()[0] for line in axes.lines
                 if line.get_marker() == "."}  # fmt: skip
@@ -60,7 +60,7 @@ def test_a_ridge_for_every_method_and_snapshot():
 
 
 def test_the_tail_of_lpips_is_above():
-    cells = [record("ours", psnr=np.linspace(10.0, 30.0, 50))]
+    cells = [record("r3", psnr=np.linspace(10.0, 30.0, 50))]
     axes = ridge_figure(cells, "lpips").axes[0]
     dot = next(line.get_xdata()[0] for line in axes.lines if line.get_marker() == ".")
     assert dot == pytest.approx(np.percentile(cells[0]["views"]["lpips"], 95))

@@ -51,15 +51,15 @@ def test_all_panels_share_one_box():
 
 
 def test_a_flat_path_still_has_a_box():
-    same_height = {"ours": np.array([[0.0, 0.0, 1.5], [4.0, 2.0, 1.5]])}
+    same_height = {"r3": np.array([[0.0, 0.0, 1.5], [4.0, 2.0, 1.5]])}
     (axes,) = panels(positions_figure(same_height))
     assert axes.get_zlim() == pytest.approx((1.1, 1.9))
-    assert_drawn_inside(positions_figure({"ours": np.ones((1, 3))}))
+    assert_drawn_inside(positions_figure({"r3": np.ones((1, 3))}))
 
 
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match="no positions"):
         positions_figure({})
     for shape in ((3, 2), (0, 3), (3,)):
-        with pytest.raises(ValueError, match=r"ours: positions must be \[n, 3\]"):
-            positions_figure({"ours": np.zeros(shape)})
+        with pytest.raises(ValueError, match=r"r3: positions must be \[n, 3\]"):
+            positions_figure({"r3": np.zeros(shape)})

@@ -14,12 +14,12 @@ from tests.evaluation.records import benchmark
 
 @pytest.fixture(scope="module")
 def tables():
-    cells = benchmark(("random", "active-gs", "ours", "ours-pano"))
-    cells = [c for c in cells if (c["policy"], c["scene"]) != ("ours", "house")]
+    cells = benchmark(("random", "active-gs", "r3", "r3-pano"))
+    cells = [c for c in cells if (c["policy"], c["scene"]) != ("r3", "house")]
     return [
         quality_table(cells),
         tail_table(cells, resamples=50),
-        difference_table(cells, "ours-pano", resamples=50),
+        difference_table(cells, "r3-pano", resamples=50),
     ]
 
 

@@ -190,7 +190,7 @@ def test_a_command_that_is_none_is_refused(command, says):
 @pytest.mark.parametrize(
     ("name", "short"),
     [
-        ("ours-pano", "ours-pano"),
+        ("r3-pano", "r3-pano"),
         ("my.module:Highest", "Highest"),
         ("exec:python -u some/where/mine.py --fast", "mine"),
         ("exec:python", "python"),

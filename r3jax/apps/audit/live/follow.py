@@ -71,7 +71,7 @@ _WARNINGS: dict[Kind, str] = {
 class Guide:
     """Maps frames and asks for views. A context manager: leaving it ends its thread."""
 
-    def __init__(self, page: GuidePage, up: str | None = None, policy: str = "ours-pano"):
+    def __init__(self, page: GuidePage, up: str | None = None, policy: str = "r3-pano"):
         """Knows nothing yet.
 
         Args:

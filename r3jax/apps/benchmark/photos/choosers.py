@@ -23,7 +23,7 @@ from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import fitted_size
 
 SCORED = (
-    "ours",
+    "r3",
     "active-gs",
     "active-gamer",
     "cover",

@@ -78,7 +78,7 @@ def test_a_folder_that_grows_is_followed_and_what_came_in_is_left(tmp_path, monk
 
 def test_a_robot_shows_the_same_page_with_three_verbs():
     config = r3jax.MappingConfig(capacity=1 << 13)
-    planner = r3jax.start(LENS.camera, BOUNDS, "ours-pano", starts=[POSES[0]], config=config)
+    planner = r3jax.start(LENS.camera, BOUNDS, "r3-pano", starts=[POSES[0]], config=config)
     with open_guide(port=0) as page:
         for pose in POSES[:2]:
             frame = frame_at(pose)

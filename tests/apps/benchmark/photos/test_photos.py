@@ -132,7 +132,7 @@ def test_nobody_sees_the_pixels_that_were_not_chosen(pool, monkeypatch):
     opened = []
     honest = type(pool).frame
     monkeypatch.setattr(type(pool), "frame", lambda self, n: opened.append(n) or honest(self, n))
-    for name in ("ours", "gavis"):
+    for name in ("r3", "gavis"):
         opened.clear()
         outcome = run_photos(pool, make_chooser(name, 3, 5.0), TERMS, seed=0)
         assert opened == outcome.chosen
@@ -147,9 +147,9 @@ def test_cover_is_the_published_rule(pool, monkeypatch):
         return np.zeros(len(poses))
 
     monkeypatch.setattr(choosers, "totals_of", totals)
-    for name in ("cover", "ours", "gavis"):
+    for name in ("cover", "r3", "gavis"):
         run_photos(pool, make_chooser(name, 3, 5.0), TERMS, seed=0)
-    assert unexplored == {"cover": False, "ours": True, "gavis": True}
+    assert unexplored == {"cover": False, "r3": True, "gavis": True}
 
 
 def test_the_same_run_gives_the_same_bits_and_another_seed_another_choice(pool, spied):
@@ -159,7 +159,7 @@ def test_the_same_run_gives_the_same_bits_and_another_seed_another_choice(pool, 
 
 
 def test_who_looks_at_the_model_joins_by_name(pool, monkeypatch, tmp_path):
-    with pytest.raises(ValueError, match=r"frontier cannot choose among photos; known: ours, "):
+    with pytest.raises(ValueError, match=r"frontier cannot choose among photos; known: r3, "):
         make_chooser("frontier", 3, 5.0)
     monkeypatch.setitem(choosers.MODEL_CHOOSERS, "spy", Spy)
     check_chooser("spy")
@@ -214,18 +214,18 @@ def test_the_table_by_hand():
     rows = table_rows(
         [
             record("random", 0, [20.0, 22.0]), record("random", 1, [18.0, 20.0]),
-            record("ours", 1, [19.0, 21.0]), record("ours", 0, [21.0, 23.0]),
+            record("r3", 1, [19.0, 21.0]), record("r3", 0, [21.0, 23.0]),
             record("cover", 0, [30.0, 30.0]),
         ]
     )  # fmt: skip
-    assert [row["chooser"] for row in rows] == ["cover", "ours", "random"]
+    assert [row["chooser"] for row in rows] == ["cover", "r3", "random"]
     assert rows[1]["PSNR [dB]"].startswith("21.00 [")
     assert rows[1]["minus random"] == "+1.00 [+1.00, +1.00]"  # paired by photo and by seed
     assert rows[1]["5th percentile"] == "18.00"
     assert rows[1]["seconds a choice"] == "0.200"  # the first one compiles
     assert rows[0]["minus random"] == rows[2]["minus random"] == ""  # other seeds; itself
     assert "LPIPS" not in rows[0]
-    (row,) = table_rows([record("ours", 0, [20.0, 22.0], lpips=[0.2, 0.4])])
+    (row,) = table_rows([record("r3", 0, [20.0, 22.0], lpips=[0.2, 0.4])])
     assert row["LPIPS"] == "0.300"
 
 
@@ -279,7 +279,7 @@ def test_the_command_prints_a_table_and_does_nothing_twice(recording, tmp_path, 
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--policies", "ours-pano"], "ours-pano cannot choose among photos"),
+        (["--policies", "r3-pano"], "r3-pano cannot choose among photos"),
         (["--scenes", "office"], "--photos takes these from the captures"),
         (["--choose", "30"], "choose fewer"),
     ],
