@@ -56,9 +56,7 @@ from r3jax.runs.reader import read_run
 
 NAME = "captures"
 
-TableName = Literal[
-    "modes", "rivals", "gaze", "spacing", "horizon", "sample", "turning", "r3con", "training"
-]
+TableName = Literal["modes", "rivals", "gaze", "spacing", "horizon", "turning", "r3con", "training"]
 
 
 @dataclass(frozen=True)
@@ -155,11 +153,6 @@ TABLES: dict[TableName, dict[str, Row]] = {
             "4 views, a beam of 4": {},  # as it is
             "10 views, a beam of 10": {"horizon": 10, "beam": 10},
         }.items()
-    },
-    # Scored by one of so many voxels, the time of a decision as it was.
-    "sample": {
-        OURS: Row("r3-ahead", loop=ON_THE_WAY, training=LONG),
-        f"{OURS}, one of 4 voxels": Row("r3-ahead", OURS, {"scoring.sample": 4}, ON_THE_WAY, LONG),
     },
     # A camera that turns at most 90 degrees a second, instead of in no time.
     "turning": {

@@ -37,8 +37,8 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
 from r3jax.runs.reader import read_run
 from r3jax.scoring.backend import rows_in_pixels
-from r3jax.scoring.backends.reference import voxels_of_rows
 from r3jax.scoring.config import Forms, ScoringConfig
+from r3jax.scoring.formulas import voxels_of_rows
 from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene

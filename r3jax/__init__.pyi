@@ -1,3 +1,10 @@
+from .apps.forecast.difficulty import voxel_difficulty
+from .apps.forecast.expected_error import (
+    ErrorImages,
+    ExpectedError,
+    expected_error,
+    expected_error_images,
+)
 from .evaluation.evaluate import Evaluation, evaluate
 from .exploration.loop import Result, explore
 from .frame import Frame
@@ -14,13 +21,6 @@ from .planning.planner import Planner, decide, observe, start
 from .planning.policy import Decision
 from .planning.registry import make_policy, register_policy
 from .scoring.config import ScoringConfig
-from .scoring.difficulty import voxel_difficulty
-from .scoring.expected_error import (
-    ErrorImages,
-    ExpectedError,
-    expected_error,
-    expected_error_images,
-)
 from .scoring.explain import Explanation, explain_view
 from .scoring.panorama import Panorama, panorama
 from .scoring.renderability import (

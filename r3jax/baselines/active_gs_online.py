@@ -24,11 +24,11 @@ from r3jax.baselines.online_map import DISCS, OnlineMap, Seen, colored, supporte
 from r3jax.baselines.policy import OnlinePolicy, memory_of
 from r3jax.geometry.cameras import Camera, invert_pose, project, transform
 from r3jax.geometry.numerics import safe_norm
-from r3jax.mapping.occupancy import OccupancyGrid, world_to_cell
+from r3jax.kernels.calls import Cells
+from r3jax.mapping.occupancy import OccupancyGrid, cells_of, world_to_cell
 from r3jax.planning.candidates import Candidates, draw_lots
 from r3jax.planning.decide import Drawn
 from r3jax.planning.policy import Situation
-from r3jax.scoring.cells import Cells, cells_of
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.information import with_room

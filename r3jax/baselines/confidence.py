@@ -18,11 +18,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.baselines.normals import pixel_normals
 from r3jax.frame import Frame
-from r3jax.geometry.compaction import positions_of_set
 from r3jax.geometry.numerics import safe_norm
+from r3jax.geometry.selection import positions_of_set
 from r3jax.geometry.voxels import EMPTY_WORD, unpack, voxel_center
+from r3jax.kernels.constants import JOINED
 from r3jax.mapping.associate import Groups, group_by_voxel, points_of_pixels
-from r3jax.mapping.join import CHUNK
 from r3jax.mapping.seen import rows_in_view
 from r3jax.mapping.state import MapState
 from r3jax.mapping.table import find
@@ -127,12 +127,12 @@ def _see(seen: Sightings, state: MapState, frame: Frame, max_range: Float[Array,
     # Normals stand in for colors: groups add up any three numbers per point.
     groups = group_by_voxel(points, normals.T, valid.reshape(-1), state.voxel_size)
     num = groups.is_leader.shape[0]
-    size = min(num, CHUNK)
+    size = min(num, JOINED)
     # Room for whole chunks: XLA would shift a slice past the end back over the one before.
     leaders = positions_of_set(groups.is_leader, -(-num // size) * size)
     num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
 
-    # Chunks are counted one by one, as in `visibility.selection`: XLA miscounts other steps.
+    # Chunks are counted one by one, as in `geometry.selection`: XLA miscounts other steps.
     def see_chunk(chunk: Int[Array, ""], seen: Sightings) -> Sightings:
         index = jax.lax.dynamic_slice_in_dim(leaders, chunk * size, size)
         return _sight(seen, state, groups, index, frame, max_range)

@@ -19,13 +19,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.calls import Cells
 from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.seen import seen_in_view
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import Candidates
 from r3jax.planning.policy import Situation
-from r3jax.scoring.backend import rows_in_pixels, seen_in_view
+from r3jax.scoring.backend import rows_in_pixels
 from r3jax.scoring.batch import map_over_devices
-from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
 from r3jax.visibility.views import pinhole_view

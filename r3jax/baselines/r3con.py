@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.kernels.calls import Cells
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import Candidates, candidates_along, candidates_at, host_generator
 from r3jax.planning.config import PlannerConfig
@@ -34,7 +35,6 @@ from r3jax.planning.decide import Drawn, GreedyPolicy, net_utility
 from r3jax.planning.policy import Situation
 from r3jax.scoring.backend import sums_and_seen
 from r3jax.scoring.batch import map_over_devices
-from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
 from r3jax.visibility.views import panorama_view

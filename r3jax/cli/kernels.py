@@ -9,17 +9,11 @@ from r3jax.files import make_folder, write_atomic
 
 def main(note: Path) -> None:
     """Compiles all kernels, and leaves a note."""
-    # What takes longest first, then what is needed last: who waits opens a scene, renders, and
-    # compiles the map's kernels meanwhile.
-    from r3jax.kernels.scoring import bridge as scoring
+    # Those of maps and scores first: they are needed first.
+    from r3jax.kernels import bridge
 
-    for name in (scoring.SUMS, scoring.SUMS_OF_FEW, scoring.PIXELS):
-        scoring.register(name)
-    from r3jax.kernels.mapping import bridge as mapping
-
-    for name in (mapping.MARK, mapping.LOOK, mapping.ADD):
-        mapping.register(name)
-    scoring.register(scoring.CHANGES)
+    for name in bridge.HANDLERS:
+        bridge.register(name)
     from r3jax.kernels.splatting import bridge as splatting
 
     splatting.register()
@@ -27,7 +21,6 @@ def main(note: Path) -> None:
 
     for name in (training.LOSS, training.ADAM):
         training.register(name)
-    scoring.register(scoring.ROWS)
     make_folder(note.parent)
     write_atomic(note, b"")
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.frame import Frame
 from r3jax.geometry.voxels import pack, voxel_index
+from r3jax.kernels.constants import FAR, STRAY, THIN
 from r3jax.mapping.table import hash_key
 
 _SCRATCH_BITS = (7, 7, 6)
@@ -61,13 +62,10 @@ def group_by_voxel(
     low, high = pack(x, y, z)
     leader = _leaders(low, high, _torus_slot(x, y, z), valid)
     num = points_world.shape[1]
-    # Always zero, but only known once the leaders are: XLA would otherwise lay out the colors
-    # first, and scratch memory above 32 MB costs more in page faults than all the arithmetic.
-    zero = jnp.minimum(leader[0], 0).astype(rgb.dtype)
     # A fourth channel of ones counts the points in the same pass.
-    rows = jnp.concatenate([rgb, jnp.ones((num, 1), dtype=rgb.dtype)], axis=1) + zero
+    rows = jnp.concatenate([rgb, jnp.ones((num, 1), dtype=rgb.dtype)], axis=1)
     # One scatter of rows of four is as quick as a scatter of scalars.
-    sums = jnp.broadcast_to(zero, (num, 4)).at[leader].add(rows, mode="drop")
+    sums = jnp.zeros((num, 4), dtype=rgb.dtype).at[leader].add(rows, mode="drop")
     is_leader = leader == jnp.arange(num, dtype=jnp.int32)
     return Groups(key=jnp.stack([low, high]), leader=leader, is_leader=is_leader, rgb_sum=sums)
 
@@ -153,17 +151,15 @@ def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Boo
         depth: z-depth [m]; 0 no measurement, inf beyond range.
         voxel_size: edge of a voxel [m].
     """
-    far = 1e4  # stands for inf, so that differences stay finite
     # What is no measurement is a hole, whatever it is.
-    capped = jnp.where(depth > 0.0, jnp.minimum(depth, far), 0.0)
+    capped = jnp.where(depth > 0.0, jnp.minimum(depth, FAR), 0.0)
     around = _neighborhood(capped)
     # Holes take the value of the pixel in the middle.
     median = _median9([jnp.where(value > 0.0, value, capped) for value in around])
-    # A stray within two or three sigma of 1 % noise is no edge.
-    is_edge = jnp.abs(capped - median) > voxel_size + 0.01 * capped
+    is_edge = jnp.abs(capped - median) > voxel_size + STRAY * capped
     is_edge |= _breaks(median, _neighborhood(median), voxel_size)
     # What noise of 1 % cannot explain is an edge whatever the median says: thin parts.
-    is_edge |= _breaks(capped, around, voxel_size + 0.06 * capped)
+    is_edge |= _breaks(capped, around, voxel_size + THIN * capped)
     return (depth > 0.0) & is_edge
 
 

@@ -14,11 +14,9 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import is_traced
+from r3jax.kernels.constants import JOINED
 from r3jax.mapping.state import MapState, a_map, empty_map
 from r3jax.mapping.table import find_or_insert
-
-CHUNK = 1 << 13
-"""Voxels that join the map at once. A frame rarely touches more; one that does takes turns."""
 
 
 class Statistics(eqx.Module):
@@ -104,7 +102,7 @@ def join(state: MapState, new: Statistics) -> MapState:
 def _join_map(state: MapState, other: MapState) -> MapState:
     """Joins every row of `other`, in chunks: scratch memory does not grow with the map."""
     # Both are powers of two: whole chunks cover the table, and no slice is shifted back.
-    size = min(CHUNK, other.capacity)
+    size = min(JOINED, other.capacity)
 
     def join_chunk(i: Int[Array, ""], state: MapState) -> MapState:
         def rows(x: Array) -> Array:

@@ -21,6 +21,7 @@ Shape symbols: X Y Z cells along the axes; H W image size; h w blocks; n points.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -33,6 +34,7 @@ from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked, one
 from r3jax.geometry.cameras import Camera, invert_pose, pixel_rays, sound
 from r3jax.geometry.voxels import check_near_origin
+from r3jax.kernels.calls import Cells
 
 FREE_LOG_ODDS = -1.3862944
 """A cell is free below this: p = 0.2."""
@@ -105,6 +107,22 @@ class OccupancyGrid(eqx.Module):
         if self.worth_a_look is not None:
             left = left & self.worth_a_look
         return replace(self, worth_a_look=left)
+
+
+def cells_of(grid: OccupancyGrid) -> Cells:
+    """All cells of a grid, z fastest."""
+    shape = grid.log_odds.shape
+    x, y, z = (
+        grid.origin[i] + (jnp.arange(n, dtype=jnp.float32) + 0.5) * grid.cell_size
+        for i, n in enumerate(shape)
+    )
+    fill: Callable[[Array], Array] = lambda axis: jnp.broadcast_to(axis, shape).reshape(-1)
+    return Cells(
+        fill(x[:, None, None]),
+        fill(y[None, :, None]),
+        fill(z[None, None, :]),
+        grid.unexplored.reshape(-1),
+    )
 
 
 a_grid = one(OccupancyGrid, "r3jax.empty_grid makes one", leaf="log_odds", ndim=3)

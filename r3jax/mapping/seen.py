@@ -7,23 +7,33 @@ renderability however often one looks at it, and a planner would look for ever.
 Shape symbols: N capacity of the map; M voxels at a time; W words of bins; H W image size.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import invert_pose
 from r3jax.geometry.numerics import safe_norm
+from r3jax.geometry.selection import for_selected
 from r3jax.geometry.sphere import nearest_bin
+from r3jax.kernels import calls
+from r3jax.kernels.calls import Cells
+from r3jax.kernels.native.platform import call_of_many
 from r3jax.mapping.state import MapState
 from r3jax.visibility.config import VisibilityConfig
-from r3jax.visibility.depth_buffer import seen_in
-from r3jax.visibility.selection import Selection, for_selected, select
-from r3jax.visibility.views import pinhole_view
+from r3jax.visibility.depth_buffer import visible
+from r3jax.visibility.views import View, for_kernels, layout_of, pinhole_view
 
 _Marks = tuple[UInt32[Array, "W N"], Float[Array, " N"]]
 """A map's direction bins and best resolutions."""
+
+_FARTHEST = 1e4
+"""Stands for a range without an end [m]."""
 
 
 def bin_words(bins: Int[Array, " M"], num_words: int) -> UInt32[Array, "W M"]:
@@ -59,7 +69,10 @@ def evidence_of_view(
 
 
 def mark_rows(
-    state: MapState, rows: Selection, position: Float[Array, " 3"], focal: Float[Array, ""]
+    state: MapState,
+    seen: Bool[Array, " N"],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
 ) -> MapState:
     """Sets the direction bin of some rows and raises their best resolution, as seen from a camera.
 
@@ -67,7 +80,7 @@ def mark_rows(
 
     Args:
         state: the map before.
-        rows: which of its rows a camera sees.
+        seen: rows that a camera sees.
         position: of the camera [m].
         focal: its focal length [px].
     """
@@ -82,8 +95,51 @@ def mark_rows(
         visited = visited.at[:, row].set(visited[:, index] | words, mode="drop")
         return visited, resolution.at[row].max(sharper, mode="drop")
 
-    marks = for_selected(rows, mark, (state.visited, state.resolution))
+    marks = for_selected(seen, mark, (state.visited, state.resolution))
     return eqx.tree_at(lambda m: (m.visited, m.resolution), state, marks)
+
+
+@jax.custom_jvp
+def seen_in_view(
+    state: MapState, cells: Cells, view: View, config: VisibilityConfig
+) -> tuple[Bool[Array, " N"], Bool[Array, " c"]]:
+    """Finds the voxels and the unexplored cells that a view sees; no derivative passes through it.
+
+    By a kernel on CPUs, and by the formula `depth_buffer.visible` elsewhere.
+    """
+    num, layout = cells.x.shape[0], layout_of(view)
+
+    def kernel(known: tuple[MapState, Cells], views: Any) -> tuple[Array, Array]:
+        (state, cells), (view, tolerance) = known, views
+        laid_out = jax.vmap(for_kernels)(view, tolerance, jnp.ones_like(tolerance))
+        _, _, *bits = calls.sums(
+            state.rows, cells, laid_out, layout, calls.Forms(), 1, state.num_bins, keep=True
+        )
+        unpack = lambda bits, count: jnp.unpackbits(bits, axis=1, count=count).astype(bool)
+        return unpack(bits[0], state.capacity), unpack(bits[1], num)
+
+    def formula(known: tuple[MapState, Cells], one: Any) -> tuple[Array, Array]:
+        state, cells = known
+        points = jnp.stack([cells.x, cells.y, cells.z])
+        own = VisibilityConfig(tolerance=one[1])
+        shown, empty = visible(state.voxels, points, one[0], own)
+        return shown, empty & cells.unexplored
+
+    return call_of_many(kernel, formula, (state, cells), (view, config.tolerance), state.capacity)
+
+
+@seen_in_view.defjvp
+def _seen_in_view_jvp(primals: Any, tangents: Any) -> Any:
+    del tangents  # what is seen is piecewise constant
+    seen = seen_in_view(*primals)
+    return seen, tuple(np.zeros(mask.shape, dtype=jax.dtypes.float0) for mask in seen)
+
+
+def visible_rows(state: MapState, view: View, config: VisibilityConfig) -> Bool[Array, " N"]:
+    """Finds the voxels that a view sees."""
+    # One that does not count: batches of arrays without elements cannot be reshaped.
+    zero = jnp.zeros(1)
+    return seen_in_view(state, Cells(zero, zero, zero, zero > 0), view, config)[0]
 
 
 def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]) -> MapState:
@@ -98,7 +154,7 @@ def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]
         max_range: voxels farther from the camera than this are not seen [m].
     """
     seen = rows_in_view(state, frame, jnp.asarray(max_range, dtype=jnp.float32))
-    return mark_rows(state, select(seen), frame.position, frame.camera.focal)
+    return mark_rows(state, seen, frame.position, frame.camera.focal)
 
 
 def rows_in_view(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:
@@ -133,23 +189,18 @@ def rows_in_view(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> 
     measured = farthest[pixel]
     # One edge of slack: a surface may lie anywhere within its voxel.
     is_shown = (measured > 0.0) & (z <= measured + state.voxel_size)
-    is_hole = is_in & (frame.depth.reshape(-1)[pixel] == 0.0)
+    is_hole = frame.depth.reshape(-1)[pixel] == 0.0
+    return is_in & (is_shown | (is_hole & hidden_by_none(state, frame, max_range)))
+
+
+def hidden_by_none(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:
+    """Finds the voxels that the map itself shows in a frame's view, if depth failed anywhere."""
+
+    def look() -> Bool[Array, " N"]:
+        config = VisibilityConfig(max_range=jnp.minimum(max_range, _FARTHEST))
+        view = pinhole_view(frame.camera, frame.T_world_camera, config)
+        return visible_rows(state, view, config)
+
     # A branch: a depth buffer of the whole map is needed only where depth has failed.
-    hidden_by_none = jax.lax.cond(
-        jnp.any(is_hole),
-        lambda: _hidden_by_none(state, frame, jnp.where(is_in, x * x + y * y + z * z, 0.0)),
-        lambda: jnp.zeros(state.capacity, dtype=bool),
-    )
-    return (is_in & is_shown) | (is_hole & hidden_by_none)
-
-
-def _hidden_by_none(
-    state: MapState, frame: Frame, squared_distance: Float[Array, " N"]
-) -> Bool[Array, " N"]:
-    """Voxels that the map itself shows in a frame's view, up to the farthest in it."""
-    # No farther than the voxels asked for: what lies behind them all hides none of them.
-    farthest = jnp.sqrt(jnp.max(squared_distance)) + state.voxel_size
-    config = VisibilityConfig(max_range=farthest)
-    view = pinhole_view(frame.camera, frame.T_world_camera, config)
-    _, visible = seen_in(state, view, config)
-    return visible.mask
+    nothing: Callable[[], Bool[Array, " N"]] = lambda: jnp.zeros(state.capacity, dtype=bool)
+    return jax.lax.cond(jnp.any(frame.depth == 0.0), look, nothing)

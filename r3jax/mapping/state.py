@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.geometry.arguments import one
 from r3jax.geometry.voxels import EMPTY_WORD, unpack, voxel_center
+from r3jax.kernels.calls import MapRows
+from r3jax.visibility.depth_buffer import Voxels
 
 
 class MapState(eqx.Module):
@@ -99,6 +101,18 @@ class MapState(eqx.Module):
             m2=self.m2[row],
             resolution=self.resolution[row],
         )
+
+    @property
+    def rows(self) -> MapRows:
+        """What R depends on, as kernels take it."""
+        return MapRows(
+            self.key, self.visited, self.count, self.m2, self.resolution, self.voxel_size
+        )
+
+    @property
+    def voxels(self) -> Voxels:
+        """Where the voxels are, of rows that were seen."""
+        return Voxels(self.center, self.present, self.voxel_size)
 
     @property
     @jax.jit

@@ -13,11 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 from r3jax.geometry.voxels import EMPTY_WORD
-
-MAX_PROBES = 192
-"""A key that finds no place within this many probes counts as dropped: at a load of 0.7 the
-expected longest search is about 30."""
-
+from r3jax.kernels.constants import MAX_PROBES
 
 _Search = tuple[Int[Array, ""], Int[Array, " n"], Bool[Array, " n"]]
 """Number of the probe, row of each key so far, keys still searching."""

@@ -15,9 +15,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked
-from r3jax.geometry.cameras import is_traced, sound
-from r3jax.geometry.compaction import positions_of_set
+from r3jax.geometry.cameras import invert_pose, is_traced, sound
+from r3jax.geometry.selection import positions_of_set
 from r3jax.geometry.voxels import INDEX_LIMIT, check_near_origin, unpack, voxel_center
+from r3jax.kernels import calls
+from r3jax.kernels.constants import JOINED
 from r3jax.kernels.native.platform import by_platform
 from r3jax.mapping.associate import (
     Groups,
@@ -26,8 +28,8 @@ from r3jax.mapping.associate import (
     group_means,
     points_of_pixels,
 )
-from r3jax.mapping.join import CHUNK, Statistics, grow, join
-from r3jax.mapping.seen import evidence_of_view, mark_seen, rows_in_view
+from r3jax.mapping.join import Statistics, grow, join
+from r3jax.mapping.seen import evidence_of_view, hidden_by_none, mark_seen
 from r3jax.mapping.state import MapState, a_map
 
 _NEAR = 1000.0
@@ -67,7 +69,7 @@ def integrate_groups(
     camera_position: Float[Array, " 3"] | Float[Array, "P 3"],
     focal: Float[Array, ""],
 ) -> MapState:
-    """One observation per touched voxel joins the map, `CHUNK` voxels at a time.
+    """One observation per touched voxel joins the map, `JOINED` voxels at a time.
 
     Args:
         state: the map before.
@@ -76,12 +78,12 @@ def integrate_groups(
         focal: focal length [px].
     """
     num = groups.is_leader.shape[0]
-    size = min(num, CHUNK)
+    size = min(num, JOINED)
     # Rounded up to whole chunks, so that the last slice is never shifted back.
     leaders = positions_of_set(groups.is_leader, -(-num // size) * size)
     num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
 
-    # Chunks are counted one by one, as in `visibility.selection`: XLA miscounts other steps.
+    # Chunks are counted one by one, as in `geometry.selection`: XLA miscounts other steps.
     def join_chunk(chunk: Int[Array, ""], state: MapState) -> MapState:
         index = jax.lax.dynamic_slice_in_dim(leaders, chunk * size, size)
         valid = index < num
@@ -130,21 +132,36 @@ def _by_kernels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     """The same in machine code."""
-    from r3jax.kernels import mapping
-
     factor = sound(frame.camera, frame.T_world_camera)
-    position, focal = frame.position, frame.camera.focal
     # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
-    state = mapping.join_pixels(state, frame, factor * max_range, drop_edges)
-    state = eqx.tree_at(lambda m: m.voxel_size, state, factor * state.voxel_size)
-    codes, has_holes = mapping.codes_of_rows(state, frame, max_range)
-    # A branch: what hides what must be known only where depth has failed.
-    shown_in_holes = jax.lax.cond(
-        has_holes,
-        lambda: rows_in_view(state, frame, max_range).astype(jnp.uint8),
-        lambda: jnp.zeros(state.capacity, dtype=jnp.uint8),
+    image = for_kernels(frame, factor * max_range, drop_edges)
+    rows, mean, lost = calls.map_add(state.rows, state.mean, image, state.num_bins)
+    after = MapState(
+        key=rows.key,
+        visited=rows.visited,
+        count=rows.counts,
+        mean=mean,
+        m2=rows.m2,
+        resolution=rows.resolution,
+        voxel_size=factor * rows.voxel_size,
+        dropped=state.dropped + lost,
+        num_bins=state.num_bins,
     )
-    return mapping.mark(state, codes, shown_in_holes, position, focal)
+    is_visible = hidden_by_none(after, frame, max_range).astype(jnp.uint8)
+    rows = calls.map_mark(after.rows, image, is_visible, state.num_bins)
+    marks = (rows.visited, rows.resolution)
+    return eqx.tree_at(lambda m: (m.visited, m.resolution), after, marks)
+
+
+def for_kernels(
+    frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> calls.FrameArrays:
+    """Lays a frame out as kernels take it."""
+    camera, T = frame.camera, frame.T_world_camera
+    return calls.FrameArrays(
+        frame.depth, frame.rgb, T, invert_pose(T), camera.fx, camera.fy, camera.cx, camera.cy,
+        camera.focal, max_range, drop_edges.astype(jnp.float32),
+    )  # fmt: skip
 
 
 @jax.custom_jvp

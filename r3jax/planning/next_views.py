@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from r3jax.geometry.arguments import a_camera, checked
 from r3jax.geometry.cameras import Camera, rigid_error
+from r3jax.kernels.calls import Cells
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, centers_on_host
 from r3jax.mapping.state import MapState, a_map
 from r3jax.planning.candidates import best_views, candidates_at, spread
@@ -26,7 +27,6 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.batch import cache_positions_near, score_cached_near, score_views_near
-from r3jax.scoring.cells import Cells
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.simulated import simulate_view_near
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera, pose_along
+from r3jax.kernels.calls import Cells
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import JITTER, Candidates, path_lengths
 from r3jax.planning.config import PlannerConfig
@@ -26,7 +27,6 @@ from r3jax.planning.policy import Situation
 from r3jax.planning.robot.limits import angles_along, directions_along
 from r3jax.planning.robot.travel import Travel
 from r3jax.scoring.batch import score_views_near
-from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.soft_utility import soft_utility_near

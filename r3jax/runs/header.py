@@ -139,9 +139,8 @@ def policy_fields(policy: Policy) -> dict[str, Any]:
 def settings_of(policy: object) -> dict[str, Any]:
     """What JSON can hold of a policy's settings.
 
-    A free-flying camera's motion is left out, and so are refinement where there is none, the
-    mounting of a camera that turns by itself, and a sample of all voxels: that is what their
-    absence has always meant.
+    A free-flying camera's motion is left out, and so are refinement where there is none and the
+    mounting of a camera that turns by itself: that is what their absence has always meant.
     """
     settings = plain_settings(getattr(policy, "config", {}))
     # Left out where it changes nothing: headers from before there was this setting stay equal.
@@ -151,8 +150,6 @@ def settings_of(policy: object) -> dict[str, Any]:
         del settings["motion"]["fixed_camera"]
     if settings.get("refine") == 0:
         del settings["refine"], settings["refine_radius"]
-    if settings.get("scoring", {}).get("sample") == 1:
-        del settings["scoring"]["sample"]
     return settings
 
 

@@ -15,7 +15,7 @@ from r3jax.planning.registry import config_class, make_policy
 from r3jax.planning.robot.motion import motion_of_record
 from r3jax.runs.header import RunError, RunHeader, camera_fields, package_versions, policy_fields
 from r3jax.runs.reader import Run
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import scoring_config_of
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
 
@@ -82,7 +82,7 @@ def planner_config_of(run: Run) -> PlannerConfig:
     """
     try:
         settings = dict(run.header.policy["settings"])
-        scoring = ScoringConfig(**settings.pop("scoring", {}))
+        scoring = scoring_config_of(settings.pop("scoring", {}))
         motion = motion_of_record(settings.pop("motion", None))
         kind = _config_class(run)
         # Runs of all policies once recorded settings of one: dropped where they mean nothing.

@@ -1,48 +1,29 @@
-"""Which backend answers where: machine code on a CPU, dense batches on a GPU.
+"""The scores of views by kernels on CPUs, and by the formulas elsewhere.
 
 The choice is made where a program is lowered, so that `jit`, `vmap`, `lax.map` and `grad` of the
-public verbs all get it. Derivatives are those of the reference.
+public verbs all get it. Derivatives are those of the formulas.
 
 Shape symbols: n voxels; c cells; B bins of the panorama; p q bytes that hold a bit for every voxel
 and every cell; h w pixels of a depth buffer.
 """
 
-import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
-from r3jax.kernels.native.platform import by_platform, can_call_kernels
+from r3jax.kernels import calls
+from r3jax.kernels.calls import Cells, Forms
+from r3jax.kernels.native.platform import call_of_many
 from r3jax.mapping.state import MapState
-from r3jax.scoring.backends import dense, reference
-from r3jax.scoring.backends.views import layout_of, over_views, row_of
-from r3jax.scoring.cells import Cells
-from r3jax.scoring.config import PAPER, Forms, ScoringConfig
+from r3jax.scoring import formulas
+from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.terms import Renderability
-from r3jax.visibility.views import View
-
-LARGEST_BUFFER = 2048
-"""Edge [px] up to which the kernels' places in a buffer are exact in float32."""
-
-
-def _by_platform(answer_by: Callable[[Any], Callable[..., Any]], edge: int = 1) -> Any:
-    """A function that answers by `numba` on CPUs, where kernels serve, and by `dense` elsewhere.
-
-    Args:
-        answer_by: from a backend's module to the function that asks it.
-        edge: of the depth buffer [px].
-    """
-    if edge > LARGEST_BUFFER or not can_call_kernels():
-        return answer_by(dense)
-
-    from r3jax.kernels import scoring
-
-    return by_platform(cpu=answer_by(scoring), default=answer_by(dense))
+from r3jax.visibility.config import VisibilityConfig
+from r3jax.visibility.views import View, for_kernels, layout_of
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(6,))
@@ -55,7 +36,7 @@ def sums_in_view(
     config: ScoringConfig,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """`reference.sums_in_view`, by the fastest backend of the platform."""
+    """`formulas.sums_in_view`."""
     del position  # that of the view; it only carries the derivative
     deficits, unexplored = _sums(voxels, cells, view, focal, config, num_bins, keep=False)
     return deficits, unexplored
@@ -63,7 +44,7 @@ def sums_in_view(
 
 @sums_in_view.defjvp
 def _sums_in_view_jvp(num_bins: int, primals: Any, tangents: Any) -> Any:
-    score = functools.partial(reference.sums_in_view, num_bins=num_bins)
+    score = functools.partial(formulas.sums_in_view, num_bins=num_bins)
     return jax.jvp(score, primals, tangents)
 
 
@@ -75,43 +56,8 @@ def sums_and_seen(
     config: ScoringConfig,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"], UInt8[Array, " p"], UInt8[Array, " q"]]:
-    """`sums_in_view`, and which voxels (of the sample) and cells are in it: bits in bytes."""
+    """`sums_in_view`, and which voxels and cells are in it: bits in bytes."""
     return _sums(voxels, cells, view, focal, config, num_bins, keep=True)
-
-
-def change_of_sums(
-    before: tuple[MapState, Cells],
-    after: tuple[MapState, Cells],
-    kept: tuple[UInt8[Array, " p"], UInt8[Array, " q"]],
-    position: Float[Array, " 3"],
-    focal: Float[Array, ""],
-    config: ScoringConfig,
-    num_bins: int,
-) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """`reference.change_of_sums`, by the fastest backend of the platform."""
-    forms = config.forms
-
-    def score_by(backend: Any) -> Callable[..., Any]:
-        def score(known: tuple[Any, Any], places: Any) -> Any:
-            return backend.changes_of_sums(*known, places, forms, num_bins)
-
-        return lambda known, places: over_views(score, known, places)
-
-    place = (jnp.concatenate([position, focal[None]]), *kept)
-    results = _by_platform(score_by)((before, after), jax.tree.map(lambda x: x[None], place))
-    return jax.tree.map(lambda of_all: of_all[0], results)
-
-
-def seen_in_view(
-    voxels: MapState, cells: Cells, view: View, config: ScoringConfig
-) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:
-    """`reference.seen_in_view`: the voxels and the unexplored cells that a view sees."""
-    config = dataclasses.replace(config, sample=1)
-    *_, seen, empty = sums_and_seen(voxels, cells, view, jnp.ones(()), config, 1)
-    return (
-        jnp.unpackbits(seen, count=voxels.capacity).astype(bool),
-        jnp.unpackbits(empty, count=cells.x.shape[0]).astype(bool),
-    )
 
 
 def _sums(
@@ -126,15 +72,50 @@ def _sums(
 ) -> Any:
     layout, forms = layout_of(view), config.forms
 
-    def score_by(backend: Any) -> Callable[..., Any]:
-        def score(shared: tuple[MapState, Cells], views: Array) -> Any:
-            return backend.sums_in_views(*shared, views, layout, forms, num_bins, keep=keep)
+    def kernel(known: tuple[MapState, Cells], items: Any) -> tuple[Array, ...]:
+        (voxels, cells), views = known, jax.vmap(for_kernels)(*items)
+        return calls.sums(
+            voxels.rows, cells, views, layout, forms, num_bins, voxels.num_bins, keep=keep
+        )
 
-        return lambda shared, views: over_views(score, shared, views)
+    def formula(known: tuple[MapState, Cells], item: Any) -> tuple[Array, ...]:
+        (voxels, cells), (view, tolerance, focal) = known, item
+        seen = formulas.seen_in_view(voxels, cells, view, VisibilityConfig(tolerance=tolerance))
+        position = for_kernels(*item).position
+        sums = formulas.sums_of_seen(voxels, cells, seen, position, focal, forms, num_bins)
+        return (*sums, *map(jnp.packbits, seen)) if keep else sums
 
-    chosen = _by_platform(score_by, max(view.shape))
-    results = chosen((voxels, cells), row_of(view, focal, config)[None])
-    return jax.tree.map(lambda of_all: of_all[0], results)
+    item = (view, config.tolerance, focal)
+    return call_of_many(kernel, formula, (voxels, cells), item, voxels.capacity)
+
+
+def change_of_sums(
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
+    kept: tuple[UInt8[Array, " p"], UInt8[Array, " q"]],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    config: ScoringConfig,
+    num_bins: int,
+) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
+    """`formulas.change_of_sums`."""
+    forms = config.forms
+
+    def kernel(known: Any, items: Any) -> tuple[Array, Array]:
+        (voxels, cells), (voxels_after, cells_after) = known
+        gone = cells._replace(unexplored=cells.unexplored & ~cells_after.unexplored)
+        kept, position, focal = items
+        return calls.changes(
+            voxels.rows, voxels_after.rows, gone, kept, position, focal, forms, num_bins,
+            voxels.num_bins,
+        )  # fmt: skip
+
+    def formula(known: Any, item: Any) -> tuple[Array, Array]:
+        (before, after), (kept, position, focal) = known, item
+        return formulas.change_of_sums(before, after, kept, position, focal, forms, num_bins)
+
+    item = (kept, position, focal)
+    return call_of_many(kernel, formula, (before, after), item, before[0].capacity)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
@@ -146,16 +127,20 @@ def mean_in_pixels(
     config: ScoringConfig,
     forms: Forms,
 ) -> Float[Array, ""]:
-    """`reference.mean_in_pixels`, by the fastest backend of the platform."""
+    """`formulas.mean_in_pixels`."""
     del position  # that of the view; it only carries the derivative
     layout = layout_of(view)
 
-    def score_by(backend: Any) -> Callable[..., Any]:
-        score = lambda voxels, views: backend.means_in_pixels(voxels, views, layout, forms)
-        return lambda voxels, views: over_views(score, voxels, views)
+    def kernel(voxels: MapState, items: Any) -> Array:
+        views, bins = jax.vmap(for_kernels)(*items), voxels.num_bins
+        return calls.pixels(voxels.rows, views, layout, forms, bins, keep=False)[0]
 
-    chosen = _by_platform(score_by, max(view.shape))
-    return chosen(voxels, row_of(view, focal, config)[None])[0]
+    def formula(voxels: MapState, item: Any) -> Array:
+        position = for_kernels(*item).position
+        return formulas.mean_in_pixels(voxels, item[0], position, item[2], forms)
+
+    item = (view, config.tolerance, focal)
+    return call_of_many(kernel, formula, voxels, item, voxels.capacity)
 
 
 @mean_in_pixels.defjvp
@@ -164,7 +149,7 @@ def _mean_in_pixels_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
     rows = rows_in_pixels(voxels, view, config)
 
     def score(voxels: MapState, position: Array, focal: Array) -> Array:
-        return reference.mean_of_rows(voxels, rows, position, focal, forms)
+        return formulas.mean_of_rows(voxels, rows, position, focal, forms)
 
     moved = tangents[0], tangents[2], tangents[3]
     return jax.jvp(score, (voxels, position, focal), moved)
@@ -172,15 +157,20 @@ def _mean_in_pixels_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def rows_in_pixels(voxels: MapState, view: View, config: ScoringConfig) -> Int[Array, "h w"]:
-    """`reference.rows_in_pixels`, by the fastest backend of the platform."""
+    """`formulas.rows_in_pixels`."""
     layout = layout_of(view)
 
-    def look_by(backend: Any) -> Callable[..., Any]:
-        look = lambda voxels, views: backend.rows_in_pixels(voxels, views, layout, PAPER)
-        return lambda voxels, views: over_views(look, voxels, views)
+    def kernel(voxels: MapState, items: Any) -> Array:
+        view, tolerance = items
+        views = jax.vmap(for_kernels)(view, tolerance, jnp.ones_like(tolerance))
+        bins = voxels.num_bins
+        rows = calls.pixels(voxels.rows, views, layout, Forms(), bins, keep=True)[1]
+        return rows.reshape(-1, layout.height, layout.width)
 
-    chosen = _by_platform(look_by, max(view.shape))
-    return chosen(voxels, row_of(view, jnp.ones(()), config)[None])[0]
+    def formula(voxels: MapState, item: Any) -> Array:
+        return formulas.rows_in_pixels(voxels, item[0])
+
+    return call_of_many(kernel, formula, voxels, (view, config.tolerance), voxels.capacity)
 
 
 @rows_in_pixels.defjvp
@@ -194,16 +184,20 @@ def _rows_in_pixels_jvp(primals: Any, tangents: Any) -> Any:
 def terms_of_rows(
     voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
-    """`reference.terms_of_rows`, by the fastest backend of the platform."""
+    """`formulas.terms_of_rows`."""
 
-    def score_by(backend: Any) -> Callable[..., Any]:
-        score = lambda voxels, points: backend.terms_of_rows(voxels, points, forms)
-        return lambda voxels, points: over_views(score, voxels, points)
+    def kernel(voxels: MapState, items: Any) -> tuple[Array, ...]:
+        position, focal = items
+        return calls.terms(voxels.rows, position, focal, forms, voxels.num_bins)
 
-    point = jnp.concatenate([position, focal[None]])
-    return Renderability(*(term[0] for term in _by_platform(score_by)(voxels, point[None])))
+    def formula(voxels: MapState, item: Any) -> tuple[Array, ...]:
+        position, focal = item
+        return tuple(jax.tree.leaves(formulas.terms_of_rows(voxels, position, focal, forms)))
+
+    item = (position, focal)
+    return Renderability(*call_of_many(kernel, formula, voxels, item, voxels.capacity))
 
 
 @terms_of_rows.defjvp
 def _terms_of_rows_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
-    return jax.jvp(functools.partial(reference.terms_of_rows, forms=forms), primals, tangents)
+    return jax.jvp(functools.partial(formulas.terms_of_rows, forms=forms), primals, tangents)

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera, is_traced
+from r3jax.kernels.calls import Cells
 from r3jax.kernels.native.platform import can_call_kernels, num_cores
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid, cells_of
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama import Panorama, panorama_of

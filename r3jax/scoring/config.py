@@ -1,27 +1,16 @@
 """Settings of every score. Numbers are traced, so a sweep over them compiles once."""
 
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from r3jax.geometry.arguments import one, or_none
+from r3jax.kernels.calls import Forms
 from r3jax.visibility.config import VisibilityConfig, as_float32
-
-
-class Forms(NamedTuple):
-    """Form of each term where the paper leaves a choice; fields as in `ScoringConfig`."""
-
-    kappa: str = "box"
-    delta: str = "trace"
-    sample: int = 1
-
 
 PAPER = Forms()
 """What the paper's equations and algorithms say."""
-
-MOST_SAMPLED = 64
-"""A view of 128 x 96 pixels then still scores some hundred of the voxels that it shows."""
 
 
 class ScoringConfig(VisibilityConfig):
@@ -36,20 +25,15 @@ class ScoringConfig(VisibilityConfig):
     """`box`: 1 inside the seen directions' box, else 2. `one`: always 1."""
 
     delta: str = eqx.field(default="trace", static=True)
-    """`runs`: the paper's Algorithm 2. `pairwise`: its text, 1 - 2 tr(M) / (n - 1)."""
+    """`trace`: the paper's Algorithm 2. `pairwise`: its text, 1 - 2 tr(M) / (n - 1)."""
 
     panorama_bins: int = eqx.field(default=526, static=True)
     """Directions of the panorama; 526 are 10 degrees apart."""
 
-    sample: int = eqx.field(default=1, static=True)
-    """Score one of so many visible voxels, and count it so many times; 1: every one, exactly.
-    Which voxels stay is a regular pattern, so that every surface keeps its share. What hides
-    what, and the unexplored cells, are never sampled."""
-
     @property
     def forms(self) -> Forms:
         """Forms of the terms of R."""
-        return Forms(self.kappa, self.delta, self.sample)
+        return Forms(self.kappa, self.delta)
 
     def __check_init__(self) -> None:
         """Refuses settings that no formula knows."""
@@ -57,8 +41,22 @@ class ScoringConfig(VisibilityConfig):
             raise ValueError(f"kappa must be 'box' or 'one', got {self.kappa!r}")
         if self.delta not in ("trace", "pairwise"):
             raise ValueError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
-        if not 1 <= self.sample <= MOST_SAMPLED:
-            raise ValueError(f"sample must lie between 1 and {MOST_SAMPLED}, got {self.sample}")
+
+
+RETIRED = {"sample": "it was off, and no table rests on it; commit 4fa1d20 has it"}
+"""Settings that have left the package: the reason, and where their code is."""
+
+
+def scoring_config_of(settings: dict[str, Any]) -> ScoringConfig:
+    """Makes the settings of a record or of a command.
+
+    Raises:
+        ValueError: no setting has one of these names (any more), or a value is impossible.
+    """
+    for name in settings:
+        if name in RETIRED:
+            raise ValueError(f"setting scoring.{name} has left the package: {RETIRED[name]}")
+    return ScoringConfig(**settings)
 
 
 scoring_settings = or_none(one(ScoringConfig, "None: its defaults"))

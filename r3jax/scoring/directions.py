@@ -11,9 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt32
 
 from r3jax.geometry.sphere import fibonacci_lattice
-
-ON_EDGE = 1e-6
-"""Tangent coordinates within this of 0 lie on the edge of the box, which belongs to it."""
+from r3jax.kernels.constants import ON_EDGE
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
@@ -41,20 +39,14 @@ def seen_directions(
         `cosine` and `inside`. The derivative of `cosine` is that of the nearest bin's product;
         `inside` is piecewise constant.
     """
-    # One output behind a branch: XLA on a CPU would otherwise repeat the whole scan over the
-    # bins in every kernel that uses one of its results.
-    packed = jax.lax.cond(
+    # One array of pairs behind a branch: XLA on a CPU would otherwise repeat the whole scan over
+    # the bins in every kernel that uses one of its results.
+    pairs = jax.lax.cond(
         jnp.any(visited != jnp.uint32(0)),
-        lambda: _pack(*_scan(visited, direction, num_bins)[:2]),
-        lambda: jnp.zeros_like(direction[0]),
+        lambda: jax.lax.complex(*_scan(visited, direction, num_bins)[:2]),
+        lambda: jnp.zeros(direction.shape[1], dtype=jnp.complex64),
     )
-    inside = packed >= 2.0
-    return jnp.where(inside, packed - 2.0, packed), inside.astype(direction.dtype)
-
-
-def _pack(cosine: Float[Array, " n"], inside: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Both results in one number; the shift by 2 costs the cosine one bit."""
-    return jnp.where(inside > 0.0, cosine + 2.0, cosine)
+    return pairs.real, pairs.imag
 
 
 @seen_directions.defjvp

@@ -17,13 +17,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
-from r3jax.mapping.occupancy import OccupancyGrid, a_grid
+from r3jax.geometry.selection import for_selected
+from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
+from r3jax.mapping.seen import seen_in_view
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.backend import seen_in_view
-from r3jax.scoring.cells import cells_of
 from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
 from r3jax.scoring.terms import score_voxels
-from r3jax.visibility.selection import Selection, for_selected, select
 from r3jax.visibility.views import pinhole_view
 
 CAUSES = ("never seen", "too oblique", "inconsistent", "too far")
@@ -78,9 +77,8 @@ def explain_view(
     view = pinhole_view(camera, T_world_camera, config)
     # The steps of `view_utility`, one by one: the parts must sum to its total.
     shown, unseen = seen_in_view(state, cells_of(grid), view, config)
-    visible = select(shown)
     position = T_world_camera[:3, 3]
-    shares, rendering = _divide_visible(state, visible, position, camera.focal, config.forms)
+    shares, rendering = _divide_visible(state, shown, position, camera.focal, config.forms)
     exploration = config.lambda1 * jnp.sum(unseen, dtype=jnp.float32)
     factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
     return Explanation(
@@ -93,13 +91,13 @@ def explain_view(
 
 def _divide_visible(
     voxels: MapState,
-    visible: Selection,
+    visible: Bool[Array, " N"],
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
     forms: Forms,
 ) -> _Sums:
     """What the visible voxels lack, by cause; summed in the order in which U_R is."""
-    num = visible.num
+    num = voxels.capacity
 
     def add(index: Int[Array, " K"], valid: Bool[Array, " K"], sums: _Sums) -> _Sums:
         shares, totals = sums

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import is_traced
-from r3jax.geometry.compaction import positions_of_set
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.geometry.selection import positions_of_set
+from r3jax.kernels.calls import Cells
+from r3jax.mapping.occupancy import OccupancyGrid, cells_of
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig
 from r3jax.visibility.views import Coordinates
 
@@ -73,7 +73,7 @@ def _masks(
         reach = config.max_range + margin
         return gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] <= reach * reach
 
-    # With the margin of `candidates_of`: the same voxels hide as if the whole map were at hand.
+    # With a voxel as margin: the same voxels hide as if the whole map were at hand.
     near_voxels = voxels.present & is_near(voxels.center, voxels.voxel_size)
     near_cells = cells.unexplored & is_near((cells.x, cells.y, cells.z), 0.0)
     return near_voxels, near_cells

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.calls import Cells
 from r3jax.mapping.state import MapState
 from r3jax.scoring.backend import change_of_sums, sums_and_seen
-from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.panorama import Panorama, panorama_of_bins
 from r3jax.visibility.views import panorama_view

@@ -19,8 +19,8 @@ from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked
 from r3jax.geometry.cameras import Camera, is_traced, sound
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.backend import mean_in_pixels, rows_in_pixels, terms_of_rows
-from r3jax.scoring.backends.reference import voxels_of_rows
 from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
+from r3jax.scoring.formulas import voxels_of_rows
 from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.visibility.views import pinhole_view
 

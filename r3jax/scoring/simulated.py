@@ -20,15 +20,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.calls import Cells
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.seen import mark_rows
+from r3jax.mapping.seen import mark_rows, seen_in_view, visible_rows
 from r3jax.mapping.state import MapState
-from r3jax.scoring.backend import seen_in_view
-from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
-from r3jax.visibility.depth_buffer import seen_in
-from r3jax.visibility.selection import Selection, select
 from r3jax.visibility.views import pinhole_view
 
 
@@ -50,8 +47,8 @@ def simulate_view(
     Returns:
         The map, and the voxels that the view shows.
     """
-    _, visible = seen_in(state, pinhole_view(camera, T_world_camera, config), config)
-    return observed(state, visible, T_world_camera[:3, 3], camera.focal), visible.mask
+    shown = visible_rows(state, pinhole_view(camera, T_world_camera, config), config)
+    return observed(state, shown, T_world_camera[:3, 3], camera.focal), shown
 
 
 @jax.jit
@@ -99,23 +96,26 @@ def simulate_view_near(
     """
     view = pinhole_view(camera, T_world_camera, config)
     shown, empty = seen_in_view(voxels, cells, view, config)
-    after = observed(voxels, select(shown), T_world_camera[:3, 3], camera.focal)
-    return after, eqx.tree_at(lambda c: c.unexplored, cells, cells.unexplored & ~empty)
+    after = observed(voxels, shown, T_world_camera[:3, 3], camera.focal)
+    return after, cells._replace(unexplored=cells.unexplored & ~empty)
 
 
 def observed(
-    voxels: MapState, visible: Selection, position: Float[Array, " 3"], focal: Float[Array, ""]
+    voxels: MapState,
+    shown: Bool[Array, " n"],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
 ) -> MapState:
     """The voxels with one more, imagined, observation of those that are visible.
 
     Args:
         voxels: before.
-        visible: which of them a camera sees.
+        shown: which of them a camera sees.
         position: its center [m].
         focal: its focal length [px].
     """
     # Bins and resolution by the code of real frames, so that both count alike.
-    marked, shown, n = mark_rows(voxels, visible, position, focal), visible.mask, voxels.count
+    marked, n = mark_rows(voxels, shown, position, focal), voxels.count
     grows = shown & (n > 1.0)
     m2 = jnp.where(grows, voxels.m2 * n / jnp.maximum(n - 1.0, 1.0), voxels.m2)
     return eqx.tree_at(lambda v: (v.count, v.m2), marked, (n + shown.astype(n.dtype), m2))

@@ -28,11 +28,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
-from r3jax.geometry.compaction import positions_of_set
-from r3jax.mapping.occupancy import OccupancyGrid, a_grid
+from r3jax.geometry.selection import positions_of_set
+from r3jax.kernels.calls import Cells
+from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
+from r3jax.mapping.seen import seen_in_view
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.backend import seen_in_view
-from r3jax.scoring.cells import Cells, cells_of
 from r3jax.scoring.config import ScoringConfig, scoring_settings
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import pinhole_view

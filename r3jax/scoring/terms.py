@@ -44,7 +44,7 @@ def consistency(
 ) -> Float[Array, " n"]:
     """delta: how consistent the colors of a voxel are, in [0, 1].
 
-    `runs` is Algorithm 2 of arXiv 2601.07484, 1 - sqrt(2 / 1.5) sqrt(tr(M) / (n - 1));
+    `trace` is Algorithm 2 of arXiv 2601.07484, 1 - sqrt(2 / 1.5) sqrt(tr(M) / (n - 1));
     `pairwise` is its text, one minus the mean squared difference over pairs, which equals
     1 - 2 tr(M) / (n - 1). Both are clipped to [0, 1], and are 1 for n <= 1.
     """

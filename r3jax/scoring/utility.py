@@ -6,10 +6,11 @@ from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
-from r3jax.mapping.occupancy import OccupancyGrid, a_grid
+from r3jax.kernels.calls import Cells
+from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
+from r3jax.mapping.seen import seen_in_view
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.backend import seen_in_view, sums_in_view
-from r3jax.scoring.cells import Cells, cells_of
+from r3jax.scoring.backend import sums_in_view
 from r3jax.scoring.config import ScoringConfig, scoring_settings
 from r3jax.visibility.views import pinhole_view
 

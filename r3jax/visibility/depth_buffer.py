@@ -1,118 +1,124 @@
-"""Which voxels and cells a camera can see: depth buffers of voxels, pinhole and panoramic.
+"""Which voxels and points a camera can see: depth buffers of voxels, pinhole and panoramic.
 
-Every voxel is splatted once into an image pyramid (`footprint`); then the coarse levels are pushed
-down. This is the idea of ODGS, omnidirectional splatting, on voxels.
+Every voxel is splatted once into an image pyramid, on the level on which it covers at most 2x2
+pixels; then the coarse levels are pushed down. A near voxel so covers many pixels and a far one
+less than one, at the same cost. Walls have no gaps: every voxel covers the pixel centers inside its
+own projection, and the projections of neighbors meet. This is the idea of ODGS, omnidirectional
+splatting, on voxels.
 
-Shape symbols: n voxels or points; h w size of the finest level.
+Shape symbols: n voxels; m points; h w size of the finest level.
 """
 
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.geometry.compaction import SPARE
-from r3jax.mapping.state import MapState
+from r3jax.geometry.selection import SPARE, spare_places
+from r3jax.kernels.constants import (
+    CORNER,
+    FAR,
+    HALF_WIDTH,
+    MAX_STRETCH,
+    NEAR,
+    SEAM,
+    STRIDES,
+)
 from r3jax.visibility.config import VisibilityConfig
-from r3jax.visibility.footprint import footprint, pyramid
-from r3jax.visibility.selection import Selection, for_selected, narrow, select
-from r3jax.visibility.slope import surface_limit
 from r3jax.visibility.views import Placement, View, wrap
-
-CORNER = 0.6
-"""Where visibility is tested, in edges from a voxel's center along columns and rows."""
-
-# The largest word: every voxel wins the minimum against it.
-_NOTHING = 0xFFFFFFFF
 
 
 class DepthBuffer(eqx.Module):
-    """The nearest voxel per pixel."""
-
-    item: Int[Array, "h w"]
-    """Index of the voxel; n where there is none."""
+    """The nearest voxel per pixel, of equals the first."""
 
     distance: Float[Array, "h w"]
     """Distance of its center from the camera [m]; inf where there is none."""
+
+    row: Int[Array, "h w"]
+    """Its number; n where there is none."""
 
     limit: Float[Array, "h w"]
     """Voxels up to this distance are visible in this pixel [m]."""
 
 
-def candidates_of(voxels: MapState, view: View) -> Selection:
-    """The voxels that may appear in a view: a tenth to a half of a map."""
-    return select(voxels.present & view.may_see(voxels.center, voxels.voxel_size))
+class Voxels(eqx.Module):
+    """Where voxels are."""
+
+    center: Float[Array, "3 n"]
+    """[m]."""
+
+    present: Bool[Array, " n"]
+    """False where there is none."""
+
+    size: Float[Array, ""]
+    """Edge [m]."""
 
 
-def depth_buffer(
-    voxels: MapState, candidates: Selection, view: View, config: VisibilityConfig
-) -> DepthBuffer:
-    """The nearest voxel in every pixel of a view."""
+def depth_buffer(voxels: Voxels, view: View, config: VisibilityConfig) -> DepthBuffer:
+    """Finds the nearest voxel in every pixel of a view; no derivative passes through it."""
+    voxels = jax.lax.stop_gradient(voxels)
+    distance, row = _nearest(voxels, view)
+    # A slanting wall has voxels behind one another that are one surface.
+    limit = surface_limit(distance, view.pixel_angle, config.tolerance * voxels.size)
+    return DepthBuffer(distance, row, limit)
+
+
+def _nearest(voxels: Voxels, view: View) -> tuple[Float[Array, "h w"], Int[Array, "h w"]]:
+    """Distance and number of the nearest voxel in every pixel."""
     shapes = pyramid(view.shape)
     offsets = [0]
     for height, width in shapes:
         offsets.append(offsets[-1] + height * width)
-    num = candidates.num
-    # As many bits for the index as it needs; all others sharpen the distance.
-    item_bits = max(1, (num - 1).bit_length())
-
-    def splat(
-        index: Int[Array, " K"], valid: Bool[Array, " K"], pixels: UInt32[Array, " p"]
-    ) -> UInt32[Array, " p"]:
-        place = view.place(voxels.center_of(index))
-        valid = valid & place.ahead & (place.distance <= view.max_range)
-        # As a share of the range: the bits left beside the index cover the distances that occur.
-        packed = _pack(place.distance / view.max_range, index, item_bits)
-        for target in footprint(place, valid, voxels.voxel_size, shapes, offsets, wraps=view.wraps):
-            # A minimum commutes: the result does not depend on the order of the scatter.
-            pixels = pixels.at[target].min(packed, mode="drop")
-        return pixels
-
-    # All levels in one flat array: one scatter serves voxels of every size.
-    blank = jnp.full(offsets[-1] + SPARE, _NOTHING, dtype=jnp.uint32)
-    finest = _push_down(for_selected(candidates, splat, blank), shapes, offsets)
-    is_hit = finest != jnp.uint32(_NOTHING)
-    item = jnp.where(is_hit, (finest & jnp.uint32((1 << item_bits) - 1)).astype(jnp.int32), num)
-    share = (finest >> item_bits).astype(jnp.float32) / _num_steps(item_bits)
-    # Rounded down to a step of the share: the fewer voxels there are, the finer the steps.
-    distance = jnp.where(is_hit, share * view.max_range, jnp.inf)
-    # A slanting wall has voxels behind one another that are one surface.
-    limit = surface_limit(distance, view.pixel_angle, config.tolerance * voxels.voxel_size)
-    return DepthBuffer(item, distance, limit)
+    place, num = view.place(voxels.center), voxels.present.shape[0]
+    valid = voxels.present & place.ahead & (place.distance <= view.max_range)
+    targets = footprint(place, valid, voxels.size, shapes, offsets, wraps=view.wraps)
+    # All levels in one flat array: one scatter serves voxels of every size. A minimum commutes: the
+    # result does not depend on the order of the scatter.
+    distances = jnp.full(offsets[-1] + SPARE, jnp.inf)
+    for target in targets:
+        distances = distances.at[target].min(place.distance)
+    rows = jnp.full(offsets[-1] + SPARE, num, dtype=jnp.int32)
+    for target in targets:
+        is_nearest = valid & (place.distance == distances[target])
+        rows = rows.at[target].min(jnp.where(is_nearest, jnp.arange(num, dtype=jnp.int32), num))
+    distance, row = jnp.full((1, 1), jnp.inf), jnp.full((1, 1), num, dtype=jnp.int32)
+    # From coarse to fine, each pixel once: a near voxel was written to four pixels at most.
+    for (height, width), begin in zip(shapes[::-1], offsets[-2::-1], strict=True):
+        # Odd sizes: the last coarse pixel sticks out and is cut off.
+        distance, row = (_doubled(x)[:height, :width] for x in (distance, row))
+        own = slice(begin, begin + height * width)
+        near, first = distances[own].reshape(height, width), rows[own].reshape(height, width)
+        is_own = (near < distance) | ((near == distance) & (first < row))
+        distance, row = jnp.where(is_own, near, distance), jnp.where(is_own, first, row)
+    return distance, row
 
 
-def visible_voxels(
-    voxels: MapState, candidates: Selection, view: View, buffer: DepthBuffer
-) -> Selection:
-    """The voxels that the view sees: in the image, within range, and not hidden as a whole."""
-
-    def test(index: Int[Array, " K"]) -> Bool[Array, " K"]:
-        place = view.place(voxels.center_of(index))
-        margin = corner_margin(view, place, voxels.voxel_size, buffer.limit)
-        return is_in_view(view, place) & (margin >= 0.0)
-
-    return narrow(candidates, test)
+def _doubled(image: Array) -> Array:
+    return jnp.repeat(jnp.repeat(image, 2, axis=0), 2, axis=1)
 
 
-def seen_in(
-    voxels: MapState, view: View, config: VisibilityConfig
-) -> tuple[DepthBuffer, Selection]:
-    """The depth buffer of a view, and the voxels that it sees."""
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, config)
-    return buffer, visible_voxels(voxels, candidates, view, buffer)
+def visible(
+    voxels: Voxels, points: Float[Array, "3 m"], view: View, config: VisibilityConfig
+) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
+    """Finds the voxels that a view sees, and the points in empty space that nothing hides."""
+    buffer = depth_buffer(voxels, view, config)
+    return sees_voxels(voxels, view, buffer), sees_points(points, view, buffer)
 
 
-def is_visible(view: View, place: Placement, limit: Float[Array, "h w"]) -> Bool[Array, " n"]:
-    """True for points in the image and within range, no farther than `limit` at their pixel.
+def sees_voxels(voxels: Voxels, view: View, buffer: DepthBuffer) -> Bool[Array, " n"]:
+    """True for the voxels in the image, within range, and not hidden as a whole."""
+    place = view.place(jax.lax.stop_gradient(voxels.center))
+    margin = corner_margin(view, place, voxels.size, buffer.limit)
+    return voxels.present & is_in_view(view, place) & (margin >= 0.0)
 
-    Args:
-        view: the view.
-        place: where the points fall in it.
-        limit: `DepthBuffer.distance` for points in empty space, which nothing may hide.
-    """
-    return is_in_view(view, place) & (depth_margin(view, place, limit) >= 0.0)
+
+def sees_points(points: Float[Array, "3 m"], view: View, buffer: DepthBuffer) -> Bool[Array, " m"]:
+    """True for the points in the image, within range, and before every voxel."""
+    place = view.place(jax.lax.stop_gradient(points))
+    # Before the surface itself: the slack behind it is for voxels that belong to it.
+    return is_in_view(view, place) & (depth_margin(view, place, buffer.distance) >= 0.0)
 
 
 def depth_margin(view: View, place: Placement, limit: Float[Array, "h w"]) -> Float[Array, " n"]:
@@ -143,7 +149,7 @@ def corner_margin(
 
 
 def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
-    """True for points that fall into the image, at whatever distance."""
+    """True for points that fall into the image, at any distance."""
     height, width = view.shape
     # Half-open: a point on the far border belongs to a pixel that is not there.
     is_in = (place.column >= 0.0) & (place.column < width) & place.ahead
@@ -176,31 +182,136 @@ def _at_pixel(
     return image.reshape(-1)[r * width + c]
 
 
-def _num_steps(item_bits: int) -> float:
-    # The largest value of the bits that the index leaves: a share of 1 must still fit.
-    return float((1 << (32 - item_bits)) - 1)
+def pyramid(shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Heights and widths of all levels, the finest first, each half of the one before."""
+    shapes = [shape]
+    while max(shapes[-1]) > 1:
+        height, width = shapes[-1]
+        # Rounded up: every pixel of the finer level needs a parent.
+        shapes.append((-(-height // 2), -(-width // 2)))
+    return shapes
 
 
-def _pack(
-    share: Float[Array, " n"], index: Int[Array, " n"], item_bits: int
-) -> UInt32[Array, " n"]:
-    """Distance in the high bits, index in the low ones: `min` keeps the nearest voxel."""
-    # Points that are not valid are packed as well: unclipped, theirs could be a cast out of range.
-    steps = (jnp.clip(share, 0.0, 1.0) * _num_steps(item_bits)).astype(jnp.uint32)
-    packed = (steps << item_bits) | index.astype(jnp.uint32)
-    return jnp.minimum(packed, jnp.uint32(_NOTHING - 1))  # all ones would read as "nothing"
+def footprint(
+    place: Placement,
+    valid: Bool[Array, " n"],
+    voxel_size: Float[Array, ""],
+    shapes: list[tuple[int, int]],
+    offsets: list[int],
+    *,
+    wraps: bool,
+) -> list[Int[Array, " n"]]:
+    """Indices into the pyramid of the pixels that each voxel covers; behind its end: none.
+
+    The level is the first on which the footprint spans at most two pixel centers an axis. A
+    footprint is the octagon round the projected cube.
+
+    Args:
+        place: where the voxels fall in the view.
+        valid: False for voxels to leave out.
+        voxel_size: edge of a voxel [m].
+        shapes: of the pyramid's levels.
+        offsets: where each level begins; one more for the end, behind which lie spare places.
+        wraps: True for an octahedral map.
+    """
+    half = voxel_size * (HALF_WIDTH + NEAR * voxel_size / place.distance)
+    widths = [2.0 * half * x for x in (place.column_scale, place.row_scale)]
+    widest = jnp.maximum(jnp.maximum(widths[0], widths[1]), 1e-6)
+    # Half the width before the logarithm: on its level a footprint is at most two pixels wide.
+    level = jnp.clip(jnp.ceil(jnp.log2(0.5 * widest)), 0.0, len(shapes) - 1.0)
+    scale = jnp.exp2(-level)
+    level = level.astype(jnp.int32)
+    table: Callable[[list[int]], Array] = lambda values: jnp.asarray(values, dtype=jnp.int32)[level]
+    # Voxels side by side may lie on different levels, so sizes and offsets are gathered for each.
+    height, width = table([s[0] for s in shapes]), table([s[1] for s in shapes])
+    offset = table(offsets[:-1])
+    begins_level = (level > 0) & (0.5 * widest * scale < SEAM)
+    spread = jnp.where(begins_level, 0.25, 0.0)
+    columns = _covered(place.column * scale, 0.5 * widths[0] * scale + spread)
+    rows = _covered(place.row * scale, 0.5 * widths[1] * scale + spread)
+    # The octagon's slanted sides: a cube seen at an edge does not fill its bounding rectangle.
+    slanted = [half * w * scale + 2.0 * spread for w in (place.sum_scale, place.difference_scale)]
+    nowhere = spare_places(offsets[-1], level.shape[0])
+    indices: list[Int[Array, " n"]] = []
+    for r, covers_row, down in rows:
+        for c, covers_column, right in columns:
+            # A far voxel may reach no pixel center at all, and must show in its own pixel still.
+            is_own = (jnp.abs(right) <= 0.5) & (jnp.abs(down) <= 0.5)
+            covers = (jnp.abs(right + down) <= slanted[0]) & (jnp.abs(right - down) <= slanted[1])
+            is_in = valid & covers_row & covers_column & (covers | is_own)
+            if wraps:
+                r_in, c_in = wrap(r, c, height)
+            else:
+                is_in = is_in & (r >= 0) & (r < height) & (c >= 0) & (c < width)
+                r_in, c_in = r, c
+            indices.append(jnp.where(is_in, offset + r_in * width + c_in, nowhere))
+    return indices
 
 
-def _push_down(
-    pixels: UInt32[Array, " p"], shapes: list[tuple[int, int]], offsets: list[int]
-) -> UInt32[Array, "h w"]:
-    """The minimum over all levels, at the finest."""
-    level: Callable[[int], Array] = lambda i: pixels[offsets[i] : offsets[i + 1]].reshape(shapes[i])
-    # From coarse to fine, each pixel once: a near voxel was written to four pixels at most.
-    combined = level(len(shapes) - 1)
-    for i in range(len(shapes) - 2, -1, -1):
-        height, width = shapes[i]
-        # Odd sizes: the last coarse pixel sticks out and is cut off.
-        enlarged = jnp.repeat(jnp.repeat(combined, 2, axis=0), 2, axis=1)[:height, :width]
-        combined = jnp.minimum(level(i), enlarged)
-    return combined
+def _covered(
+    middle: Float[Array, " n"], reach: Float[Array, " n"]
+) -> list[tuple[Int[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]]:
+    """The two pixels round a coordinate, and whether `reach` covers each center, and its offset.
+
+    The pixel that holds the coordinate is always covered.
+    """
+    # Clipped before it becomes an integer: far outside, int32 would wrap round.
+    first = jnp.floor(jnp.clip(middle, -2.0, 1e6) - 0.5)
+    reach = jnp.maximum(reach, 0.5)
+    return [
+        (pixel.astype(jnp.int32), jnp.abs(pixel + 0.5 - middle) <= reach, pixel + 0.5 - middle)
+        for pixel in (first, first + 1.0)
+    ]
+
+
+def surface_limit(
+    distance: Float[Array, "h w"],
+    pixel_angle: float | Float[Array, ""],
+    allowance: Float[Array, ""],
+) -> Float[Array, "h w"]:
+    """Distance up to which voxels count as the surface in the buffer, not as behind it [m].
+
+    On a surface at angle a to the line of sight, voxels that lie one behind the other across it
+    are 1 / cos(a) as far apart along the line: the allowance is stretched by that. It stays the
+    same measured across the surface, so what stands behind a wall is not let through, however
+    obliquely the wall is seen.
+
+    Args:
+        distance: the buffer [m]; inf where there is nothing.
+        pixel_angle: angle that a pixel covers [rad].
+        allowance: depth of the surface across itself [m].
+    """
+    capped = jnp.minimum(distance, FAR)
+    # Beyond the border the buffer is continued in a straight line.
+    padded = jnp.pad(capped, max(STRIDES), mode="reflect", reflect_type="odd")
+    squared = jnp.zeros_like(distance)
+    for axis in (0, 1):
+        steepest = jnp.zeros_like(distance)
+        for step in STRIDES:
+            steepest = jnp.maximum(steepest, _slope(capped, padded, step, axis))
+        squared = squared + steepest * steepest
+    # Meters of depth per pixel, over the meters that a pixel spans there.
+    tangent = jnp.sqrt(squared) / (pixel_angle * jnp.maximum(capped, 1e-6))
+    # 1 / cos a = sqrt(1 + tan^2 a); uncapped, a wall seen edge on would hide nothing.
+    stretch = jnp.minimum(jnp.sqrt(1.0 + tangent * tangent), MAX_STRETCH)
+    # On the uncapped distance: where there is nothing, the limit stays infinite.
+    return distance + allowance * stretch
+
+
+def _slope(
+    distance: Float[Array, "h w"], padded: Float[Array, "hp wp"], step: int, axis: int
+) -> Float[Array, "h w"]:
+    """Change per pixel on the flatter side of each pixel [m/px]; 0 where the sides disagree.
+
+    So neither a silhouette nor a ragged edge counts as a slope.
+    """
+    margin = max(STRIDES)
+    height, width = distance.shape
+
+    def moved(shift: int) -> Float[Array, "h w"]:
+        row, column = margin + shift * (axis == 0), margin + shift * (axis == 1)
+        return padded[row : row + height, column : column + width]
+
+    before, after = distance - moved(-step), moved(step) - distance
+    flatter = jnp.minimum(jnp.abs(before), jnp.abs(after)) / step
+    return jnp.where(before * after > 0.0, flatter, 0.0)

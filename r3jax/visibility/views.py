@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels import calls
 from r3jax.visibility.config import VisibilityConfig
 
 Coordinates = Float[Array, "3 n"] | tuple[Array, Array, Array]
@@ -204,6 +205,23 @@ class PanoramaView(eqx.Module):
 
 
 View = PinholeView | PanoramaView
+
+
+def layout_of(view: View) -> calls.Layout:
+    """Finds what kernels need to know of a view while tracing."""
+    return calls.Layout(view.wraps, *view.shape)
+
+
+def for_kernels(view: View, tolerance: Float[Array, ""], focal: Float[Array, ""]) -> calls.Views:
+    """Lays one view out as kernels take it; `jax.vmap` makes `calls.Views` of many."""
+    angle = jnp.asarray(view.pixel_angle, dtype=jnp.float32)
+    rest = (view.max_range, tolerance, angle, focal)
+    if isinstance(view, PanoramaView):
+        one = jnp.ones(())
+        return calls.Views(view.position, jnp.zeros(9), one, one, one, one, *rest)
+    camera, T = view.camera, view.T_world_camera
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return calls.Views(T[:3, 3], T[:3, :3].ravel(), *lens, *rest)
 
 
 def pinhole_view(

@@ -16,7 +16,8 @@ from r3jax.baselines.normals import pixel_normals
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.geometry.voxels import unpack
-from r3jax.mapping.join import CHUNK, grow
+from r3jax.kernels.constants import JOINED as CHUNK
+from r3jax.mapping.join import grow
 
 pytestmark = pytest.mark.full
 

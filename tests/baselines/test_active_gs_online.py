@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from r3jax.baselines import active_gs_online
 from r3jax.baselines.online_map import Seen, turned_to
 from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.scoring.cells import Cells
+from r3jax.kernels.calls import Cells
 from tests.splatting.clouds import random_cloud
 
 RANGE = jnp.float32(5.0)

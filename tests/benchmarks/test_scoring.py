@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 import r3jax
+from r3jax.kernels.native import platform
+from r3jax.mapping.occupancy import cells_of
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.registry import make_policy
-from r3jax.scoring import backend
-from r3jax.scoring.backends import reference
 from r3jax.scoring.batch import score_positions, score_views
-from r3jax.scoring.cells import cells_of
-from r3jax.visibility.views import panorama_view
+from r3jax.scoring.panorama import panorama_of
 from tests.benchmarks.conftest import Explored
 
 pytestmark = pytest.mark.full
@@ -82,26 +81,35 @@ def test_1000_renderabilities(benchmark, explored, around):
     assert float(benchmark(score).max()) > 0.5
 
 
-@pytest.mark.parametrize("way", ["chosen", "reference"])
-def test_10_panoramas_beside_the_reference(benchmark, explored, scoring, around, way):
-    """What the kernels gain over the formulas, voxel by voxel in plain JAX."""
-    module = {"chosen": backend, "reference": reference}[way]
+@pytest.fixture(params=["kernels", "formulas"])
+def form(request, monkeypatch) -> str:
+    """The machine code of CPUs, and the plain JAX that other platforms get, on this CPU."""
+    if request.param == "formulas":
+        monkeypatch.setattr(platform, "can_call_kernels", lambda: False)
+    return request.param
 
-    @jax.jit
-    def sums(m, grid, positions):
-        cells, focal, bins = cells_of(grid), explored.camera.focal, scoring.panorama_bins
 
-        def one(position):
-            view = panorama_view(position, scoring)
-            return module.sums_in_view(m, cells, view, position, focal, scoring, bins)
+@pytest.mark.usefixtures("form")
+def test_10_panoramas(benchmark, explored, scoring, around):
+    cells = cells_of(explored.grid)
 
-        together = jax.vmap(one) if way == "chosen" else lambda at: jax.lax.map(one, at)
-        return together(positions)
+    def one(position):
+        return panorama_of(explored.map, cells, explored.camera, position, scoring)
 
-    score = lambda: jax.block_until_ready(sums(explored.map, explored.grid, around[:10, :3, 3]))
+    mapped = jax.jit(jax.vmap(one))
+    score = lambda: jax.block_until_ready(mapped(around[:10, :3, 3]))
     score()
-    deficits, _ = benchmark(score)
-    assert float(deficits.sum()) > 0.0
+    assert float(benchmark(score).best_score.sum()) > 0.0
+
+
+@pytest.mark.usefixtures("form")
+def test_100_renderabilities(benchmark, explored, around):
+    mapped = jax.jit(
+        jax.vmap(functools.partial(r3jax.renderability.__wrapped__, explored.map, explored.camera))
+    )
+    score = lambda: jax.block_until_ready(mapped(around[:100]))
+    score()
+    assert float(benchmark(score).max()) > 0.5
 
 
 def test_100_panoramas(benchmark, explored, scoring):
@@ -138,20 +146,19 @@ def test_a_decision(benchmark, views, edge):
 
 
 FLOWN = [
-    ("r3-pano", 2, 96, 1),
+    ("r3-pano", 2, 96),
     *(
-        pytest.param(policy, views, 256, sample, marks=pytest.mark.measured)
+        pytest.param(policy, views, 256, marks=pytest.mark.measured)
         for policy in ("r3-pano", "r3-ahead")
         for views in (4, 40)
-        for sample in (1, 4)
     ),
 ]
 
 
-@pytest.mark.parametrize(("policy", "views", "edge", "sample"), FLOWN)
-def test_a_decision_on_its_own_way(benchmark, policy, views, edge, sample):
+@pytest.mark.parametrize(("policy", "views", "edge"), FLOWN)
+def test_a_decision_on_its_own_way(benchmark, policy, views, edge):
     """Target: 200 ms of `r3-ahead`, after so many views of the flat that it chose itself."""
-    policy = make_policy(policy, scoring=r3jax.ScoringConfig(sample=sample))
+    policy = make_policy(policy)
     world = r3jax.open_scene("flat", camera=r3jax.Camera.from_fov(edge, edge))
     pose = world.start_pose
     planner = r3jax.start(world.camera, world.bounds, policy, starts=[pose])

@@ -22,7 +22,7 @@ from r3jax.cli.main import main
 from r3jax.evaluation import judge
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.geometry.cameras import Camera
-from r3jax.kernels.mapping import bridge as mapping
+from r3jax.kernels import bridge
 from r3jax.kernels.native.ahead import compile_ahead
 from r3jax.mapping.join import merge
 from r3jax.runs.header import header_to_json
@@ -101,8 +101,8 @@ def seeds(run: Files, splats: Files, recording: Files) -> list[Files]:
     """Every command with a run that holds a model, a recording, and a scene."""
     compile_ahead()  # once in a process, and not by the command under test
     # Numba unpickles its own machine code, which the guard would lay at a command's door.
-    for name in (mapping.ADD, mapping.LOOK, mapping.MARK):
-        mapping.register(name)
+    for name in ("map_add", "map_mark"):
+        bridge.register(name)
     walls = world_of(box_quads((-2, -2, -1.5), (2, 2, 1.5), inward=True))
     _ = RaycastSimulator(walls, Camera.from_fov(6, 4, 90.0)).start_pose
     files: dict[str, Entry] = {}

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.geometry import compaction
-from r3jax.geometry.compaction import positions_of_set, running_count
+from r3jax.geometry import selection as compaction
+from r3jax.geometry.selection import positions_of_set, running_count
 
 SIZES = [1, 2, 63, 64, 65, 4095, 4097, 64**3 + 5]
 

@@ -56,11 +56,15 @@ MUTANTS = [
     *faults(
         "r3jax/kernels/scoring/voxels.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[sums_agree]",
-        ("math.sqrt(_TWO_THIRDS_OF_TWO * variance)", "math.sqrt(variance)"),
-        ("counts[group] += 1\n        rows", "rows"),
+        ("counts[group] += 1\n        voxels", "voxels"),
     ),
     *faults(
-        "r3jax/kernels/scoring/voxels.py",
+        "r3jax/kernels/scoring/terms.py",
+        "tests/scoring/test_kernel_faults.py::test_the_laws_hold[sums_agree]",
+        ("math.sqrt(_TWO_THIRDS_OF_TWO * variance)", "math.sqrt(variance)"),
+    ),
+    *faults(
+        "r3jax/kernels/scoring/terms.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[terms_agree]",
         ("max(count - _ONE, _ONE)", "count"),
     ),
@@ -90,13 +94,13 @@ MUTANTS = [
     *faults(
         "r3jax/kernels/scoring/sums.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[in_images]",
-        ("empty[axis, k] = centers[axis, order[k]]", "empty[axis, k] = centers[axis, k]"),
+        ("found.centers[axis, order[k]]", "found.centers[axis, k]"),
     ),
     *faults(
         "r3jax/kernels/scoring/pixels.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[images_agree]",
         (
-            "key_of(placed[DISTANCE + i], rows[first + i])",
+            "key_of(placed[DISTANCE + i], numbers[first + i])",
             "key_of(placed[DISTANCE + i], first + i)",
         ),
         ("if row != last:", "if last < 0:"),

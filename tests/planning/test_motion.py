@@ -18,7 +18,6 @@ from r3jax.planning.robot.motion import (
     motion_of_record,
 )
 from r3jax.runs.header import settings_of
-from r3jax.scoring.config import ScoringConfig
 
 
 @pytest.mark.parametrize(
@@ -84,14 +83,6 @@ def test_a_record_without_refinement_reads_as_it_always_did():
     assert not {"refine", "refine_radius"} & set(plain)
     assert refined["refine"] == 4
     assert PlannerConfig(refine_radius=refined["refine_radius"]).refine == 0
-
-
-def test_a_record_without_a_sample_reads_as_it_always_did():
-    plain, sampled = (
-        settings_of(make_policy("r3-pano", scoring=ScoringConfig(sample=num))) for num in (1, 4)
-    )
-    assert "sample" not in plain["scoring"]
-    assert sampled["scoring"] == plain["scoring"] | {"sample": 4}
 
 
 def test_a_damaged_record_is_refused():

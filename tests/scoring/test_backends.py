@@ -1,6 +1,5 @@
 """Every backend says what the reference says, however it is asked: one by one or many at once."""
 
-import dataclasses
 import functools
 
 import jax
@@ -11,15 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import r3jax
-from r3jax.geometry.voxels import pack
+from r3jax.kernels.calls import Cells
 from r3jax.kernels.native import platform
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid, cells_of
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
-from r3jax.scoring import backend
-from r3jax.scoring.backends import dense, reference
-from r3jax.scoring.backends.views import layout_of, row_of
-from r3jax.scoring.cells import Cells, cells_of
+from r3jax.scoring import backend, formulas
+from r3jax.scoring.config import scoring_config_of
 from r3jax.scoring.simulated import simulate_view_near
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import View, panorama_view, pinhole_view
@@ -64,7 +61,7 @@ def view_at(kind: str, pose: jax.Array) -> View:
 
 
 def asked_of(module, kind: str, config: r3jax.ScoringConfig = CONFIG):
-    """`sums_in_view` of `backend` or `reference`, as a function of what is known and of a pose."""
+    """`sums_in_view` of `backend` or `formulas`, as a function of what is known and of a pose."""
 
     def ask(voxels: MapState, cells: Cells, pose: jax.Array):
         view, position = view_at(kind, pose), pose[:3, 3]
@@ -77,7 +74,7 @@ def asked_of(module, kind: str, config: r3jax.ScoringConfig = CONFIG):
 @functools.cache
 def programs(kind: str):
     """The reference one by one; the chosen backend one by one, mapped, and in a loop."""
-    ask, exact = asked_of(backend, kind), asked_of(reference, kind)
+    ask, exact = asked_of(backend, kind), asked_of(formulas, kind)
     loop = lambda v, c, poses: jax.lax.map(lambda pose: ask(v, c, pose), poses)
     return (
         jax.jit(lambda v, c, poses: jax.lax.map(lambda pose: exact(v, c, pose), poses)),
@@ -106,55 +103,20 @@ def test_sums_are_those_of_the_reference(kind, seed):
     assert_same(looped(*arguments), expected)
 
 
+@pytest.fixture
+def no_kernels(monkeypatch):
+    """As on a machine where machine code cannot be called, with batches smaller than the views."""
+    monkeypatch.setattr(platform, "can_call_kernels", lambda: False)
+    monkeypatch.setattr(platform, "MOST_PAIRS", 4 * CAPACITY)
+
+
 @pytest.mark.parametrize("kind", NUM_BINS)
-def test_dense_batches_are_those_of_the_reference(kind):
+def test_batches_of_formulas_are_those_of_one_by_one(kind, no_kernels):
     state, grid = world(0)
-    cells, poses = cells_of(grid), poses_of(0)
-    view = view_at(kind, poses[0])
-    rows = jax.vmap(lambda pose: row_of(view_at(kind, pose), CAMERA.focal, CONFIG))(poses)
-    frame, forms = layout_of(view), CONFIG.forms
-    found = jax.jit(
-        lambda v, c, rows: dense.sums_in_views(v, c, rows, frame, forms, NUM_BINS[kind])
-    )(state, cells, rows)
-    assert_same(found, programs(kind)[0](state, cells, poses))
-
-
-@pytest.mark.parametrize("kind", NUM_BINS)
-def test_a_sample_is_that_of_the_reference(kind):
-    """One by one by the reference; many, few, and as dense batches by what is chosen."""
-    state, grid = world(1)
-    cells, poses = cells_of(grid), poses_of(1)
-    config = dataclasses.replace(CONFIG, sample=4)
-    ask = lambda module: jax.jit(
-        jax.vmap(lambda pose: asked_of(module, kind, config)(state, cells, pose))
-    )
-    expected = ask(reference)(poses)
-    assert_same(ask(backend)(poses), expected)
-    assert_same(ask(backend)(poses[:2]), jax.tree.map(lambda x: x[:2], expected))
-    rows = jax.vmap(lambda pose: row_of(view_at(kind, pose), CAMERA.focal, config))(poses)
-    layout = layout_of(view_at(kind, poses[0]))
-    found = dense.sums_in_views(state, cells, rows, layout, config.forms, NUM_BINS[kind])
-    assert_same(found, expected)
-
-
-def test_a_sample_keeps_its_share_of_every_wall():
-    """Of walls along every axis the same share stays."""
-    ranges = jnp.arange(-32, 32)
-    a, b = (x.reshape(-1) for x in jnp.meshgrid(ranges, ranges))
-    for axis in range(3):
-        index = [a, b]
-        index.insert(axis, jnp.full_like(a, 7))
-        wall = dataclasses.replace(r3jax.empty_map(len(a), 0.1), key=jnp.stack(pack(*index)))
-        for sample in (2, 3, 4, 8):
-            share = float(jnp.mean(reference.is_sampled(wall, sample)))
-            # Less than one voxel too many or too few in each of the 64 rows of a wall.
-            assert abs(share - 1.0 / sample) < 1.0 / 64, (axis, sample)
-
-
-@pytest.mark.parametrize("sample", [0, -1, 65])
-def test_samples_that_are_none_are_refused(sample):
-    with pytest.raises(ValueError, match=f"sample must lie between 1 and 64, got {sample}"):
-        r3jax.ScoringConfig(sample=sample)
+    arguments = state, cells_of(grid), poses_of(0)
+    mapped = jax.jit(jax.vmap(asked_of(backend, kind), (None, None, 0)))
+    assert "custom_call" not in mapped.lower(*arguments).as_text()
+    assert_same(mapped(*arguments), programs(kind)[0](*arguments))
 
 
 @pytest.mark.parametrize("kind", NUM_BINS)
@@ -166,7 +128,7 @@ def test_gradients_are_those_of_the_reference(kind):
         total = lambda pose: jnp.sum(asked_of(module, kind)(state, cells, pose)[0])
         return jax.jit(jax.grad(total))(pose)
 
-    found, expected = gradient(backend), gradient(reference)
+    found, expected = gradient(backend), gradient(formulas)
     assert np.abs(np.asarray(expected[:3, 3])).max() > 0.1
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
@@ -201,7 +163,7 @@ def renderabilities():
 
     def exact(m: MapState, pose: jax.Array):
         view, position = pinhole_view(CAMERA, pose, CONFIG), pose[:3, 3]
-        return reference.mean_in_pixels(m, view, position, CAMERA.focal, CONFIG.forms)
+        return formulas.mean_in_pixels(m, view, position, CAMERA.focal, CONFIG.forms)
 
     mean = lambda m, pose: r3jax.renderability(m, CAMERA, pose, CONFIG)
     image = lambda m, pose: r3jax.renderability_image(m, CAMERA, pose, CONFIG)
@@ -275,22 +237,18 @@ def test_a_question_without_an_answer_has_none_in_any_row(place, focal):
 
 @functools.cache
 def changes():
-    """What imagined views change: by the reference, one by one; mapped; as dense batches."""
+    """What imagined views change: by the formulas, one by one; mapped."""
     bins = CONFIG.panorama_bins
 
     def ask(module, known, kept, position):
         return module(*known, kept, position, CAMERA.focal, CONFIG, bins)
 
     def by_formulas(before, after, kept, position, focal, config, bins):
-        return reference.change_of_sums(before, after, kept, position, focal, config.forms, bins)
-
-    def batches(known, kept, positions):
-        points = jnp.concatenate([positions, jnp.full((NUM, 1), CAMERA.focal)], axis=1)
-        return dense.changes_of_sums(*known, (points, *kept), CONFIG.forms, bins)
+        return formulas.change_of_sums(before, after, kept, position, focal, config.forms, bins)
 
     exact = lambda known, kept, at: jax.lax.map(lambda x: ask(by_formulas, known, *x), (kept, at))
     chosen = functools.partial(ask, backend.change_of_sums)
-    return jax.jit(exact), jax.jit(jax.vmap(chosen, (None, 0, 0))), jax.jit(batches)
+    return jax.jit(exact), jax.jit(jax.vmap(chosen, (None, 0, 0)))
 
 
 def known_after(seed: int):
@@ -309,12 +267,11 @@ def known_after(seed: int):
 @given(st.integers(0, 1000))
 def test_changes_are_those_of_the_reference(seed):
     known, kept = known_after(seed)
-    exact, mapped, batches = changes()
+    exact, mapped = changes()
     expected = exact(known, kept, poses_of(seed)[:, :3, 3])
-    for found in (mapped, batches):
-        change, explored = found(known, kept, poses_of(seed)[:, :3, 3])
-        np.testing.assert_allclose(change, expected[0], atol=1e-4)
-        np.testing.assert_array_equal(explored, expected[1])
+    change, explored = mapped(known, kept, poses_of(seed)[:, :3, 3])
+    np.testing.assert_allclose(change, expected[0], atol=1e-4)
+    np.testing.assert_array_equal(explored, expected[1])
 
 
 def test_imagined_views_change_sums_for_the_better():
@@ -324,3 +281,9 @@ def test_imagined_views_change_sums_for_the_better():
     assert float(change.max()) <= 1e-6  # no renderability ever falls
     assert float(change.sum()) < -1.0
     assert float(explored.sum()) > 1.0
+
+
+def test_a_setting_that_has_left_the_package_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"scoring\.sample"):
+        scoring_config_of({"sample": 4})
+    assert scoring_config_of({"kappa": "one"}).kappa == "one"

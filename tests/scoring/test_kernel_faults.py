@@ -11,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
-from r3jax.kernels import scoring
-from r3jax.scoring.backends import reference
-from r3jax.scoring.backends.views import row_of
-from r3jax.scoring.cells import cells_of
+from r3jax.kernels import calls
+from r3jax.mapping.occupancy import cells_of
+from r3jax.scoring import formulas
 from r3jax.scoring.terms import score_voxels
-from r3jax.visibility.views import wrap
+from r3jax.visibility.views import for_kernels, layout_of, wrap
+from tests.mapping.test_kernels import arrays_of
 from tests.plain_kernels import Modules, kernels_as_python, load
 from tests.scoring.test_backends import (
     CAMERA,
@@ -29,15 +28,12 @@ from tests.scoring.test_backends import (
     world,
 )
 
-SIGHT, SCORES = scoring.visibility_kernels.__name__, scoring.__name__
-BINS = f"{scoring.mapping_kernels.__name__}.bins"
+SIGHT = ("views", "picture", "splat", "limit", "seen", "bricks")
+SCORES = ("terms", "voxels", "sums", "pixels", "rows", "changes")
 CHAIN = (
-    *(f"{SIGHT}.{name}" for name in ("views", "picture", "splat", "limit", "seen", "bricks")),
-    BINS,
-    *(
-        f"{SCORES}.{name}"
-        for name in ("voxels", "near", "terms", "shown", "few", "sums", "pixels", "rows", "changes")
-    ),
+    *(f"r3jax.kernels.visibility.{name}" for name in SIGHT),
+    "r3jax.kernels.mapping.bins",
+    *(f"r3jax.kernels.scoring.{name}" for name in SCORES),
 )
 VIEWS = 5
 
@@ -56,80 +52,63 @@ def asked():
     is_left = jnp.arange(state.capacity) % 7 == 0
     state = dataclasses.replace(state, count=jnp.where(is_left, 0.0, state.count))
     cells = cells_of(grid)
-    arrays = state.key, state.visited, state.count, state.m2, state.resolution
-    space = cells.x, cells.y, cells.z, cells.unexplored.astype(jnp.uint8)
-    known = (*(np.array(x) for x in arrays), np.float32(state.voxel_size))
-    return state, cells, known, tuple(np.array(x) for x in space)
+    return state, cells, arrays_of(state), cells_as_arrays(cells)
 
 
-def frame_and_rows(kind: str):
+def cells_as_arrays(cells: calls.Cells) -> calls.Cells:
+    return calls.Cells(*map(np.array, calls._as_bytes(cells)))
+
+
+def views_of(kind: str):
+    """Views, and the same as kernels take them."""
     views = [view_at(kind, pose) for pose in poses_of(2)[:VIEWS]]
-    rows = [np.array(row_of(view, CAMERA.focal, CONFIG)) for view in views]
-    return views, (views[0].wraps, views[0].shape), np.stack(rows)
+    laid_out = [for_kernels(view, CONFIG.tolerance, CAMERA.focal) for view in views]
+    together = calls.Views(*(np.stack(part) for part in zip(*laid_out, strict=True)))
+    return views, together, layout_of(views[0])
 
 
 @functools.cache
-def expected(kind: str, sample: int = 1):
-    """Sums, cells, and means in pixels of every view, by the reference."""
-    config = dataclasses.replace(CONFIG, sample=sample)
+def expected(kind: str):
+    """Sums, cells, and means in pixels of every view, by the formulas."""
     state, cells, *_ = asked()
-    views, *_ = frame_and_rows(kind)
 
     @jax.jit
     def look(view, position):
-        at = position, CAMERA.focal, config
-        sums = reference.sums_in_view(state, cells, view, *at, NUM_BINS[kind])
-        return *sums, reference.mean_in_pixels(state, view, *at[:2], CONFIG.forms)
+        at = position, CAMERA.focal, CONFIG
+        sums = formulas.sums_in_view(state, cells, view, *at, NUM_BINS[kind])
+        return *sums, formulas.mean_in_pixels(state, view, *at[:2], CONFIG.forms)
 
-    answers = [look(v, p[:3, 3]) for v, p in zip(views, poses_of(2), strict=False)]
+    answers = [look(v, p[:3, 3]) for v, p in zip(views_of(kind)[0], poses_of(2), strict=False)]
     return [np.stack([np.array(x) for x in part]) for part in zip(*answers, strict=True)]
 
 
-def bins_of(state) -> np.ndarray:
-    return fibonacci_lattice(state.num_bins).astype(np.float32)
+def tables_of(modules: Modules, state, bins: int):
+    return modules["sums"].Tables(calls._lattice(state.num_bins), *calls._bins(bins))
 
 
-def sums_agree(
-    modules: Modules,
-    kind: str = "panorama",
-    num: int = VIEWS,
-    way: str = "sums_of_many",
-    sample: int = 1,
-) -> None:
-    state, _, known, space = asked()
-    _, frame, rows = frame_and_rows(kind)
-    bins = NUM_BINS[kind]
-    table = np.ascontiguousarray(nearest_bin_table(bins).T)
-    tables = bins_of(state), table, fibonacci_lattice(bins).astype(np.float32)
-    none = np.empty((num, 0), np.uint8)
-    results = (*np.empty((2, num, bins), np.float32), none, none)
-    add_up = getattr(modules["sums"], way)
-    add_up(known, space, rows[:num], frame, (False, False, sample), tables, 2, results)
-    deficits, unexplored = (part[:num] for part in expected(kind, sample)[:2])
-    np.testing.assert_allclose(sample * results[0], deficits, atol=1e-4 * deficits.max())
-    np.testing.assert_array_equal(results[1], unexplored)
+def forms_of(modules: Modules):
+    return modules["terms"].Choices(False, False)
 
 
-def few_agree(modules: Modules) -> None:
-    """Without an index, by two threads that share the views' work."""
-    sums_agree(modules, num=2, way="sums_of_few")
-
-
-def samples_agree(modules: Modules) -> None:
-    """One of four voxels is scored, and all of them hide what is behind them."""
-    sums_agree(modules, sample=4)
-
-
-def few_samples_agree(modules: Modules) -> None:
-    sums_agree(modules, num=2, way="sums_of_few", sample=4)
+def sums_agree(modules: Modules, kind: str = "panorama") -> None:
+    state, _, rows, cells = asked()
+    _, views, layout = views_of(kind)
+    bins, none = NUM_BINS[kind], np.empty((VIEWS, 0), np.uint8)
+    results = modules["sums"].Sums(*np.empty((2, VIEWS, bins), np.float32), none, none)
+    forms, tables = forms_of(modules), tables_of(modules, state, bins)
+    modules["sums"].sums(rows, cells, views, layout, forms, tables, 2, results)
+    deficits, unexplored, _ = expected(kind)
+    np.testing.assert_allclose(results.deficits, deficits, atol=1e-4 * deficits.max())
+    np.testing.assert_array_equal(results.unexplored, unexplored)
 
 
 def images_agree(modules: Modules, kind: str = "pinhole") -> None:
-    state, _, known, _ = asked()
-    _, frame, rows = frame_and_rows(kind)
-    results = np.empty(VIEWS, np.float32), np.empty((VIEWS, 0), np.int32)
-    modules["pixels"].pixels_pass(known, rows, frame, (False, False), bins_of(state), 2, results)
-    np.testing.assert_allclose(results[0], expected(kind)[2], atol=1e-4)
+    state, _, rows, _ = asked()
+    _, views, layout = views_of(kind)
+    means, images = np.empty(VIEWS, np.float32), np.empty((VIEWS, 0), np.int32)
+    lattice = calls._lattice(state.num_bins)
+    modules["pixels"].pixels(rows, views, layout, forms_of(modules), lattice, 2, means, images)
+    np.testing.assert_allclose(means, expected(kind)[2], atol=1e-4)
 
 
 def images_all_round(modules: Modules) -> None:
@@ -155,66 +134,61 @@ def in_images(modules: Modules) -> None:
 
 def points_lie_in_their_bricks(modules: Modules) -> None:
     """Each once, in the order that they had, as far from the middle as is said at most."""
-    sort = modules["bricks"].sorted_points
+    bricks, most = modules["bricks"], modules["bricks"].MOST
     points = np.random.default_rng(0).uniform(-4.0, 3.0, (3, 500)).astype(np.float32)
     points[:, 400:] = np.float32([2.4, -3.2, 0.8])[:, None]  # many in one place, on edges
-    for most in (1 << 12, 5):
-        order, starts, spheres = sort(points, most)
+    for bricks.MOST in (1 << 12, 5):
+        order, (starts, spheres) = bricks.sorted_points(points)
         np.testing.assert_array_equal(np.sort(order), np.arange(500))
-        assert 1 <= len(spheres) == len(starts) - 1 <= most
+        assert 1 <= len(spheres) == len(starts) - 1 <= bricks.MOST
         for i, (*middle, radius) in enumerate(spheres):
             own = order[starts[i] : starts[i + 1]]
             assert len(own) > 0
             assert (np.diff(own) > 0).all()
             assert np.linalg.norm(points[:, own].T - middle, axis=1).max() <= radius
-        assert radius < (1.0 if most > 5 else 12.0)  # edges of 0.8 and 12.8 m
+        assert radius < (1.0 if bricks.MOST > 5 else 12.0)  # edges of 0.8 and 12.8 m
+    bricks.MOST = most
     for odd in (points[:, :0], np.full((3, 2), np.nan, np.float32)):
-        order, starts, spheres = sort(odd, 8)
+        order, (starts, spheres) = bricks.sorted_points(odd)
         assert order.tolist() == list(range(odd.shape[1]))
         assert starts.tolist() == [0, odd.shape[1]]
         np.testing.assert_array_equal(spheres, [[0.0, 0.0, 0.0, np.inf]])
 
 
 def terms_agree(modules: Modules) -> None:
-    state, _, known, _ = asked()
-    position = poses_of(2)[0, :3, 3]
-    points = np.append(np.array(position), CAMERA.focal).astype(np.float32)[None]
-    results = tuple(np.empty((modules["rows"].NUM_TERMS, 1, state.capacity), np.float32))
-    modules["rows"].rows_pass(known, points, (False, False), bins_of(state), 2, results)
-    terms = jax.jit(score_voxels)(state, position, CAMERA.focal)
-    for found, (name, term) in zip(results, vars(terms).items(), strict=True):
-        np.testing.assert_allclose(found[0], term, atol=1e-4, err_msg=name)
+    state, _, rows, _ = asked()
+    position, focal = poses_of(2)[:1, :3, 3], np.float32([CAMERA.focal])
+    results = modules["rows"].Terms(*np.empty((6, 1, state.capacity), np.float32))
+    lattice = calls._lattice(state.num_bins)
+    modules["rows"].terms(rows, np.array(position), focal, forms_of(modules), lattice, 2, results)
+    terms = jax.jit(score_voxels)(state, position[0], CAMERA.focal)
+    for name, found in results._asdict().items():
+        np.testing.assert_allclose(found[0], getattr(terms, name), atol=1e-4, err_msg=name)
 
 
 def changes_agree(modules: Modules) -> None:
     (before, after), kept = known_after(2)
     positions, bins = poses_of(2)[:2, :3, 3], CONFIG.panorama_bins
-    some = [np.array(bits[:2]) for bits in kept]
-    known = [
-        (*(np.array(x) for x in (m.key, m.visited, m.count, m.m2, m.resolution)),
-         np.float32(m.voxel_size))
-        for m in (before[0], after[0])
-    ]  # fmt: skip
-    space = [np.array(x) for x in (before[1].x, before[1].y, before[1].z)]
-    explored = np.array(before[1].unexplored & ~after[1].unexplored, np.uint8)
-    points = np.float32([[*position, float(CAMERA.focal)] for position in positions.tolist()])
-    table = np.ascontiguousarray(nearest_bin_table(bins).T)
-    tables = bins_of(before[0]), table, fibonacci_lattice(bins).astype(np.float32)
+    seen = [np.array(bits[:2]) for bits in kept]
+    gone = before[1]._replace(unexplored=before[1].unexplored & ~after[1].unexplored)
+    focals = np.full(2, CAMERA.focal, np.float32)
     results = np.empty((2, bins), np.float32), np.empty((2, bins), np.float32)
-    modules["changes"].changes_pass(
-        *known, (*space, explored), some, points, (False, False), tables, results
-    )
-    one = lambda bits, position: reference.change_of_sums(
+    modules["changes"].changes(
+        arrays_of(before[0]), arrays_of(after[0]), cells_as_arrays(gone), seen,
+        np.array(positions), focals, forms_of(modules), tables_of(modules, before[0], bins),
+        results,
+    )  # fmt: skip
+    one = lambda bits, position: formulas.change_of_sums(
         before, after, bits, position, CAMERA.focal, CONFIG.forms, bins
     )
-    change, explored = jax.jit(jax.vmap(one))(some, positions)
+    change, explored = jax.jit(jax.vmap(one))(seen, positions)
     np.testing.assert_allclose(results[0], change, atol=1e-4)
     np.testing.assert_array_equal(results[1], explored)
 
 
 LAWS = (
-    borders_agree, points_lie_in_their_bricks, sums_agree, few_agree, samples_agree,
-    few_samples_agree, in_images, images_agree, images_all_round, terms_agree, changes_agree,
+    borders_agree, points_lie_in_their_bricks, sums_agree, in_images, images_agree,
+    images_all_round, terms_agree, changes_agree,
 )  # fmt: skip
 
 

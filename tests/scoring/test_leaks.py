@@ -10,7 +10,7 @@ import pytest
 import r3jax
 from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.visibility.depth_buffer import candidates_of, depth_buffer, visible_voxels
+from r3jax.visibility.depth_buffer import visible
 from r3jax.visibility.views import panorama_view, pinhole_view
 
 CAPACITY = 1 << 15
@@ -87,10 +87,7 @@ def seen_in_view(state, camera, T_world_camera, config):
 
 
 def _seen(state, view, config):
-    voxels = state
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, config)
-    return visible_voxels(voxels, candidates, view, buffer).mask
+    return visible(state.voxels, jnp.zeros((3, 0)), view, config)[0]
 
 
 CONFIG = r3jax.ScoringConfig(max_range=10.0)

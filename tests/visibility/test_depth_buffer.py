@@ -6,23 +6,17 @@ import numpy as np
 import pytest
 
 import r3jax
-from r3jax.visibility.depth_buffer import candidates_of, depth_buffer, visible_voxels
+from r3jax.visibility.depth_buffer import visible
 from r3jax.visibility.views import panorama_view
 from tests.scoring.scanned import f1, scan, sphere_of_rays
 
 CONFIG = r3jax.ScoringConfig()
 
 
-def _visible(state, view):
-    voxels = state
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, CONFIG)
-    return visible_voxels(voxels, candidates, view, buffer).mask
-
-
 @jax.jit
 def seen_all_round(state, position):
-    return _visible(state, panorama_view(position, CONFIG))
+    nothing = jnp.zeros((3, 0))
+    return visible(state.voxels, nothing, panorama_view(position, CONFIG), CONFIG)[0]
 
 
 def agreement(name: str, num_places: int) -> np.ndarray:

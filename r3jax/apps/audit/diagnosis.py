@@ -23,15 +23,15 @@ from scipy.spatial import Delaunay, KDTree
 
 from r3jax.apps.audit.survey import MARGIN
 from r3jax.geometry.cameras import Camera
+from r3jax.geometry.selection import for_selected
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
+from r3jax.mapping.seen import visible_rows
 from r3jax.mapping.state import MapState
 from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.batch import map_over_devices
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
 from r3jax.scoring.terms import score_voxels
-from r3jax.visibility.depth_buffer import seen_in
-from r3jax.visibility.selection import for_selected, select
 from r3jax.visibility.views import panorama_view
 
 _HEIGHTS = (5.0, 95.0)
@@ -268,10 +268,9 @@ def _visible(
     voxels: MapState, config: ScoringConfig, positions: Float[Array, "p 3"]
 ) -> Bool[Array, "p N"]:
     def seen_from(position: Float[Array, " 3"]) -> Bool[Array, " N"]:
-        _, visible = seen_in(voxels, panorama_view(position, config), config)
-        return visible.mask
+        return visible_rows(voxels, panorama_view(position, config), config)
 
-    return jax.lax.map(seen_from, positions)
+    return jax.vmap(seen_from)(positions)
 
 
 def score_from_standpoints(
@@ -321,7 +320,7 @@ def _answers(
 
         seen = demand.visible[index] & voxels.present
         blank = jnp.zeros(num), jnp.ones((3, num))
-        value, factors = for_selected(select(seen), score, blank)
+        value, factors = for_selected(seen, score, blank)
         costs = -jnp.log(jnp.maximum(factors, LEAST))
         return value, jnp.where(seen[None, :], factors, 0.0), costs
 

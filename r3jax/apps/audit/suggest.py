@@ -44,6 +44,7 @@ from r3jax.apps.audit.diagnosis import (
 )
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.geometry.selection import for_selected
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -51,13 +52,12 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.planner import Planner, decide
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
+from r3jax.scoring.backend import rows_in_pixels
 from r3jax.scoring.batch import map_over_devices, score_positions
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.simulated import simulate_view
 from r3jax.scoring.terms import score_voxels
 from r3jax.scoring.utility import visible_unexplored
-from r3jax.visibility.depth_buffer import candidates_of, depth_buffer
-from r3jax.visibility.selection import for_selected, select
 from r3jax.visibility.views import pinhole_view
 
 _ENOUGH = 0.95
@@ -105,10 +105,10 @@ def _coverage(
 ) -> Float[Array, " C"]:
     def share(pose: Float[Array, "4 4"]) -> Float[Array, ""]:
         view = pinhole_view(camera, pose, config)
-        buffer = depth_buffer(state, candidates_of(state, view), view, config)
-        return jnp.mean(buffer.item < state.capacity, dtype=jnp.float32)
+        rows = rows_in_pixels(state, view, config)
+        return jnp.mean(rows < state.capacity, dtype=jnp.float32)
 
-    return jax.lax.map(share, poses)
+    return jax.vmap(share)(poses)
 
 
 @jax.jit
@@ -143,7 +143,7 @@ def _gains(
             ids = jnp.arange(demand.position.shape[0], dtype=jnp.int32)
             return total + jnp.sum(jax.lax.map(of_standpoint, ids))
 
-        surfaces = for_selected(select(shown & lacks), add, jnp.zeros(()))
+        surfaces = for_selected(shown & lacks, add, jnp.zeros(()))
         cells = visible_unexplored(state, grid, camera, pose, config)
         return surfaces + config.lambda1 * jnp.sum(cells, dtype=jnp.float32)
 

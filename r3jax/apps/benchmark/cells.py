@@ -22,7 +22,7 @@ from r3jax.planning.policy import Policy
 from r3jax.planning.registry import make_policy, policy_class
 from r3jax.planning.robot.motion import Motion, make_motion, motion_of_record
 from r3jax.runs.header import plain_settings, settings_of
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import RETIRED, ScoringConfig, scoring_config_of
 from r3jax.splatting.config import Backend, RasterConfig
 from r3jax.splatting.training.config import TrainConfig
 
@@ -183,7 +183,7 @@ class Conditions:
             k.removeprefix(_SCORING): v for k, v in settings.items() if k not in planner
         }
         known = [field.name for field in fields(ScoringConfig)]
-        unknown = [name for name in scoring if name not in known]
+        unknown = [name for name in scoring if name not in known and name not in RETIRED]
         if unknown or "scoring" in planner:
             wrong = ", ".join(unknown) or "scoring"
             raise ValueError(
@@ -194,7 +194,7 @@ class Conditions:
         if "motion" in planner:
             planner["motion"] = _motion(planner["motion"])
         try:
-            return make_policy(name, scoring=ScoringConfig(**scoring), **planner)
+            return make_policy(name, scoring=scoring_config_of(scoring), **planner)
         except TypeError as error:  # a text where a number belongs
             raise ValueError(f"policy {name!r} with {settings}: {error}") from None
 

@@ -26,16 +26,16 @@ from r3jax.apps.viewer.story import Moment
 from r3jax.exploration.coverage import probe_poses
 from r3jax.exploration.taken_views import StepRow
 from r3jax.geometry.cameras import Camera
+from r3jax.geometry.selection import for_selected
 from r3jax.geometry.voxels import INDEX_LIMIT, unpack
 from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.seen import visible_rows
 from r3jax.mapping.state import MapState
 from r3jax.runs.header import RunHeader
 from r3jax.runs.reasons import Reason
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.explain import CAUSES
 from r3jax.scoring.terms import score_voxels
-from r3jax.visibility.depth_buffer import seen_in
-from r3jax.visibility.selection import for_selected
 from r3jax.visibility.views import panorama_view
 
 NUM_PROBES = 24
@@ -122,7 +122,7 @@ def _add_sightings(
     totals: Float[Array, "5 N"],
 ) -> Float[Array, "5 N"]:
     """Adds the terms of the voxels that one position sees, and one sighting each."""
-    _, visible = seen_in(voxels, panorama_view(position, config), config)
+    visible = visible_rows(voxels, panorama_view(position, config), config)
     num = totals.shape[1]
 
     def add(

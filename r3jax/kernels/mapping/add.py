@@ -1,6 +1,6 @@
 """Groups of pixels join the map in machine code: `mapping.join`, voxel by voxel.
 
-The rows that new voxels take are those of the plain formulas: `CHUNK` voxels claim together, in
+The rows that new voxels take are those of the plain formulas: `JOINED` voxels claim together, in
 rounds, and of those that want the same row the last one gets it.
 """
 
@@ -11,13 +11,17 @@ import numpy as np
 from numba import prange
 
 from r3jax.geometry.voxels import EMPTY_WORD
-from r3jax.kernels.mapping.bins import is_sound, mark_rows
+from r3jax.kernels.constants import JOINED, MAX_PROBES
+from r3jax.kernels.mapping.bins import camera_of, is_sound, mark_rows
 from r3jax.kernels.mapping.group import group_pixels
-from r3jax.kernels.native.compiled import inlined, inlined_fused, kernel, parallel_kernel, prefetch
-from r3jax.mapping.join import CHUNK
-from r3jax.mapping.table import MAX_PROBES
+from r3jax.kernels.native.compiled import (
+    inlined,
+    inlined_fused,
+    kernel,
+    parallel_kernel,
+    prefetch,
+)
 
-_CHUNK, _PROBES = CHUNK, MAX_PROBES
 _AHEAD = 8
 """Voxels whose rows are on their way from memory while one is worked on: rows lie anywhere."""
 
@@ -61,7 +65,7 @@ def _find_rows(table, keys, workers, rows):
                 prefetch(table[1], rows[i + _AHEAD])
             low, high = keys[i, 0], keys[i, 1]
             hashed, found, probe = _hash(low, high), np.int64(capacity), 0
-            while probe < _PROBES:
+            while probe < MAX_PROBES:
                 slot = _slot(hashed, probe, capacity)
                 if table[1, slot] == high and table[0, slot] == low:
                     found = slot
@@ -86,7 +90,7 @@ def _claim_rows(table, keys, rows):
             wanting[num] = i
             num += 1
     probe = 0
-    while num > 0 and probe < _PROBES:
+    while num > 0 and probe < MAX_PROBES:
         for k in range(num):
             group = wanting[k]
             slot = _slot(_hash(keys[group, 0], keys[group, 1]), probe, capacity)
@@ -110,10 +114,9 @@ def _claim_rows(table, keys, rows):
 
 
 @inlined_fused
-def _combine(table, row, red, green, blue):
+def _combine(rows, mean, row, red, green, blue):
     """One observation joins a row's moments (`join.combine_moments`)."""
-    count, mean, m2 = table[2], table[3], table[4]
-    before = count[row]
+    before = rows.counts[row]
     after = before + _ONE
     weight = _ONE / after
     squared = _ZERO
@@ -121,76 +124,65 @@ def _combine(table, row, red, green, blue):
         d = color - mean[channel, row]
         mean[channel, row] += d * weight
         squared += d * d
-    count[row] = after
-    m2[row] += squared * before * weight
+    rows.counts[row] = after
+    rows.m2[row] += squared * before * weight
 
 
 @inlined
-def _ask_for(table, row):
-    """Asks for what is known of a row, which lies in as many places as it has numbers."""
-    key, visited, count, mean, m2, resolution = table
-    if row < count.shape[0]:
-        for word in range(visited.shape[0]):
-            prefetch(visited[word], row)
+def _prefetch_row(rows, mean, row):
+    """Prefetches what is known of a row, which lies in as many places as it has numbers."""
+    if row < rows.counts.shape[0]:
+        for word in range(rows.visited.shape[0]):
+            prefetch(rows.visited[word], row)
         for channel in range(3):
             prefetch(mean[channel], row)
-        prefetch(key[0], row)
-        prefetch(key[1], row)
-        prefetch(count, row)
-        prefetch(m2, row)
-        prefetch(resolution, row)
+        prefetch(rows.key[0], row)
+        prefetch(rows.key[1], row)
+        prefetch(rows.counts, row)
+        prefetch(rows.m2, row)
+        prefetch(rows.resolution, row)
 
 
 @parallel_kernel
-def _join_rows(
-    key, visited, count, mean, m2, resolution,
-    sums, rows, camera, bins, lattice, workers,
-):  # fmt: skip
+def _join_rows(rows, mean, sums, found, camera, bins, lattice, workers):
     """The observations of a chunk join their rows (`update.observe_voxels`, `join.join`)."""
-    table = key, visited, count, mean, m2, resolution
-    capacity, num = key.shape[1], sums.shape[0]
+    capacity, num = rows.counts.shape[0], sums.shape[0]
     for worker in prange(workers):
         begin, end = worker * num // workers, (worker + 1) * num // workers
         joined, number = np.empty(end - begin, np.int64), 0
         for i in range(begin, end):
             if i + _AHEAD < end:
-                _ask_for(table, rows[i + _AHEAD])
-            if rows[i] < capacity:
+                _prefetch_row(rows, mean, found[i + _AHEAD])
+            if found[i] < capacity:
                 points = max(sums[i, 3], _ONE)
                 colors = sums[i, 0] / points, sums[i, 1] / points, sums[i, 2] / points
-                _combine(table, rows[i], colors[0], colors[1], colors[2])
-                joined[number] = rows[i]
+                _combine(rows, mean, found[i], colors[0], colors[1], colors[2])
+                joined[number] = found[i]
                 number += 1
-        mark_rows(key, visited, resolution, joined, number, camera, bins, lattice)
+        mark_rows(rows.key, rows.visited, rows.resolution, joined, number, camera, bins, lattice)
 
 
 @kernel
-def add_pass(table, camera, depth, rgb, numbers, bins, lattice, workers, lost):
+def map_add(rows, mean, frame, bins, lattice, workers, lost):
     """Adds a frame's pixels to the map, in place.
 
     Args:
-        table: key, visited, count, mean, m2, resolution.
-        camera: voxel size, focal length and position.
-        depth: z-depth [H, W].
-        rgb: colors [H, W, 3].
-        numbers: of the frame, as `group_pixels` takes them.
+        rows: of the map, `calls.MapRows`.
+        mean: colors of the rows [3, N].
+        frame: `calls.FrameArrays`.
         bins: candidates of each octahedral cell [S^2, K].
         lattice: directions of the bins [B, 3].
         workers: threads.
         lost: written: voxels that found no row [1].
     """
-    lost[0] = 0
+    lost[0], camera = 0, camera_of(frame, rows.voxel_size)
     if not is_sound(camera):
         return
-    key, visited, count, mean, m2, resolution = table
-    all_keys, all_sums = group_pixels(depth, rgb, numbers, workers)
-    rows, voxels = np.empty(_CHUNK, np.int64), all_keys.shape[0]
-    for first in range(0, voxels, _CHUNK):
-        size = min(_CHUNK, voxels - first)
+    all_keys, all_sums = group_pixels(frame, rows.voxel_size, workers)
+    found, voxels = np.empty(JOINED, np.int64), all_keys.shape[0]
+    for first in range(0, voxels, JOINED):
+        size = min(JOINED, voxels - first)
         keys, sums = all_keys[first : first + size], all_sums[first : first + size]
-        _find_rows(key, keys, workers, rows)
-        lost[0] += _claim_rows(key, keys, rows)
-        _join_rows(
-            key, visited, count, mean, m2, resolution,
-            sums, rows, camera, bins, lattice, workers,
-        )  # fmt: skip
+        _find_rows(rows.key, keys, workers, found)
+        lost[0] += _claim_rows(rows.key, keys, found)
+        _join_rows(rows, mean, sums, found, camera, bins, lattice, workers)

@@ -4,6 +4,7 @@
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,29 @@ _CHUNK = 256
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _LEAST, _TINY, _INFINITE = np.float32(1e-6), np.float32(1e-20), np.float32(np.inf)
+
+
+class Camera(NamedTuple):
+    """Where voxels are seen from, and how sharply."""
+
+    voxel_size: Any
+    """[m]."""
+
+    focal: Any
+    """Focal length of resolutions [px]."""
+
+    x: Any
+    """Center [m]."""
+
+    y: Any
+    z: Any
+
+
+@inlined
+def camera_of(frame, voxel_size):
+    """The camera of a frame."""
+    T = frame.T_world_camera
+    return Camera(voxel_size, frame.focal, T[0, 3], T[1, 3], T[2, 3])
 
 
 @inlined_fused
@@ -78,12 +102,12 @@ def _look(low, high, num, camera, size, looks, cells):
     """Directions to a camera, their octahedral cells, and resolutions of some voxels."""
     in_wide_vectors()
     for i in range(num):
-        center = center_of_words(low[i], high[i], camera[0])
-        x, y, z = camera[2] - center[0], camera[3] - center[1], camera[4] - center[2]
+        center = center_of_words(low[i], high[i], camera.voxel_size)
+        x, y, z = camera.x - center[0], camera.y - center[1], camera.z - center[2]
         distance = max(math.sqrt(x * x + y * y + z * z), _LEAST)
         x, y, z = x / distance, y / distance, z / distance
         looks[_X, i], looks[_Y, i], looks[_Z, i] = x, y, z
-        looks[_SHARPNESS, i] = camera[1] / distance
+        looks[_SHARPNESS, i] = camera.focal / distance
         cells[i] = fold(x, y, z, size)
 
 
@@ -97,7 +121,7 @@ def mark_rows(key, visited, resolution, rows, num, camera, table, lattice):
         resolution: best so far [px/m], changed in place [N].
         rows: which; all of them hold voxels.
         num: how many of them.
-        camera: voxel size, focal length and position.
+        camera: which.
         table: candidates of each octahedral cell [S^2, K].
         lattice: directions of the bins [B, 3].
     """
@@ -119,9 +143,7 @@ def mark_rows(key, visited, resolution, rows, num, camera, table, lattice):
 
 
 @inlined
-def is_sound(numbers, first=0):
-    """False if a voxel size, or a number from place `first` on, cannot be: nothing is seen then."""
-    sound = numbers[0] > _ZERO
-    for i in range(first, numbers.shape[0]):
-        sound &= abs(numbers[i]) < _INFINITE
-    return sound
+def is_sound(camera):
+    """False for a camera or a voxel size that cannot be: nothing is seen then."""
+    total = camera.voxel_size + camera.focal + camera.x + camera.y + camera.z
+    return (camera.voxel_size > _ZERO) & (abs(total) < _INFINITE)

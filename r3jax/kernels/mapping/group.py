@@ -11,6 +11,7 @@ import numpy as np
 from numba import prange
 
 from r3jax.geometry.voxels import EMPTY_WORD, INDEX_LIMIT
+from r3jax.kernels import constants
 from r3jax.kernels.native.arithmetic import floor, high_word, low_word
 from r3jax.kernels.native.compiled import (
     in_wide_vectors,
@@ -19,9 +20,6 @@ from r3jax.kernels.native.compiled import (
     kernel,
     parallel_kernel,
 )
-
-_SIZE, _RANGE, _DROPS_EDGES, _FX, _FY, _CX, _CY, _POSE = 0, 1, 2, 3, 4, 5, 6, 7
-"""Places in the numbers of a frame; the last begins [R | t] of `T_world_camera`, row by row."""
 
 _ROWS = 32
 """Rows of a block: a thread takes one block after the other."""
@@ -34,8 +32,8 @@ _SPREAD_LOW, _SPREAD_HIGH = np.uint32(0x9E3779B1), np.uint32(0x85EBCA77)
 
 _EMPTY = np.uint32(EMPTY_WORD)
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
-_FAR, _NEAR, _INFINITE = np.float32(1e4), np.float32(1e-4), np.float32(np.inf)
-_STRAY, _THIN = np.float32(0.01), np.float32(0.06)
+_FAR, _NEAR, _INFINITE = np.float32(constants.FAR), np.float32(1e-4), np.float32(np.inf)
+_STRAY, _THIN = np.float32(constants.STRAY), np.float32(constants.THIN)
 _LOWEST, _HIGHEST = np.float32(-INDEX_LIMIT), np.float32(INDEX_LIMIT - 1)
 
 
@@ -114,26 +112,36 @@ def _drop_edges(block, medians, k, size, counted):
 
 
 @inlined_fused
-def _index(numbers, axis, x, y, depth):
-    """Index of the voxel along one axis of the world, as a float (`voxels.voxel_index`)."""
-    row = np.uint32(_POSE + 4 * axis)
-    along = numbers[row] * x + numbers[row + np.uint32(1)] * y
-    along = along + numbers[row + np.uint32(2)] * depth + numbers[row + np.uint32(3)]
-    return min(max(floor(along / numbers[_SIZE]), _LOWEST), _HIGHEST)
+def _index(T, x, y, depth, size):
+    """Index of the voxel along one axis of the world, as a float (`voxels.voxel_index`).
+
+    Args:
+        T: row of `T_world_camera` for that axis.
+        x: of the point in the camera's frame [m].
+        y: see x.
+        depth: see x.
+        size: edge of a voxel [m].
+    """
+    along = T[0] * x + T[1] * y
+    along = along + T[2] * depth + T[3]
+    return min(max(floor(along / size), _LOWEST), _HIGHEST)
 
 
 @inlined_fused
-def _pack_row(depths, counted, columns, v, numbers, low, high, spread):
+def _pack_row(depths, counted, columns, v, frame, size, low, high, spread):
     """Packed keys of the voxels of a row's pixels, all ones where nothing counts."""
     in_wide_vectors()
-    reach = numbers[_RANGE]
+    reach, T = frame.max_range, frame.T_world_camera
+    T_x = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    T_y = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    T_z = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for j in range(depths.shape[0]):
         depth = depths[j]
         is_in = (depth > _ZERO) & (depth <= reach) & (depth < _INFINITE) & (counted[j] > _ZERO)
         depth = depth if is_in else _ONE
         x, y = columns[j] * depth, v * depth
-        at_x, at_y = _index(numbers, 0, x, y, depth), _index(numbers, 1, x, y, depth)
-        at_z = _index(numbers, 2, x, y, depth)
+        at_x, at_y = _index(T_x, x, y, depth, size), _index(T_y, x, y, depth, size)
+        at_z = _index(T_z, x, y, depth, size)
         low[j] = low_word(at_x, at_y) if is_in else _EMPTY
         high[j] = high_word(at_y, at_z) if is_in else _EMPTY
         spread[j] = _spread(low[j], high[j])
@@ -224,12 +232,13 @@ def _group_row(low, high, spread, rgb, shift, slots, keys, sums, count):
 
 
 @parallel_kernel
-def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
+def _group_blocks(frame, size, workers, keys, sums, counts):
     """Groups the pixels of each block; those of the block from row i on stand from i W on."""
+    depth, rgb = frame.depth, frame.rgb
     height, width = depth.shape
     columns, shift = np.empty(width, np.float32), _shift_for(_ROWS * width)
     for j in range(width):
-        columns[j] = (np.float32(j) + _HALF - numbers[_CX]) / numbers[_FX]
+        columns[j] = (np.float32(j) + _HALF - frame.cx) / frame.fx
     for worker in prange(workers):
         block = np.empty((_ROWS + 2 * _AROUND, width + 2), np.float32)
         medians = np.empty((_ROWS + 2 * _AROUND, width + 2), np.float32)
@@ -244,16 +253,16 @@ def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
         own_sums = np.empty((_ROWS * width, 4), np.float32)
         for number in range(worker, counts.shape[0], workers):
             first, end = number * _ROWS, min((number + 1) * _ROWS, height)
-            if numbers[_DROPS_EDGES] > _ZERO:
+            if frame.drops_edges > _ZERO:
                 _copy_rows(depth, first, block)
                 _fill_medians(block, medians, first, height)
             _empty(slots)
             count = 0
             for row in range(end - 1, first - 1, -1):
-                if numbers[_DROPS_EDGES] > _ZERO:
-                    _drop_edges(block, medians, row - first + _AROUND, numbers[_SIZE], counted)
-                v = (np.float32(row) + _HALF - numbers[_CY]) / numbers[_FY]
-                _pack_row(depth[row], counted, columns, v, numbers, low, high, spread)
+                if frame.drops_edges > _ZERO:
+                    _drop_edges(block, medians, row - first + _AROUND, size, counted)
+                v = (np.float32(row) + _HALF - frame.cy) / frame.fy
+                _pack_row(depth[row], counted, columns, v, frame, size, low, high, spread)
                 count = _group_row(
                     low, high, spread, rgb[row], shift, slots, own_keys, own_sums, count
                 )
@@ -266,23 +275,23 @@ def _group_blocks(depth, rgb, numbers, workers, keys, sums, counts):
 
 
 @kernel
-def group_pixels(depth, rgb, numbers, workers):
+def group_pixels(frame, size, workers):
     """Groups a frame's pixels by voxel.
 
     Args:
-        depth: z-depth [H, W].
-        rgb: colors [H, W, 3].
-        numbers: voxel size, range, whether edges are left out, camera, pose.
+        frame: `calls.FrameArrays`.
+        size: edge of a voxel [m].
         workers: threads.
 
     Returns:
         Packed keys [G, 2] and sums of colors and numbers of pixels [G, 4] of the voxels that
         pixels fall into, in the order of their last pixels.
     """
-    height, width = depth.shape
-    keys, sums = np.empty((depth.size, 2), np.uint32), np.empty((depth.size, 4), np.float32)
+    height, width = frame.depth.shape
+    num = height * width
+    keys, sums = np.empty((num, 2), np.uint32), np.empty((num, 4), np.float32)
     counts, most = np.empty((height + _ROWS - 1) // _ROWS, np.int64), 0
-    _group_blocks(depth, rgb, numbers, workers, keys, sums, counts)
+    _group_blocks(frame, size, workers, keys, sums, counts)
     for number in range(counts.shape[0]):
         most += counts[number]
     merged_keys, merged_sums = np.empty((most, 2), np.uint32), np.empty((most, 4), np.float32)

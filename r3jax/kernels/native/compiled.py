@@ -23,25 +23,22 @@ entry would hold the kernel once more, to be compiled once more."""
 
 _FAST = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
-_HERE = Path(__file__).parent
+_KERNELS = Path(__file__).parents[1]
 
 
-def forget_outdated_code(folder: Path = _HERE, *others: Path) -> None:
+def forget_outdated_code(folder: Path = _KERNELS) -> None:
     """Deletes machine code on the disk that is older than any source that it may come from.
 
-    Numba compares a kernel with its own file only, not with the files of what it inlines.
+    Numba compares a handler with its own file only, not with the files of what it inlines.
 
     Args:
-        folder: with sources of kernels; they may inline what stands in each other's files and
-            in this package.
-        others: folders with kernels that they inline as well.
+        folder: with sources of kernels, also in folders in it.
     """
-    sources = {source.stem for source in folder.glob("*.py")}
-    newest = max(s.stat().st_mtime for at in (folder, *others, _HERE) for s in at.glob("*.py"))
-    for index in folder.glob("__pycache__/*.nbi"):
-        is_ours = index.name.partition(".")[0] in sources  # of a kernel in one of these files
+    sources = [*folder.rglob("*.py"), *Path(__file__).parent.glob("*.py")]
+    newest = max(source.stat().st_mtime for source in sources)
+    for index in folder.rglob("__pycache__/*.nbi"):
         with contextlib.suppress(OSError):
-            if is_ours and index.stat().st_mtime < newest:
+            if index.stat().st_mtime < newest:
                 remove(index)
 
 
@@ -129,7 +126,10 @@ def inlined_fused(function: _Function) -> _Function:
 
 
 def parallel_kernel(function: _Function) -> _Function:
-    """Compiles a kernel whose `prange` loops share the cores that the process may use."""
+    """Compiles a kernel whose `prange` loops share the cores that the process may use.
+
+    Named tuples that a loop uses must be arguments of the kernel, and hold no other tuples.
+    """
     return _compiled_by(njit(error_model="numpy", **_BARE, parallel=True), function)
 
 

@@ -111,6 +111,12 @@ def _length(buffer, axis):
 
 
 @inlined
+def float0(frame, kind, index):
+    """Reads the index-th argument, a float32 without axes."""
+    return carray(_floats(_int64_at(_buffer(frame, kind, index) + _DATA)), (1,))[0]
+
+
+@inlined
 def floats1(frame, kind, index):
     """Views the index-th argument or result as float32 with one axis."""
     buffer = _buffer(frame, kind, index)

@@ -8,6 +8,8 @@ from importlib.metadata import version
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 from jax.extend import backend
 
 from r3jax.kernels.native.structs import misread
@@ -26,6 +28,75 @@ def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Call
     if is_cpu_only():
         return cpu
     return functools.partial(jax.lax.platform_dependent, cpu=cpu, default=default)
+
+
+MOST_PAIRS = 1 << 24
+"""Items of a call times rows of what they share that the formulas work on at once: of a map and a
+view each pair takes some 60 bytes."""
+
+
+def call_of_many(
+    kernel: Callable[[Any, Any], Any],
+    formula: Callable[[Any, Any], Any],
+    shared: Any,
+    item: Any,
+    num_rows: int,
+) -> Any:
+    """`formula(shared, item)`, such that `vmap` over items is one call of a kernel on CPUs.
+
+    Elsewhere it is the formula in batches, whose memory does not grow with the number of items.
+    Where what is shared differs as well, one call follows the other.
+
+    Args:
+        kernel: of many items, whose arrays have a leading axis; gives arrays with the same axis.
+        formula: of one item.
+        shared: such as the map.
+        item: such as a view.
+        num_rows: of what is shared.
+    """
+
+    def by_formula(shared: Any, items: Any) -> Any:
+        num = jax.tree.leaves(items)[0].shape[0]
+        size = min(num, max(1, MOST_PAIRS // num_rows))
+        return jax.lax.map(functools.partial(formula, shared), items, batch_size=size)
+
+    items = jax.tree.map(lambda x: jnp.asarray(x)[None], item)
+    results = _over_items(by_platform(cpu=kernel, default=by_formula), shared, items)
+    return jax.tree.map(lambda x: x[0], results)
+
+
+def _over_items(score: Callable[[Any, Any], Any], shared: Any, items: Any) -> Any:
+    """`score(shared, items)`, so that `vmap` over items is one call of all of them."""
+    # Jitted, so that its constants stay inside: a branch under `vmap` would batch them, too.
+    batched = custom_vmap(jax.jit(score))
+
+    @batched.def_vmap
+    def rule(axis_size: int, in_batched: Any, shared: Any, items: Any) -> tuple[Any, Any]:
+        if any(jax.tree.leaves(in_batched[0])):
+            flags = jax.tree.leaves(in_batched)
+            leaves, treedef = jax.tree.flatten((shared, items))
+            mapped = [x for x, is_mapped in zip(leaves, flags, strict=True) if is_mapped]
+
+            def one(part: list[jax.Array]) -> Any:
+                own = iter(part)
+                whole = [
+                    next(own) if is_mapped else x
+                    for x, is_mapped in zip(leaves, flags, strict=True)
+                ]
+                return _over_items(score, *jax.tree.unflatten(treedef, whole))
+
+            scores = jax.lax.map(one, mapped)
+        else:
+
+            def flattened(x: jax.Array, is_mapped: bool) -> jax.Array:
+                every = x if is_mapped else jnp.broadcast_to(x[None], (axis_size, *x.shape))
+                return every.reshape(-1, *every.shape[2:])
+
+            flat = _over_items(score, shared, jax.tree.map(flattened, items, in_batched[1]))
+            scores = jax.tree.map(lambda x: x.reshape(axis_size, -1, *x.shape[1:]), flat)
+        return scores, jax.tree.map(lambda _: True, scores)
+
+    return batched(shared, items)
 
 
 def is_cpu_only() -> bool:

@@ -7,12 +7,26 @@ import math
 
 import numpy as np
 
+from r3jax.kernels.mapping.bins import center_of
 from r3jax.kernels.native.compiled import inlined, kernel
-from r3jax.kernels.scoring.near import find_consistency, gather
-from r3jax.kernels.scoring.shown import add_by_direction, find_deficits, find_directions
-from r3jax.kernels.scoring.sums import unexplored_of
-from r3jax.kernels.scoring.terms import ANGLES
-from r3jax.kernels.scoring.voxels import DELTA, LOG_DELTA, SIZE
+from r3jax.kernels.scoring.sums import (
+    add_by_direction,
+    find_deficits,
+    find_directions,
+    new_scratch,
+    unexplored_of,
+)
+from r3jax.kernels.scoring.terms import consistency, log2_or_never
+from r3jax.kernels.scoring.voxels import (
+    DELTA,
+    LOG_DELTA,
+    RESOLUTION,
+    X,
+    Y,
+    Z,
+    bins_of,
+    empty_voxels,
+)
 from r3jax.kernels.visibility.views import CHUNK
 
 _ONE = np.float32(1.0)
@@ -40,81 +54,91 @@ def _find_set(items, bits, chosen):
 
 
 @kernel
-def _known(state, rows, is_pairwise):
+def _known(rows, shown, is_pairwise):
     """Gathers what R needs to know of some rows, once for all positions."""
-    key, words, count, m2, resolution, voxel_size = state
-    num = rows.shape[0]
-    voxels, same = np.empty((SIZE, num), np.float32), np.empty(num, np.int32)
-    visited = np.empty(((words.shape[0] + 1) // 2, num), np.uint64)
-    gather(key, words, count, m2, resolution, voxel_size, num, rows, 0, voxels, visited, same)
-    find_consistency(voxels[DELTA], voxels[LOG_DELTA], is_pairwise)
-    return voxels, visited
+    voxels = empty_voxels(shown.shape[0], rows.visited.shape[0])
+    for j in range(shown.shape[0]):
+        row = np.int64(shown[j])
+        delta = consistency(rows.counts[row], rows.m2[row], is_pairwise)
+        x, y, z = center_of(rows.key, row, rows.voxel_size)
+        voxels.known[X, j], voxels.known[Y, j], voxels.known[Z, j] = x, y, z
+        voxels.known[DELTA, j], voxels.known[LOG_DELTA, j] = delta, log2_or_never(delta)
+        voxels.known[RESOLUTION, j], voxels.rows[j] = rows.resolution[row], row
+        for word in range(0, rows.visited.shape[0], 2):
+            voxels.visited[word >> 1, j] = bins_of(rows.visited, word, row)
+    return voxels
+
+
+@inlined
+def _take(chosen, first, num, scratch):
+    """Copies a chunk of chosen items to where the passes read them."""
+    for j in range(num):
+        scratch.chosen[j] = chosen[first + j]
 
 
 @kernel
-def _add_voxels(point, chosen, before, after, is_always_one, tables, scratch, sums):
+def _add_voxels(position, focal, chosen, num, was, now, is_kappa_one, tables, scratch, old, sums):
     """Adds 1 - R after the views less 1 - R before them, for chosen voxels."""
-    directions, table, lattice = tables
-    angles, bins, weights, was = scratch
-    position, settings = (point[0], point[1], point[2]), (is_always_one, point[3])
-    size = np.float32(math.sqrt(table.shape[0]))
-    for first in range(0, chosen.shape[0], CHUNK):
-        some = chosen[first : first + CHUNK]
-        num = some.shape[0]
-        find_directions(position, before[0], 0, some, num, size, angles, bins)
-        find_deficits(before, 0, some, num, settings, directions, angles, was)
-        find_deficits(after, 0, some, num, settings, directions, angles, weights)
-        for j in range(num):
-            weights[j] -= was[j]
-        add_by_direction(angles, bins, weights, num, table, lattice, sums)
+    size = np.float32(math.sqrt(tables.table.shape[0]))
+    for first in range(0, num, CHUNK):
+        count = min(CHUNK, num - first)
+        _take(chosen, first, count, scratch)
+        find_directions(position, was.known, 0, count, size, scratch)
+        find_deficits(was, 0, count, is_kappa_one, focal, tables.directions, scratch, old)
+        find_deficits(
+            now, 0, count, is_kappa_one, focal, tables.directions, scratch, scratch.weights
+        )
+        for j in range(count):
+            scratch.weights[j] -= old[j]
+        add_by_direction(scratch, count, tables, sums)
 
 
 @kernel
-def _count_cells(point, chosen, centers, tables, scratch, counts):
+def _count_cells(position, chosen, num, centers, tables, scratch, counts):
     """Counts chosen cells by direction."""
-    _, table, lattice = tables
-    angles, bins, weights, _ = scratch
-    position, size = (point[0], point[1], point[2]), np.float32(math.sqrt(table.shape[0]))
-    weights[:] = _ONE
-    for first in range(0, chosen.shape[0], CHUNK):
-        some = chosen[first : first + CHUNK]
-        num = some.shape[0]
-        find_directions(position, centers, 0, some, num, size, angles, bins)
-        add_by_direction(angles, bins, weights, num, table, lattice, counts)
+    size = np.float32(math.sqrt(tables.table.shape[0]))
+    scratch.weights[:] = _ONE
+    for first in range(0, num, CHUNK):
+        count = min(CHUNK, num - first)
+        _take(chosen, first, count, scratch)
+        find_directions(position, centers, 0, count, size, scratch)
+        add_by_direction(scratch, count, tables, counts)
 
 
 @kernel
-def changes_pass(before, after, cells, kept, points, forms, tables, results):
+def changes(before, after, cells, seen, positions, focals, forms, tables, results):
     """Sums up what imagined views have changed, for positions that see the same as before.
 
     By the thread that calls: a search over paths has one for each core.
 
     Args:
-        before: the map, as in `sums_of_many`.
-        after: the same voxels after the views.
-        cells: x, y, z [m], and which are unexplored before, but not after [c].
-        kept: bits of the rows and of the cells that each position sees [P, N / 8], [P, c / 8].
-        points: positions [m] and focal lengths [px], [P, 4].
-        forms: whether kappa is always 1, whether delta is that of pairs.
-        tables: as in `sums_of_many`.
+        before: rows of the map, `calls.MapRows`.
+        after: the same rows after the views.
+        cells: `calls.Cells`; those count that are unexplored before, but not after.
+        seen: bits of the rows and of the cells that each position sees [P, N / 8], [P, c / 8].
+        positions: of the cameras [P, 3] [m].
+        focals: focal lengths [P] [px].
+        forms: `Choices` of R.
+        tables: of the voxels' and the panorama's bins.
         results: written; sums of 1 - R after less before, and numbers of cells that are no longer
             unexplored [P, B].
     """
-    shown = _shown_rows(before[2], after[2])
-    was, now = _known(before, shown, forms[1]), _known(after, shown, forms[1])
-    centers, explored = unexplored_of(cells[:3], cells[3])
-    chosen = np.empty(max(shown.shape[0], explored.shape[0]) + 1, np.int32)
-    sums = np.empty(results[0].shape[1], np.float64)
-    scratch = (
-        np.empty(ANGLES, np.float32), np.zeros(CHUNK, np.int32), np.empty(CHUNK, np.float32),
-        np.empty(CHUNK, np.float32),
-    )  # fmt: skip
-    for i in range(points.shape[0]):
+    shown = _shown_rows(before.counts, after.counts)
+    was, now = _known(before, shown, forms.is_pairwise), _known(after, shown, forms.is_pairwise)
+    explored = unexplored_of(cells)
+    chosen = np.empty(max(shown.shape[0], explored.numbers.shape[0]) + 1, np.int32)
+    sums, scratch = np.empty(results[0].shape[1], np.float64), new_scratch()
+    old = np.empty(CHUNK, np.float32)
+    for i in range(positions.shape[0]):
+        position = positions[i, 0], positions[i, 1], positions[i, 2]
         for bin in range(sums.shape[0]):
             sums[bin], results[1][i, bin] = 0.0, 0.0
-        num = _find_set(shown, kept[0][i], chosen)
-        _add_voxels(points[i], chosen[:num], was, now, forms[0], tables, scratch, sums)
-        num = _find_set(explored, kept[1][i], chosen)
-        _count_cells(points[i], chosen[:num], centers, tables, scratch, results[1][i])
+        num = _find_set(shown, seen[0][i], chosen)
+        _add_voxels(
+            position, focals[i], chosen, num, was, now, forms.is_kappa_one, tables, scratch, old,
+            sums,
+        )  # fmt: skip
+        num = _find_set(explored.numbers, seen[1][i], chosen)
+        _count_cells(position, chosen, num, explored.centers, tables, scratch, results[1][i])
         for bin in range(sums.shape[0]):
             results[0][i, bin] = sums[bin]

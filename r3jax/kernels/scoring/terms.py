@@ -1,4 +1,4 @@
-"""R of the voxels that a view sees: the formulas of `renderability` and `directions`.
+"""R of a voxel: the formulas of `scoring.terms` and `scoring.directions`.
 
     R = cos^kappa  delta^(kappa (1 - b))  min(1, rho_max / rho)^(1 - delta b)
 
@@ -8,15 +8,28 @@ Of the direction bins only those that are set are looked at, one to three of 64 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
+import math
+from typing import Any, NamedTuple
+
 import numpy as np
 from llvmlite import ir
 from numba import types
 
-from r3jax.kernels.native.arithmetic import exp2
-from r3jax.kernels.native.compiled import inlined_fused, intrinsic
-from r3jax.kernels.scoring.voxels import log2_or_never
+from r3jax.kernels.constants import ON_EDGE
+from r3jax.kernels.native.arithmetic import exp2, log2
+from r3jax.kernels.native.compiled import inlined, inlined_fused, intrinsic
 from r3jax.kernels.visibility.views import CHUNK
-from r3jax.scoring import directions
+
+
+class Choices(NamedTuple):
+    """Forms of the terms (`calls.Forms`)."""
+
+    is_kappa_one: Any
+    """Whether kappa is always 1."""
+
+    is_pairwise: Any
+    """Whether delta is that of pairs."""
+
 
 TO_X, TO_Y, TO_Z = 0 * CHUNK, 1 * CHUNK, 2 * CHUNK
 """Where the parts of a chunk's angles begin: unit vectors from the camera to the points,"""
@@ -33,10 +46,28 @@ ANGLES = 8 * CHUNK
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 _INFINITE, _POLE, _LEAST = np.float32(np.inf), np.float32(1e-12), np.float32(1e-6)
-_EDGE = np.float32(directions.ON_EDGE)
+_EDGE = np.float32(ON_EDGE)
+_TWO_THIRDS_OF_TWO = np.float32(2.0 / 1.5)
+NEVER = np.float32(-1e30)
+"""Stands for log2 of 0: any power of it but the zeroth is 0, and the zeroth is 1."""
+
 _NO_BITS, _ONE_BIT = np.uint64(0), np.uint64(1)
 NEARLY_ONE = np.float32(0.999)
 """Cosine of 2.6 degrees: far outside of a box as large as `_EDGE`."""
+
+
+@inlined
+def log2_or_never(x):
+    """log2 x; `NEVER` where x is 0."""
+    return log2(x) if x > _ZERO else NEVER
+
+
+@inlined
+def consistency(count, m2, is_pairwise):
+    """Delta of a voxel, in [0, 1] (`scoring.terms.consistency`)."""
+    variance = m2 / max(count - _ONE, _ONE)
+    spread = _TWO * variance if is_pairwise else math.sqrt(_TWO_THIRDS_OF_TWO * variance)
+    return min(max(_ONE - spread, _ZERO), _ONE) if count > _ONE else _ONE
 
 
 @intrinsic

@@ -3,19 +3,34 @@
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
-import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
 
 from r3jax.kernels.mapping.bins import center_of
-from r3jax.kernels.native.arithmetic import bits_of, count_bits, float_of, log2
+from r3jax.kernels.native.arithmetic import bits_of, count_bits, float_of
 from r3jax.kernels.native.compiled import inlined, kernel, parallel_kernel
+from r3jax.kernels.scoring.terms import consistency, log2_or_never
+from r3jax.kernels.visibility.bricks import sorted_slots
 from r3jax.kernels.visibility.views import CHUNK
 
+
+class Voxels(NamedTuple):
+    """What is known of the voxels near some views."""
+
+    known: Any
+    """Centers [m], delta, log2 of it, and best resolution [px/m], one a row [SIZE, n]."""
+
+    visited: Any
+    """Direction bins, 64 in a word [ceil(W / 2), n]."""
+
+    rows: Any
+    """Rows of the map [n]."""
+
+
 X, Y, Z, DELTA, LOG_DELTA, RESOLUTION = 0, 1, 2, 3, 4, 5
-"""Rows of the array that `gather_voxels` writes: center [m], color consistency and log2 of it,
-best resolution [px/m]."""
+"""Rows of `Voxels.known`."""
 
 SIZE = 6
 
@@ -24,26 +39,6 @@ _ROW, _WORDS = 6, 7
 
 _CLASSES = 8
 """Numbers of directions that are told apart: 0 to 6, and more."""
-
-NEVER = np.float32(-1e30)
-"""Stands for log2 of 0: any power of it but the zeroth is 0, and the zeroth is 1."""
-
-_ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
-_TWO_THIRDS_OF_TWO = np.float32(2.0 / 1.5)
-
-
-@inlined
-def log2_or_never(x):
-    """log2 x; `NEVER` where x is 0."""
-    return log2(x) if x > _ZERO else NEVER
-
-
-@inlined
-def consistency(count, m2, is_pairwise):
-    """Delta of a voxel, in [0, 1] (`renderability.consistency`)."""
-    variance = m2 / max(count - _ONE, _ONE)
-    spread = _TWO * variance if is_pairwise else math.sqrt(_TWO_THIRDS_OF_TWO * variance)
-    return min(max(_ONE - spread, _ZERO), _ONE) if count > _ONE else _ONE
 
 
 @inlined
@@ -65,7 +60,7 @@ def _num_directions(record, words):
 
 
 @kernel
-def _unpack_sorted(records, begin, end, words, counts, voxels, visited, rows):
+def _unpack_sorted(records, begin, end, words, counts, voxels):
     """Unpacks records, those that were seen from few directions first.
 
     A counting sort. Loops over the directions of one voxel after the other then end after as many
@@ -82,48 +77,60 @@ def _unpack_sorted(records, begin, end, words, counts, voxels, visited, rows):
         group = min(_num_directions(record, words), _CLASSES - 1)
         place = counts[group]
         counts[group] += 1
-        rows[place] = record[_ROW]
+        voxels.rows[place] = record[_ROW]
         for part in range(SIZE):
-            voxels[part, place] = float_of(record[part])
+            voxels.known[part, place] = float_of(record[part])
         for word in range(0, words, 2):
+            low = np.uint64(record[_WORDS + word])
             high = np.uint64(record[_WORDS + word + 1]) if word + 1 < words else np.uint64(0)
-            visited[word >> 1, place] = np.uint64(record[_WORDS + word]) | (high << np.uint64(32))
+            voxels.visited[word >> 1, place] = low | (high << np.uint64(32))
+
+
+@kernel
+def empty_voxels(num, num_words):
+    """Room for so many voxels, with so many words of 32 bins."""
+    return Voxels(
+        np.empty((SIZE, num), np.float32), np.empty(((num_words + 1) // 2, num), np.uint64),
+        np.empty(num, np.int32),
+    )  # fmt: skip
+
+
+@kernel
+def sorted_voxels(rows, views, is_sound, forms, workers):
+    """Bricks of the voxels that some view may see, and what is known of them."""
+    slots, bricks = sorted_slots(rows, views, is_sound, workers)
+    voxels = empty_voxels(bricks.starts[bricks.starts.shape[0] - 1], rows.visited.shape[0])
+    _gather(slots, bricks, rows, forms, workers, voxels)
+    return bricks, voxels
 
 
 @parallel_kernel
-def gather_voxels(slots, starts, key, words, count, m2, resolution, voxel_size, is_pairwise,
-                  workers, voxels, visited, rows):  # fmt: skip
+def _gather(slots, bricks, rows, forms, workers, voxels):
     """Gathers what is known of voxels in the order of the bricks.
 
     Args:
         slots: of every row of the map, -1: none [N].
-        starts: of the bricks among the slots [b + 1].
-        key: of the map, like the next five.
-        words: its visited bins, 32 in a word.
-        count: observations.
-        m2: spread of the colors.
-        resolution: best resolution [px/m].
-        voxel_size: edge [m].
-        is_pairwise: form of delta.
+        bricks: of the slots.
+        rows: of the map.
+        forms: of R.
         workers: threads.
-        voxels: written, [SIZE, n].
-        visited: written, the visited bins, 64 in a word [ceil(W / 2), n].
-        rows: written, the rows of the map [n].
+        voxels: written.
     """
-    num, capacity, num_words = rows.shape[0], slots.shape[0], words.shape[0]
+    num, capacity, num_words = voxels.rows.shape[0], slots.shape[0], rows.visited.shape[0]
+    starts = bricks.starts
     # Records, so that a voxel out of its order costs one miss of the cache and not one for each.
     records = np.empty((num, _WORDS + num_words), np.uint32)
     for share in prange(workers):
         for row in range(capacity * share // workers, capacity * (share + 1) // workers):
             if slots[row] >= 0:
                 record = records[slots[row]]
-                delta = consistency(count[row], m2[row], is_pairwise)
-                x, y, z = center_of(key, row, voxel_size)
+                delta = consistency(rows.counts[row], rows.m2[row], forms.is_pairwise)
+                x, y, z = center_of(rows.key, row, rows.voxel_size)
                 record[X], record[Y], record[Z] = bits_of(x), bits_of(y), bits_of(z)
                 record[DELTA], record[LOG_DELTA] = bits_of(delta), bits_of(log2_or_never(delta))
-                record[RESOLUTION], record[_ROW] = bits_of(resolution[row]), row
+                record[RESOLUTION], record[_ROW] = bits_of(rows.resolution[row]), row
                 for word in range(num_words):
-                    record[_WORDS + word] = words[word, row]
+                    record[_WORDS + word] = rows.visited[word, row]
     for share in prange(workers):
         first, last = num * share // workers, num * (share + 1) // workers
         counts = np.empty(_CLASSES, np.int64)
@@ -131,4 +138,4 @@ def gather_voxels(slots, starts, key, words, count, m2, resolution, voxel_size, 
             for begin in range(starts[brick], starts[brick + 1], CHUNK):
                 if first <= begin < last:
                     end = min(begin + CHUNK, starts[brick + 1])
-                    _unpack_sorted(records, begin, end, num_words, counts, voxels, visited, rows)
+                    _unpack_sorted(records, begin, end, num_words, counts, voxels)

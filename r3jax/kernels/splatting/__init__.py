@@ -1,6 +1,5 @@
 """Rasterizer for CPUs: projection, binning, sort, compositing and all gradients in Numba."""
 
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera, invert_pose
-from r3jax.kernels.native.compiled import forget_outdated_code
 from r3jax.kernels.native.ffi import num_workers
 from r3jax.kernels.splatting import records
 from r3jax.kernels.splatting.bridge import (
@@ -23,8 +21,6 @@ from r3jax.kernels.splatting.bridge import (
 from r3jax.splatting.backend import Composite
 from r3jax.splatting.config import TILE, RasterConfig
 from r3jax.splatting.scene import GaussianScene
-
-forget_outdated_code(Path(__file__).parent)
 
 _Size = tuple[int, int, int]
 """Width and height of the image [px], and the budget of intersections."""

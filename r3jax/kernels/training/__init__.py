@@ -3,20 +3,14 @@
 Shape symbols: H W image size.
 """
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.kernels import splatting as rasterizer
-from r3jax.kernels.native.compiled import forget_outdated_code
 from r3jax.kernels.native.ffi import num_workers
 from r3jax.kernels.training.bridge import ADAM, LOSS, register
 from r3jax.splatting.scene import GaussianScene
-
-forget_outdated_code(Path(__file__).parent, Path(rasterizer.__file__).parent)
 
 _Residuals = tuple[Float[Array, "H W 3"], Float[Array, ""] | float]
 

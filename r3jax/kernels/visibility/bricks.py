@@ -7,13 +7,13 @@ The index is built anew in every call, by counting: a share of the time of one p
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
 
 from r3jax.geometry.voxels import INDEX_LIMIT
 from r3jax.kernels.native.compiled import inlined, kernel, parallel_kernel
-from r3jax.kernels.visibility.views import LENS, POSITION, RANGE, ROTATION
 
 EDGE = 3
 """log2 of the voxels along a brick, unless that makes too many bricks."""
@@ -23,6 +23,17 @@ MOST = 1 << 19
 
 POINTS_EDGE = 0.8
 """Edge of a brick of points [m], unless that makes too many bricks."""
+
+
+class Bricks(NamedTuple):
+    """Items that lie close together stand together."""
+
+    starts: Any
+    """Where each brick begins among the items, and their number [b + 1]."""
+
+    spheres: Any
+    """Middle and radius of a sphere round each brick [b, 4] [m]."""
+
 
 _LIMIT = np.int64(INDEX_LIMIT)
 _LOW = np.int64((1 << 21) - 1)
@@ -47,10 +58,10 @@ def box_of(views, is_sound, voxel_size):
     """Indices of the voxels that bound what the views may see: [2, 3], the upper ones included."""
     box = np.empty((2, 3), np.int64)
     box[0], box[1] = _LIMIT, -_LIMIT
-    for view in range(views.shape[0]):
+    for view in range(is_sound.shape[0]):
         if is_sound[view]:
             for axis in range(3):
-                middle, far = np.float64(views[view, POSITION + axis]), views[view, RANGE]
+                middle, far = np.float64(views.position[view, axis]), views.max_range[view]
                 low = _clipped(math.floor((middle - far) / voxel_size) - 1.0)
                 high = _clipped(math.floor((middle + far) / voxel_size) + 1.0)
                 box[0, axis], box[1, axis] = min(box[0, axis], low), max(box[1, axis], high)
@@ -68,14 +79,14 @@ def _brick_of(key, row, box, shift, dims):
 
 
 @kernel
-def divide(box, most):
+def divide(box):
     """Chooses the edge of the bricks (its log2); their number along each axis follows."""
     shift = EDGE
     dims = np.zeros(3, np.int64)
     while True:
         for axis in range(3):
             dims[axis] = max((box[1, axis] - box[0, axis] + (1 << shift)) >> shift, 0)
-        if np.float64(dims[0]) * dims[1] * dims[2] <= most:
+        if np.float64(dims[0]) * dims[1] * dims[2] <= MOST:
             return shift, dims
         shift += 1
 
@@ -153,37 +164,34 @@ def spheres_round(bricks, dims, low, edge):
 
 
 @kernel
-def sorted_slots(key, count, views, is_sound, voxel_size, most, workers):
+def sorted_slots(rows, views, is_sound, workers):
     """Sorts the rows that some view may see into bricks.
 
     Args:
-        key: of the map.
-        count: observations; 0 where there is no voxel.
-        views: one a row.
+        rows: of the map.
+        views: which.
         is_sound: False for views that see nothing.
-        voxel_size: edge [m].
-        most: bricks at most; 1 keeps the order of the map.
         workers: threads.
 
     Returns:
-        The slot of every row [N], -1 for those out of range; where each brick begins among the
-        slots [b + 1]; and a sphere round each brick [b, 4] [m].
+        The slot of every row [N], -1 for those out of range, and the bricks that share the slots.
     """
-    box = box_of(views, is_sound, voxel_size)
-    shift, dims = divide(box, most)
+    box = box_of(views, is_sound, rows.voxel_size)
+    shift, dims = divide(box)
     num_bricks = dims[0] * dims[1] * dims[2]
     counts = np.empty((workers, num_bricks), np.int32)
-    slots = np.empty(count.shape[0], np.int32)
-    count_rows(key, count, box, shift, dims, slots, counts)
+    slots = np.empty(rows.counts.shape[0], np.int32)
+    count_rows(rows.key, rows.counts, box, shift, dims, slots, counts)
     starts, bricks = np.empty(num_bricks + 1, np.int64), np.empty(num_bricks, np.int64)
     used = begin_bricks(counts, starts, bricks)
     number_slots(counts, slots)
-    low, edge = voxel_size * box[0].astype(np.float64), np.float64(voxel_size) * (1 << shift)
-    return slots, starts[: used + 1], spheres_round(bricks[:used], dims, low, edge)
+    size = np.float64(rows.voxel_size)
+    low, edge = size * box[0].astype(np.float64), size * (1 << shift)
+    return slots, Bricks(starts[: used + 1], spheres_round(bricks[:used], dims, low, edge))
 
 
 @kernel
-def divide_points(points, most):
+def divide_points(points):
     """Chooses bricks for points [3, n], all of them finite: lower corner, edge [m], numbers."""
     low, high, dims, edge = np.empty(3), np.empty(3), np.empty(3), POINTS_EDGE
     for axis in range(3):
@@ -194,7 +202,7 @@ def divide_points(points, most):
     while True:
         for axis in range(3):
             dims[axis] = math.floor((high[axis] - low[axis]) / edge) + 1.0
-        if dims[0] * dims[1] * dims[2] <= most:
+        if dims[0] * dims[1] * dims[2] <= MOST:
             return low, edge, dims.astype(np.int64)
         edge *= 2.0
 
@@ -210,16 +218,14 @@ def are_finite(numbers):
 
 
 @kernel
-def sorted_points(points, most):
+def sorted_points(points):
     """Sorts points into bricks.
 
     Args:
         points: x, y and z [3, n] [m].
-        most: bricks at most.
 
     Returns:
-        The order of the points [n], by brick, as they stand within a brick; where each brick
-        begins in it [b + 1]; and a sphere round each brick [b, 4] [m].
+        The order of the points [n], by brick, as they stand within a brick, and the bricks.
     """
     num = points.shape[1]
     order, slots = np.empty(num, np.int32), np.empty(num, np.int64)
@@ -232,8 +238,8 @@ def sorted_points(points, most):
         spheres[0, 3] = np.inf
         for i in range(num):
             order[i] = i
-        return order, starts, spheres
-    low, edge, dims = divide_points(points, most)
+        return order, Bricks(starts, spheres)
+    low, edge, dims = divide_points(points)
     counts = np.zeros((1, dims[0] * dims[1] * dims[2]), np.int32)
     for i in range(num):
         brick = np.int64(0)
@@ -247,23 +253,21 @@ def sorted_points(points, most):
     for i in range(num):
         order[counts[0, slots[i]]] = i
         counts[0, slots[i]] += 1
-    return order, starts[: used + 1], spheres_round(bricks[:used], dims, low, edge)
+    return order, Bricks(starts[: used + 1], spheres_round(bricks[:used], dims, low, edge))
 
 
 @inlined
-def bounds_of(view, wraps, shape):
+def bounds_of(view, layout):
     """The range of a view [m] and the planes that bound it, as `may_see` takes them.
 
     Each plane by its slope, `along = slope z`, and by how far along a margin reaches.
     """
-    fx, fy, cx, cy = view[LENS], view[LENS + 1], view[LENS + 2], view[LENS + 3]
-    left, right = -cx / fx, (np.float32(shape[1]) - cx) / fx
-    top, bottom = -cy / fy, (np.float32(shape[0]) - cy) / fy
-    r = ROTATION
+    left, right = -view.cx / view.fx, (np.float32(layout.width) - view.cx) / view.fx
+    top, bottom = -view.cy / view.fy, (np.float32(layout.height) - view.cy) / view.fy
+    r = view.rotation
     return (
-        wraps, view[RANGE], (view[POSITION], view[POSITION + 1], view[POSITION + 2]),
-        (view[r], view[r + 3], view[r + 6]), (view[r + 1], view[r + 4], view[r + 7]),
-        (view[r + 2], view[r + 5], view[r + 8]), (left, right, top, bottom),
+        layout.wraps, view.max_range, view.position,
+        (r[0], r[3], r[6]), (r[1], r[4], r[7]), (r[2], r[5], r[8]), (left, right, top, bottom),
         (_slant(left), _slant(right), _slant(top), _slant(bottom)),
     )  # fmt: skip
 
@@ -302,24 +306,22 @@ def may_see(bounds, x, y, z, radius, margin):
 
 
 @kernel
-def find_runs(view, wraps, shape, voxel_size, starts, spheres, runs):
+def find_runs(view, layout, voxel_size, bricks, runs):
     """Finds the runs of sorted voxels that may appear in a view; neighbors in memory join.
 
     Args:
-        view: one row.
-        wraps: True for an octahedral map.
-        shape: height and width [px].
+        view: which.
+        layout: of it.
         voxel_size: edge [m].
-        starts: of the bricks among the voxels [b + 1].
-        spheres: round the bricks [b, 4] [m].
+        bricks: of the voxels.
         runs: written; the first voxel and the one after the last of each run [b, 2].
 
     Returns:
         How many runs there are.
     """
-    num, bounds = 0, bounds_of(view, wraps, shape)
-    for brick in range(spheres.shape[0]):
-        x, y, z, radius = spheres[brick]
+    num, bounds, starts = 0, bounds_of(view, layout), bricks.starts
+    for brick in range(bricks.spheres.shape[0]):
+        x, y, z, radius = bricks.spheres[brick]
         if may_see(bounds, x, y, z, radius, voxel_size):
             if num > 0 and runs[num - 1, 1] == starts[brick]:
                 runs[num - 1, 1] = starts[brick + 1]

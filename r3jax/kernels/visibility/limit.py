@@ -1,4 +1,4 @@
-"""How far behind a depth buffer a voxel may lie: `visibility.slope` as kernels."""
+"""How far behind a depth buffer a voxel may lie: `depth_buffer.surface_limit` as kernels."""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
@@ -7,14 +7,14 @@ import math
 
 import numpy as np
 
+from r3jax.kernels import constants
 from r3jax.kernels.native.compiled import in_wide_vectors, inlined_fused, kernel
 from r3jax.kernels.visibility.picture import begin_of, stride_of
-from r3jax.visibility import slope
 
-MARGIN = max(slope.STRIDES)
+MARGIN = max(constants.STRIDES)
 """Pixels by which a buffer is continued beyond its border."""
 
-_FAR, _MAX_STRETCH = np.float32(slope.FAR), np.float32(slope.MAX_STRETCH)
+_FAR, _MAX_STRETCH = np.float32(constants.FAR), np.float32(constants.MAX_STRETCH)
 _ZERO, _ONE, _TWO, _LEAST = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(1e-6)
 
 
@@ -55,7 +55,7 @@ def _steepest_down(lines, stride, slopes):
     """Writes the slope along columns: lines of the buffer from `MARGIN` above to as many below."""
     here = MARGIN * stride + MARGIN
     middle = lines[here : here + slopes.shape[0]]
-    for step in slope.STRIDES:
+    for step in constants.STRIDES:
         above, below = lines[here - step * stride :], lines[here + step * stride :]
         for c in range(slopes.shape[0]):
             flat = _flatter(middle[c] - above[c], below[c] - middle[c], np.float32(step))
@@ -66,7 +66,7 @@ def _steepest_down(lines, stride, slopes):
 def _steepest_right(line, c):
     """Slope along the row at one column; the line begins `MARGIN` before the first."""
     here, found = line[MARGIN + c], _ZERO
-    for step in slope.STRIDES:
+    for step in constants.STRIDES:
         before, after = here - line[MARGIN + c - step], line[MARGIN + c + step] - here
         found = max(found, _flatter(before, after, np.float32(step)))
     return found
@@ -74,7 +74,7 @@ def _steepest_right(line, c):
 
 @inlined_fused
 def _limit_line(distance, line, slopes, pixel_angle, allowance, limit):
-    """Writes the limits of one row, see `visibility.slope`."""
+    """Writes the limits of one row, see `depth_buffer.surface_limit`."""
     for c in range(slopes.shape[0]):
         right, down = _steepest_right(line, c), slopes[c]
         span = pixel_angle * max(line[MARGIN + c], _LEAST)

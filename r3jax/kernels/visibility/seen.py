@@ -5,6 +5,7 @@
 
 import numpy as np
 
+from r3jax.kernels.constants import CORNER
 from r3jax.kernels.native.arithmetic import floor, whole
 from r3jax.kernels.native.compiled import in_wide_vectors, inlined_fused
 from r3jax.kernels.visibility.picture import begin_of, stride_of
@@ -17,9 +18,8 @@ from r3jax.kernels.visibility.views import (
     ROW,
     ROW_SCALE,
 )
-from r3jax.visibility import depth_buffer
 
-_CORNER = np.float32(depth_buffer.CORNER)
+_CORNER = np.float32(CORNER)
 _ZERO, _ONE, _INFINITE = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
 
 

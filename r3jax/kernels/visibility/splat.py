@@ -1,10 +1,11 @@
-"""Which pixels of an image pyramid voxels cover: `visibility.footprint` as kernels."""
+"""Which pixels of an image pyramid voxels cover: `depth_buffer.footprint` as kernels."""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
 import numpy as np
 
+from r3jax.kernels import constants
 from r3jax.kernels.native.arithmetic import ceil_log2, floor, power_of_two, whole
 from r3jax.kernels.native.compiled import in_wide_vectors, inlined_fused
 from r3jax.kernels.visibility.picture import RING, pyramid_size, stride_of
@@ -18,7 +19,6 @@ from r3jax.kernels.visibility.views import (
     ROW_SCALE,
     SUM_SCALE,
 )
-from r3jax.visibility import footprint
 
 TARGETS = 4 * CHUNK
 """Places in the pyramid of a chunk's voxels, four each."""
@@ -29,8 +29,8 @@ SPARE = 64
 _SPARES = np.arange(CHUNK, dtype=np.float32) % SPARE
 """Which of them: not one for all, or each write would wait for the one before."""
 
-_HALF_WIDTH, _NEAR = np.float32(footprint.HALF_WIDTH), np.float32(footprint.NEAR)
-_SEAM, _RING = np.float32(footprint.SEAM), np.float32(RING)
+_HALF_WIDTH, _NEAR = np.float32(constants.HALF_WIDTH), np.float32(constants.NEAR)
+_SEAM, _RING = np.float32(constants.SEAM), np.float32(RING)
 _ZERO, _QUARTER, _HALF = np.float32(0.0), np.float32(0.25), np.float32(0.5)
 _ONE, _TWO, _LEAST = np.float32(1.0), np.float32(2.0), np.float32(1e-6)
 
@@ -56,7 +56,7 @@ def _covers(down, right, reach, slants):
 
 @inlined_fused
 def find_targets(placed, count, voxel_size, side, targets):
-    """Finds the up to four pixels that each voxel covers (`footprint.footprint`).
+    """Finds the up to four pixels that each voxel covers (`depth_buffer.footprint`).
 
     Places are worked out in float32, which holds them exactly below 2^24.
     """

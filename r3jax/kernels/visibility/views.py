@@ -8,10 +8,11 @@ below say where each part of it begins.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from r3jax.kernels.native.compiled import in_wide_vectors, inlined_fused
+from r3jax.kernels.native.compiled import in_wide_vectors, inlined, inlined_fused, kernel
 
 CHUNK = 512
 """Voxels at a time."""
@@ -29,13 +30,52 @@ REACH = 7 * CHUNK
 PLACED = 8 * CHUNK
 """Floats that a chunk's placement takes."""
 
-POSITION, ROTATION, LENS, RANGE, TOLERANCE, FOCAL, PIXEL_ANGLE = 0, 3, 12, 16, 17, 18, 19
-"""Where the parts of a view's row begin: the camera's center, `T_world_camera`'s rotation row by
-row, fx fy cx cy of the buffer, range [m], tolerance [voxels], focal length of R [px], angle of a
-pixel [rad]. A panorama has neither rotation nor lens."""
 
-VIEW_SIZE = 20
-"""Floats that describe a view."""
+class View(NamedTuple):
+    """One of `calls.Views`."""
+
+    position: Any
+    """Of the camera: x, y, z [m]."""
+
+    rotation: Any
+    """Of `T_world_camera`, row by row [9]."""
+
+    fx: Any
+    fy: Any
+    cx: Any
+    cy: Any
+    max_range: Any
+    tolerance: Any
+    pixel_angle: Any
+    focal: Any
+
+
+@inlined
+def view_at(views, i):
+    """The i-th of some views."""
+    return View(
+        (views.position[i, 0], views.position[i, 1], views.position[i, 2]), views.rotation[i],
+        views.fx[i], views.fy[i], views.cx[i], views.cy[i], views.max_range[i],
+        views.tolerance[i], views.pixel_angle[i], views.focal[i],
+    )  # fmt: skip
+
+
+@kernel
+def sound_views(views, voxel_size):
+    """False for views with anything that is not finite, which see nothing."""
+    is_sound = np.empty(views.focal.shape[0], np.bool_)
+    is_size = voxel_size > _ZERO and voxel_size < _INFINITE
+    for i in range(is_sound.shape[0]):
+        # Differences of infinities are NaN, and what is added to NaN stays NaN.
+        total = views.fx[i] + views.fy[i] + views.cx[i] + views.cy[i] + views.focal[i]
+        total += views.max_range[i] + views.tolerance[i] + views.pixel_angle[i]
+        for axis in range(3):
+            total += views.position[i, axis]
+        for k in range(9):
+            total += views.rotation[i, k]
+        is_sound[i] = is_size and math.isfinite(total)
+    return is_sound
+
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _LEAST, _AHEAD, _INFINITE = np.float32(1e-6), np.float32(1e-3), np.float32(np.inf)
@@ -50,8 +90,8 @@ def _sign(x):
 def place_all_round(view, size, x, y, z, placed):
     """Places voxels on the octahedral map round a position (`PanoramaView.place`)."""
     in_wide_vectors()
-    center_x, center_y, center_z = view[POSITION], view[POSITION + 1], view[POSITION + 2]
-    far, half = view[RANGE], _HALF * np.float32(size)
+    center_x, center_y, center_z = view.position
+    far, half = view.max_range, _HALF * np.float32(size)
     for i in range(x.shape[0]):
         dx, dy, dz = x[i] - center_x, y[i] - center_y, z[i] - center_z
         distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), _LEAST)
@@ -82,13 +122,13 @@ def place_all_round(view, size, x, y, z, placed):
 def place_in_image(view, x, y, z, placed):
     """Places voxels in the image of a camera (`PinholeView.place`)."""
     in_wide_vectors()
-    center_x, center_y, center_z = view[POSITION], view[POSITION + 1], view[POSITION + 2]
-    r = ROTATION
-    xx, xy, xz = view[r], view[r + 1], view[r + 2]
-    yx, yy, yz = view[r + 3], view[r + 4], view[r + 5]
-    zx, zy, zz = view[r + 6], view[r + 7], view[r + 8]
-    fx, fy, cx, cy = view[LENS], view[LENS + 1], view[LENS + 2], view[LENS + 3]
-    far = view[RANGE]
+    center_x, center_y, center_z = view.position
+    r = view.rotation
+    xx, xy, xz = r[0], r[1], r[2]
+    yx, yy, yz = r[3], r[4], r[5]
+    zx, zy, zz = r[6], r[7], r[8]
+    fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
+    far = view.max_range
     for i in range(x.shape[0]):
         dx, dy, dz = x[i] - center_x, y[i] - center_y, z[i] - center_z
         right = xx * dx + yx * dy + zx * dz
@@ -113,12 +153,12 @@ def place_in_image(view, x, y, z, placed):
 
 
 @inlined_fused
-def place(view, shape, wraps, x, y, z, first, count, placed):
-    """Places `count` voxels from `first` on."""
+def place(view, layout, points, first, count, placed):
+    """Places `count` voxels from `first` on, of points [3, n] [m]."""
     # Slices, not offsets: Numba allows for negative indices, and LLVM would gather one by one.
     end = first + count
-    x, y, z = x[first:end], y[first:end], z[first:end]
-    if wraps:
-        place_all_round(view, shape[0], x, y, z, placed)
+    x, y, z = points[0, first:end], points[1, first:end], points[2, first:end]
+    if layout.wraps:
+        place_all_round(view, layout.height, x, y, z, placed)
     else:
         place_in_image(view, x, y, z, placed)

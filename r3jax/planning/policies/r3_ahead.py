@@ -34,6 +34,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import shortest_path
 
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.calls import Cells
 from r3jax.kernels.native.platform import num_cores
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import (
@@ -51,7 +52,6 @@ from r3jax.planning.policy import Situation
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.travel import Travel, segment_is_inside
 from r3jax.scoring.batch import cache_positions_near, score_cached_near
-from r3jax.scoring.cells import Cells
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama_cache import PanoramaCache
 from r3jax.scoring.simulated import simulate_view_near

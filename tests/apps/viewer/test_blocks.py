@@ -22,9 +22,9 @@ from r3jax.apps.viewer.blocks import (
 from r3jax.apps.viewer.color_maps import UNSEEN
 from r3jax.apps.viewer.story import Timeline
 from r3jax.geometry.voxels import INDEX_LIMIT
+from r3jax.mapping.seen import visible_rows
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.scoring.config import ScoringConfig
-from r3jax.visibility.depth_buffer import candidates_of, depth_buffer, visible_voxels
 from r3jax.visibility.views import panorama_view
 
 FIELDS = ("value", "bias", "noise", "resolution")
@@ -48,10 +48,8 @@ def test_one_position_gives_the_closed_form_where_it_sees(moment, run, places):
     terms = one(moment, run, places[0])
     seen = np.asarray(terms.sightings) > 0
     config, state = ScoringConfig(), moment.map_state
-    voxels, view = state, panorama_view(jnp.asarray(places[0]), config)
-    candidates = candidates_of(voxels, view)
-    buffer = depth_buffer(voxels, candidates, view, config)
-    visible = np.asarray(visible_voxels(voxels, candidates, view, buffer).mask)
+    view = panorama_view(jnp.asarray(places[0]), config)
+    visible = np.asarray(visible_rows(state, view, config))
     np.testing.assert_array_equal(seen, visible)
     assert 100 < seen.sum() < np.asarray(state.occupied).sum()
     expected = r3jax.voxel_renderability(state, places[0], run.camera.focal)

@@ -1,11 +1,15 @@
-"""Running counts and compaction of masks, as small matrix products.
+"""Selects the few of many that a mask marks: running counts, places, and loops in chunks.
 
 XLA's `cumsum` on a CPU takes 1.5 ms for the pixels of a 512x512 image; a product with a
 triangular matrix of ones takes a quarter of that and is exact below 2^24.
 
-Shape symbols: n flags; M places.
+Shape symbols: n flags; M places; K items of a chunk.
 """
 
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
@@ -20,9 +24,9 @@ SPARE = 64
 def spare_places(size: int, num: int) -> Int[Array, " n"]:
     """Where to scatter what shall be dropped: `num` indices of the places behind `size` others.
 
-    XLA on a CPU asks of each element whether it lies in bounds; where chance decides, the processor
-    guesses wrong every other time, which costs more than the element. A write that is always
-    in bounds costs nothing, and spread over some places it need not wait for the one before.
+    On CPUs XLA bounds-checks every element; where the outcome is random, half of the branches are
+    mispredicted, which costs more than the write. A write that is always in bounds costs nothing,
+    and spread over some places it need not wait for the one before.
     """
     return size + jnp.arange(num, dtype=jnp.int32) % SPARE
 
@@ -59,3 +63,35 @@ def positions_of_set(flags: Bool[Array, " n"], size: int) -> Int[Array, " M"]:
     target = jnp.where(flags, running_count(flags) - 1, spare_places(size, n))
     empty = jnp.full(size + SPARE, n, dtype=jnp.int32)
     return empty.at[target].min(jnp.arange(n, dtype=jnp.int32), mode="drop")[:size]
+
+
+CHUNK = 1 << 12
+"""Items of `for_selected` at once: they stay in the cache of one core."""
+
+Carry = TypeVar("Carry")
+
+
+def for_selected(
+    selected: Bool[Array, " n"],
+    body: Callable[[Int[Array, " K"], Bool[Array, " K"], Carry], Carry],
+    start: Carry,
+) -> Carry:
+    """Calls `body(index, valid, carry) -> carry` for the selected items, a chunk at a time.
+
+    The cost follows the number that are selected, not that of all. `index` holds places of selected
+    items in increasing order; where `valid` is False it is padding (and within bounds). A loop of
+    unknown length: forward derivatives only.
+    """
+    num = selected.shape[0]
+    size = min(CHUNK, num)
+    # Rounded up to whole chunks, so that the last slice is never shifted back.
+    order = positions_of_set(selected, -(-num // size) * size)
+
+    # Chunks are counted one by one: for a limit that XLA knows and that is no multiple of the
+    # step, it gets the number of turns wrong (one chunk: none).
+    def next_chunk(chunk: Int[Array, ""], carry: Carry) -> Carry:
+        index = jax.lax.dynamic_slice_in_dim(order, chunk * size, size)
+        return body(jnp.minimum(index, num - 1), index < num, carry)
+
+    num_chunks = (jnp.sum(selected, dtype=jnp.int32) + (size - 1)) // size
+    return jax.lax.fori_loop(0, num_chunks, next_chunk, start)

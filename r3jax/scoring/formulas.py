@@ -1,7 +1,7 @@
 """What a view shows of a map, by the paper's formulas, in plain JAX.
 
 Differentiable with respect to the position, the focal length and what is known of the voxels;
-what is visible is held fixed. What other backends answer is held to this.
+what is visible is held fixed. The kernels are held to this.
 
 Shape symbols: n voxels; c cells; B bins of the panorama; h w pixels of the depth buffer.
 """
@@ -14,12 +14,12 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
-from r3jax.geometry.voxels import unpack
+from r3jax.kernels.calls import Cells
 from r3jax.mapping.state import MapState
-from r3jax.scoring.cells import Cells
 from r3jax.scoring.config import Forms, ScoringConfig
 from r3jax.scoring.terms import Renderability, score_voxels
-from r3jax.visibility.reference import nearest_voxels, visible
+from r3jax.visibility.config import VisibilityConfig
+from r3jax.visibility.depth_buffer import depth_buffer, visible
 from r3jax.visibility.views import View
 
 
@@ -44,12 +44,24 @@ def sums_in_view(
         num_bins: bins of the Fibonacci lattice; 1 sums over all directions.
     """
     seen, empty = seen_in_view(voxels, cells, view, config)
-    seen = seen & is_sampled(voxels, config.sample)
-    deficit = 1.0 - score_voxels(voxels, position, focal, config.forms).value
-    deficit, unexplored = jnp.where(seen, deficit, 0.0), empty.astype(jnp.float32)
+    return sums_of_seen(voxels, cells, (seen, empty), position, focal, config.forms, num_bins)
+
+
+def sums_of_seen(
+    voxels: MapState,
+    cells: Cells,
+    seen: tuple[Bool[Array, " n"], Bool[Array, " c"]],
+    position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    forms: Forms,
+    num_bins: int,
+) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
+    """`sums_in_view` of voxels and cells that are known to be seen."""
+    deficit = 1.0 - score_voxels(voxels, position, focal, forms).value
+    deficit, unexplored = jnp.where(seen[0], deficit, 0.0), seen[1].astype(jnp.float32)
     points = jnp.stack([cells.x, cells.y, cells.z])
     return (
-        config.sample * sum_by_direction(voxels.center, deficit, position, num_bins),
+        sum_by_direction(voxels.center, deficit, position, num_bins),
         sum_by_direction(points, unexplored, position, num_bins),
     )
 
@@ -68,10 +80,10 @@ def change_of_sums(
     Args:
         before: voxels and cells before the views.
         after: the same after them (`simulated.simulate_view_near`).
-        kept: which voxels (of the sample) and which cells are seen, as bits in bytes.
+        kept: which voxels and which cells are seen, as bits in bytes.
         position: of the camera [m].
         focal: focal length of R [px].
-        forms: of kappa and delta, and the sample.
+        forms: of kappa and delta.
         num_bins: bins of the Fibonacci lattice.
 
     Returns:
@@ -82,39 +94,31 @@ def change_of_sums(
         jnp.unpackbits(bits, count=num).astype(bool)
         for bits, num in zip(kept, (voxels.capacity, cells.x.shape[0]), strict=True)
     )
-    lack, left = (
+    deficit, left = (
         1.0 - score_voxels(known, position, focal, forms).value for known in (voxels, voxels_after)
     )
-    # The count tells: an imagined view adds to it in just the voxels that it shows.
+    # An imagined view adds to the count of just the voxels that it shows.
     shown = seen & (voxels_after.count > voxels.count)
     explored = empty & cells.unexplored & ~cells_after.unexplored
     points = jnp.stack([cells.x, cells.y, cells.z])
-    change = forms.sample * jnp.where(shown, left - lack, 0.0)
     return (
-        sum_by_direction(voxels.center, change, position, num_bins),
+        sum_by_direction(voxels.center, jnp.where(shown, left - deficit, 0.0), position, num_bins),
         sum_by_direction(points, explored.astype(jnp.float32), position, num_bins),
     )
 
 
 def seen_in_view(
-    voxels: MapState, cells: Cells, view: View, config: ScoringConfig
+    voxels: MapState, cells: Cells, view: View, config: VisibilityConfig
 ) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:
     """Finds the voxels and the unexplored cells that a view sees."""
     points = jnp.stack([cells.x, cells.y, cells.z])
-    seen, empty = visible(voxels, points, view, config)
+    seen, empty = visible(voxels.voxels, points, view, config)
     return seen, empty & cells.unexplored
-
-
-def is_sampled(voxels: MapState, sample: int) -> Bool[Array, " n"]:
-    """Tells which voxels stand for `sample` of their neighbors: one of so many in every plane."""
-    x, y, z = unpack(voxels.key[0], voxels.key[1])
-    # With factors that differ, walls along any axis keep their share, not all of it or none.
-    return (x + 3 * y + 2 * z) % sample == 0
 
 
 def rows_in_pixels(voxels: MapState, view: View) -> Int[Array, "h w"]:
     """Finds the row of the voxel that each pixel of a view shows; n where it shows none."""
-    return nearest_voxels(voxels, view)[1]
+    return depth_buffer(voxels.voxels, view, VisibilityConfig()).row
 
 
 def mean_in_pixels(

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import r3jax
+from r3jax.apps.forecast import difficulty
 from r3jax.geometry.voxels import unpack
-from r3jax.scoring import difficulty
 from tests.strategies import VOXEL_SIZE, Sighting, sightings
 
 CAPACITY = 1 << 9

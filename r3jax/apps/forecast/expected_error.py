@@ -1,7 +1,7 @@
 """The error to expect of a view, pixel by pixel: how well it was seen times how hard it is.
 
 R says how well a surface was looked at, not how hard it is to render. With the difficulty C of a
-voxel (`scoring.difficulty`) and D = 1 - R, a pixel is expected to be off by
+voxel (`difficulty`) and D = 1 - R, a pixel is expected to be off by
 
     e = a                        whatever is shown,
       + b C + c D^2 + d C D      where it shows a voxel,
@@ -22,13 +22,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from r3jax.apps.forecast.difficulty import difficulty_of_rows
 from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, sound
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.backend import rows_in_pixels
-from r3jax.scoring.backends.reference import voxels_of_rows
 from r3jax.scoring.config import ScoringConfig, scoring_settings
-from r3jax.scoring.difficulty import difficulty_of_rows
+from r3jax.scoring.formulas import voxels_of_rows
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import pinhole_view
 

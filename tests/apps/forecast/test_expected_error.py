@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import r3jax
-from r3jax.scoring import expected_error
-from r3jax.scoring.expected_error import (
+from r3jax.apps.forecast import expected_error
+from r3jax.apps.forecast.expected_error import (
     DISSIMILARITY,
     REACH,
     SQUARED,

@@ -1,0 +1,225 @@
+"""The kernels of maps and scores as XLA's custom calls: each reads its arguments and runs."""
+
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
+from typing import Any
+
+import numpy as np
+
+from r3jax.kernels.calls import Cells, FrameArrays, Layout, MapRows, Views
+from r3jax.kernels.mapping.add import map_add
+from r3jax.kernels.mapping.mark import map_mark
+from r3jax.kernels.native.compiled import inlined
+from r3jax.kernels.native.ffi import (
+    ARGUMENTS,
+    RESULTS,
+    answers_metadata,
+    bytes1,
+    bytes2,
+    float0,
+    floats1,
+    floats2,
+    floats3,
+    ints1,
+    ints2,
+    register_handlers,
+    words2,
+)
+from r3jax.kernels.scoring.changes import changes
+from r3jax.kernels.scoring.pixels import pixels
+from r3jax.kernels.scoring.rows import Terms, terms
+from r3jax.kernels.scoring.sums import Sums, Tables, sums
+from r3jax.kernels.scoring.terms import Choices
+
+# Places of arguments are literals, so that LLVM sees through all of this.
+
+
+@inlined
+def _map(frame, first):
+    return MapRows(
+        words2(frame, ARGUMENTS, first), words2(frame, ARGUMENTS, first + 1),
+        floats1(frame, ARGUMENTS, first + 2), floats1(frame, ARGUMENTS, first + 3),
+        floats1(frame, ARGUMENTS, first + 4), float0(frame, ARGUMENTS, first + 5),
+    )  # fmt: skip
+
+
+@inlined
+def _cells(frame, first):
+    return Cells(
+        floats1(frame, ARGUMENTS, first), floats1(frame, ARGUMENTS, first + 1),
+        floats1(frame, ARGUMENTS, first + 2), bytes1(frame, ARGUMENTS, first + 3),
+    )  # fmt: skip
+
+
+@inlined
+def _views(frame, first):
+    return Views(
+        floats2(frame, ARGUMENTS, first), floats2(frame, ARGUMENTS, first + 1),
+        floats1(frame, ARGUMENTS, first + 2), floats1(frame, ARGUMENTS, first + 3),
+        floats1(frame, ARGUMENTS, first + 4), floats1(frame, ARGUMENTS, first + 5),
+        floats1(frame, ARGUMENTS, first + 6), floats1(frame, ARGUMENTS, first + 7),
+        floats1(frame, ARGUMENTS, first + 8), floats1(frame, ARGUMENTS, first + 9),
+    )  # fmt: skip
+
+
+@inlined
+def _image(frame, first):
+    return FrameArrays(
+        floats2(frame, ARGUMENTS, first), floats3(frame, ARGUMENTS, first + 1),
+        floats2(frame, ARGUMENTS, first + 2), floats2(frame, ARGUMENTS, first + 3),
+        float0(frame, ARGUMENTS, first + 4), float0(frame, ARGUMENTS, first + 5),
+        float0(frame, ARGUMENTS, first + 6), float0(frame, ARGUMENTS, first + 7),
+        float0(frame, ARGUMENTS, first + 8), float0(frame, ARGUMENTS, first + 9),
+        float0(frame, ARGUMENTS, first + 10),
+    )  # fmt: skip
+
+
+@inlined
+def _tables(frame, first):
+    """Directions of a voxel's bins, then candidates and directions of the panorama's bins."""
+    return Tables(
+        floats2(frame, ARGUMENTS, first), ints2(frame, ARGUMENTS, first + 1),
+        floats2(frame, ARGUMENTS, first + 2),
+    )  # fmt: skip
+
+
+@inlined
+def _layout(options):
+    height: Any = np.int64(options[1])
+    width: Any = np.int64(options[2])
+    return Layout(options[0] != 0, height, width)
+
+
+def _map_add(frame):
+    """Arguments: rows and mean (6), voxel size, frame (11), bins (2), workers."""
+    if answers_metadata(frame):
+        return 0
+    map_add(
+        MapRows(
+            words2(frame, RESULTS, 0), words2(frame, RESULTS, 1), floats1(frame, RESULTS, 2),
+            floats1(frame, RESULTS, 3), floats1(frame, RESULTS, 4), float0(frame, ARGUMENTS, 6),
+        ),
+        floats2(frame, RESULTS, 5),
+        _image(frame, 7),
+        ints2(frame, ARGUMENTS, 18),
+        floats2(frame, ARGUMENTS, 19),
+        np.int64(ints1(frame, ARGUMENTS, 20)[0]),
+        ints1(frame, RESULTS, 6),
+    )  # fmt: skip
+    return 0
+
+
+def _map_mark(frame):
+    """Arguments: visited, resolution, key, voxel size, frame (11), visible, bins (2), workers."""
+    if answers_metadata(frame):
+        return 0
+    map_mark(
+        words2(frame, RESULTS, 0),
+        floats1(frame, RESULTS, 1),
+        words2(frame, ARGUMENTS, 2),
+        float0(frame, ARGUMENTS, 3),
+        _image(frame, 4),
+        bytes1(frame, ARGUMENTS, 15),
+        ints2(frame, ARGUMENTS, 16),
+        floats2(frame, ARGUMENTS, 17),
+        np.int64(ints1(frame, ARGUMENTS, 18)[0]),
+    )
+    return 0
+
+
+def _sums(frame):
+    """Arguments: map (6), cells (4), views (10), options, tables (3)."""
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 20)
+    sums(
+        _map(frame, 0),
+        _cells(frame, 6),
+        _views(frame, 10),
+        _layout(options),
+        Choices(options[3] != 0, options[4] != 0),
+        _tables(frame, 21),
+        np.int64(options[5]),
+        Sums(
+            floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1),
+            bytes2(frame, RESULTS, 2), bytes2(frame, RESULTS, 3),
+        ),
+    )  # fmt: skip
+    return 0
+
+
+def _pixels(frame):
+    """Arguments: map (6), views (10), options, directions of a voxel's bins."""
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 16)
+    pixels(
+        _map(frame, 0),
+        _views(frame, 6),
+        _layout(options),
+        Choices(options[3] != 0, options[4] != 0),
+        floats2(frame, ARGUMENTS, 17),
+        np.int64(options[5]),
+        floats1(frame, RESULTS, 0),
+        ints2(frame, RESULTS, 1),
+    )
+    return 0
+
+
+def _terms(frame):
+    """Arguments: map (6), positions, focal lengths, options, directions of a voxel's bins."""
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 8)
+    terms(
+        _map(frame, 0),
+        floats2(frame, ARGUMENTS, 6),
+        floats1(frame, ARGUMENTS, 7),
+        Choices(options[0] != 0, options[1] != 0),
+        floats2(frame, ARGUMENTS, 9),
+        np.int64(options[2]),
+        Terms(
+            floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1), floats2(frame, RESULTS, 2),
+            floats2(frame, RESULTS, 3), floats2(frame, RESULTS, 4), floats2(frame, RESULTS, 5),
+        ),
+    )  # fmt: skip
+    return 0
+
+
+def _changes(frame):
+    """Arguments: map twice (12), cells (4), bits (2), positions, focals, options, tables (3)."""
+    if answers_metadata(frame):
+        return 0
+    options = ints1(frame, ARGUMENTS, 20)
+    changes(
+        _map(frame, 0),
+        _map(frame, 6),
+        _cells(frame, 12),
+        (bytes2(frame, ARGUMENTS, 16), bytes2(frame, ARGUMENTS, 17)),
+        floats2(frame, ARGUMENTS, 18),
+        floats1(frame, ARGUMENTS, 19),
+        Choices(options[0] != 0, options[1] != 0),
+        _tables(frame, 21),
+        (floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1)),
+    )
+    return 0
+
+
+# What takes longest and is waited for first comes first: who has a core to spare compiles in this
+# order (`native.ahead`).
+HANDLERS = {
+    "sums": _sums,
+    "map_mark": _map_mark,
+    "map_add": _map_add,
+    "pixels": _pixels,
+    "changes": _changes,
+    "terms": _terms,
+}
+
+
+def register(name: str) -> str:
+    """Compiles a kernel (or takes it from the disk) and tells XLA of it, once; gives its target."""
+    target = f"r3jax_{name}"
+    register_handlers({target: HANDLERS[name]})
+    return target

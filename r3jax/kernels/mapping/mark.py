@@ -1,0 +1,150 @@
+"""Which voxels a frame shows, and their direction bins: `mapping.seen` in machine code."""
+
+# Kernels have the types that Numba infers where they are called; annotations it would not read.
+# pyright: reportMissingParameterType=false, reportUnknownParameterType=false
+
+import math
+
+import numpy as np
+from numba import prange
+
+from r3jax.geometry.voxels import EMPTY_WORD
+from r3jax.kernels.mapping.bins import camera_of, center_of, is_sound, mark_rows
+from r3jax.kernels.native.arithmetic import whole
+from r3jax.kernels.native.compiled import (
+    in_wide_vectors,
+    inlined,
+    inlined_fused,
+    kernel,
+    parallel_kernel,
+    prefetch,
+)
+
+_BLOCK = 1 << 12
+"""Rows that a worker looks at before it takes the next."""
+
+_AHEAD = 16
+"""Rows whose pixels are on their way from memory while one is looked at: they lie anywhere."""
+
+_EMPTY = np.uint32(EMPTY_WORD)
+_ZERO, _ONE, _NEAREST = np.float32(0.0), np.float32(1.0), np.float32(1e-3)
+
+
+@inlined_fused
+def _along(T, axis, center):
+    """One coordinate of a point in the camera's frame."""
+    along = T[axis, 0] * center[0] + T[axis, 1] * center[1]
+    return along + T[axis, 2] * center[2] + T[axis, 3]
+
+
+@inlined_fused
+def _farthest_around(depth, row, column):
+    """Largest depth of a pixel and its neighbors: on a slope it changes within a pixel."""
+    farthest = _ZERO
+    for i in range(max(row - 1, 0), min(row + 2, depth.shape[0])):
+        for j in range(max(column - 1, 0), min(column + 2, depth.shape[1])):
+            farthest = max(farthest, depth[i, j])
+    return farthest
+
+
+@inlined_fused
+def _project(key, first, num, frame, voxel_size, pixels, depths):
+    """Pixel and z-depth of each row from `first` on; -1 for rows out of the image or of range.
+
+    Without a branch, so that LLVM turns the loop into vectors: most rows end here.
+    """
+    in_wide_vectors()
+    shape, T = frame.depth.shape, frame.T_camera_world
+    height, width = np.float32(shape[0]), np.float32(shape[1])
+    last_row, last_column = height - _ONE, width - _ONE
+    reach = frame.max_range * frame.max_range
+    fx, fy, cx, cy = frame.fx, frame.fy, frame.cx, frame.cy
+    for i in range(num):
+        center = center_of(key, first + i, voxel_size)
+        z = _along(T, 2, center)
+        x, y = _along(T, 0, center), _along(T, 1, center)
+        per_z = _ONE / z
+        u = fx * x * per_z + cx
+        v = fy * y * per_z + cy
+        is_in = (z > _NEAREST) & (u >= _ZERO) & (u < width) & (v >= _ZERO) & (v < height)
+        # Straight from the camera, as the grid and the scores have it; depth alone is along the
+        # axis.
+        is_in &= x * x + y * y + z * z <= reach
+        is_in &= key[1, first + i] != _EMPTY
+        # Into the image before they become whole, whatever they are: masked where they are not in.
+        row, column = whole(min(max(v, _ZERO), last_row)), whole(min(max(u, _ZERO), last_column))
+        pixels[i] = np.int32(np.int32(row * np.int32(shape[1])) + column) if is_in else np.int32(-1)
+        depths[i] = z
+
+
+@inlined_fused
+def _is_shown(pixel, measured, z, depth, slack, is_visible):
+    """Whether a frame shows a row that lies in one of its pixels."""
+    if measured == _ZERO:
+        return is_visible  # a hole
+    if not measured > _ZERO:
+        return False
+    # One edge of slack: a surface may lie anywhere within its voxel. Mostly the pixel itself says
+    # so, which is farther than none of those around it.
+    if z <= measured + slack:
+        return True
+    row, column = pixel // depth.shape[1], pixel % depth.shape[1]
+    return z <= _farthest_around(depth, row, column) + slack
+
+
+@inlined
+def _is_camera(frame, camera):
+    """False for intrinsics or a pose that cannot be."""
+    total = frame.fx + frame.fy + frame.cx + frame.cy
+    for axis in range(3):
+        for k in range(4):
+            total += frame.T_camera_world[axis, k]
+    return math.isfinite(total) & is_sound(camera)
+
+
+@kernel
+def map_mark(visited, resolution, key, voxel_size, frame, is_visible, bins, lattice, workers):
+    """Sets bins and resolutions of the rows that a frame shows, in place.
+
+    Args:
+        visited: words of bins [W, N].
+        resolution: best so far [N].
+        key: of the map [2, N].
+        voxel_size: edge [m].
+        frame: `calls.FrameArrays`.
+        is_visible: 1 where no other voxel hides a row [N].
+        bins: candidates of each octahedral cell [S^2, K].
+        lattice: directions of the bins [B, 3].
+        workers: threads.
+    """
+    camera = camera_of(frame, voxel_size)
+    if _is_camera(frame, camera):
+        _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice, workers)
+
+
+@parallel_kernel
+def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice, workers):
+    depth, voxel_size, capacity = frame.depth, camera.voxel_size, key.shape[1]
+    flat, blocks = depth.reshape(depth.size), (capacity + _BLOCK - 1) // _BLOCK
+    for worker in prange(workers):
+        pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
+        seen, shown = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int64)
+        for block in range(worker, blocks, workers):
+            first, size = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
+            _project(key, first, size, frame, voxel_size, pixels, depths)
+            # Listed without a branch: whether a row is in view is often mispredicted.
+            num = 0
+            for i in range(size):
+                seen[num] = i
+                num += pixels[i] >= 0
+            count = 0
+            for k in range(num):
+                if k + _AHEAD < num:
+                    prefetch(flat, np.int64(pixels[seen[k + _AHEAD]]))
+                i = np.int64(seen[k])
+                pixel = np.int64(pixels[i])
+                shown[count] = first + i
+                count += _is_shown(
+                    pixel, flat[pixel], depths[i], depth, voxel_size, is_visible[first + i] != 0
+                )
+            mark_rows(key, visited, resolution, shown, count, camera, bins, lattice)

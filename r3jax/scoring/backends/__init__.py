@@ -1,1 +1,0 @@
-"""How scores are made fast on a platform; each backend is held to `reference`."""
