@@ -204,7 +204,7 @@ def test_full_map_keeps_its_rows_and_counts_what_it_drops() -> None:
 
 
 def test_maps_of_many_chunks_merge_and_grow(monkeypatch) -> None:
-    monkeypatch.setattr(real, "CHUNK", 4)
+    monkeypatch.setattr(real, "JOINED", 4)
     batches = [Batch(seed, num_voxels=7) for seed in range(4)]
     a, b = map_of(batches[:2]), map_of(batches[2:])
     assert_same_rows(read_map(real.merge(a, b)), expected_rows(batches))

@@ -194,7 +194,7 @@ EXAMPLES = [
 
 def test_scans_of_many_chunks(monkeypatch) -> None:
     """With chunks smaller than a scan, so that leaders and their positions stay together."""
-    monkeypatch.setattr(real, "CHUNK", 4)
+    monkeypatch.setattr(real, "JOINED", 4)
     reference = reference_of(EXAMPLES)
     assert reference.clearance > 1e-5
     assert_same_rows(read_map(map_of(EXAMPLES, real.integrate_points)), reference.rows())

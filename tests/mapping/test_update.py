@@ -8,8 +8,9 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from r3jax.kernels.constants import JOINED
 from r3jax.mapping import update as real
-from r3jax.mapping.join import CHUNK, grow, merge
+from r3jax.mapping.join import grow, merge
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_points
 from tests.mapping.reference import assert_same_rows, read_map
@@ -131,7 +132,7 @@ def test_a_room_of_many_chunks_fits_in_10_mb():
     is_wall = ((index == [-50, -40, 0]) | (index == [49, 39, 53])).any(axis=1)
     table = (np.abs(index[:, :2]) < [20, 10]).all(axis=1) & (index[:, 2] == 15)
     voxels = index[is_wall | table]
-    assert len(voxels) > 4 * CHUNK
+    assert len(voxels) > 4 * JOINED
     points = np.repeat((voxels + 0.5) * 0.05, 2, axis=0).astype(np.float32)
     rgb = np.random.default_rng(0).random(points.shape).astype(np.float32)
     state = integrate_points(empty_map(), points, rgb, np.array([0.1, 0.2, 1.3]))
@@ -211,7 +212,7 @@ SEEN = [random_sighting(seed) for seed in range(10, 14)]
 
 
 def test_points_of_many_chunks(monkeypatch) -> None:
-    monkeypatch.setattr(real, "CHUNK", 4)
+    monkeypatch.setattr(real, "JOINED", 4)
     reference = reference_of(SEEN)
     assert reference.clearance > 1e-6
     assert_same_rows(read_map(map_of(SEEN, real.integrate_points)), reference.rows())
