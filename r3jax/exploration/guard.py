@@ -35,6 +35,8 @@ def first_pose(simulator: Simulator, motion: Motion, cell_size: float) -> np.nda
         ValueError: a start outside the world's box, or at a height that the robot cannot reach;
             a world that cannot be explored (see `check_world`).
     """
+    # First: neither the search for a start nor the grid names the scale that would mend the mesh.
+    check_world(simulator.bounds, cell_size)
     pose = np.asarray(simulator.start_pose, dtype=np.float64)
     lower, upper = np.asarray(simulator.bounds, dtype=np.float64)
     # The grid ends just beyond the box: outside it no cell is there to fly through.
@@ -43,8 +45,6 @@ def first_pose(simulator: Simulator, motion: Motion, cell_size: float) -> np.nda
             f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
             f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
         )
-    # Before the grid is made: its own refusal names no scale that would mend the mesh.
-    check_world(simulator.bounds, cell_size)
     return begin_at(motion, pose)
 
 

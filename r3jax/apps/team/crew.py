@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from r3jax.apps.team.team import Member, TeamResult
-from r3jax.exploration.guard import first_pose
+from r3jax.exploration.guard import check_world, first_pose
 from r3jax.files import (
     check_own,
     clear_partial,
@@ -78,7 +78,7 @@ def begin_team(
         ImportError: the scene's simulator is not installed.
     """
     _check_leftovers(folder, len(scenes))
-    placed, simulators = _with_starts(scenes)
+    placed, simulators = _with_starts(scenes, settings[0].config.cell_size)
     members = [Member(s, each.policy) for s, each in zip(simulators, settings, strict=True)]
     for member in members:  # refused before there is a folder
         first_pose(member.simulator, motion_of(member.policy), settings[0].config.cell_size)
@@ -145,7 +145,7 @@ def _only_writer(folder: Path, stack: contextlib.ExitStack) -> None:
 
 
 def _with_starts(
-    scenes: Sequence[SceneSettings],
+    scenes: Sequence[SceneSettings], cell_size: float
 ) -> tuple[list[SceneSettings], list[Simulator]]:
     """The scene as each camera sees it; all but the first start beside the first.
 
@@ -153,6 +153,7 @@ def _with_starts(
         ValueError: there is no room.
     """
     placed, simulators = [scenes[0]], [scenes[0].open()]
+    check_world(simulators[0].bounds, cell_size)  # the search for a start names no scale
     places = places_beside(simulators[0].start_pose[:3, 3])
     for scene in scenes[1:]:
         for place in places:
