@@ -6,7 +6,7 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.policies import ALIASES, HOMES, REGISTERED, home_of, known_names
+from r3jax.planning.policies import HOMES, REGISTERED, current_name, home_of, known_names
 from r3jax.planning.policies.foreign.commands import COMMAND
 from r3jax.planning.policy import Policy
 
@@ -30,7 +30,7 @@ def register_policy(policy_class: PolicyClass) -> PolicyClass:
     if not isinstance(name, str) or not name:
         raise ValueError(f"{policy_class.__qualname__} needs a class attribute `name`")
     # A policy of this package cannot be replaced: recorded runs name it.
-    if name in {*HOMES, *ALIASES}:
+    if current_name(name) in HOMES:
         raise ValueError(f"a policy of this package is called {name!r}: choose another name")
     REGISTERED[name] = policy_class
     return policy_class
