@@ -11,7 +11,7 @@ import pytest
 from r3jax.kernels.native import ffi, platform
 from tests.kernels.native.small_use import use
 
-_ROOT = Path(__file__).parents[2]
+_ROOT = Path(__file__).resolve().parents[3]
 
 
 def used(*words: str, **settings: str) -> dict:
