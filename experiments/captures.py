@@ -1,4 +1,4 @@
-"""At equal time or views: what looking on the way, gaze, spacing, and longer trainings are worth.
+"""Compares capturing while moving, gaze, spacing and training length at equal time or views.
 
     python -m experiments.captures modes --size small --scenes flat office --seeds 0
     python -m experiments.captures gaze --size small --scenes flat office --seeds 0
@@ -8,9 +8,9 @@ A table is a list of rows, each a policy under settings that differ from the sui
 compared on the same test views with the row that it changes. The mission clock is the model's: a
 decision 0.3 s, one reconsidered on arrival 0.05 s, a frame 0.02 s, a gaze 0.01 s, 1 m/s, turns for
 nothing; or, with `--clock wall`, what all of this takes on this machine, which then has nothing
-else to do. Whoever does not look or plan on the way flies as published. With `--budget views` the
-views that a policy chose are counted, and frames on the way come on top. What is done in `--work`
-is not done again, and what differs in its training only is not flown again.
+else to do. Policies that do not capture or plan while moving fly as published. With `--budget
+views` the views that a policy chose are counted; frames captured while moving come on top. What is
+done in `--work` is not done again, and what differs in its training only is not flown again.
 
 Beside a table lie its records, and the poses of flights that no machine flies twice alike. So
 another machine, or another day, adds a seed:
@@ -64,7 +64,7 @@ class Row:
     """One line of a table: who flies, how, and what it is compared with."""
 
     policy: str
-    """Who chooses the views."""
+    """The policies."""
 
     against: str = ""
     """The row whose scores are subtracted; empty: none."""
@@ -83,7 +83,7 @@ REFERENCE = "active-gs"
 """As published: key frames only."""
 
 OURS = "r3-ahead, captures, plans on the way"
-"""With all that looks on the way."""
+"""With everything that captures while moving."""
 
 POLICIES = (REFERENCE, "r3con", "r3-pano", "r3-ahead", "frontier", "random")
 
@@ -131,7 +131,7 @@ TABLES: dict[TableName, dict[str, Row]] = {
             for mode, loop in MODES.items()
         },
     },
-    # Where the camera looks on the way.
+    # Where the camera looks while moving.
     "gaze": {
         gaze: Row("r3-ahead", "panorama", loop=ON_THE_WAY | {"gaze": gaze})
         for gaze in ("panorama", "ahead")
@@ -245,7 +245,7 @@ def main(options: Options) -> Path:
 
 
 def rows_of(options: Options) -> dict[str, Row]:
-    """The rows of the table that are asked for.
+    """Selects the rows of the table by their names.
 
     Raises:
         ValueError: a row that is none of the table's, or none is left.

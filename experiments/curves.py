@@ -167,7 +167,7 @@ def snapshot_kind(cells: Sequence[Cell]) -> str:
     """What the snapshots count: views, seconds or meters.
 
     Raises:
-        ValueError: not all the same; then they are no points of one curve.
+        ValueError: the kinds differ; then they are no points of one curve.
     """
     kinds = sorted({snapshot.partition(":")[0] for snapshot in snapshots_of(cells)})
     if len(kinds) > 1:

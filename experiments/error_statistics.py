@@ -1,7 +1,7 @@
 """Rank statistics of many models evaluated by the same views, with intervals over both.
 
 A statistic belongs to one model (scene, policy, seed, snapshot); a scene's number is its mean over
-models. Its interval is a bootstrap that draws views and explorations anew, independently (the
+models. Its interval is a bootstrap that resamples views and explorations independently (the
 pigeonhole bootstrap, Owen 2007): a view that is hard for one model is hard for all, so all models
 of a resample are evaluated by the same drawn views, and an exploration (policy and seed) brings all
 its snapshots along, which share their first frames. Drawing models x views one by one would take a

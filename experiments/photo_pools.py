@@ -1,4 +1,4 @@
-"""The photo-pool protocol: who chooses the better photos of a real capture.
+"""The photo-pool protocol: which policy chooses the better photos of a real capture.
 
     python -m experiments.photo_pools --size smoke --photos LOUNGE runs/flat-uniform
 
@@ -57,7 +57,7 @@ SIZES: dict[SizeName, Size] = {
 
 @dataclass(frozen=True)
 class Options:
-    """Choice among the nearest photos of a capture, one every so many steps of training."""
+    """Choice among the nearest photos of a capture, one per fixed number of training steps."""
 
     photos: tuple[Path, ...]
     """Captures with depth: whatever `r3jax train` opens."""
@@ -66,7 +66,7 @@ class Options:
     """How much is done."""
 
     choosers: tuple[str, ...] = ("r3", "cover", "gavis", "fisherrf", "random")
-    """Who chooses."""
+    """The choosers."""
 
     seeds: tuple[int, ...] = ()
     """By default those of the size."""

@@ -2,9 +2,9 @@
 
     python -m experiments.planner_work --size smoke
 
-The map is that of an apartment after so many views from the middles of its rooms; a decision of
-`r3-pano` is made on it again and again, from where the last view was taken. Run it on an idle
-machine.
+The map is that of an apartment after the given number of views from the middles of its rooms; a
+decision of `r3-pano` is made on it again and again, from where the last view was taken. Run it on
+an idle machine.
 """
 
 import dataclasses

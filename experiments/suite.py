@@ -117,7 +117,7 @@ _AMOUNTS = {
 
 
 def request_of(options: Options, unit: Literal["views", "seconds"]) -> Request:
-    """What the benchmark is asked for."""
+    """Makes the request to the benchmark."""
     size = _SIZES[options.size]
     amounts = options.snapshots or _AMOUNTS[options.size, unit]
     snapshots = tuple(f"{unit}:{amount}" for amount in amounts)

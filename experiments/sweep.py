@@ -52,13 +52,13 @@ class Options:
     default lambda1, with the values of the size."""
 
     random: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Try so many points at random instead of all combinations."""
+    """Try this number of random points instead of all combinations."""
 
     seed: int = 0
     """Seed of the random points."""
 
     policy: str = "r3-pano"
-    """Who chooses the views."""
+    """The policies."""
 
     scenes: tuple[str, ...] = ()
     """Scenes other than the size's."""

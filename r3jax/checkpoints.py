@@ -102,7 +102,7 @@ def write_checkpoint(path: Path, tables: Tables) -> None:
     """Writes one: it is there as a whole, or not at all.
 
     Args:
-        path: a number in a folder that is there, in which nobody else writes.
+        path: a number in an existing folder, in which no other process writes.
         tables: the arrays.
 
     Raises:
@@ -191,7 +191,7 @@ def _read_hashes(folder: Path) -> dict[str, str]:
 def _quiet() -> Generator[None]:
     """Keeps Orbax from printing tracebacks of an error that it also raises.
 
-    An error leaves it when Orbax's other threads have ended: nobody writes any more.
+    An error leaves it when Orbax's other threads have ended: none of them writes any more.
     """
     log, hook = logging.getLogger("absl"), sys.unraisablehook
     level = log.level

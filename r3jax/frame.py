@@ -289,7 +289,7 @@ def _hint(shape: tuple[int, ...]) -> str:
 
 
 def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float[Array, "..."]:
-    """z-depth [m]: from meters, or from steps of so many meters.
+    """Returns z-depth [m] from meters, or from steps of `metres_per_step`.
 
     Raises:
         ValueError: whole numbers without a unit, a unit that cannot be one, no numbers.

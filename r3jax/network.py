@@ -18,7 +18,7 @@ def exposure_warning(host: str, what: str = "sees the page") -> str | None:
 
 
 def check_free(host: str, port: int) -> None:
-    """Refuses a port or address at which nobody could listen now.
+    """Refuses a port or address that cannot be listened at now.
 
     Raises:
         ValueError: no number of a port.

@@ -211,7 +211,7 @@ def memory_figure(memory: Samples, title: str = "", limit: float | None = None) 
 
 
 def _panels(count: int, *, share: bool = False) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels, in lines of four."""
+    """Makes a figure with this number of panels, in lines of four."""
     columns = min(count, _PANELS_PER_LINE)
     lines = -(-count // columns)
     figure = style.new_figure(max(5.6, 3.6 * columns), 3.2 * lines)

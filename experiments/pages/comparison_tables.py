@@ -58,7 +58,7 @@ def tail_table(
     Columns: mean over scenes with its 95 % interval (`statistics.mean_over_scenes`), the worst
     scene, then median, 5th percentile, worst view and the share of views under 20 dB of all test
     views of all scenes and seeds together. For LPIPS the tail is the upper one (95th percentile),
-    and there is no share. A method that lacks a scene has no numbers here.
+    and there is no share. A method without one of the scenes has no numbers here.
 
     Args:
         cells: as in `quality_table`.

@@ -213,7 +213,7 @@ def _interval(estimate: Estimate, sign: str = "") -> str:
 
 
 def _short(value: Value) -> Value:
-    """Without the digits that nobody reads."""
+    """Formats a number without superfluous digits."""
     if not isinstance(value, float):
         return value
     rounded = float(f"{value:.4g}")

@@ -89,7 +89,7 @@ class LatticeStage:
             points = np.arange(0.5 * self.spacing, length * cell_size, self.spacing)
             # The nudge puts points that lie on a border of cells on the same side of it.
             cells = np.floor(points / cell_size + 1e-3).astype(np.int64)
-            # Cells wider than the spacing hold several points, and are one place all the same.
+            # Cells wider than the spacing hold several points, and are still one place.
             axes.append(np.unique(cells[cells < length]))
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -141,7 +141,7 @@ class Pool(eqx.Module):
     """Candidates that could be stood at, once."""
 
     left: Bool[Array, "P D"] = eqx.field(converter=jnp.asarray)
-    """Those that were worth nothing or were chosen; they never return."""
+    """Those that gained nothing or were chosen; they never return."""
 
     gain: Float[Array, "P D"] = eqx.field(converter=jnp.asarray)
     """Share of empty pixels when last scored; 1 before."""
@@ -197,7 +197,7 @@ def admit(pool: Pool, has_place: np.ndarray) -> Pool:
 
 
 def dismiss(pool: Pool, draw: Draw, gain: np.ndarray, best: int) -> Pool:
-    """Notes the gains [C]; the chosen candidate and those that are worth nothing leave."""
+    """Notes the gains [C]; the chosen candidate and those without gain leave."""
     is_done = gain < LEAST_GAIN
     # What the chosen view did not show now, it will never show.
     is_done[best] = True
@@ -315,7 +315,7 @@ class ActiveGamer(GreedyPolicy):
         utilities: dict[str, np.ndarray],
         best: int,
     ) -> Pools:
-        """The chosen candidate leaves the pool, and those that are worth nothing."""
+        """Removes the chosen candidate and those without gain from the pool."""
         pools, found = situation.memory, situation.notes
         # Random views came from no pool, so that none can leave one.
         if found is None:

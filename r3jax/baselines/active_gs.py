@@ -68,7 +68,7 @@ _FACES = [tuple(sign * (axis == i) for i in range(3)) for axis in range(3) for s
 
 @dataclass(frozen=True)
 class Regions:
-    """Cells worth a look. On the host: NumPy."""
+    """Unexplored cells that count. On the host: NumPy."""
 
     cells: np.ndarray
     """Their indices, [R, 3] int64."""
@@ -228,7 +228,7 @@ EXPLORATION_WEIGHT = 1000.0
 """Weight of the share of all cells that are unexplored and in view."""
 
 _REACH = 3.0
-"""Voxels are drawn up to so many times the sensor's range: a known wall that is too far away for
+"""Voxels are drawn up to this multiple of the sensor's range: a known wall that is too far away for
 a measurement promises nothing, which is not the same as an unseen one."""
 
 
@@ -324,7 +324,7 @@ class ActiveGS(GreedyPolicy):
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """The share of the utility less that of the path; the lots where nothing is of use."""
         is_reachable = np.isfinite(utilities["path"])
-        # All zero: the path alone would keep the robot where it is for ever.
+        # All zero: the path alone would keep the robot where it is.
         if not np.any(utilities["utility"][is_reachable]):
             return np.where(is_reachable, utilities["lot"], -np.inf)
         return super().weigh(utilities)

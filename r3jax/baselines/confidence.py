@@ -203,7 +203,7 @@ def glance(
 
     No pixel of the frame fell into these; the map counts them as seen for every policy
     (`mapping.seen`), and without the same rule here the noise in front of a surface would keep
-    Active-GS looking for ever. The normal is the one known so far: only pixels tell of normals.
+    Active-GS looking without end. The normal is the one known so far: only pixels tell of normals.
 
     Args:
         before: the sightings before the frame, row by row those of the map (`aligned`).

@@ -145,7 +145,7 @@ def known_information(
     """
     scene, camera = on_cpu((scene, camera))
     total = jax.tree.map(jnp.zeros_like, scene)
-    # One view a call: a scan would compile anew for every number of views.
+    # One view a call: a scan would be recompiled for every number of views.
     for pose in np.asarray(poses, np.float32):
         total = with_room(partial(_added, form=form), scene, camera, pose, total)
     return total
@@ -248,7 +248,7 @@ class FisherRF(OnlinePolicy):
         """The information that each view adds to that of all frames so far."""
         online, form = memory_of(situation), self.config.form
         camera = self.score_camera(situation.camera)
-        # Anew for each decision: the model has moved since, and with it what is known of it.
+        # Recomputed for each decision: the model has changed since, and its information with it.
         known = known_information(online.scene, camera, online.frames.T_world_camera, form)
         found = scores(online.scene, camera, candidates.poses_on_device(), known, form)
         lots = draw_lots(len(candidates.valid), key=key)

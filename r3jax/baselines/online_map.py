@@ -62,7 +62,7 @@ class MapSettings:
     """It does where the measured surface is nearer than the rendered one by this share."""
 
     steps: int = 10
-    """Steps of Adam per key frame; Adam begins anew at each."""
+    """Steps of Adam per key frame; Adam restarts at each."""
 
     recent: int = 3
     """Latest key frames in every batch."""
@@ -283,7 +283,7 @@ SUPPORT = 0.03
 """A key frame sees a Gaussian that weighs more than this at one of its pixels with depth."""
 
 _LONGEST_STEP = 3.2
-"""Steps of Adam are at most so many learning rates long: (1 - beta1) / sqrt(1 - beta2)."""
+"""Longest step of Adam [learning rates]: (1 - beta1) / sqrt(1 - beta2)."""
 
 
 class Keyframes(eqx.Module):
@@ -430,7 +430,7 @@ def _with_births(online: OnlineMap, settings: MapSettings, rng: np.random.Genera
     more = len(born.means)
     capacity = max(online.scene.capacity, _length_for(num + more))
     scene, marks = grown((online.scene, online.marks), capacity)
-    # On the host: on the device, every number of births would compile anew.
+    # On the host: on the device, every number of births would be compiled.
     scene, rows = jax.tree.map(np.array, scene), slice(num, num + more)
     scene.means[rows], scene.quats[rows] = born.means, born.quats
     scene.log_scales[rows], scene.opacity_logits[rows] = born.log_scales, 0.0
@@ -538,13 +538,13 @@ def _trained(online: OnlineMap, settings: MapSettings, rng: np.random.Generator)
 
 
 def _filled_up(rows: np.ndarray, capacity: int) -> Int[np.ndarray, " r"]:
-    """Rows to one of few lengths, as each compiles anew; the last ones lie beyond the capacity."""
+    """Pads rows to one of few lengths, as each is compiled; the last lie beyond the capacity."""
     beyond = capacity + np.arange(_length_for(len(rows)) - len(rows))
     return np.concatenate([rows, beyond]).astype(np.int32)
 
 
 def _length_for(num: int) -> int:
-    """The first of the few lengths that holds so many rows."""
+    """Returns the first of the few lengths that holds this number of rows."""
     length = FIRST_CAPACITY
     while length < num:
         length *= 2

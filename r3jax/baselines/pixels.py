@@ -45,7 +45,7 @@ class PixelView(eqx.Module):
     """From the voxel's center to the camera [m]; meaningless where there is none."""
 
     rows: Any
-    """What was asked for about the voxels, `[..., h, w]` each; meaningless where there is none."""
+    """The requested quantities of the visible voxel, `[..., h, w]`; undefined where none is."""
 
     cells: Float[Array, ""]
     """Visible unexplored cells of the coarse grid; pixels without a voxel hide nothing."""

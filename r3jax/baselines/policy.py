@@ -50,7 +50,7 @@ class OnlinePolicy(GreedyPolicy):
 
     @property
     def map_settings(self) -> MapSettings:
-        """How the map is kept, at the size that was asked for."""
+        """Settings of the map, at the requested size."""
         return replace(self.settings, image_width=self.config.train_width)
 
     def note(self, online: OnlineMap) -> OnlineMap:

@@ -121,7 +121,7 @@ def terms_in_scene(cell: Cell) -> dict[str, object]:
 
 
 def differing(first: Mapping[str, object], other: Mapping[str, object]) -> list[str]:
-    """Lists the terms that are not the same; one that an old record lacks counts as None."""
+    """Lists the terms that are not the same; one missing from an old record counts as None."""
     names = dict.fromkeys((*first, *other))
     return [name for name in names if first.get(name) != other.get(name)]
 

@@ -26,7 +26,7 @@ def in_batches(
     """Applies a function to slices of arrays along their first axis and joins the results.
 
     All slices have one length: the last reaches back over images that are done already, because
-    a shorter one would compile anew.
+    a shorter one would be recompiled.
 
     Args:
         call: takes as many arrays as are given, [b, ...] each, and returns [b, ...].

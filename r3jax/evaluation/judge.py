@@ -30,7 +30,7 @@ from r3jax.splatting.views import Views, load_views
 from r3jax.validation.json_text import sealed
 
 OnProgress = Callable[[str, int], None]
-"""Told that a stage of so many steps begins, or, without a name, that so many steps are done."""
+"""Receives a stage's name and number of steps, or, without a name, the steps just done."""
 
 NETWORKS = {"alex": "AlexNet", "vgg": "VGG16"}
 """The networks of LPIPS."""
@@ -274,7 +274,7 @@ def write_judgment(
     Args:
         judgment: what came out.
         folder: where to.
-        spec: how the test views were asked for.
+        spec: the specification of the test views.
         rows: kind of the file with one row per view.
         worst: views on the contact sheet; 0 draws none.
 

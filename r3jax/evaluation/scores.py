@@ -33,7 +33,7 @@ class ViewRow:
     """In [-1, 1]."""
 
     lpips: float | None
-    """0 and up, lower is better; None where it was not asked for."""
+    """0 and up, lower is better; None where it was not requested."""
 
     psnr_measured: float
     """PSNR over the pixels with a depth measurement [dB]: holes of the scan (windows, mirrors,

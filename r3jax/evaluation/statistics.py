@@ -1,7 +1,7 @@
 """Means over scenes, seeds and views, and differences of methods, with intervals.
 
 Intervals are percentile bootstraps (Efron 1979) at 95 %. Scenes are the fixed set that a table
-names: views and seeds are drawn anew, scenes never.
+names: views and seeds are resampled, scenes never.
 
 Shape symbols used throughout:
     S  seeds      V  test views of a scene      R  resamples

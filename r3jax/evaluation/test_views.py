@@ -140,7 +140,7 @@ def compute_view_set(
             more views than this; None: keep all.
 
     Raises:
-        ValueError: settings out of range, fewer than six views asked for, or none found.
+        ValueError: settings out of range, fewer than six views requested, or none found.
     """
     if max_views is not None and max_views < len(LOOKS):
         raise ValueError(
@@ -182,7 +182,7 @@ def load_view_set(
 ) -> ViewSet:
     """The stored test views of a scene; computed and stored if they are not there yet.
 
-    Several processes may ask at once: whoever is first, all get the same views.
+    Several processes may call this at once: all get the same views.
 
     Args:
         folder: where sets are kept; created if it is missing.

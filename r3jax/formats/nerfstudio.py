@@ -8,7 +8,7 @@ OpenGL camera axes (x right, y up, z backward), camera to world, pixel centers a
 Read, poses stay in the coordinates of the file, as do the points of `ply_file_path`: those are the
 capture's own, and suggested cameras have to come back in them. `applied_transform` says how they
 were made of the coordinates of an earlier program; it is kept and not undone. `applied_scale` is
-undone where there are depth images, which nobody scaled: poses are in their units again.
+undone where there are depth images, which were not scaled: poses are in their units again.
 
 Written, they are in meters, world z up. Depth images are uint16; one step is
 `depth_unit_scale_factor` meters; 0 is no measurement and `depth_beyond_range_value` means that
@@ -211,7 +211,7 @@ def _applied(content: _Fields) -> np.ndarray | None:
 
 
 def _applied_scale(content: _Fields) -> float:
-    """What all positions were multiplied by; 1 where nobody says so."""
+    """What all positions were multiplied by; 1 where the file does not say."""
     scale = content.get("applied_scale")
     check_type("applied_scale", scale, float | None)
     if scale is None:

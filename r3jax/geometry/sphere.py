@@ -23,7 +23,7 @@ def _lattice(num: int) -> np.ndarray:
     azimuth = 2.0 * np.pi * k / GOLDEN_RATIO
     radius = np.sqrt(1.0 - z * z)
     points = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
-    # Cached and shared by all callers: nobody may write into it.
+    # Cached and shared by all callers: it must stay read-only.
     points.flags.writeable = False
     return points
 

@@ -114,7 +114,7 @@ def _leaders(
         scratch = jnp.full(num_slots, -1, dtype=jnp.int32)
         # `max` commutes: who leads does not depend on the order of the scatter.
         scratch = scratch.at[jnp.where(waiting, slot, num_slots)].max(point, mode="drop")
-        # Slots for which nobody waits hold -1, which would read from the end.
+        # Slots without a waiting point hold -1, which would read from the end.
         elected = jnp.maximum(scratch[slot], 0)
         # Voxels may share a slot: only points with the winner's very key follow it.
         agrees = waiting & (low[elected] == low) & (high[elected] == high)

@@ -7,7 +7,7 @@ The model, per cell and frame (log-odds as in Active-GS, Jin et al. 2025):
     pass  - step: at least half of the cell was seen through, and no point of the frame lies in it
     else    0, and the sum is clipped to +-4.5
 
-One look decides (a cell at 5 m gets 1.4 > ln 4). *Seen through* is asked of the centers of the
+One look decides (a cell at 5 m gets 1.4 > ln 4). **Seen through* is tested at the centers of the
 cell's eight octants. Such a point passes if it lies in the image, within range, and before
 the nearest measurement of its block of pixels (about one degree wide), short of it by a quarter
 of a cell. Asking the cells, not walking the rays, leaves no gaps far away, lets no ray that only
@@ -76,7 +76,7 @@ class OccupancyGrid(eqx.Module):
     cell_size: Float[Array, ""]
     """Edge of a cell [m]."""
 
-    worth_a_look: Bool[Array, "X Y Z"] | None = None
+    explorable: Bool[Array, "X Y Z"] | None = None
     """Mask of the cells that count as unexplored while nothing is known of them; None: all."""
 
     @property
@@ -92,21 +92,21 @@ class OccupancyGrid(eqx.Module):
     @property
     @jax.jit  # one program, not one for every operation: planning asks outside of jit
     def unexplored(self) -> Bool[Array, "X Y Z"]:
-        """Cells that are neither, and worth a look."""
-        # The mask never makes a known cell unexplored, only an unknown one not worth a look.
+        """Cells that are neither, and may be explored."""
+        # The mask never makes a known cell unexplored; it only drops unknown ones.
         unknown = ~(self.free | self.occupied)
-        return unknown if self.worth_a_look is None else unknown & self.worth_a_look
+        return unknown if self.explorable is None else unknown & self.explorable
 
     def ignoring(self, cells: Bool[Array | np.ndarray, "X Y Z"]) -> "OccupancyGrid":
-        """Masks cells out for one decision: they are not worth a look, whatever they hold.
+        """Masks cells out for one decision: they do not count, whatever they hold.
 
         What is known of them stays: a planner that wrote them as occupied would have a robot's
-        body collide with space that nobody has seen.
+        body collide with space that was never seen.
         """
         left = jnp.asarray(~cells, dtype=bool)
-        if self.worth_a_look is not None:
-            left = left & self.worth_a_look
-        return replace(self, worth_a_look=left)
+        if self.explorable is not None:
+            left = left & self.explorable
+        return replace(self, explorable=left)
 
 
 def cells_of(grid: OccupancyGrid) -> Cells:

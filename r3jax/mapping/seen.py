@@ -2,7 +2,7 @@
 
 A frame's points do not touch all that it sees: of a floor seen at a grazing angle one voxel in
 five, of what lies on a depth edge or behind glass none. Such a voxel would keep a low
-renderability however often one looks at it, and a planner would look for ever.
+renderability however often it is in view, and a planner would look at it without end.
 
 Shape symbols: N capacity of the map; M voxels at a time; W words of bins; H W image size.
 """
@@ -161,7 +161,7 @@ def rows_in_view(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> 
     """Finds the voxels within range that the frame shows.
 
     Where it has a measurement, those whose center is no farther. Where it has none, those that no
-    other voxel hides: the color image shows what lies behind glass all the same, and whatever
+    other voxel hides: the color image shows what lies behind glass anyway, and whatever
     the map does not know of is in front of it in every later view from here, too.
     """
     camera, T = frame.camera, invert_pose(frame.T_world_camera)

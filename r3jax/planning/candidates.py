@@ -46,7 +46,7 @@ class Candidates(eqx.Module):
     """Camera centers in the world [m]; float64, because a path ends exactly there."""
 
     direction: Float[np.ndarray, "C 3"]
-    """Lines of sight, world, of any length but 0: whoever scales them rounds them."""
+    """Lines of sight, world, of any length but 0: scaling would round them."""
 
     valid: Bool[np.ndarray, " C"]
     """False for padding: it repeats views that are valid, and is never chosen."""
@@ -162,7 +162,7 @@ def draw_positions(
         robot can stop nowhere.
     """
     frontier_key, local_key = jax.random.split(key)
-    # Of the masked grid: a frontier that nobody can get beyond is none.
+    # Of the masked grid: a frontier that cannot be passed is none.
     targets = np.asarray(frontier(scoring_grid))
     positions, aims = region_of_interest(travel, targets, config.num_frontier, key=frontier_key)
     # What the frontier leaves goes to local positions: every decision scores the same number.
@@ -253,7 +253,7 @@ def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
     Returns:
         Indices of cells, [n, 3], n <= 256.
     """
-    # Imported only here: whoever plans no way does not wait for Numba.
+    # Lazy import: Numba is only loaded when a path is planned.
     from r3jax.kernels.robot.cells import nearest_in_ring
 
     reach = int(np.ceil(VIEW_DISTANCE[1] / travel.cell_size))

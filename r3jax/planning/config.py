@@ -52,7 +52,7 @@ class PlannerConfig:
     """A climb ends at this distance along each axis [m]; 0: it turns the view and no more."""
 
     motion: Motion = field(default_factory=Motion)
-    """What carries the camera: where it may be, how it may look and how fast it goes."""
+    """The robot: where it may be, how it may look and how fast it goes."""
 
     scoring: ScoringConfig = field(default_factory=ScoringConfig)
     """Settings of the utilities, lambda1 among them."""

@@ -311,7 +311,7 @@ def look_round(
         map_state, grid, state.camera, jnp.asarray(T_world_camera, jnp.float32), config.scoring
     )
     state = replace(state, looks=state.looks + np.asarray(visible, dtype=np.int32))
-    # After that many, more would not help, and the utility would call for them for ever.
+    # After that many, more would not help, and the utility would never stop calling for them.
     is_exhausted = state.looks >= MAX_FAILED_LOOKS
     scoring_grid = mask_unexplorable(grid, travel.reachable, is_exhausted)
     limits = Limits(motion, pose, travel.heights)

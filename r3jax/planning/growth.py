@@ -1,6 +1,6 @@
 """Compiles for the next size of a map before it is needed.
 
-A table that grows has another shape, and everything is compiled anew for it: many seconds in which
+A table that grows has another shape, and everything is recompiled for it: many seconds in which
 a robot stands still. While there is room yet, the programs of `observe` and `decide` are compiled
 in a thread, by running both on a copy of the map in a larger table; the copy is thrown away.
 """

@@ -109,7 +109,7 @@ def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) 
             f"{config.safety_margin} m: integrate a frame with depth, or give poses"
         )
     centers = centers_on_host(grid, cells)
-    # Spread, not drawn: the same map gives the same list, and no seed is asked for.
+    # Spread, not drawn: the same map gives the same list, and no seed is needed.
     return centers[spread(centers, config.num_candidates)]
 
 
@@ -119,7 +119,7 @@ def _checked(poses: ArrayLike, k: int) -> np.ndarray:
         raise ValueError(f"poses must have shape [C, 4, 4], got {checked.shape}")
     if len(checked) < k:
         raise ValueError(f"{k} views cannot be chosen from {len(checked)} poses, each at most once")
-    # A pose that is not rigid would be scored all the same, and the number would mean nothing.
+    # A pose that is not rigid would be scored, too, and the number would mean nothing.
     for i, pose in enumerate(checked):
         if (error := rigid_error(pose)) is not None:
             raise ValueError(f"pose {i}: {error}")

@@ -81,7 +81,7 @@ class Situation:
     """Grid as it is; for travel."""
 
     scoring_grid: OccupancyGrid
-    """The same with a mask of the cells that are worth a look (`look_round`); for
+    """The same with a mask of the cells that count (`look_round`); for
     utilities."""
 
     travel: Travel
@@ -163,7 +163,7 @@ class PlansAhead(Policy, Protocol):
     ) -> tuple[Decision | None, Any, PlanInfo]:
         """Decides again among the best candidates of a decision, on what has come in since.
 
-        None: no path leads to any of them, and the policy is asked to decide anew.
+        None: no path leads to any of them, and the policy has to decide again.
         """
         ...
 
@@ -172,7 +172,7 @@ class PlansAhead(Policy, Protocol):
 class LivesOutside(Policy, Protocol):
     """A policy whose memory is in a program of its own: it cannot be stored, and must be ended.
 
-    A run of it is gone on with from its first view: the program is shown and asked all anew.
+    Resuming a run of it shows the program all frames from the first view on, and decides again.
     """
 
     def close(self) -> None:

@@ -4,7 +4,7 @@ A direction is an azimuth and an elevation [rad]. A turn is as long as the strai
 directions, azimuth wrapped: what a camera without roll turns through, and no less than the angle of
 the rotation. Every piece of a path allows for a turn of some size. A direction is feasible if the
 camera can turn to it on the piece before, and from it to the view at the end on the pieces after:
-no look on the way makes the camera late.
+no frame captured while moving makes the camera late.
 
 On the host: NumPy. Shape symbols: n pieces of a path, the last one ends at the chosen view; m
 directions; B bins of a panorama.
@@ -153,7 +153,7 @@ def axes_within(
 def worthwhile_grid(
     grid: OccupancyGrid, places: np.ndarray, exhausted: np.ndarray | None
 ) -> OccupancyGrid:
-    """The grid for a look on the way: without cells that nobody could look at, or did in vain.
+    """Masks the grid for frames while moving: drops cells that cannot be seen, or were given up.
 
     Args:
         grid: the grid.

@@ -57,7 +57,7 @@ def floor_picture(
     shape = np.asarray(grid.log_odds.shape)
     layer = int(np.clip((height - origin[2]) / cell, 0, shape[2] - 1))
     voxel = float(map_state.voxel_size)
-    # A pixel shows a voxel, unless the cells are so much larger that nobody could see one.
+    # A pixel shows a voxel, unless the cells are so much larger that one could not be seen.
     scale = max(1, min(round(cell / voxel), _LARGEST // int(shape[:2].max())))
     picture = np.full((*shape[:2], 3), _UNKNOWN)
     picture[np.asarray(grid.free)[:, :, layer]] = _FREE
@@ -111,7 +111,7 @@ def panorama_picture(
     Args:
         map_state: the voxels.
         grid: free and unexplored space.
-        camera: its focal length sets the resolution that is asked for.
+        camera: its focal length sets the target resolution.
         T_world_camera: the pose, [4, 4].
         max_range: range of the sensor [m].
     """

@@ -168,7 +168,7 @@ def scene_of_run(run: Run) -> SceneSettings:
         RunError: the header does not say.
     """
     scene = run.header.scene
-    # Headers of earlier versions lack what there was not yet.
+    # Headers of earlier versions do not have the fields added since.
     given: dict[str, Any] = {"up": None, "scale": 1.0, "cull_backfaces": False} | scene
     try:
         how: dict[str, Any] = {name: given[name] for name in _RECORDED}

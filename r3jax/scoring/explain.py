@@ -2,7 +2,7 @@
 
     U = lambda1 U_G + sum of (1 - R),    R = bias x noise x resolution        (arXiv 2601.07484)
 
-The first term is space that was never seen. What a visible voxel lacks, 1 - R, is divided among
+The first term is space that was never seen. The deficit of a visible voxel, 1 - R, is divided among
 the factors of R in proportion to their logarithms, because these add up to that of R. A factor
 of 1 so takes nothing, the order of the factors makes no difference, and a factor that falls to 0
 takes all: the limit of the rule, so no floor is needed. The paper has no such division.
@@ -68,7 +68,7 @@ def explain_view(
 
     Args:
         state: the map.
-        grid: whose unexplored cells count; planners count those worth a look only.
+        grid: whose unexplored cells count; planners count explorable ones only.
         camera: of the view, its focal length in the unit that the map was made with.
         T_world_camera: the view.
         config: lambda1, range, and settings of the closed forms.
@@ -96,14 +96,14 @@ def _divide_visible(
     focal: Float[Array, ""],
     forms: Forms,
 ) -> _Sums:
-    """What the visible voxels lack, by cause; summed in the order in which U_R is."""
+    """Deficits of the visible voxels by cause; summed in the order in which U_R is."""
     num = voxels.capacity
 
     def add(index: Int[Array, " K"], valid: Bool[Array, " K"], sums: _Sums) -> _Sums:
         shares, totals = sums
         terms = score_voxels(voxels.take(index, valid), position, focal, forms)
         factors = jnp.stack([terms.bias, terms.noise, terms.resolution])
-        part = jnp.where(valid[None, :], divide_lack(1.0 - terms.value, factors), 0.0)
+        part = jnp.where(valid[None, :], attribute_deficit(1.0 - terms.value, factors), 0.0)
         target = jnp.where(valid, index, num)  # out of range on purpose: dropped
         return shares.at[:, target].set(part, mode="drop"), totals + jnp.sum(part, axis=1)
 
@@ -111,22 +111,24 @@ def _divide_visible(
     return for_selected(visible, add, start)
 
 
-def divide_lack(lack: Float[Array, " n"], factors: Float[Array, "F n"]) -> Float[Array, "F n"]:
-    """Divides what products of factors lack to 1 among the factors.
+def attribute_deficit(
+    deficit: Float[Array, " n"], factors: Float[Array, "F n"]
+) -> Float[Array, "F n"]:
+    """Attributes the deficit 1 - prod(f) to the factors, in proportion to -log f.
 
-    share of f = lack log(f) / sum of the logarithms; if factors are 0, they share alike, and
+    share of f = deficit log(f) / sum of the logarithms; if factors are 0, they share alike, and
     the others take nothing.
 
     Args:
-        lack: 1 - the product of the factors.
+        deficit: 1 - the product of the factors.
         factors: each in [0, 1].
 
     Returns:
-        Shares >= 0 that sum to `lack`; all 0 where nothing lacks.
+        Shares >= 0 that sum to `deficit`; all 0 where it is 0.
     """
     is_zero = factors < _LEAST
     cost = -jnp.log(jnp.where(is_zero, 1.0, factors))
     weight = jnp.where(jnp.any(is_zero, axis=0)[None, :], is_zero.astype(factors.dtype), cost)
     total = jnp.sum(weight, axis=0)
-    # Nothing lacks where all weights are 0, and 0 / 0 must not become NaN.
-    return weight * (lack / jnp.where(total > 0.0, total, 1.0))[None, :]
+    # The deficit is 0 where all weights are 0, and 0 / 0 must not become NaN.
+    return weight * (deficit / jnp.where(total > 0.0, total, 1.0))[None, :]

@@ -46,7 +46,7 @@ def gather_in_range(
 
 
 def _sizes(voxels: int, cells: int, capacity: int, num_cells: int) -> tuple[int, int]:
-    """Room for so many voxels and cells, in few different pairs.
+    """Rounds numbers of voxels and cells up to one of a few pairs.
 
     The cells get as much as the voxels, or all that there are.
     """

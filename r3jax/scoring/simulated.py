@@ -1,4 +1,4 @@
-"""A view that nobody has taken yet, as if it had been: what the map would know then.
+"""The map as it would be after a view that is not taken yet.
 
 A hypothetical observation of every voxel that the view would show:
 
@@ -8,8 +8,8 @@ A hypothetical observation of every voxel that the view would show:
     m2          m2 n / (n - 1) for n > 1: the variance m2 / (n - 1) stays, as it would on average if
                 the new color scattered like the others. A view cannot talk noise away.
 
-Colors and surfaces stay: what nobody has seen cannot be foreseen. So no renderability ever falls,
-from wherever it is asked; and the order of hypothetical views does not matter.
+Colors and surfaces stay: unseen space cannot be predicted. So no renderability ever falls,
+seen from anywhere; and the order of hypothetical views does not matter.
 
 Shape symbols: N rows of the map; n voxels; c cells; M voxels at a time.
 """
@@ -61,7 +61,7 @@ def imagine_view(
 ) -> tuple[MapState, OccupancyGrid]:
     """Map and grid for a decision that takes a view as taken.
 
-    The unexplored cells that the view would show are not worth a look.
+    The unexplored cells that the view would show no longer count.
 
     Args:
         map_state: the map before.

@@ -50,7 +50,7 @@ _WIDEST = math.radians(75.0)
 """Half the field of view in which they are collected, at most [rad]: a plane cannot show 90."""
 
 _RANGE_MARGIN = 1.2
-"""Points are collected up to so many times the range."""
+"""Points are collected up to this multiple of the range."""
 
 
 class SoftUtility(eqx.Module):

@@ -135,7 +135,7 @@ class GroundTruth:
         """Least distances to a surface along paths, and where it is that.
 
         Sampled every 2 cm. Glass that no depth sensor sees (`Material.is_hole`) does not count:
-        nobody who explores can know of it.
+        no explorer can detect it.
 
         Args:
             paths: waypoints [K, 3] [m] of each, one at least.

@@ -51,7 +51,7 @@ _STRIP = 5
 def check_claims(path: Path, tree: dict[str, Any]) -> None:
     """Refuses a glTF file that claims, or repeats, far more than it stores.
 
-    Room is made for what is claimed, for every primitive anew.
+    Memory is allocated for what is claimed, for every primitive.
 
     Args:
         path: the file; its buffers lie in it or beside it.
@@ -97,7 +97,7 @@ def _stored(path: Path, tree: dict[str, Any]) -> int:
             try:
                 stored += check_regular(path.parent / urllib.parse.unquote(name))
             except (OSError, ForeignFileError):
-                continue  # whoever opens it says what is wrong with it
+                continue  # opening it reports what is wrong with it
     return stored
 
 

@@ -30,7 +30,7 @@ Backend = Literal["auto", "numba", "xla", "splax", "reference"]
 
 
 class RasterConfig(eqx.Module):
-    """How to rasterize; all of it structure: another value compiles anew."""
+    """How to rasterize; all of it static: another value recompiles."""
 
     backend: Backend = eqx.field(static=True, default="auto")
     """`numba` on CPUs, `splax` on NVIDIA GPUs where it is installed, `xla` everywhere else;
@@ -47,7 +47,7 @@ class RasterConfig(eqx.Module):
     """`xla`: Gaussians composited at a time in each tile."""
 
     def budget(self, num_gaussians: int) -> int:
-        """The budget of intersections for so many Gaussians."""
+        """Returns the budget of intersections for this number of Gaussians."""
         if self.max_intersections is not None:
             return self.max_intersections
         return fitting_budget(max(8 * num_gaussians, 1 << 14), headroom=1.0)

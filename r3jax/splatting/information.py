@@ -101,7 +101,7 @@ def with_room(
 ) -> Any:
     """Calls `function(config, scene, *args)` with a budget that every view fits into.
 
-    Not to be called under jit: a view that overflows is asked for again, with a larger budget.
+    Not to be called under jit: a view that overflows is rendered again, with a larger budget.
     """
     config = RasterConfig()
     result, overflow = function(config, scene, *args)

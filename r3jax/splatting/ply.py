@@ -104,9 +104,9 @@ def read_scene(path: Path | str) -> GaussianScene:
     the file may be binary of either byte order or text, and hold other elements.
 
     Raises:
-        SceneFileError: the file is missing, not a PLY, cut off, lacks fields, is compressed, is
-            not what its hash was made of, or holds no Gaussians, numbers that are not finite or
-            rotations that are zero.
+        SceneFileError: the file is missing, not a PLY, cut off, compressed, without needed
+            fields, not the content that its hash was made of, or holds no Gaussians, numbers that
+            are not finite or rotations that are zero.
     """
     path = Path(path)
     try:

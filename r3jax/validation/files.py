@@ -21,7 +21,7 @@ _MAX_POINTER = 1024
 def check_regular(path: str | Path) -> int:
     """Size of a regular file [bytes]; links are followed.
 
-    Opening a pipe would wait for ever, and a device such as /dev/zero has no end.
+    Opening a pipe would block, and a device such as /dev/zero has no end.
 
     Raises:
         ForeignFileError: a folder, a pipe, a device, no name of a file at all, or a pointer of Git
@@ -63,7 +63,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
             f"the file has {size >> 20} MiB, more than {limit >> 20} MiB: it is something else"
         )
     with open(path, "rb") as file:
-        # Python makes room for all that is asked for, before it reads.
+        # Python allocates the requested size before it reads.
         return file.read(min(limit, max(size, _SMALL)))
 
 
@@ -75,7 +75,7 @@ def plain_text(data: bytes) -> bytes:
 
 
 def check_tree(folder: Path) -> None:
-    """Refuses a folder with pipes or devices below it: a library would wait for them for ever.
+    """Refuses a folder with pipes or devices below it: a library would block on them.
 
     Raises:
         ForeignFileError: says which.

@@ -156,7 +156,7 @@ def build(kind: type[T], plain: Any, /, **ready: Any) -> T:
 
 
 def check_fields(name: str, record: Any, kinds: Mapping[str, Any]) -> None:
-    """Refuses a JSON object that lacks fields, or has them of other types; others may be there.
+    """Refuses a JSON object with missing fields or fields of other types; others may be there.
 
     Raises:
         ForeignFileError: says which field of `name`.

@@ -103,4 +103,4 @@ def test_masks_add_up_and_what_is_known_stays():
     np.testing.assert_array_equal(masked.unexplored, (np.arange(4) == 3)[:, None, None] & ~free)
     np.testing.assert_array_equal(masked.free, grid.free)
     assert not masked.occupied.any()
-    assert grid.worth_a_look is None
+    assert grid.explorable is None

@@ -30,12 +30,14 @@ def lack_of(factors: np.ndarray) -> np.ndarray:
     return np.float32(1) - factors[0] * factors[1] * factors[2]
 
 
-_divide_lack = jax.jit(explain.divide_lack)
+_attribute_deficit = jax.jit(explain.attribute_deficit)
 
 
 def divided(factors: np.ndarray) -> np.ndarray:
     """Shares of every column, in float64."""
-    return np.asarray(_divide_lack(jnp.asarray(lack_of(factors)), jnp.asarray(factors)), np.float64)
+    return np.asarray(
+        _attribute_deficit(jnp.asarray(lack_of(factors)), jnp.asarray(factors)), np.float64
+    )
 
 
 def by_hand(factors: np.ndarray) -> np.ndarray:
@@ -159,7 +161,7 @@ def test_the_division_reaches_every_branch() -> None:
         ],
         np.float32,
     )
-    shares = explain.divide_lack(jnp.asarray(lack_of(factors)), jnp.asarray(factors))
+    shares = explain.attribute_deficit(jnp.asarray(lack_of(factors)), jnp.asarray(factors))
     found = np.asarray(shares, np.float64)
     np.testing.assert_allclose(found, by_hand(factors), rtol=2e-6, atol=1.5e-7)
 

@@ -1,1 +1,1 @@
-"""What a capture that exists lacks for splats, and which views would mend it."""
+"""Audit of an existing capture: where splats of it would fail, and which views would mend it."""

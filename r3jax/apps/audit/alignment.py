@@ -55,7 +55,7 @@ class Alignment:
 
 
 def evenly_spaced(count: int, most: int) -> np.ndarray:
-    """At most so many indices of a sequence, from its first to its last, ascending."""
+    """Picks at most `most` indices of a sequence, from its first to its last, ascending."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 

@@ -45,7 +45,7 @@ SATURATED = 0.9
 each held out once, it was 0.96, and its rank correlation with PSNR -0.00."""
 
 _MAX_FAILED_LOOKS = 3
-"""Unexplored cells that so many images looked at in vain (glass, black) are left alone."""
+"""A cell still unexplored after this many images that should show it is given up."""
 
 
 @dataclass(frozen=True)

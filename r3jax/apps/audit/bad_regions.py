@@ -1,4 +1,4 @@
-"""The places where a capture lacks most: blocks of voxels that render badly, the worst first.
+"""The places with the largest deficit: blocks of voxels that render badly, the worst first.
 
 Shape symbols: N rows of the map; m bad voxels; X Y Z cells of the coarse grid.
 """
@@ -22,7 +22,7 @@ MOST_UNSEEN = 6
 """Unseen regions that are listed."""
 
 _SMALLEST = 0.02
-"""Smaller regions are not worth a line [square audit units]."""
+"""Smaller regions are not reported [square audit units]."""
 
 _FACES = ndimage.generate_binary_structure(3, 1)
 
@@ -99,7 +99,7 @@ def _worst_block(points: np.ndarray, loss: np.ndarray) -> np.ndarray:
 
 
 def unseen_edges(grid: OccupancyGrid, open_cells: np.ndarray) -> np.ndarray:
-    """Cells where known free space ends in what nobody has looked at, [X, Y, Z] bool.
+    """Finds cells where known free space borders on unseen space, [X, Y, Z] bool.
 
     Args:
         grid: free and occupied space.

@@ -74,7 +74,7 @@ def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: 
 
     Raises:
         FormatError, RunError: a file is missing or broken.
-        ValueError: so many voxels that they are surely too small.
+        ValueError: more voxels than any sensible voxel size would give.
     """
     whole, grid = _surfaces(source, survey, on_frame)
     count = min(folds, len(survey.chosen))

@@ -284,7 +284,7 @@ def score_from_standpoints(
         focal: focal length of the camera that would render [px], in the map's unit.
         config: of the closed forms.
     """
-    # Numbers of the standpoints; candidates are floats to whoever deals them out.
+    # Numbers of the standpoints, as floats: `map_over_devices` distributes floats.
     ids = jnp.arange(demand.position.shape[0], dtype=jnp.float32)
     part = functools.partial(_answers, state, demand, focal, config)
     value, terms, costs = map_over_devices(part, ids)

@@ -7,7 +7,7 @@ _LEAST = {"max_frames": 2, "folds": 2, "views": 0, "seed": 0}
 """Least values of settings that count something."""
 
 _MOST_VIEWS = 200
-"""A report of more is read by nobody."""
+"""More would make the report too long to read."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What is audited: posed images with some depth, whoever recorded them.
+"""The capture that is audited: posed images with some depth, from any device or program.
 
 An audit needs no more pixels than fall into a voxel each, and no more exactness than a voxel: so
 images are thinned out, not averaged, and lenses are straightened by taking the nearest pixel. Where
@@ -257,7 +257,7 @@ class Source:
     """The vertical, [3], where the format says so."""
 
     stride: int
-    """Every so many pixels are read."""
+    """Stride of the pixels that are read."""
 
     read: Callable[[int], Picture]
     """The thinned image of an index."""
@@ -437,7 +437,7 @@ def _thinned_colors(images: PosedImages, index: int, stride: int) -> tuple[np.nd
 
 
 def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
-    """Points that nobody says who sees: those of a model without tracks, or of a PLY."""
+    """Points without tracks: no image is known to see them (as in a PLY)."""
     if images.points is not None and len(images.points):
         xyz, rgb = images.points.xyz, images.points.rgb
     elif images.points_path is not None:

@@ -9,7 +9,7 @@ exactly, after `simulate_view`:
                  + the utility of the unexplored cells that the view shows
 
 in voxels: 1 is a voxel that could not be rendered at all, and then perfectly. Only voxels that the
-view shows can change, and only those that lack something can gain.
+view shows can change, and only those with a deficit can gain.
 
 Of all candidates the one with the largest gain is taken (`LazyGreedy`, the policy that `decide`
 asks), the map goes on as if it had been, the unexplored cells that it shows count no longer, and

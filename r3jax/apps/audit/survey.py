@@ -178,10 +178,10 @@ class Survey:
     """Twice the distance of the farthest camera from the median of all [capture units]."""
 
     unit: str
-    """`m`, or `u` where nobody knows what a unit is."""
+    """`m`, or `u` where the scale is unknown."""
 
     doubt: str | None = None
-    """How depth images and poses contradict each other, where they were to be trusted all the same;
+    """How depth images and poses contradict each other, where they were to be trusted anyway;
     None: they do not, or the capture would have been refused."""
 
     @property

@@ -157,7 +157,7 @@ class Conditions:
         )
 
     def train_config(self, seed: int) -> TrainConfig:
-        """Settings of the training: vanilla 3DGS, whoever chose the views."""
+        """Settings of the training: vanilla 3DGS, the same for every policy."""
         return TrainConfig(
             iterations=self.iterations,
             num_gaussians=self.gaussians,
@@ -237,7 +237,7 @@ class Cell:
     """SHA-256 of what the scene shows."""
 
     policy: str
-    """Who chooses the views."""
+    """The policy."""
 
     seed: int
     """Seed of exploration, sensor noise and training."""
@@ -304,7 +304,7 @@ def identity(cell: Cell) -> dict[str, Any]:
         # What was done before a policy had settings of its own stays done.
         planner = FORMER_SETTINGS | settings_of(policy)
     if not cell.conditions.exploration_config().captures and "motion" in planner:
-        planner["motion"].pop("fixed_camera", None)  # it decides on frames on the way alone
+        planner["motion"].pop("fixed_camera", None)  # only matters for frames captured while moving
     return {
         "version": IDENTITY_VERSION,
         "scene": cell.scene_hash,

@@ -250,7 +250,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 @functools.cache
 def machine() -> str:
-    """The kind of machine; its name is nobody's business."""
+    """The kind of machine; never its name, which is private."""
     import jax
 
     devices = jax.devices()
@@ -262,7 +262,7 @@ def machine() -> str:
 
 @functools.cache
 def source_commit() -> str | None:
-    """The commit of this package's source, `-dirty` if it was changed; None if nobody knows."""
+    """The commit of this package's source, `-dirty` if it was changed; None: not known."""
     package = Path(__file__).resolve().parents[2]
 
     def git(*words: str) -> str:

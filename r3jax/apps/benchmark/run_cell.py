@@ -1,7 +1,7 @@
 """One cell: explore once, then for each snapshot train from scratch, evaluate, and record.
 
-Whatever is finished stays finished: a process that is killed at any moment and started again
-goes on behind the last complete stage (a training behind its last checkpoint).
+Finished stages stay finished: a process that is killed at any moment and started again
+resumes after the last complete stage (a training after its last checkpoint).
 """
 
 import contextlib
@@ -269,7 +269,7 @@ def steps_within(run: Run, snapshot: str) -> tuple[StepRow, ...]:
     def is_within(numbered: tuple[int, StepRow]) -> bool:
         before, row = numbered
         seconds = row.seconds - row.charged.get("mapping", 0.0)
-        # A frame on the way belongs to the view that it was captured on the way to.
+        # A frame captured while moving belongs to the view at the end of its path.
         return budget.allows(
             views=before + 1, frames=row.step + 1, seconds=seconds, metres=row.metres
         )

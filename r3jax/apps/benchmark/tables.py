@@ -189,8 +189,8 @@ def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
     """The paper's table: methods x (SSIM, PSNR, LPIPS) by scenes and their mean.
 
     A field is the mean over seeds of the mean over the scene's test views. The last column is the
-    mean of the scenes, and missing for a method that lacks one: means over other scenes are not
-    comparable.
+    mean of the scenes, and missing for a method without one of them: means over other scenes are
+    not comparable.
 
     Args:
         cells: records of one snapshot; rows go in the order of `equal_terms.POLICIES`.

@@ -33,7 +33,7 @@ from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import pinhole_view
 
 REACH = 4.0
-"""Views show voxels up to so many times the sensor's range: what was measured from nearby is no
+"""Views show voxels up to this multiple of the sensor's range: what was measured from nearby is no
 hole when it is seen from afar."""
 
 TERMS = ("always", "unseen", "difficulty", "squared deficit", "difficulty x deficit")

@@ -1,6 +1,6 @@
-"""A forecast of the image quality all over a place, from the map alone; a goal for it ends a run.
+"""A forecast of the image quality throughout a place, from the map alone; a goal ends a run.
 
-While a place is being explored, nobody knows its free space: what is known to be free is too
+While a place is being explored, its free space is not known: what is known to be free is too
 little, and a forecast over it alone would be content with the first room. So the views whose
 quality is forecast stand wherever the space is free or unexplored, connects to what is known to be
 free, and keeps its distance from everything known to be occupied. That is too much while much is
@@ -88,7 +88,7 @@ def _sequence() -> np.ndarray:
 
 
 NUM_VIEWS = 96
-"""Views that a forecast looks at; a percentile of so many is known to a few hundredths of them."""
+"""Views that a forecast looks at; enough for a percentile to within a few hundredths."""
 
 _LEAST_SHOWN = 0.5
 """A view that shows less than this share of surface and nothing unexplored looks into the void
@@ -122,7 +122,7 @@ def forecast_map(
     max_range: float = 5.0,
     calibration: Calibration | None = None,
 ) -> Forecast:
-    """Forecasts the PSNR of views all over the place. Not to be called under jit.
+    """Predicts the PSNR of views throughout the scene. Not to be called under jit.
 
     Args:
         state: the map.
@@ -244,7 +244,7 @@ class Outlook:
             yield map_state, grid
 
     def add(self, frames: int, map_state: MapState, grid: OccupancyGrid) -> None:
-        """The forecast after so many frames, if there is none yet."""
+        """Makes the forecast after this number of frames, if there is none yet."""
         if frames not in self.frames:
             reach = config_of(self.run).max_range
             self.frames.append(frames)

@@ -21,7 +21,7 @@ from r3jax.runs.rows import paths_to
 from r3jax.scoring.explain import CAUSES
 
 _DOT, _CAPTURED_DOT = 26, 8
-"""Areas of the marks of views, and of frames that were captured on the way [pt^2]."""
+"""Areas of the marks of views, and of frames captured while moving [pt^2]."""
 
 
 def progress_figure(run: Run) -> Figure:
@@ -229,7 +229,7 @@ def outlook_lines(outlook: Outlook) -> list[str]:
 
 
 _MANY = 60
-"""From so many views on their bars touch: gaps would be narrower than a pixel."""
+"""From this number of views on, bars touch: gaps would be narrower than a pixel."""
 
 
 def utility_by_cause(
@@ -242,7 +242,7 @@ def utility_by_cause(
         states: as `explain_run` takes them.
 
     Returns:
-        [views, 4] float64, in the order of `CAUSES`; NaN for views that nobody chose.
+        [views, 4] float64, in the order of `CAUSES`; NaN for views that no policy chose.
 
     Raises:
         RunError: as `explain_run`.
@@ -264,7 +264,7 @@ def reasons_figure(utility: np.ndarray) -> Figure:
     Where much is unexplored, that hides the other causes in the shares.
 
     Args:
-        utility: by view and cause, [views, 4]; NaN for views that nobody chose.
+        utility: by view and cause, [views, 4]; NaN for views that no policy chose.
     """
     figure = style.new_figure(10.0, 5.2)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.6, 1.0])

@@ -70,7 +70,7 @@ def stage_times(run: Run) -> list[StageTime]:
 
 
 def count_of_views(run: Run) -> str:
-    """Views, and the frames that were captured on the way beside them."""
+    """Counts views and, beside them, frames captured while moving."""
     captured = sum(row.captured for row in run.rows)
     views = str(len(run.rows) - captured)
     return f"{views} + {captured} on the way" if captured else views

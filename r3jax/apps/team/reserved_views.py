@@ -1,8 +1,8 @@
 """A policy that decides as if views that others will take had been taken.
 
-Two cameras that know the same would want the same view. Whoever decides second takes the first
-one's view as taken: what it will show of the map is foreseen (`scoring.simulated`), and the
-unexplored cells in it are no longer worth a look. Nor are those that lie nearer to where the
+Two cameras that know the same would want the same view. The second to decide treats
+the first one's view as taken: its effect on the map is simulated (`scoring.simulated`), and the
+unexplored cells in it no longer count. Nor are those that lie nearer to where the
 other goes, unless nothing else is left: two cameras that see a door go through it one after the
 other for nothing. All that holds for one decision: neither the map nor the grid that is kept
 learns of it.
@@ -30,7 +30,7 @@ from r3jax.scoring.simulated import imagine_view
 
 @dataclass(frozen=True)
 class PromisedView:
-    """A view that somebody has decided to take, and nobody has seen yet."""
+    """A view that one robot has decided to take, and that is not taken yet."""
 
     camera: Camera
 
@@ -43,7 +43,7 @@ class ReservedViews:
     """Decides as another policy does, on what will be known once the promised views are taken."""
 
     policy: Policy
-    """Whose decisions are asked for."""
+    """The robot that decides."""
 
     promised: tuple[PromisedView, ...]
 
@@ -101,8 +101,8 @@ def without_yielded(
 ) -> OccupancyGrid:
     """The grid for a decision that leaves to others what lies nearer to them.
 
-    Cells that are nearer to one of the others than to here are not worth a look, unless that would
-    leave nothing to explore.
+    Cells that are nearer to one of the others than to here do not count, unless that would leave
+    nothing to explore.
 
     Args:
         grid: the coarse grid.
@@ -112,6 +112,6 @@ def without_yielded(
     # Two arrays at a time, never [K, X, Y, Z]; and squares order as distances do, without roots.
     nearest = functools.reduce(jnp.minimum, [squared_distance(grid, other) for other in others])
     is_yielded = nearest < squared_distance(grid, here)
-    # Asked of the frontier: cells that no free cell borders on are no work for anybody.
+    # Only frontier cells matter: no robot can explore cells that border on no free cell.
     is_left = jnp.any(frontier_unexplored(grid.ignoring(is_yielded)))
     return grid.ignoring(is_yielded & is_left)

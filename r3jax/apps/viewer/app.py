@@ -271,7 +271,7 @@ class App:
             self.controls.show_busy(f"{what}: being computed", 0.0)
 
     def _tell(self, error: Exception) -> None:
-        """Something went wrong: what was asked for will not come."""
+        """Something went wrong: the requested view will not appear."""
         self.controls.show_ready()
         self.controls.show_note(str(error) or type(error).__name__)
 

@@ -81,10 +81,10 @@ def surface_terms(
 
     Args:
         state: the map.
-        camera: its focal length sets the resolution that is asked for.
+        camera: its focal length sets the target resolution.
         positions: camera centers [P, 3] [m]; every direction round them counts.
         config: range and settings of the closed forms.
-        pad_to: at least so many positions are computed, so that a growing set compiles once.
+        pad_to: pads to this number of positions, so that a growing set compiles once.
     """
     given = np.asarray(positions, dtype=np.float32).reshape(-1, 3)
     missing = max(pad_to, 1) - len(given)
@@ -194,7 +194,7 @@ def blocks_of(map_state: MapState, budget: int = BUDGET) -> Blocks:
     if budget < 1:
         raise ValueError(f"budget must be at least 1 block, got {budget}")
     rows = np.flatnonzero(np.asarray(map_state.occupied))
-    # All rows, used or not: of another number of them, JAX would compile anew.
+    # All rows, used or not: another number of them would make JAX recompile.
     index = np.asarray(jnp.stack(unpack(map_state.key[0], map_state.key[1])))[:, rows]
     size = float(map_state.voxel_size)
     points = (index.astype(np.float64) + 0.5) * size

@@ -228,7 +228,7 @@ def export_film(
     Raises:
         FormatError: `out` is no name of a folder.
         RunError: the run has no view, or a frame is missing or broken.
-        ImportError: a film is asked for, and PyAV is not installed.
+        ImportError: a film needs PyAV, which is not installed.
         OSError: `out` holds something; the disk is full, not writable, ...
     """
     if "\0" in str(out):
@@ -268,7 +268,7 @@ def _fill(
 
 
 def _write_video(path: Path, pictures: Iterable[Path], rate: int) -> None:
-    """Writes an MP4 of pictures of `WIDTH` x `HEIGHT`, so many a second."""
+    """Writes an MP4 of pictures of `WIDTH` x `HEIGHT`, at a fixed frame rate."""
     av = load_av()
     encoder = next(name for name in ENCODERS if _is_known(name))
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:

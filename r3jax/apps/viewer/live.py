@@ -1,7 +1,7 @@
 """A running exploration on a page: the loop hands over references, another thread does the rest.
 
 The loop never waits for the page, nor for a browser: what it hands over goes into a queue. Nothing
-flows back: the run is the one that it would be if nobody watched.
+flows back: the run is the one that it would be without a viewer.
 """
 
 import queue

@@ -84,7 +84,7 @@ def recorded_points(run: Run, budget: int = POINT_BUDGET) -> tuple[np.ndarray, n
         frame = run.frame(row.step)
         depth, rgb = np.asarray(frame.depth), np.asarray(frame.rgb)
         v, u = np.nonzero((depth > 0.0) & np.isfinite(depth))
-        # Drawn anew for each view: a fixed pattern would show as lines.
+        # Drawn for each view: a fixed pattern would show as lines.
         chosen = np.random.default_rng(row.step).permutation(len(v))[:share]
         v, u = v[chosen], u[chosen]
         z = depth[v, u]

@@ -103,7 +103,7 @@ class Menu:
 
 
 class _Section:
-    """HTML that belongs to one view and pose, and is faint once another one is asked for."""
+    """HTML that belongs to one view and pose, and is faint once another one is selected."""
 
     def __init__(self, handle: viser.GuiHtmlHandle):
         """Takes over what the handle shows."""
@@ -266,7 +266,7 @@ class Controls:
         self._pictures.mark("being computed …")
 
     def mark_view_stale(self, step: int) -> None:
-        """The facts belong to another view than the one that is asked for."""
+        """Marks the facts as those of another view than the selected one."""
         self._facts.mark(f"opening view {step + 1} …")
 
     def show_busy(self, text: str, share: float) -> None:
@@ -282,7 +282,7 @@ class Controls:
             self._legend.content, self._bar.visible = content, False
 
     def show_ready(self) -> None:
-        """All that was asked for is shown."""
+        """Marks everything requested as shown."""
         self.show_legend(self._caption)
 
     def show_note(self, text: str) -> None:

@@ -38,7 +38,7 @@ class Context:
     grid: OccupancyGrid
 
     camera: Camera
-    """Camera of the run, at full size: its focal length sets the resolution that is asked for."""
+    """Camera of the run, at full size: its focal length sets the target resolution."""
 
     config: ScoringConfig = field(default_factory=ScoringConfig)
 
@@ -99,7 +99,7 @@ class CameraPreview:
     """The trained splats from here, RGB in [0, 1], [H, W, 3]."""
 
     truth: np.ndarray | None = None
-    """The true picture, RGB in [0, 1], [H, W, 3], where it was asked for."""
+    """The true picture, RGB in [0, 1], [H, W, 3], where it was requested."""
 
 
 def quick_preview_from(around: Context, T_world_camera: np.ndarray) -> QuickPreview:

@@ -222,7 +222,7 @@ class PlaceLayer:
         return _Drawing(show, moment, detail)
 
     def _known_at(self, moment: Moment, *, with_terms: bool) -> Known:
-        """Blocks and terms of a moment, from the few that are kept or made anew."""
+        """Blocks and terms of a moment, from a small cache or computed."""
         for has_terms in (True, with_terms):
             if (moment.step, has_terms) in self._known:
                 return self._known[moment.step, has_terms]
@@ -428,7 +428,7 @@ class QueryHandler:
         around = self._around(moment)
         glance = quick_preview_from(around, pose)
         yield functools.partial(self._show_glance, glance, moment.step)
-        if settings.place == PLACES[0]:  # drawn anew for another moment only, and then first
+        if settings.place == PLACES[0]:  # drawn again for another moment only, and then first
             yield from draw()
         look = preview_from(around, pose, glance)
         yield functools.partial(self._show_look, look, settings.layer.quantity, moment.step)
@@ -454,7 +454,7 @@ class QueryHandler:
             yield functools.partial(self._controls.show_busy, text, _REPLAYED * done / total)
 
     def _ground(self, moment: Moment) -> Iterator[Show]:
-        """The grid below the map, anew where the floor is seen to be elsewhere."""
+        """Draws the grid below the map again where the floor turns out to be elsewhere."""
         if moment.step == self._grounded:
             return
         self._grounded = moment.step
@@ -552,7 +552,7 @@ class QueryHandler:
 
     def forget_view(self) -> None:
         """What is shown of the view on the slider belongs to another one."""
-        self._view = None  # shown anew even if the slider comes back
+        self._view = None  # shown again even if the slider comes back
         self._canvas.show_lines("/candidates", np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), 0.0)
         self._candidates = None
 

@@ -48,9 +48,9 @@ def open_run_page(
         run: with at least one view.
         host: address to listen at.
         port: port to listen at; 0 takes any free one.
-        allow: further names under which the page may be asked for.
+        allow: further host names under which the page may be requested.
         model: name of the model to show; None: `last`, or the newest, or none.
-        with_scene: open the scene that the run was recorded in when it is asked for.
+        with_scene: open the scene that the run was recorded in when it is needed.
 
     Raises:
         ValueError, OSError: the port is in use, the address is not this machine's, there is no
@@ -113,7 +113,7 @@ def _splats(run: Run, name: str | None) -> tuple[GaussianScene, tuple[float, flo
 
 
 class RecordedScene:
-    """The scene that a run was recorded in, opened when first asked for: large ones take long."""
+    """The scene that a run was recorded in, opened on first use: large ones take long."""
 
     def __init__(self, run: Run):
         """Opens nothing yet."""

@@ -25,7 +25,7 @@ from r3jax.network import LOOPBACK, check_free, in_use
 
 
 class _PrivateServer(viser.ViserServer):
-    """Never opens a tunnel to the internet, whoever asks for it."""
+    """Never opens a tunnel to the internet, even on a page's request."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Declines."""
@@ -37,16 +37,16 @@ def open_server(host: str, port: int, allow: Collection[str] = ()) -> viser.Vise
     """Starts a server with an empty page.
 
     Args:
-        host: the address to listen at; nobody else can reach what listens at 127.0.0.1.
+        host: the address to listen at; 127.0.0.1 can be reached from this machine only.
         port: 0 takes any free one.
-        allow: names of machines under which the page may be asked for, and whose pages may use it,
+        allow: host names under which the page may be requested, and whose pages may use it,
             beside this machine's own.
 
     Raises:
         ValueError: no number of a port.
         OSError: the port is in use or not permitted, or the address is not one of this machine.
     """
-    check_free(host, port)  # viser tries a thousand ports, and any address for ever
+    check_free(host, port)  # viser tries a thousand ports, and any address without end
     # It would print a box of its own.
     with contextlib.redirect_stdout(io.StringIO()), _guarded(_Guard(host, allow)):
         server = _PrivateServer(host=host, port=port, label="r3jax", verbose=False)
@@ -126,7 +126,7 @@ _PATCHING = threading.Lock()
 
 @contextlib.contextmanager
 def _guarded(guard: _Guard) -> Generator[None]:
-    """Viser asks nobody whom to serve: what it serves with asks, while it starts."""
+    """Adds the check of host names while viser starts: viser itself has none."""
     serve = websockets.asyncio.server.serve
 
     def serve_guarded(*args: Any, process_request: _Hook | None = None, **options: Any) -> Any:
@@ -141,7 +141,7 @@ def _guarded(guard: _Guard) -> Generator[None]:
 
 
 def _answer(server: viser.ViserServer, host: str) -> int:
-    """The status of the page when it is asked for under a name."""
+    """Requests the page under a host name and returns the HTTP status."""
     connection = http.client.HTTPConnection(_reachable(server), server.get_port(), timeout=10.0)
     try:
         connection.request("GET", "/", headers={"Host": host})

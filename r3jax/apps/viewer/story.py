@@ -231,7 +231,7 @@ class Timeline:
         self._shown = moment
 
     def follow(self) -> Iterator[Moment]:
-        """Every state in order, each when it is asked for; `at` may be called in between.
+        """Yields every state in order, lazily; `at` may be called in between.
 
         Raises:
             RunError: as `at`.

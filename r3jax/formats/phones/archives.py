@@ -242,7 +242,7 @@ class Shot:
 def complete_shots(
     archive: Archive, shots: Sequence[Shot], total: int, advice: str, *, images: bool = True
 ) -> tuple[list[Shot], str | None]:
-    """Leaves out the frames that lack their depth image or image.
+    """Leaves out the frames without a depth image or an image.
 
     Args:
         archive: that holds them.

@@ -47,11 +47,11 @@ _MAX_VIDEO = 4 << 30
 
 
 _AHEAD = 90
-"""Frames so close before the next one asked for are decoded rather than jumped over."""
+"""Gap between requested frames up to which frames are decoded rather than skipped by a seek."""
 
 
 class Video:
-    """A video that is asked for its frames one by one, best in order."""
+    """A video that is read frame by frame, fastest in order."""
 
     def __init__(self, path: Path, source: Path | bytes):
         """Opens it and counts its frames without decoding them.

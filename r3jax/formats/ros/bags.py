@@ -89,7 +89,7 @@ class _BagPath(type(Path())):
 
 
 class Bag:
-    """An opened bag; it closes itself when nobody holds it any more."""
+    """An opened bag; it closes itself when it is garbage-collected."""
 
     def __init__(self, path: Path):
         """Opens it and reads what topics it has.
@@ -321,7 +321,7 @@ def unpack_chunk(data: bytes, compression: str, size: int | None = None) -> byte
 
 
 def _unpacked(data: bytes, compression: str, most: int) -> bytes:
-    """At most so many bytes of it."""
+    """Reads at most this number of bytes of it."""
     decompressor = _decompressor(compression)
     try:
         return decompressor.decompress(data, max_length=most)

@@ -70,7 +70,7 @@ _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 
 
 def stamp_of(message: Any, otherwise: int = 0) -> int:
-    """When a message was taken, by its header [ns]; `otherwise` where nobody filled it in."""
+    """When a message was taken, by its header [ns]; `otherwise` where it is not filled in."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or otherwise
 

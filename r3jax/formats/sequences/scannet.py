@@ -209,7 +209,7 @@ def _head(file: BinaryIO) -> _Head:
 
 
 def _counted(count: int, size: int) -> int:
-    """The number of frames, that must fit into a file of so many bytes."""
+    """Reads the number of frames, which must fit into a file of this size."""
     if not 0 < count <= size // _FRAME.size:
         raise ForeignFileError(f"it claims to hold {count} frames in {size} bytes: copy it again")
     return count

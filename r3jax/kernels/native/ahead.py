@@ -1,7 +1,7 @@
 """Compiles the kernels for CPUs in a process of its own, while the first planner begins.
 
-Numba holds Python's lock while it compiles, over a minute of one core for all kernels. Whoever
-has another core to spare finds them on the disk, or waits for the one that it needs
+Numba holds Python's lock while it compiles, over a minute of one core for all kernels. With
+a spare core the main process finds them in the cache, or waits only for the one that it needs
 (`ffi.register_handlers`). Afterwards the disk has them, and nothing is started.
 """
 

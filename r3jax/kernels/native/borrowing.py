@@ -24,7 +24,7 @@ _types: Any = types
 
 @intrinsic
 def borrowed(typingctx: Any, value: Any) -> Any:
-    """The same array that nobody owns; what else there is stays as it is, tuples inside."""
+    """Returns a view of each array in `value`, tuples included, without reference counting."""
 
     def without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
         if isinstance(kind, _types.BaseTuple):

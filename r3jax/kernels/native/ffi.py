@@ -203,7 +203,7 @@ def require_threads() -> str:
         Numba's threading layer; with `workqueue` the threads are ours.
 
     Raises:
-        ValueError: a threading layer was asked for that is not there.
+        ValueError: the requested threading layer is not installed.
     """
     with _starting:
         return _start_threads()

@@ -4,7 +4,7 @@ Left to itself Numba optimizes every function, makes machine code of it and link
 callers, which are optimized together with it once more: what stands at the end of a chain of six
 calls is compiled six times. The functions of a kernel are called by each other only. Here each is
 optimized once, together with the small ones that it calls. Large ones stand apart, and are joined
-to what calls them when the address of the whole is asked for.
+to what calls them when the address of the whole is needed.
 """
 
 # Numba's compiler has no types, and what is private in it may change with its version.
@@ -29,7 +29,7 @@ LARGE = 400
 
 
 class _Library(JITCodeLibrary):
-    """Code of a function, which becomes machine code when an address in it is asked for."""
+    """Code of a function, which becomes machine code when an address in it is needed."""
 
     _is_native = _is_apart = False
     environments: ClassVar[dict[str, Any]] = {}
@@ -61,7 +61,7 @@ class _Library(JITCodeLibrary):
     def _get_module_for_linking(self) -> Any:
         """The function and all that it calls, for what Numba compiles in its own way."""
         module = super()._get_module_for_linking().clone()
-        # Callers first: LLVM leaves out what nobody calls yet.
+        # Callers first: LLVM leaves out functions that have no caller yet.
         for library in reversed(self._apart):
             module.link_in(JITCodeLibrary._get_module_for_linking(library), preserve=True)
         return module

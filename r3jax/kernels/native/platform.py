@@ -24,7 +24,7 @@ def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Call
     """
     if not can_call_kernels():
         return default
-    # Both would be traced, which takes a fifth of a short run, for one that nobody can ask for.
+    # Both would be traced, which takes a fifth of a short run, for one that cannot be used.
     if is_cpu_only():
         return cpu
     return functools.partial(jax.lax.platform_dependent, cpu=cpu, default=default)

@@ -37,7 +37,7 @@ def shortest_paths(
         Lengths between cells' centers [cells], inf where there is no way; and the flat index of
         the cell before, -1 at the start and where there is no way.
     """
-    # A border of cells that nobody may use: no step needs to be checked against the edges.
+    # A border of closed cells: no step needs to be checked against the edges.
     padded = np.pad(usable, 1)
     cost = np.full(padded.size, np.inf)
     previous = np.full(padded.size, -1, dtype=np.int64)

@@ -63,8 +63,8 @@ def _num_directions(record, words):
 def _unpack_sorted(records, begin, end, words, counts, voxels):
     """Unpacks records, those that were seen from few directions first.
 
-    A counting sort. Loops over the directions of one voxel after the other then end after as many
-    turns as the ones before, which the processor foresees.
+    A counting sort. Neighboring voxels then have equal trip counts, so that loop exits are
+    predicted.
     """
     counts[:] = 0
     for i in range(begin, end):
@@ -88,7 +88,7 @@ def _unpack_sorted(records, begin, end, words, counts, voxels):
 
 @kernel
 def empty_voxels(num, num_words):
-    """Room for so many voxels, with so many words of 32 bins."""
+    """Allocates room for this number of voxels, with the given number of 32-bit words of bins."""
     return Voxels(
         np.empty((SIZE, num), np.float32), np.empty(((num_words + 1) // 2, num), np.uint64),
         np.empty(num, np.int32),

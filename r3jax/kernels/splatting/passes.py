@@ -35,7 +35,7 @@ _madvise = types.ExternalFunction("madvise", types.int32(types.intp, types.uintp
 def expect_writes(array):
     """Asks Linux for huge pages below a large array that is about to be written as a whole.
 
-    XLA and Numba allocate it anew for every call; only advice, so failure means nothing.
+    XLA and Numba allocate it for every call. This is only advice: a failure is ignored.
     """
     size = array.size * array.itemsize
     if _ON_LINUX and size >= _WORTH_IT:

@@ -1,6 +1,6 @@
 """Voxels and points, sorted into bricks: what a view cannot see is skipped by the brick.
 
-The index is built anew in every call, by counting: a share of the time of one panorama.
+The index is rebuilt in every call, by counting: a share of the time of one panorama.
 """
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.

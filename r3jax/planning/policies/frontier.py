@@ -152,7 +152,7 @@ def nearest_views(
     # Far more than are tried: the nearest in a straight line may be far away by path.
     count = min(64, len(stops))
     distance, index = KDTree(places).query(aims, k=count, distance_upper_bound=farthest)
-    # SciPy drops the axis of neighbors if one alone is asked for.
+    # SciPy drops the axis of neighbors if only one is requested.
     distance, index = distance.reshape(-1, count), index.reshape(-1, count)
     is_allowed = (distance >= closest) & (distance <= farthest)
     cost = np.append(travel.cost[tuple(stops.T)], np.inf)[index]  # index of nothing: len(stops)

@@ -57,7 +57,7 @@ from r3jax.scoring.panorama_cache import PanoramaCache
 from r3jax.scoring.simulated import simulate_view_near
 
 _NEIGHBORS = 8
-"""Straight paths are looked for to so many of the nearest places."""
+"""Number of nearest places to which straight paths are tried."""
 
 _APART = 0.7
 """Views from places this far apart are two choices [m]."""
@@ -255,7 +255,7 @@ def search(problem: BeamProblem) -> list[Path]:
         )
         for i in _apart(ranked.tolist(), views, (), config.beam)
     ]
-    # A path by each core: what is worth a few milliseconds is not dealt out further.
+    # One path per core: a few milliseconds of work are not split further.
     with ThreadPoolExecutor(num_cores()) as pool:
         for _ in range(config.horizon - 1):
             # Parents leave the beam: only paths of as many views compare their rates.

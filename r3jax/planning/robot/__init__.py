@@ -1,1 +1,1 @@
-"""What carries the camera: where it can go, how it may look, and what it could ever see."""
+"""The robot: where it can go, how it may look, and what it could ever see."""

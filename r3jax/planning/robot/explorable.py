@@ -1,7 +1,7 @@
-"""Which unexplored cells are worth a look: those that a robot could ever look at.
+"""The unexplored cells that count: those that the robot could ever see.
 
 The inside of walls, the ground below the floor and whatever lies outside the building stay
-unexplored for ever. A planner that counts them is drawn to them for ever.
+unexplored. A planner that counts them is drawn to them without end.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarr
     Returns:
         The unexplored cells that count, [X, Y, Z] bool.
     """
-    # Imported only here: whoever plans no way does not wait for Numba.
+    # Lazy import: Numba is only loaded when a path is planned.
     from r3jax.kernels.robot.cells import flood
 
     # Free space seen through a window counts for nothing: no robot gets there to look on.

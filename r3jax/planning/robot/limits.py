@@ -152,7 +152,7 @@ def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
     check_height(height, (low, high))
     pose = np.array(T_world_camera, dtype=np.float64)
     wanted = angles_of(pose[None])
-    # The elevation alone: nobody came from anywhere, so that no turn can be too long.
+    # The elevation alone: there is no earlier pose, so that no turn can be too long.
     allowed = Limits(motion, pose).clipped(*wanted)
     if _distance(wanted, allowed)[0] > _SAME:
         pose[:3, :3] = rotations(*allowed)[0]

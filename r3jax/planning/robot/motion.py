@@ -1,4 +1,4 @@
-"""What carries the camera: where it may be, how it may look, how fast it goes and turns.
+"""The robot: its body, height, limits of turning, and speed.
 
 Constraints are data: they change which candidates there are and what paths cost, and nothing else.
 `Limits` is a motion at a moment; every policy's candidates pass through it.
@@ -65,7 +65,7 @@ class Motion:
     [deg/m]: who turns on the spot blurs the images. None: any turn, anywhere."""
 
     fixed_camera: bool = False
-    """Whether the camera turns with what carries it only: frames on the way look along it."""
+    """Whether the camera turns only with the robot: frames while moving look along the path."""
 
     def __post_init__(self) -> None:
         """Refuses what cannot work, and says what to do."""

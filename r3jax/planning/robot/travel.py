@@ -52,7 +52,7 @@ class Travel:
     """Cells known to be free, [X, Y, Z] bool."""
 
     safe: np.ndarray
-    """Cells that keep the margin and are open to what carries the camera, [X, Y, Z] bool."""
+    """Cells that keep the margin and are open to the robot, [X, Y, Z] bool."""
 
     usable: np.ndarray
     """Cells that paths may cross: the safe ones, the robot's own, [X, Y, Z] bool."""
@@ -213,7 +213,7 @@ def plan_travel(
             not safe (a closer look found something in the margin), it may go back through them
             unless they turned out to be occupied; otherwise they change nothing.
         heights: lowest and highest place of the camera [m], world.
-        body: what carries the camera reaches so far down from it [m]
+        body: how far the robot extends down from the camera [m]
             (`cells_over_matter`).
 
     Raises:
@@ -293,7 +293,7 @@ def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
         a: one end, in cells (cell (0, 0, 0) spans 0 to 1), [3].
         b: the other end.
     """
-    # Imported only here: whoever plans no way does not wait for Numba.
+    # Lazy import: Numba is only loaded when a path is planned.
     from r3jax.kernels.robot.cells import segments_are_inside
 
     return bool(segments_are_inside(mask, a, b[None])[0])

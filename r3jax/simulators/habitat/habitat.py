@@ -139,7 +139,7 @@ class HabitatSimulator:
 
     @property
     def start_pose(self) -> np.ndarray:
-        """`T_world_camera` at the start, [4, 4] float64; searched for when first asked for.
+        """`T_world_camera` at the start, [4, 4] float64; searched for on first use.
 
         Raises:
             ValueError: no place has half a meter free all round, or Habitat shows another place

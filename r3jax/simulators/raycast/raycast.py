@@ -94,7 +94,7 @@ class RaycastSimulator:
 
     @property
     def start_pose(self) -> np.ndarray:
-        """`T_world_camera` at the start, [4, 4] float64; searched for when first asked for.
+        """`T_world_camera` at the start, [4, 4] float64; searched for on first use.
 
         Raises:
             ValueError: no place in the mesh has half a meter free all round.

@@ -333,7 +333,7 @@ def filter_block(floats, wholes, atlas, steps, num):
         num: rays.
     """
     texels, sizes, offsets = atlas
-    # Whole vectors: what lies beyond is of the block before, and nobody asks for it.
+    # Whole vectors: values beyond `num` are left over from the block before, and never read.
     num = (num + _LANES - 1) // _LANES * _LANES
     _measure(floats, steps, num)
     for i in range(3 * BLOCK):
@@ -567,7 +567,7 @@ def shade(
     path_before = np.zeros(1, np.float32) if path_before is None else path_before
     mirror = np.zeros((1, 3), np.float32) if mirror is None else mirror
     columns = (hits.face, hits.u, hits.v, hits.distance, directions, origins, mirror, path_before)
-    # One layout and writable, whatever the caller's are: each other one compiles anew.
+    # One layout and writable, whatever the caller's are: every other one is compiled.
     per_ray = [np.require(column, requirements=("C", "W")) for column in columns]
     colors = np.empty((len(hits.face), 3), np.float32)
     _shade_all(

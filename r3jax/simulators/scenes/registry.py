@@ -84,7 +84,7 @@ def open_scene(
     """Opens a scene for exploration.
 
     The first one on a machine also starts a process that compiles the kernels for CPUs, which
-    whoever explores will need.
+    an exploration will need.
 
     Args:
         spec: the name of an embedded scene, or one of `outside_scenes`.

@@ -22,7 +22,7 @@ class Addition(NamedTuple):
     """What a training goes on with."""
 
     views: Views
-    """Of the number and the size of those before: another number would compile the step anew."""
+    """Keeps the number and the size of those before: another number would recompile the step."""
 
     newborn: GaussianScene | None = None
     """Gaussians that join, of the scene's harmonics; unused rows count for nothing."""

@@ -53,7 +53,7 @@ def initialize(
 
     Args:
         views: images with depth.
-        num_gaussians: at most so many, and nearly so many if the depth has that much detail.
+        num_gaussians: upper bound, nearly reached if the depth has that much detail.
         capacity: rows of the scene; the rest is unused. None: as many as Gaussians.
         sh_degree: degree of the harmonics, 0 to 3; all but the constant begin at 0.
         voxel_size: edge of the voxels [m]; `num_gaussians` is then ignored. None: chosen.
@@ -150,7 +150,7 @@ def _on_edge(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def fitting_voxel_size(points: np.ndarray, num_gaussians: int) -> float:
-    """The edge [m] of voxels of which at most `num_gaussians`, and nearly so many, are occupied.
+    """Finds the voxel size [m] at which nearly, but at most, `num_gaussians` are occupied.
 
     Surfaces occupy voxels by the inverse square of the edge: the search starts with that slope
     and goes on with the slope that it finds. No finer than a millimeter, nor than float32 can

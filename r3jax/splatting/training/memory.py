@@ -60,7 +60,7 @@ def training_bytes(width: int, height: int, config: TrainConfig, rows: int | Non
 
 
 def free_bytes(device: Any = None) -> int | None:
-    """Bytes that are free for the device's arrays; None where nobody can tell.
+    """Returns the bytes that are free for the device's arrays; None where it is not known.
 
     Args:
         device: one of `jax.devices()`, the first by default. On a CPU the limits of the
@@ -148,7 +148,7 @@ def check_memory(views: Views, config: TrainConfig, *, free: int | None = None) 
     Args:
         views: the training views, already in memory.
         config: sizes, strategy and backend.
-        free: bytes. None: what the device has free; nothing is refused where nobody can tell.
+        free: bytes. None: what the device has free; nothing is refused where that is not known.
 
     Raises:
         TooLargeError: it would not fit; the message says how much is needed, how much is free

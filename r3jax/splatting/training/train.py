@@ -298,7 +298,7 @@ class _Loop:
             self.on_progress(self._progress(done))
 
     def _raise_budget(self, needed: int) -> None:
-        """Makes room for a view that needs more; the next step compiles anew."""
+        """Makes room for a view that needs more; the next step is recompiled."""
         budget = fitting_budget(needed)
         raster = dataclasses.replace(self.run.config.raster, max_intersections=budget)
         config = dataclasses.replace(self.run.config, raster=raster)

@@ -36,7 +36,7 @@ _TEXTURED = 4.0
 """Blocks with less detail than this in both frames are plain walls and noise (of 255, squared)."""
 
 _SCALES = 1.4
-"""Frames that saw a surface from so many times as far are not compared: fine detail is lost."""
+"""Frames at a larger ratio of distances are not compared: fine detail is lost."""
 
 _NOISE = 0.5
 """Detail that is next to nothing (of 255, squared)."""
@@ -45,7 +45,7 @@ _PLAIN = 10.0
 """Percentile of the blocks' detail that is taken for noise: some walls are plain everywhere."""
 
 _WITNESSES = 2
-"""Of two frames alone nobody knows which is the odd one."""
+"""With two frames alone, the odd one cannot be identified."""
 
 _OBLIQUE = 25.0
 """Nor are those that saw it from directions farther apart, as what is oblique looks finer [deg]."""

@@ -168,7 +168,7 @@ FEWEST = 40
 
 
 _REWEIGHTED = 8
-"""Times that pairs are weighted anew."""
+"""Iterations of the reweighting of pairs."""
 
 _SMALLEST_ERROR = 1e-3
 """Smaller differences are not told apart: the sum of absolute values has no second derivative."""

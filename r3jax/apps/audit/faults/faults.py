@@ -51,13 +51,13 @@ _LITTLE = 0.01
 """Pairs that differ by less have the same exposure."""
 
 _PAIRS_OF_CHANCE = 2
-"""The so many largest differences between two frames may be a mirror's, and are not believed."""
+"""Number of largest differences between two frames that a mirror may cause; ignored."""
 
 _OFF = 0.01
 """Poses that are off by less, as a share of the median depth, are as good as depth cameras are."""
 
 _OFF_TYPICAL = 6.0
-"""And so are those that are off by less than so many times what surfaces differ anyway. Both let
+"""Ignored, too: offsets below this multiple of the spread of surfaces. Both let
 5 cm in a room be found; of the recording by HoloLens (2.6 mm) no frame is off by 3 cm."""
 
 _MISFIT = 0.08

@@ -5,7 +5,7 @@ of every frame is sought that brings the surfaces of neighbors onto each other, 
 
     n . (p_i + d_i(p_i) - q_j - d_j(q_j)) = 0,    d(p) = t + w x (p - c)
 
-with c the frame's own camera, by least squares that are weighted anew with Cauchy's weights, as
+with c the frame's own camera, by iteratively reweighted least squares (Cauchy weights), as
 most of the error lies where one frame does not show what the other does. What a frame's surfaces
 move beside its neighbors' is what its pose is off. A drift that all frames share does not show.
 
@@ -40,13 +40,13 @@ _MATCHES = 200
 """Matches of a pair that are used at most."""
 
 _ROUNDS = 4
-"""Times that matches are weighted anew."""
+"""Iterations of the reweighting of matches."""
 
 _PARALLEL = 0.8
 """Surfaces whose normals have a smaller cosine are different ones."""
 
 _MOST, _APART, _BROUGHT = 90.0, 6.0, 0.4
-"""Percentile of a frame's distances that must be so many times the typical one for its pose to be
+"""Percentile of a frame's distances, the multiple of the typical one from which its pose is
 off, and the share of it that moving the frame may leave. Moved along a wall a frame still fits that
 wall, so few of its surfaces may tell: a shift by 5 cm gives 15 and 0.2, frames whose poses are true
 2 to 3 and 0.9 to 1."""
@@ -271,7 +271,7 @@ def _fit(error: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
         weight = _weight(left, _scatter(left))
         information = float((weight * moved**2).sum()) + 1e-12
         size = -float((weight * moved * error).sum()) / information
-    # Neighboring matches err alike: so many of them count as one.
+    # Neighboring matches have correlated errors: `_ALIKE` of them count as one.
     return size, float(np.sqrt(_ALIKE / max(information, 1e-12)))
 
 

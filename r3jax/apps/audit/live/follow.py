@@ -1,9 +1,9 @@
-"""Guides whoever scans: maps frames as they come in, and asks for the next view beside it.
+"""Guides a person who scans: maps frames as they arrive and decides on the next view meanwhile.
 
 The same three verbs as in a robot: `start`, `observe`, `decide`. A frame is on the page as soon as
 it is in the map; the decision is made in a thread of its own, so that no frame waits for it. A
-view to take stays the same until the camera has been near it, or some frames have come: nobody
-follows advice that changes with every step.
+view to take stays the same until the camera has been near it, or some frames have come: advice
+that changes with every step cannot be followed.
 """
 
 import queue
@@ -39,7 +39,7 @@ _RIM = 2.0
 """A camera nearer to the rim than this makes the space larger, by as much again [m]."""
 
 _TILTED = 5.0
-"""The vertical is estimated; if it was off by more, all is mapped anew [deg]."""
+"""The vertical is estimated; if it was off by more, all is mapped again [deg]."""
 
 _NEAR, _FACING = 0.5, 30.0
 """A view counts as taken from as near as this [m], in a direction as near as this [deg]."""

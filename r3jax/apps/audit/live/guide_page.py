@@ -139,7 +139,7 @@ class GuidePage:
         return {"next": f"{words[:1].upper()}{words[1:]}.", "note": note, "is_current": True}
 
     def answer(self, path: str) -> tuple[str, bytes] | None:
-        """Kind and content of what is asked for; None: there is no such thing."""
+        """Returns kind and content of a resource; None: there is no such thing."""
         name = path.partition("?")[0].lstrip("/")
         with self._lock:
             if name == "":
@@ -166,7 +166,7 @@ def open_guide(host: str = "127.0.0.1", port: int = 8080) -> Generator[GuidePage
     """Serves a page until the block is left.
 
     Args:
-        host: address to listen at; nobody else can reach what listens at 127.0.0.1.
+        host: address to listen at; 127.0.0.1 can be reached from this machine only.
         port: 0 takes any free one.
 
     Raises:
@@ -195,7 +195,7 @@ class _Server(ThreadingHTTPServer):
     page: GuidePage
 
     is_private: bool
-    """True if nobody but this machine can reach it."""
+    """True if only this machine can reach it."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -234,7 +234,7 @@ _HEADROOM = 0.35
 """As in `floor_picture` [m]."""
 
 _FARTHEST = 5.0
-"""What is farther from a place is not asked of it [m]."""
+"""Surfaces farther from a place do not count for it [m]."""
 
 _MARGIN = 0.6
 """Shown round what is known [m]."""

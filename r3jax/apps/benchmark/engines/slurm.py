@@ -86,7 +86,7 @@ _TIMEOUT = 240
 """Minutes that a job asks for, unless the user says otherwise."""
 
 _MAX_TIMEOUTS = 100
-"""A job goes back into the queue so many times: each time it gets further."""
+"""How often a job goes back into the queue: each time it gets further."""
 
 _LOOKS_PER_QUESTION = 6
 """Results are looked for at each look, the queue is asked at every sixth: a controller has many

@@ -1,4 +1,4 @@
-"""Who chooses among photos: a policy by its utility, or whoever looks at the model that is trained.
+"""Choosers among photos: a policy by its utility, or a method that scores the trained model.
 
 Shape symbols: K candidates.
 """
@@ -131,7 +131,7 @@ def check_chooser(name: str) -> None:
     """Refuses who cannot choose among photos.
 
     Raises:
-        ValueError: nobody of that name scores poses; names those who do.
+        ValueError: no method of that name scores poses; lists those that do.
     """
     if name not in SCORED and name not in MODEL_CHOOSERS:
         known = ", ".join((*SCORED, *MODEL_CHOOSERS))

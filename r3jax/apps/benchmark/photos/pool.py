@@ -1,4 +1,4 @@
-"""The photos of a capture: those that may be chosen, and those that judge and that nobody sees.
+"""The photos of a capture: those that may be chosen, and those held out for evaluation.
 
 Shape symbols: n photos of the capture; K candidates.
 """
@@ -59,7 +59,7 @@ def open_pool(
     Args:
         path: what `r3jax.formats.captures.open_capture` opens.
         resolution: longer side of the images that are trained on and judged [px].
-        hold_out: every so many-th photo judges, beginning with the first.
+        hold_out: every `hold_out`-th photo is held out for evaluation, beginning with the first.
         up: axis of a recording's world that points up.
 
     Raises:
@@ -95,7 +95,7 @@ def first_photos(pool: PhotoPool, num: int, seed: int) -> list[int]:
     """The photos that every choice begins with: drawn by the seed, the same for all choosers.
 
     Raises:
-        PhotosError: so many are not on offer.
+        PhotosError: fewer are on offer.
     """
     if num >= len(pool.on_offer):
         raise PhotosError(

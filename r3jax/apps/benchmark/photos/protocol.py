@@ -1,6 +1,6 @@
-"""The photo-pool protocol: one photo joins the training every so many steps (COVER, CVPR 2026).
+"""The photo-pool protocol: one photo joins the training every 200 steps (COVER, CVPR 2026).
 
-Of a capture every eighth photo judges, and is seen by nobody. A model begins on ten photos drawn
+Every eighth photo of a capture is held out for evaluation. A model begins on ten photos drawn
 by the seed, the same for all. Every 200 steps the chooser takes one of the five photos nearest to
 the one chosen last, by its pose alone; then it joins the map and the training. After the last one
 the training goes on for the stated number of steps, and the model is judged.
@@ -125,7 +125,7 @@ def run_photos(
 
     Args:
         pool: the photos.
-        chooser: who chooses.
+        chooser: the method that chooses.
         terms: how many, how long.
         seed: of the first photos, of the chooser and of the training.
         lpips: the perceptual metric; left out by default.
@@ -196,7 +196,7 @@ class _Choice:
     def views(self, step: int) -> Views:
         """The photos for the steps up to the next choice, one a step.
 
-        As many as there are steps, so that nothing is compiled anew when a photo joins; every photo
+        As many as there are steps, so that nothing is recompiled when a photo joins; every photo
         is shown as often as any other, or once more.
         """
         random = np.random.default_rng((self.seed, step))

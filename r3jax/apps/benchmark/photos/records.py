@@ -47,14 +47,14 @@ def kept_or_made(
     Args:
         root: folder of the benchmark.
         pool: the photos.
-        chooser: name of who chooses.
+        chooser: name of the method that chooses.
         terms: how many, how long.
         seed: of the run.
         lpips: the perceptual metric; left out by default.
         on_stage: told what happens now.
 
     Raises:
-        ValueError: nobody of that name chooses among photos, or the pool is too small.
+        ValueError: no chooser has that name, or the pool is too small.
         OSError: the record cannot be written.
     """
     path = record_path(root, pool, chooser, seed)

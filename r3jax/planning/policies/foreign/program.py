@@ -102,7 +102,7 @@ class Program:
         raise PolicyError(f"the program {self.command!r} {reason}{last}")
 
     def _exchange(self, data: bytes, end: float) -> bytes:
-        """Writes and reads at the same time, so that neither side waits for the other for ever.
+        """Writes and reads at the same time, so that neither side blocks the other.
 
         Raises:
             TimeoutError: it is past `end` on the monotonic clock.

@@ -24,7 +24,7 @@ _SCENES = {
     "classroom": "classroom",
     "library": "library",
 }
-"""Names, and the files of the catalog that make them; these load when first asked for."""
+"""Names, and the files of the catalog that make them; these load on first use."""
 
 
 def names() -> tuple[str, ...]:
