@@ -27,7 +27,7 @@ set for the version that these were measured with alone."""
 
 
 _LEFT_TO_TEST_ALL = (
-    "apps", "experiments", "notebooks", "plots",
+    "apps", "captures", "experiments", "notebooks", "plots",
     "cli/test_evaluate.py", "cli/test_odd_worlds.py", "cli/test_train.py",
     "evaluation/test_test_views.py",
     "exploration/test_captures.py", "exploration/test_guard.py", "exploration/test_motion.py",

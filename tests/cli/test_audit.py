@@ -7,11 +7,11 @@ import shlex
 import numpy as np
 import pytest
 
-from r3jax.apps.audit import capture_maps
-from r3jax.apps.audit.camera_paths import write_camera_path
 from r3jax.apps.audit.live.growing import subset
 from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import source_of
+from r3jax.captures import capture_maps
+from r3jax.captures.camera_paths import write_camera_path
+from r3jax.captures.source import source_of
 from r3jax.cli.commands import audit as command
 from r3jax.cli.main import main
 from r3jax.files import MARKER

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from r3jax.apps.audit.source import source_of
+from r3jax.captures.source import source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.depth import register_depth
 from r3jax.formats.errors import FormatError

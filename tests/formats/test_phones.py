@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from r3jax.apps.audit.source import source_of
+from r3jax.captures.source import source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
 from r3jax.formats.phones import archives

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.apps.audit.camera_paths import is_camera_path, read_camera_path
 from r3jax.apps.benchmark.cells import Conditions
 from r3jax.apps.benchmark.record import read_records
 from r3jax.apps.benchmark.reference_images import (
@@ -32,6 +31,7 @@ from r3jax.apps.report.model_report import (
     read_evaluated_model,
     training_figure,
 )
+from r3jax.captures.camera_paths import is_camera_path, read_camera_path
 from r3jax.cli.commands.benchmark import print_results
 from r3jax.cli.console import Console
 from r3jax.evaluation import test_views as view_sets

@@ -12,26 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.apps.audit.bad_regions import Region, bad_regions, unseen_edges, unseen_regions
-from r3jax.apps.audit.camera_paths import CameraPath
-from r3jax.apps.audit.capture_maps import Seen, see
 from r3jax.apps.audit.diagnosis import (
     Diagnosis,
     ViewScore,
     demand_of,
-    places_in_free_space,
-    places_in_hull,
     view_score,
 )
-from r3jax.apps.audit.faults.faults import Faults, find_faults, stray_finding
 from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import Source, thinned
 from r3jax.apps.audit.suggest import SuggestedViews, Task, suggest
-from r3jax.apps.audit.survey import RANGE, Survey, survey_of
+from r3jax.captures.camera_paths import CameraPath
+from r3jax.captures.capture_maps import Seen, see
+from r3jax.captures.faults.faults import Faults, find_faults, stray_finding
+from r3jax.captures.source import Source, thinned
+from r3jax.captures.standpoints import standpoints_of
+from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.formats.lenses import Lens
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
-from r3jax.planning.candidates import spread
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
@@ -188,7 +185,7 @@ def audit(
     lens = Counter(source.lenses).most_common(1)[0][0]
     camera = thinned(lens.camera, source.stride)
     cameras = survey.alignment.points(source.poses[survey.chosen, :3, 3])
-    places = _places(source, survey, seen, cameras, settings.num_places)
+    places = standpoints_of(seen.state, seen.grid, cameras, settings.num_places, source.is_dense)
     standpoints = places[: settings.num_standpoints]
     on_progress("evaluating frames", 0)
     frames = tuple(_evaluated_frames(source, survey, seen, config, path, step, on_progress))
@@ -215,24 +212,6 @@ def audit(
         plan=plan,
         faults=faults,
     )
-
-
-def _places(
-    source: Source, survey: Survey, seen: Seen, cameras: np.ndarray, num: int
-) -> np.ndarray:
-    """Where views are looked for; where no space is known to be free, where the camera was."""
-    if source.is_dense:
-        places = places_in_free_space(seen.grid, cameras)
-    else:
-        places = places_in_hull(cameras, _centers(seen.state))
-    if not len(places):
-        places = cameras
-    return places[spread(places, num)]
-
-
-def _centers(state: MapState) -> np.ndarray:
-    """Centers of the voxels, [m, 3]."""
-    return np.asarray(state.center, np.float64).T[np.asarray(state.occupied)]
 
 
 def _evaluated_frames(

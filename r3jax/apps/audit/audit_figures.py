@@ -11,8 +11,8 @@ from matplotlib.patches import Circle
 from r3jax.apps.audit.audit import Audit, EvaluatedFrame
 from r3jax.apps.audit.bad_regions import BLOCK, Region
 from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, region_label
-from r3jax.apps.audit.source import projected
 from r3jax.apps.audit.suggest import Suggestion
+from r3jax.captures.source import projected
 from r3jax.mapping.state import MapState
 from r3jax.plots import style
 from r3jax.plots.pictures import empty_directions, panorama_picture, show_renderability

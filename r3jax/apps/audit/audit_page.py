@@ -9,10 +9,10 @@ import numpy as np
 from r3jax.apps.audit import audit_figures, sentences
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import Region
-from r3jax.apps.audit.faults.faults import Finding
 from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, plan_figure, region_label
 from r3jax.apps.audit.outputs import suggested_poses
 from r3jax.apps.audit.suggest import Suggestion
+from r3jax.captures.faults.faults import Finding
 from r3jax.files import write_atomic
 from r3jax.plots.page import render
 from r3jax.plots.pictures import small_png

@@ -1,13 +1,10 @@
 """How well every surface would render for somebody who stands somewhere else, and why not better.
 
 Renderability belongs to a voxel *and* a place from which it is asked. The places here are spread
-over all where somebody could stand, to take an image or to look at the result; of each voxel the
-answers of those that see it are averaged. With depth images they lie in known free space, a margin
-from everything that is not known to be free, connected to where the camera was, at heights at
-which it was held. Without, they lie within the hull of the camera's positions and a margin round
-it, and a margin from every voxel.
+over all where somebody could stand (`captures.standpoints`), to take an image or to look at the
+result; of each voxel the answers of those that see it are averaged.
 
-Shape symbols: N rows of the map; p standpoints; n cameras; m voxels; c places.
+Shape symbols: N rows of the map; p standpoints.
 """
 
 import functools
@@ -18,76 +15,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy import ndimage
-from scipy.spatial import Delaunay, KDTree
 
-from r3jax.apps.audit.survey import MARGIN
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.selection import for_selected
-from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.seen import visible_rows
 from r3jax.mapping.state import MapState
-from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.batch import map_over_devices
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import panorama_view
-
-_HEIGHTS = (5.0, 95.0)
-"""Percentiles of the cameras' heights between which people hold them."""
-
-_MOST_LATTICE = 40_000
-"""Places between which the hull's are chosen."""
-
-_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-
-
-def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray:
-    """Centers of the free cells where a camera could be held, [c, 3] [audit units].
-
-    Args:
-        grid: free and occupied space.
-        cameras: where the camera was, [n, 3] [audit units].
-    """
-    cell = float(grid.cell_size)
-    safe = safe_cells(np.asarray(grid.free), cell, MARGIN)
-    labels = np.zeros(safe.shape, dtype=np.int32)
-    ndimage.label(safe, output=labels)
-    cells = np.argwhere(safe)
-    if not len(cells):
-        return np.zeros((0, 3))
-    centers = centers_on_host(grid, cells)
-    # A camera near a wall stands in a cell that is not safe: the nearest safe one is meant.
-    distance, nearest = KDTree(centers).query(cameras)
-    close = cells[np.asarray(nearest)[np.asarray(distance) <= 2.0 * MARGIN + cell]]
-    if not len(close):
-        return np.zeros((0, 3))
-    is_reached = np.isin(labels[tuple(cells.T)], np.unique(labels[tuple(close.T)]))
-    low, high = np.percentile(cameras[:, 2], _HEIGHTS)
-    is_held = (centers[:, 2] >= low - MARGIN) & (centers[:, 2] <= high + MARGIN)
-    return centers[is_reached & is_held]
-
-
-def places_in_hull(cameras: np.ndarray, voxels: np.ndarray) -> np.ndarray:
-    """Places between the cameras, away from all voxels, [c, 3] [audit units].
-
-    Args:
-        cameras: where the camera was, [n, 3].
-        voxels: centers of all voxels, [m, 3], m >= 1.
-    """
-    # The hull of boxes round the cameras is the hull and its margin, and never flat.
-    boxes = (cameras[:, None, :] + MARGIN * _CORNERS).reshape(-1, 3)
-    low, high = boxes.min(axis=0), boxes.max(axis=0)
-    spacing = max(0.5 * MARGIN, float(np.cbrt(np.prod(high - low) / _MOST_LATTICE)))
-    axes = [np.arange(a + 0.5 * spacing, b, spacing) for a, b in zip(low, high, strict=True)]
-    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = lattice[Delaunay(boxes).find_simplex(lattice) >= 0]
-    if not len(inside):
-        return inside
-    distance, _ = KDTree(voxels).query(inside)
-    return inside[np.asarray(distance) >= MARGIN]
-
 
 TERMS = ("bias", "noise", "resolution")
 """Factors of renderability, in the paper's order."""

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 
-from r3jax.apps.audit.alignment import Alignment
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import BLOCK, Region
 from r3jax.apps.audit.diagnosis import CAUSES, Diagnosis
+from r3jax.captures.alignment import Alignment
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture
 

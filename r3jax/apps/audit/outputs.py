@@ -16,9 +16,9 @@ import numpy as np
 
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import Region
-from r3jax.apps.audit.camera_paths import write_camera_path, write_path_transforms
 from r3jax.apps.audit.diagnosis import CAUSES, FEW, FINE, Diagnosis
 from r3jax.apps.audit.ground_plan import cause_colors, score_colors
+from r3jax.captures.camera_paths import write_camera_path, write_path_transforms
 from r3jax.files import write_atomic
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.formats.points import write_points

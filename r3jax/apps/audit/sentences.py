@@ -4,10 +4,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from r3jax.apps.audit.alignment import AXES
 from r3jax.apps.audit.audit import SATURATED, Audit
 from r3jax.apps.audit.diagnosis import FEW, FINE
 from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
+from r3jax.captures.alignment import AXES
 
 MEANING = {
     "fine": f"R of at least {FINE:g} for those who stand about",

@@ -7,13 +7,13 @@ from pathlib import Path
 from r3jax.apps.audit import sentences
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.audit_page import write_report
-from r3jax.apps.audit.camera_paths import CameraPath, path_of
 from r3jax.apps.audit.ground_plan import region_label
 from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.guide_page import open_guide
 from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_outputs
 from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import Source, source_of
+from r3jax.captures.camera_paths import CameraPath, path_of
+from r3jax.captures.source import Source, source_of
 from r3jax.cli.console import Console, Table
 from r3jax.cli.errors import UserError
 from r3jax.cli.options.audit import AuditOptions

@@ -7,11 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from r3jax.apps.audit import capture_maps
-from r3jax.apps.audit.alignment import Alignment
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.audit_page import picture_faults
-from r3jax.apps.audit.camera_paths import CameraPath
 from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
 from r3jax.apps.audit.ground_plan import _value_picture
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
@@ -23,9 +20,12 @@ from r3jax.apps.audit.sentences import (
     verdict,
 )
 from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import Source, source_of
-from r3jax.apps.audit.survey import MARGIN, survey_of
-from r3jax.apps.audit.vertical import Vertical
+from r3jax.captures import capture_maps
+from r3jax.captures.alignment import Alignment
+from r3jax.captures.camera_paths import CameraPath
+from r3jax.captures.source import Source, source_of
+from r3jax.captures.survey import MARGIN, survey_of
+from r3jax.captures.vertical import Vertical
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import read_transforms

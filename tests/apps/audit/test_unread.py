@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from r3jax.apps.audit.audit import audit
-from r3jax.apps.audit.faults.faults import find_faults
 from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import source_of
-from r3jax.apps.audit.survey import survey_of
+from r3jax.captures.faults.faults import find_faults
+from r3jax.captures.source import source_of
+from r3jax.captures.survey import survey_of
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import read_transforms

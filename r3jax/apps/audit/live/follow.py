@@ -15,13 +15,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
-from r3jax.apps.audit.faults.blocks import BlockImage, block_image
-from r3jax.apps.audit.faults.faults import Kind, faults_of
 from r3jax.apps.audit.live.growing import Arrival, GrowingCapture
 from r3jax.apps.audit.live.guide_page import GuidePage
-from r3jax.apps.audit.source import Source
-from r3jax.apps.audit.vertical import Normals, block_normals, estimated_up
+from r3jax.captures.alignment import Alignment, rotation_to_z, up_of
+from r3jax.captures.faults.blocks import BlockImage, block_image
+from r3jax.captures.faults.faults import Kind, faults_of
+from r3jax.captures.source import Source
+from r3jax.captures.vertical import Normals, block_normals, estimated_up
 from r3jax.formats.ros.bags import Topics
 from r3jax.frame import Frame
 from r3jax.mapping.config import MappingConfig

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.apps.audit.source import Picture, Source, source_of
+from r3jax.captures.source import Picture, Source, source_of
 from r3jax.formats.captures import open_capture
 from r3jax.formats.recordings import is_recording
 from r3jax.formats.ros.bags import Topics

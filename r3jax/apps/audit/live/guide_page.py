@@ -26,9 +26,9 @@ from urllib.parse import urlsplit
 import numpy as np
 from matplotlib import colormaps
 
-from r3jax.apps.audit.alignment import evenly_spaced
 from r3jax.apps.audit.diagnosis import FINE
 from r3jax.apps.audit.sentences import steps_between
+from r3jax.captures.alignment import evenly_spaced
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState

@@ -20,7 +20,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from r3jax.apps.audit.source import projected
+from r3jax.captures.source import projected
 from r3jax.geometry.cameras import Camera
 
 _ACROSS = 80

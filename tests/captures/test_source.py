@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from r3jax.apps.audit.source import (
+from r3jax.captures.source import (
     Source,
     distorted,
     sampling_table,

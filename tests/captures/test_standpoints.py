@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.audit.diagnosis import places_in_free_space, places_in_hull
-from r3jax.apps.audit.survey import MARGIN
+from r3jax.captures.standpoints import places_in_free_space, places_in_hull
+from r3jax.captures.survey import MARGIN
 from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid, empty_grid
 
 

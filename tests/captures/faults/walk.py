@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 import r3jax
-from r3jax.apps.audit.faults.blocks import BlockImage, block_image
+from r3jax.captures.faults.blocks import BlockImage, block_image
 from r3jax.geometry.cameras import Camera
 
 VIEWS = 16

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.audit import alignment as real
-from r3jax.apps.audit.alignment import Alignment, rotation_to_z, up_of
+from r3jax.captures import alignment as real
+from r3jax.captures.alignment import Alignment, rotation_to_z, up_of
 from r3jax.geometry.cameras import rigid_error
 from tests.formats.colmap_models import random_pose, random_rotation
 

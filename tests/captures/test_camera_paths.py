@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.audit.camera_paths import (
+from r3jax.captures.camera_paths import (
     is_camera_path,
     path_of,
     read_camera_path,

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import source_of
-from r3jax.apps.audit.survey import strays, survey_of
+from r3jax.captures.settings import SurveySettings
+from r3jax.captures.source import source_of
+from r3jax.captures.survey import strays, survey_of
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.nerfstudio import read_transforms
 from tests.apps.audit.room import round_poses, write_colmap, write_nerfstudio
@@ -59,11 +59,11 @@ def test_the_survey_is_that_of_the_others(tmp_path):
     poses = round_poses(9)
     folder = write_nerfstudio(tmp_path / "room", poses, depth=True)
     content = json.loads((folder / "transforms.json").read_text())
-    others = survey_of(_without(source_of(read_transforms(folder), "room"), 4), AuditSettings())
+    others = survey_of(_without(source_of(read_transforms(folder), "room"), 4), SurveySettings())
     for axis, far in enumerate((60.0, 3000.0)):
         content["frames"][4]["transform_matrix"][axis][3] = far
     (folder / "transforms.json").write_text(json.dumps(content))
-    survey = survey_of(source_of(read_transforms(folder), "room"), AuditSettings())
+    survey = survey_of(source_of(read_transforms(folder), "room"), SurveySettings())
     assert survey.strays == (4,)
     assert survey.chosen.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
     np.testing.assert_array_equal(survey.bounds, others.bounds)
@@ -87,7 +87,7 @@ def test_a_camera_of_a_structure_from_motion_that_diverged_is_left_out(tmp_path)
     source = source_of(read_colmap(write_colmap(tmp_path / "room", poses)), "room")
     far = source.poses.copy()
     far[4, :3, 3] += [3e4, 2e4, 4e3]
-    survey = survey_of(source_of(_moved(tmp_path / "room", far), "room"), AuditSettings())
+    survey = survey_of(source_of(_moved(tmp_path / "room", far), "room"), SurveySettings())
     assert survey.strays == (4,)
 
 

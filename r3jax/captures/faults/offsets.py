@@ -31,7 +31,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from r3jax.apps.audit.faults.blocks import FEWEST, BlockImage, Overlap, neighbors_of
+from r3jax.captures.faults.blocks import FEWEST, BlockImage, Overlap, neighbors_of
 
 _GATE = 0.15
 """Surfaces farther apart than this are different ones, as a share of their distance."""

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from r3jax.apps.audit.alignment import evenly_spaced
+from r3jax.captures.alignment import evenly_spaced
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 

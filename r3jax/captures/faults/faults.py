@@ -2,7 +2,7 @@
 
 Every frame is read once and kept as blocks; it is compared with a few neighbors, so time and memory
 grow with the number of frames (of which an audit uses at most `max_frames`), and not with its
-square. Each threshold says how it was chosen; `tests/apps/audit/faults` holds them to a rendered
+square. Each threshold says how it was chosen; `tests/captures/faults` holds them to a rendered
 walk, damaged on purpose, and to a real recording.
 
 Shape symbols: n frames.
@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from r3jax.apps.audit.faults.appearance import (
+from r3jax.captures.faults.appearance import (
     Light,
     Sharpness,
     image_motion,
@@ -23,9 +23,9 @@ from r3jax.apps.audit.faults.appearance import (
     repeats,
     sharpness,
 )
-from r3jax.apps.audit.faults.blocks import BlockImage, block_image, overlaps
-from r3jax.apps.audit.faults.offsets import Offsets, Systematic, offsets
-from r3jax.apps.audit.source import Source
+from r3jax.captures.faults.blocks import BlockImage, block_image, overlaps
+from r3jax.captures.faults.offsets import Offsets, Systematic, offsets
+from r3jax.captures.source import Source
 from r3jax.formats.errors import FormatError
 
 BLURRED = 0.45

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r3jax.apps.audit.source import Source
-from r3jax.apps.audit.survey import MARGIN, RANGE, Survey
+from r3jax.captures.source import Source
+from r3jax.captures.survey import MARGIN, RANGE, Survey
 from r3jax.frame import Frame
 from r3jax.mapping.join import combine_moments
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
@@ -76,7 +76,7 @@ def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: 
         FormatError, RunError: a file is missing or broken.
         ValueError: more voxels than any sensible voxel size would give.
     """
-    whole, grid = _surfaces(source, survey, on_frame)
+    whole, grid = map_surfaces(source, survey, on_frame)
     count = min(folds, len(survey.chosen))
     parts = [_blank(whole)] * count
     fold_of = np.arange(len(survey.chosen)) % count
@@ -88,7 +88,14 @@ def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: 
     return Seen(united(parts), grid, tuple(parts), fold_of)
 
 
-def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> tuple[MapState, OccupancyGrid]:
+def map_surfaces(
+    source: Source, survey: Survey, on_frame: OnFrame = lambda: None
+) -> tuple[MapState, OccupancyGrid]:
+    """Reads every image once: the map of the surfaces, and the grid of what is free.
+
+    Raises:
+        FormatError, RunError, ValueError: as `see`.
+    """
     state = empty_map(_CAPACITY, survey.voxel_size)
     grid = empty_grid(survey.bounds, survey.cell_size)
     update_grid = jax.jit(integrate_depth)

@@ -8,17 +8,17 @@ import jax
 import numpy as np
 import pytest
 
-from r3jax.apps.audit import capture_maps as real
-from r3jax.apps.audit.capture_maps import Seen, see
-from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import Source, source_of
-from r3jax.apps.audit.survey import RANGE, Survey, survey_of
+from r3jax.captures import capture_maps as real
+from r3jax.captures.capture_maps import Seen, see
+from r3jax.captures.settings import SurveySettings
+from r3jax.captures.source import Source, source_of
+from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.formats.recordings import read_recording
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate
 from tests.apps.audit.room import round_poses, write_recording
 
-SETTINGS = AuditSettings(voxel_size=0.1, folds=4)
+SETTINGS = SurveySettings(voxel_size=0.1)
 NUM = 8
 
 

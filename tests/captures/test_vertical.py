@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r3jax.apps.audit.vertical import Vertical, block_normals, estimated_up
+from r3jax.captures.vertical import Vertical, block_normals, estimated_up
 from r3jax.geometry.cameras import Camera
 from tests.apps.audit import held
 from tests.apps.audit.held import held_pose, turned

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from r3jax.apps.audit.alignment import evenly_spaced
-from r3jax.apps.audit.source import ray_lengths, taken, thinned
+from r3jax.captures.alignment import evenly_spaced
+from r3jax.captures.source import ray_lengths, taken, thinned
 from r3jax.geometry.cameras import Camera
 
 _TOLERANCE = 0.05

@@ -24,11 +24,11 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from r3jax.apps.audit.agreement import DepthImage, check_agreement
-from r3jax.apps.audit.alignment import Alignment, evenly_spaced, rotation_to_z, up_of
-from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import Source
-from r3jax.apps.audit.vertical import Vertical, block_normals, estimated_up
+from r3jax.captures.agreement import DepthImage, check_agreement
+from r3jax.captures.alignment import Alignment, evenly_spaced, rotation_to_z, up_of
+from r3jax.captures.settings import SurveySettings
+from r3jax.captures.source import Source
+from r3jax.captures.vertical import Vertical, block_normals, estimated_up
 from r3jax.formats.errors import FormatError
 from r3jax.frame import FAR
 from r3jax.geometry.voxels import INDEX_LIMIT
@@ -194,7 +194,7 @@ class Survey:
         return in_audit / self.alignment.scale
 
 
-def survey_of(source: Source, settings: AuditSettings) -> Survey:
+def survey_of(source: Source, settings: SurveySettings) -> Survey:
     """Looks at some images and decides.
 
     Raises:
@@ -313,7 +313,7 @@ def _strays(source: Source, chosen: np.ndarray, depth: float) -> np.ndarray:
 
 
 def _up(
-    source: Source, settings: AuditSettings, chosen: np.ndarray, images: Sequence[DepthImage]
+    source: Source, settings: SurveySettings, chosen: np.ndarray, images: Sequence[DepthImage]
 ) -> Vertical:
     """The vertical as it was given, as the format says, or as cameras and surfaces suggest."""
     if settings.up is not None:
@@ -340,7 +340,7 @@ def _check_voxel(voxel: float, bounds: np.ndarray, scale: float) -> None:
         )
 
 
-def _voxel_size(source: Source, settings: AuditSettings, scale: float, median: float) -> float:
+def _voxel_size(source: Source, settings: SurveySettings, scale: float, median: float) -> float:
     if settings.voxel_size is not None:
         return settings.voxel_size * scale
     focal = float(np.median([float(source.camera(i).focal) for i in _few(len(source))]))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from r3jax.apps.audit.agreement import DepthImage, check_agreement
-from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.audit.source import ray_lengths, source_of
-from r3jax.apps.audit.survey import survey_of
+from r3jax.captures.agreement import DepthImage, check_agreement
+from r3jax.captures.settings import SurveySettings
+from r3jax.captures.source import ray_lengths, source_of
+from r3jax.captures.survey import survey_of
 from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import Camera
 from tests.apps.audit.room import (
@@ -131,7 +131,7 @@ def test_coordinates_of_utm_lose_an_origin_and_no_digits(tmp_path):
             write_far_recording(tmp_path / "far", round_poses(), far),
         )
     )
-    settings = AuditSettings(voxel_size=0.2)
+    settings = SurveySettings(voxel_size=0.2)
     one, other = survey_of(near, settings), survey_of(source, settings)
     assert not one.alignment.origin.any()
     assert np.abs(other.alignment.origin - far).max() < 10.0

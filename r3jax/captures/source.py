@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.apps.audit.alignment import Alignment
+from r3jax.captures.alignment import Alignment
 from r3jax.formats.colmap.reader import find_model
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens

@@ -22,7 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from r3jax.apps.audit.faults.blocks import (
+from r3jax.captures.faults.blocks import (
     DIRECTIONS,
     FEWEST,
     BlockImage,

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from r3jax.apps.audit.faults.blocks import block_image
-from r3jax.apps.audit.faults.faults import Faults, faults_of, find_faults
-from r3jax.apps.audit.source import source_of
+from r3jax.captures.faults.blocks import block_image
+from r3jax.captures.faults.faults import Faults, faults_of, find_faults
+from r3jax.captures.source import source_of
 from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import Camera
-from tests.apps.audit.faults.walk import CAMERA, VIEWS, blocks, scattered, walk
+from tests.captures.faults.walk import CAMERA, VIEWS, blocks, scattered, walk
 from tests.conftest import shared_path
 
 NAMES = [f"{i:02d}.png" for i in range(VIEWS)]

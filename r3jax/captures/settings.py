@@ -1,0 +1,58 @@
+"""Settings of how a capture is surveyed, options of commands, too. Its import is light."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SurveySettings:
+    """How a capture is read and how fine it is mapped.
+
+    Raises:
+        ValueError: a setting that makes no sense; names the option.
+    """
+
+    voxel_size: float | None = None
+    """Edge of a voxel in the capture's units; by default 5 cm, or from the depths."""
+
+    max_range: float | None = None
+    """Surfaces farther from a camera count as invisible, in the capture's units; by default 5 m,
+    or from the depths."""
+
+    up: str | None = None
+    """Direction of the capture that points up: x, y, z, -x, -y or -z (`--up=-y`), or three numbers
+    (`--up=0.1,-0.9,0.4`). By default as the format says, or a guess from floors, walls and how the
+    cameras were held."""
+
+    max_frames: int = 400
+    """Images to use at most, evenly spread."""
+
+    depth_scale: float = 1.0
+    """Multiply all depths of depth images, where their unit is not the one that was read."""
+
+    depth_along_ray: bool = False
+    """Depth images hold the distance along each pixel's ray, as those of Hypersim and SceneNet do,
+    and not z: convert it."""
+
+    trust_depth: bool = False
+    """Take the depth images as they are, even if they contradict the poses or each other."""
+
+    def __post_init__(self) -> None:
+        """Refuses what makes no sense."""
+        for name in ("voxel_size", "max_range"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise ValueError(f"--{name.replace('_', '-')} must be positive, got {value}")
+        at_least(self, {"max_frames": 2})
+
+
+def at_least(settings: object, least: dict[str, int]) -> None:
+    """Refuses settings below their least values.
+
+    Raises:
+        ValueError: names the option.
+    """
+    for name, value in least.items():
+        if getattr(settings, name) < value:
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} must be at least {value}, got {getattr(settings, name)}")
