@@ -41,6 +41,13 @@ MUTANTS = [
         ("+ _TWO * _RING * level + _RING", "+ _RING"),
     ),
     *faults(
+        "r3jax/kernels/visibility/near.py",
+        "tests/scoring/test_kernel_faults.py::test_the_laws_hold[in_images]",
+        ("= np.inf, np.nan", "= np.inf, np.inf"),
+        ("if is_sound[view]:", "if view == 0:"),
+        ("_MARGIN = np.float32(4.0)", "_MARGIN = np.float32(-8.0)"),
+    ),
+    *faults(
         "r3jax/kernels/visibility/limit.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[sums_agree]",
         ("_flatter(before, after, np.float32(step))", "_ZERO"),
@@ -57,6 +64,7 @@ MUTANTS = [
         "r3jax/kernels/scoring/voxels.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[sums_agree]",
         ("counts[group] += 1\n        voxels", "voxels"),
+        ("rows.counts[first + i] > _ZERO", "rows.counts[first + i] >= _ZERO"),
     ),
     *faults(
         "r3jax/kernels/scoring/terms.py",

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 import r3jax
 from r3jax.kernels.calls import Cells
 from r3jax.kernels.native import platform
+from r3jax.kernels.visibility.near import MAX_VIEWS
 from r3jax.mapping.occupancy import OccupancyGrid, cells_of
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
@@ -24,7 +25,7 @@ from r3jax.visibility.views import View, panorama_view, pinhole_view
 CAPACITY = 1 << 12
 CAMERA = r3jax.Camera(50, 38, 41.0, 39.0, 26.0, 18.5)  # nothing symmetric, no power of two
 CONFIG = r3jax.ScoringConfig(max_range=2.5, zbuffer_size=48, panorama_size=64, panorama_bins=90)
-NUM = 6
+NUM = MAX_VIEWS + 2  # mapped, they share an index; in a loop, each goes without
 NUM_BINS = {"pinhole": 1, "panorama": CONFIG.panorama_bins}
 
 

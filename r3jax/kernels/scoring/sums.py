@@ -38,10 +38,12 @@ from r3jax.kernels.scoring.voxels import (
     X,
     Y,
     Z,
+    near_voxels,
     sorted_voxels,
 )
 from r3jax.kernels.visibility.bricks import find_runs, sorted_points
 from r3jax.kernels.visibility.limit import padded_size, surface_limit
+from r3jax.kernels.visibility.near import MAX_VIEWS, bricks_of_shares, compact, mark_near
 from r3jax.kernels.visibility.picture import (
     begin_of,
     fill_ring,
@@ -183,16 +185,6 @@ def _draw(view, layout, voxel_size, runs, points, scratch, buffer):
     fill_ring(buffer.limit, begin_of(0, side), stride_of(side), shape, layout.wraps)
 
 
-@inlined
-def _compact(is_seen, count, chosen):
-    """Writes the numbers of what is seen; returns how many they are."""
-    num = 0
-    for i in range(count):
-        chosen[num] = i
-        num += is_seen[i]
-    return num
-
-
 @inlined_fused
 def find_directions(position, points, first, num, size, scratch):
     """Finds unit vectors from a position to chosen points, distances, and octahedral cells."""
@@ -271,7 +263,7 @@ def _add_voxels(
                 scratch.placed, count, voxel_size, limit, side, shape, scratch.pixels,
                 scratch.is_seen,
             )  # fmt: skip
-            num = _compact(scratch.is_seen, count, scratch.chosen)
+            num = compact(scratch.is_seen, count, scratch.chosen)
             find_directions(view.position, voxels.known, first, num, size, scratch)
             _mark(voxels.rows, first, scratch.chosen, num, bits)
             find_deficits(
@@ -292,7 +284,7 @@ def _count_cells(view, layout, runs, empty, nearest, tables, scratch, counts, bi
             count = min(CHUNK, end - first)
             place(view, layout, empty.centers, first, count, scratch.placed)
             test_points(scratch.placed, count, nearest, side, shape, scratch.is_seen)
-            num = _compact(scratch.is_seen, count, scratch.chosen)
+            num = compact(scratch.is_seen, count, scratch.chosen)
             _mark(empty.numbers, first, scratch.chosen, num, bits)
             find_directions(view.position, empty.centers, first, num, size, scratch)
             add_by_direction(scratch, num, tables, counts)
@@ -342,6 +334,53 @@ def _sorted_cells(cells):
 
 
 @kernel
+def _near_cells(cells, views, is_sound, layout, voxel_size, workers):
+    """The unexplored cells that few views may show, in order: a brick for each thread's share."""
+    num = cells.unexplored.shape[0]
+    empty = Empty(np.empty((3, num), np.float32), np.empty(num, np.int32))
+    begins, ends = np.empty(workers, np.int64), np.empty(workers, np.int64)
+    _find_near_cells(cells, views, is_sound, layout, voxel_size, begins, ends, empty)
+    return bricks_of_shares(begins, ends, num), empty
+
+
+@parallel_kernel
+def _find_near_cells(cells, views, is_sound, layout, voxel_size, begins, ends, empty):
+    shares, num = begins.shape[0], cells.unexplored.shape[0]
+    for share in prange(shares):
+        begins[share] = num * share // shares
+        ends[share] = _find_share(
+            cells, views, is_sound, layout, voxel_size, begins[share], num * (share + 1) // shares,
+            empty,
+        )  # fmt: skip
+
+
+@kernel
+def _find_share(cells, views, is_sound, layout, voxel_size, begin, end, empty):
+    """Gathers the unexplored cells from `begin` to `end` that some view may show.
+
+    Returns:
+        Where they end; they begin where all of the cells do.
+    """
+    is_near, chosen, to = np.empty(CHUNK, np.int32), np.empty(CHUNK + 1, np.int32), begin
+    for first in range(begin, end, CHUNK):
+        count = min(CHUNK, end - first)
+        x, y, z = (
+            cells.x[first : first + count], cells.y[first : first + count],
+            cells.z[first : first + count],
+        )  # fmt: skip
+        mark_near(views, is_sound, layout, voxel_size, x, y, z, is_near)
+        for i in range(count):
+            is_near[i] &= np.int32(cells.unexplored[first + i] != 0)
+        num = compact(is_near, count, chosen)
+        for j in range(num):
+            i = np.int64(chosen[j])
+            empty.centers[X, to + j], empty.centers[Y, to + j] = x[i], y[i]
+            empty.centers[Z, to + j], empty.numbers[to + j] = z[i], first + i
+        to += num
+    return to
+
+
+@kernel
 def _sum_share(
     next_view, views, is_sound, layout, voxel_size, bricks, voxels, cell_bricks, empty,
     is_kappa_one, tables, results,
@@ -388,7 +427,7 @@ def _sum_all(
 
 @kernel
 def sums(rows, cells, views, layout, forms, tables, workers, results):
-    """Sums what many views of one map would show; they share an index.
+    """Sums what views of one map would show; many share an index, few need none.
 
     Args:
         rows: of the map, `calls.MapRows`.
@@ -401,8 +440,12 @@ def sums(rows, cells, views, layout, forms, tables, workers, results):
         results: written, `Sums`.
     """
     is_sound = sound_views(views, rows.voxel_size)
-    bricks, voxels = sorted_voxels(rows, views, is_sound, forms, workers)
-    cell_bricks, empty = _sorted_cells(cells)
+    if is_sound.shape[0] <= MAX_VIEWS:
+        bricks, voxels = near_voxels(rows, views, is_sound, layout, forms, workers)
+        cell_bricks, empty = _near_cells(cells, views, is_sound, layout, rows.voxel_size, workers)
+    else:
+        bricks, voxels = sorted_voxels(rows, views, is_sound, forms, workers)
+        cell_bricks, empty = _sorted_cells(cells)
     _sum_all(
         views, is_sound, layout, rows.voxel_size, bricks, voxels, cell_bricks, empty,
         forms.is_kappa_one, tables, workers, results,

@@ -8,12 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from r3jax.kernels.mapping.bins import center_of
+from r3jax.kernels.mapping.bins import center_of, center_of_words
 from r3jax.kernels.native.arithmetic import bits_of, count_bits, float_of
-from r3jax.kernels.native.compiled import inlined, kernel, parallel_kernel
+from r3jax.kernels.native.compiled import in_wide_vectors, inlined, kernel, parallel_kernel
 from r3jax.kernels.scoring.terms import consistency, log2_or_never
 from r3jax.kernels.visibility.bricks import sorted_slots
+from r3jax.kernels.visibility.near import bricks_of_shares, compact, mark_near
 from r3jax.kernels.visibility.views import CHUNK
+
+_ZERO = np.float32(0.0)
 
 
 class Voxels(NamedTuple):
@@ -139,3 +142,86 @@ def _gather(slots, bricks, rows, forms, workers, voxels):
                 if first <= begin < last:
                     end = min(begin + CHUNK, starts[brick + 1])
                     _unpack_sorted(records, begin, end, num_words, counts, voxels)
+
+
+@kernel
+def near_voxels(rows, views, is_sound, layout, forms, workers):
+    """The same of few views, in the order of the map: a brick for each thread's share of it."""
+    capacity = rows.counts.shape[0]
+    voxels = empty_voxels(capacity, rows.visited.shape[0])
+    begins, ends = np.empty(workers, np.int64), np.empty(workers, np.int64)
+    _gather_near(rows, views, is_sound, layout, forms, begins, ends, voxels)
+    return bricks_of_shares(begins, ends, capacity), voxels
+
+
+@parallel_kernel
+def _gather_near(rows, views, is_sound, layout, forms, begins, ends, voxels):
+    shares, capacity = begins.shape[0], rows.counts.shape[0]
+    for share in prange(shares):
+        begins[share] = capacity * share // shares
+        ends[share] = _gather_share(
+            rows, views, is_sound, layout, forms, begins[share],
+            capacity * (share + 1) // shares, voxels,
+        )  # fmt: skip
+
+
+@kernel
+def _gather_share(rows, views, is_sound, layout, forms, begin, end, voxels):
+    """Gathers what is known of the rows from `begin` to `end` that some view may show.
+
+    Returns:
+        Where the voxels end; they begin where the rows do.
+    """
+    centers, is_near = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
+    chosen, to = np.empty(CHUNK + 1, np.int32), begin
+    for first in range(begin, end, CHUNK):
+        count = min(CHUNK, end - first)
+        x, y, z = centers[X, :count], centers[Y, :count], centers[Z, :count]
+        _find_centers(rows.key[0, first:], rows.key[1, first:], rows.voxel_size, x, y, z)
+        mark_near(views, is_sound, layout, rows.voxel_size, x, y, z, is_near)
+        for i in range(count):
+            is_near[i] &= np.int32(rows.counts[first + i] > _ZERO)
+        num = compact(is_near, count, chosen)
+        _take_chosen(rows, first, centers, chosen, num, to, voxels)
+        deltas, logs = voxels.known[DELTA, to : to + num], voxels.known[LOG_DELTA, to : to + num]
+        _find_consistency(deltas, logs, forms.is_pairwise)
+        to += num
+    return to
+
+
+@kernel
+def _find_centers(low, high, voxel_size, x, y, z):
+    """Finds centers of voxels from the words of their keys [m]."""
+    in_wide_vectors()
+    for i in range(x.shape[0]):
+        x[i], y[i], z[i] = center_of_words(low[i], high[i], voxel_size)
+
+
+@inlined
+def _take_chosen(rows, first, centers, chosen, num, to, voxels):
+    """Copies chosen rows of a chunk, counts and spreads in the places of delta and its log."""
+    # One array after the other: more misses of the cache are then under way at a time.
+    for axis in range(3):
+        for j in range(num):
+            voxels.known[axis, to + j] = centers[axis, np.int64(chosen[j])]
+    for j in range(num):
+        voxels.rows[to + j] = first + np.int64(chosen[j])
+    for j in range(num):
+        voxels.known[DELTA, to + j] = rows.counts[first + np.int64(chosen[j])]
+    for j in range(num):
+        voxels.known[LOG_DELTA, to + j] = rows.m2[first + np.int64(chosen[j])]
+    for j in range(num):
+        voxels.known[RESOLUTION, to + j] = rows.resolution[first + np.int64(chosen[j])]
+    for word in range(0, rows.visited.shape[0], 2):
+        for j in range(num):
+            row = first + np.int64(chosen[j])
+            voxels.visited[word >> 1, to + j] = bins_of(rows.visited, word, row)
+
+
+@kernel
+def _find_consistency(counts, spreads, is_pairwise):
+    """Replaces counts by delta, and spreads of colors by its logarithm."""
+    in_wide_vectors()
+    for i in range(counts.shape[0]):
+        delta = consistency(counts[i], spreads[i], is_pairwise)
+        counts[i], spreads[i] = delta, log2_or_never(delta)
