@@ -1,7 +1,7 @@
-"""Finds words in prose that read translated: `python docs/hooks/words.py`, a part of `make lint`.
+"""Finds words that read translated: `python docs/hooks/words.py`, a part of `make lint`.
 
-Looks at Markdown, at docstrings and comments of Python, and at text given to options. A line that
-ends in `words: ok` is let through.
+Looks at Markdown, at docstrings and comments of Python, and at the messages of the package. A line
+that ends in `words: ok` is let through.
 """
 
 import ast
@@ -24,12 +24,13 @@ INSTEAD = {
     r"asked (?:of|for)": "required, target",
     r"worth (?:a|so|more|less|nothing)": "gains, pays, utility",
     r"lacks?": "is missing, without, deficit",
-    r"foresees?": "predict",
+    r"foresees?|foreseen": "predict",
     r"its kin": "name them",
     r"all over the place": "throughout",
     r"for ever": "forever, without end",
     r"who chooses": "the policy",
     r"what carries": "the robot, the platform",
+    r"found no room": "was dropped",
     r"(?:frames?|captures?|captured|looks?|looking|plans?) on the way": "while moving",
 }
 """Patterns, and what to write in their place."""
@@ -53,32 +54,42 @@ def main() -> int:
 def _files() -> Iterator[Path]:
     for folder in ("r3jax", "docs", "examples", "experiments"):
         for path in (ROOT / folder).rglob("*"):
-            if path.suffix in {".py", ".md"} and "results" not in path.parts[:-1]:
+            if path.suffix in {".py", ".md", ".html"} and "results" not in path.parts[:-1]:
                 yield path
     yield from (ROOT / "docs" / "results").glob("*.md")
     yield from ROOT.glob("*.md")
 
 
 def _prose(path: Path) -> Iterator[tuple[int, str]]:
+    if path == Path(__file__):
+        return
     text = path.read_text("utf-8")
     lines = text.splitlines()
-    if path.suffix == ".md":
-        numbers = set(range(1, len(lines) + 1))
-    elif path == Path(__file__):
-        return
-    else:
-        numbers = {
-            token.start[0]
-            for token in tokenize.generate_tokens(io.StringIO(text).readline)
-            if token.type == tokenize.COMMENT
-        }
-        for node in ast.walk(ast.parse(text)):
-            # Docstrings, those of fields too: a string that is a statement by itself.
-            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-                numbers |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    numbers = _prose_of(text, path) if path.suffix == ".py" else range(1, len(lines) + 1)
     for number in sorted(numbers):
         if not lines[number - 1].rstrip().endswith(_EXCEPTED):
             yield number, lines[number - 1]
+
+
+def _prose_of(text: str, path: Path) -> set[int]:
+    """Returns the lines with comments, docstrings and, in the package, messages."""
+    numbers = {
+        token.start[0]
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type == tokenize.COMMENT
+    }
+    has_messages = (ROOT / "r3jax") in path.parents
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.Constant) or not isinstance(node.value, str):
+            continue
+        # A string with spaces is a message; docstrings, those of fields too, have some.
+        if " " in node.value and (has_messages or "\n" in node.value or _is_docstring(node, text)):
+            numbers |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return numbers
+
+
+def _is_docstring(node: ast.Constant, text: str) -> bool:
+    return text.splitlines()[node.lineno - 1].lstrip().startswith('"""')
 
 
 if __name__ == "__main__":

@@ -303,7 +303,7 @@ class ActiveGamer(GreedyPolicy):
         return candidates, {"lot": before}
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """The score of the paper, or the lots: the path itself costs nothing."""
+        """Returns the score of the paper, or random scores: the path itself costs nothing."""
         if "lot" in utilities:
             return utilities["lot"]
         return score_of(utilities["utility"], utilities["distance"])

@@ -42,7 +42,7 @@ class PixelView(eqx.Module):
     """z-depth of the voxel's center [m]; inf where there is none."""
 
     offset: Float[Array, "3 h w"]
-    """From the voxel's center to the camera [m]; meaningless where there is none."""
+    """From the voxel's center to the camera [m]; undefined where no voxel is."""
 
     rows: Any
     """The requested quantities of the visible voxel, `[..., h, w]`; undefined where none is."""

@@ -102,7 +102,10 @@ def _lens(index: int, entry: dict[str, Any], size: tuple[int, int]) -> Lens:
     """`fov` is the vertical angle of view [deg]; `aspect` makes no difference to square pixels."""
     check_type(f"camera_path[{index}].fov", entry["fov"], float)
     if not _LEAST_ANGLE <= entry["fov"] < 180.0:
-        raise ForeignFileError(f"camera_path[{index}].fov {entry['fov']:g} is no angle of view")
+        raise ForeignFileError(
+            f"camera_path[{index}].fov must lie in [{_LEAST_ANGLE:g}, 180) degrees, got "
+            f"{entry['fov']:g}"
+        )
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * math.radians(entry["fov"]))
     return Lens("PINHOLE", width, height, (focal, focal, 0.5 * width, 0.5 * height))

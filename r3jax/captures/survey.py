@@ -163,7 +163,7 @@ class Survey:
     """Box round what the images show and where they were taken, [2, 3] [audit units]."""
 
     voxel_size: float
-    """Edge of a voxel [audit units]."""
+    """Voxel size [audit units]."""
 
     cell_size: float
     """Edge of a cell of the coarse grid [audit units]."""

@@ -188,5 +188,5 @@ class Mission:
 
     @property
     def rules(self) -> CaptureSettings:
-        """What decides on the frames of a path."""
+        """Settings that determine the frames of a path."""
         return CaptureSettings(self.config, motion_of(self.policy), self.simulator.camera)

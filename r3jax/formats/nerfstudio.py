@@ -309,7 +309,7 @@ def _focal_lengths(fields: _Fields, width: int, height: int) -> tuple[float, flo
         elif f"camera_angle_{axis}" in fields:
             angle = _value(fields, f"camera_angle_{axis}")
             if not 0.0 < angle < math.pi:
-                raise ForeignFileError(f"the camera_angle_{axis} {angle:g} is no angle of view")
+                raise ForeignFileError(f"camera_angle_{axis} must lie in (0, pi), got {angle:g}")
             found.append(0.5 * side / math.tan(0.5 * angle))
     if not found:
         raise ForeignFileError("there is no focal length (fl_x) and no camera_angle_x")

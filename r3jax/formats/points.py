@@ -109,7 +109,7 @@ def _header(data: bytes) -> _Vertices:
         raise ForeignFileError("the header names no format that is known, or no element")
     missing = sorted(set("xyz") - fields.keys())
     if missing:
-        raise ForeignFileError(f"the vertices lack {', '.join(missing)}")
+        raise ForeignFileError(f"the vertices are missing {', '.join(missing)}")
     return _Vertices(order, count, tuple(fields.items()), line_end + 1)
 
 
@@ -122,7 +122,7 @@ def _count(words: list[str]) -> int:
 def _check_length(vertices: _Vertices, row: int, left: int) -> None:
     if vertices.count * row > left:
         raise ForeignFileError(
-            f"it promises {vertices.count} points, but only {left} bytes follow: is it cut off?"
+            f"it is truncated: it declares {vertices.count} points, and only {left} bytes follow"
         )
 
 

@@ -324,4 +324,4 @@ def left_out(count: int, total: int, frames: str = "frames") -> str | None:
     """
     if not count:
         return None
-    return f"{count} of {total} {frames} lack an image, depth or a pose and are left out."
+    return f"{count} of {total} {frames} without an image, depth or a pose are left out."

@@ -366,7 +366,7 @@ def _frame_of(plain: Any, number: int) -> SubmittedFrame:
     """A frame of its line; `number` is that of the frame that comes next."""
     known: dict[str, Any] = plain if isinstance(plain, dict) else {}
     if known and known.get("pose") is None:
-        raise ForeignFileError("the frame lacks `pose`")
+        raise ForeignFileError("the frame is missing `pose`")
     ready: dict[str, Any] = {"pose": rigid_pose("pose", known.get("pose"))}
     if known.get("path") is not None:
         ready["path"] = table_of("path", known["path"], (-1, 3))

@@ -1,7 +1,7 @@
-"""Refuses arguments of the public calls that would give a plausible number for a wrong question.
+"""Validates arguments of the public API: mistakes that would give plausible but wrong results.
 
 Kinds and shapes are known while tracing, so they are refused under jit too. Values are looked at
-where they are known; under jit a pose that is none makes the result NaN (`geometry.cameras.sound`).
+where they are known; under jit an invalid pose makes the result NaN (`cameras.nan_unless_valid`).
 """
 
 import functools
@@ -104,7 +104,7 @@ def a_pose(name: str, value: Any) -> None:
         raise ValueError(
             f"{name} must be one pose, a 4x4 matrix, got shape {shape}{_stacked(shape, (4, 4))}"
         )
-    # Under jit the value is not known: there `sound` makes the score NaN instead.
+    # Under jit the value is not known: there `nan_unless_valid` makes the score NaN instead.
     if not is_traced(value) and (problem := rigid_error(np.asarray(value))) is not None:
         raise ValueError(f"{name}: {problem}")
 

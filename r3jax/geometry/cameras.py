@@ -52,7 +52,7 @@ class Camera(eqx.Module):
         """Refuses intrinsics whose rays would be infinite or NaN."""
         if self.width < 1 or self.height < 1:
             raise ValueError(f"a camera's image needs pixels, got {self.width} x {self.height}")
-        # Under jit values are not known; `sound` marks what they spoil.
+        # Under jit values are not known; `nan_unless_valid` marks what they spoil.
         if is_traced(self.fx, self.fy, self.cx, self.cy):
             return
         for name, value in (("fx", float(self.fx)), ("fy", float(self.fy))):
@@ -168,7 +168,8 @@ def pose_along(
     position, direction = _point("position", position), _point("direction", direction)
     if not is_traced(direction) and not np.any(np.asarray(direction)):
         raise ValueError("direction has no length: there is nothing to look at")
-    # Only jit lets a zero direction pass: its pose is finite but not rigid, which `sound` notices.
+    # Only jit lets a zero direction pass: its pose is finite but not rigid, which
+    # `nan_unless_valid` notices.
     forward = direction / jnp.maximum(safe_norm(direction), 1e-12)
     # The product of forward and up, so that its z is 0 exactly: level at every pitch.
     right = jnp.stack([forward[1], -forward[0], jnp.zeros_like(forward[0])])
@@ -255,12 +256,12 @@ def rigid_error(T: np.ndarray) -> str | None:
 
 
 @jax.jit
-def sound(
+def nan_unless_valid(
     camera: Camera, T_world_camera: Float[Array, "4 4"], *lengths: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """1 where a view can be meant, else NaN: the factor of a score that is worked out under jit.
+    """Returns 1 for a valid view and NaN otherwise: a factor of scores under jit.
 
-    There nothing can be refused, and a pose that is not rigid sees nothing: it would score 0.
+    Nothing can be raised there, and a pose that is not rigid sees nothing: it would score 0.
     `rigid_error` says the same of a pose outside jit.
 
     Args:

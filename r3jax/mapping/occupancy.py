@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked, one
-from r3jax.geometry.cameras import Camera, invert_pose, pixel_rays, sound
+from r3jax.geometry.cameras import Camera, invert_pose, nan_unless_valid, pixel_rays
 from r3jax.geometry.voxels import check_near_origin
 from r3jax.kernels.calls import Cells
 
@@ -264,7 +264,7 @@ def integrate_depth(
     change = jnp.where(hit, step, jnp.where(passed, -step, 0.0))
     log_odds = jnp.clip(grid.log_odds + change, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
     # Under jit nothing can be refused: NaN makes every later score say so.
-    cell_size = grid.cell_size * sound(frame.camera, frame.T_world_camera)
+    cell_size = grid.cell_size * nan_unless_valid(frame.camera, frame.T_world_camera)
     return eqx.tree_at(lambda g: (g.log_odds, g.cell_size), grid, (log_odds, cell_size))
 
 

@@ -49,7 +49,7 @@ def evidence_of_view(
     position: Float[Array, " 3"] | Float[Array, "3 M"],
     focal: Float[Array, ""],
 ) -> tuple[UInt32[Array, "W M"], Float[Array, " M"]]:
-    """Computes what a look from a camera says of voxels: the direction bin and the resolution.
+    """Computes the observation of voxels from a camera: direction bin and resolution.
 
     Args:
         state: the map; of it, the number of bins.

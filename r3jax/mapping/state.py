@@ -77,7 +77,7 @@ class MapState(eqx.Module):
     @property
     @jax.jit
     def center(self) -> Float[Array, "3 N"]:
-        """Centers of the voxels [m]; meaningless where there is none."""
+        """Centers of the voxels [m]; undefined in unused rows."""
         return voxel_center(jnp.stack(unpack(self.key[0], self.key[1])), self.voxel_size)
 
     def center_of(self, row: Int[Array, " n"]) -> Float[Array, "3 n"]:
@@ -86,7 +86,7 @@ class MapState(eqx.Module):
         return voxel_center(jnp.stack(unpack(low, high)), self.voxel_size)
 
     def take(self, row: Int[Array, " n"], valid: Bool[Array, " n"]) -> "MapState":
-        """Gathers some rows, to be scored: a map in which nothing can be looked up by its key.
+        """Gathers rows into a smaller map for scoring. It has no hash table for lookups.
 
         Args:
             row: which rows.

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked
-from r3jax.geometry.cameras import invert_pose, is_traced, sound
+from r3jax.geometry.cameras import invert_pose, is_traced, nan_unless_valid
 from r3jax.geometry.selection import positions_of_set
 from r3jax.geometry.voxels import INDEX_LIMIT, check_near_origin, unpack, voxel_center
 from r3jax.kernels import calls
@@ -103,7 +103,7 @@ def integrate_pixels(
 ) -> MapState:
     """Adds the frame's measured pixels to the map: the part of `integrate` that counts colors."""
     depth = frame.depth
-    factor = sound(frame.camera, frame.T_world_camera)
+    factor = nan_unless_valid(frame.camera, frame.T_world_camera)
     # An unsound pose makes the factor NaN, and NaN > 0 is False: the frame adds nothing.
     is_measured = (depth > 0.0) & jnp.isfinite(depth) & (depth <= max_range) & (factor > 0.0)
     # A branch, not a select: XLA would compute the medians again in each of their consumers.
@@ -132,7 +132,7 @@ def _by_kernels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     """The same in machine code."""
-    factor = sound(frame.camera, frame.T_world_camera)
+    factor = nan_unless_valid(frame.camera, frame.T_world_camera)
     # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
     image = for_kernels(frame, factor * max_range, drop_edges)
     rows, mean, lost = calls.map_add(state.rows, state.mean, image, state.num_bins)

@@ -141,7 +141,7 @@ def free_views(travel: Travel, num: int, radius: float, *, key: Array) -> Candid
 
 
 def draw_lots(num: int, *, key: Array) -> dict[str, np.ndarray]:
-    """A `lot` for each of `num` candidates, where nothing else tells them apart."""
+    """Draws a random score for each candidate (the random policy; elsewhere a tie-breaker)."""
     return {"lot": host_generator(key).random(num)}
 
 

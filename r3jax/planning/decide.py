@@ -36,7 +36,7 @@ from r3jax.scoring.explain import Explanation, explain_view
 from r3jax.scoring.utility import visible_unexplored
 
 MAX_FAILED_LOOKS = 3
-"""Views that should have shown a cell and left it unexplored, after which it is left alone: it lies
+"""A cell still unexplored after this many views that should have shown it is given up: it lies
 behind a window, where the depth sensor fails, or where hits and passes cancel out."""
 
 RECONSIDERED = 8

@@ -44,9 +44,9 @@ class NextViews(eqx.Module):
     """lambda1 U_G + U_R of each, as if those before it had been taken; never rising."""
 
 
-Ask = Callable[[MapState, Cells, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""From voxels, cells and numbers of candidates [m] to their poses [m, 4, 4], turned where they may
-turn, and the utility of each [m]."""
+ScoreIndices = Callable[[MapState, Cells, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Maps voxels, cells and indices of candidates [k] to their poses [k, 4, 4], turned where they may
+turn, and their utilities [k]."""
 
 
 @checked(state=a_map, grid=a_grid, camera=a_camera)
@@ -71,7 +71,7 @@ def next_views(
         k: how many.
         poses: what to choose from, [C, 4, 4], each at most once. By default `config.num_candidates`
             positions, spread over all known free space that keeps the safety margin; each looks
-            where its panorama is worth most.
+            where its panorama is utilities most.
         config: candidates, safety margin, and `scoring`: lambda1 and the range.
 
     Raises:
@@ -126,35 +126,35 @@ def _checked(poses: ArrayLike, k: int) -> np.ndarray:
     return checked
 
 
-def _score_as_given(poses: np.ndarray, camera: Camera, config: PlannerConfig) -> Ask:
-    def ask(voxels: MapState, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _score_as_given(poses: np.ndarray, camera: Camera, config: PlannerConfig) -> ScoreIndices:
+    def score(voxels: MapState, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         T = jnp.asarray(poses[ids], dtype=jnp.float32)
         scores = score_views_near(voxels, cells, camera, T, config.scoring)
         return poses[ids], np.asarray(scores.total, dtype=np.float64)
 
-    return ask
+    return score
 
 
 def _score_turned(
     voxels: MapState, cells: Cells, positions: np.ndarray, camera: Camera, config: PlannerConfig
-) -> tuple[Ask, tuple[np.ndarray, np.ndarray]]:
+) -> tuple[ScoreIndices, tuple[np.ndarray, np.ndarray]]:
     start, scoring = (voxels, cells), config.scoring
     places = jnp.asarray(positions, dtype=jnp.float32)
     # Kept: taking a view moves no surface, so that each position goes on seeing the same.
     panorama, kept = cache_positions_near(*start, camera, places, scoring)
 
-    def ask(voxels: MapState, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def score(voxels: MapState, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         some, after = jnp.asarray(ids), (voxels, cells)
         again = score_cached_near(kept.at(some), start, after, camera, places[some], scoring)
         turned, utility = best_views(candidates_at(positions[ids]), again)
         return turned.T_world_camera, utility
 
     turned, utility = best_views(candidates_at(positions), panorama)
-    return ask, (turned.T_world_camera, utility)
+    return score, (turned.T_world_camera, utility)
 
 
 def _lazy_greedy(
-    ask: Ask,
+    score: ScoreIndices,
     first: tuple[np.ndarray, np.ndarray],
     voxels: MapState,
     cells: Cells,
@@ -163,11 +163,11 @@ def _lazy_greedy(
     k: int,
     config: PlannerConfig,
 ) -> NextViews:
-    """K times the candidate of the greatest utility; each may be taken `left` [C] times."""
+    """Picks the best candidate k times (lazy greedy, Minoux 1978), each at most `left` times."""
     poses, bound = first
     is_new = np.ones(len(left), dtype=bool)
     taken: list[np.ndarray] = []
-    worth: list[float] = []
+    utilities: list[float] = []
     while True:
         best = int(np.argmax(np.where(left > 0, bound, -np.inf)))
         # Bounds only fall, so a fresh one at the top beats all stale ones below it (Minoux 1978).
@@ -176,14 +176,14 @@ def _lazy_greedy(
             ids = stale[np.argsort(-bound[stale], kind="stable")][:_AT_ONCE]
             # One shape, so that renewing compiles once.
             padded = ids[np.arange(_AT_ONCE) % len(ids)]
-            turned, values = ask(voxels, cells, padded)
+            turned, values = score(voxels, cells, padded)
             poses[ids], bound[ids], is_new[ids] = turned[: len(ids)], values[: len(ids)], True
             continue
         # A copy: the row is turned again when its bound is renewed.
         taken.append(poses[best].copy())
-        worth.append(float(bound[best]))
+        utilities.append(float(bound[best]))
         if len(taken) == k:
-            return NextViews(np.stack(taken), np.asarray(worth))
+            return NextViews(np.stack(taken), np.asarray(utilities))
         left[best] -= 1
         # A view was taken: every other score is a bound from here on.
         is_new[:] = False

@@ -197,7 +197,7 @@ def tell_policy(planner: Planner, frame: Frame) -> Planner:
 
 
 def follow(planner: Planner, T_world_camera: np.ndarray, waypoints: np.ndarray) -> Planner:
-    """Tells the policy of a path that somebody else chose, before it is gone.
+    """Notifies the policy of a path that another one chose, before the robot follows it.
 
     Args:
         planner: what is known.

@@ -135,7 +135,7 @@ class Policy(Protocol):
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> Any:
-        """Takes note of a way that somebody else chose, before it is gone: a fork takes over.
+        """Notes a path that another policy chose, before the robot follows it (forked runs).
 
         Args:
             state: what the policy remembers.

@@ -175,7 +175,7 @@ def scene_of_run(run: Run) -> SceneSettings:
         if how["start"] is not None:  # JSON knows lists alone
             how["start"] = tuple(how["start"])
     except KeyError as error:
-        raise RunError(run.path / "run.json", f"the scene lacks {error}") from None
+        raise RunError(run.path / "run.json", f"the scene is missing {error}") from None
     return SceneSettings(scene["name"], run.camera, run.header.seed, **how)
 
 

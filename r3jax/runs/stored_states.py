@@ -238,7 +238,7 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
     # Not `policy`: a policy that remembers nothing has no such table.
     missing = sorted({"map", "grid", "loop"} - set(tables))
     if missing:
-        raise ValueError(f"the checkpoint lacks {', '.join(missing)}")
+        raise ValueError(f"the checkpoint is missing {', '.join(missing)}")
     arrays = dict(tables["map"])
     # No array of the map, so `fill` would not notice: with other bins the visited bits of a row
     # stand for other directions.

@@ -76,7 +76,7 @@ def score_positions(
 def _at_hand(
     state: MapState, grid: OccupancyGrid, positions: Float[Array, "C 3"], config: ScoringConfig
 ) -> tuple[MapState, Cells]:
-    """The whole map and grid; where no kernel finds its way in them, what is within range."""
+    """Returns the whole map and grid if a kernel culls them itself, else the rows within range."""
     if is_traced(state.key, positions):
         raise TypeError("score_views and score_positions deal out work: call them outside jit")
     if jax.default_backend() == "cpu" and can_call_kernels():

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.arguments import a_camera, a_pose, checked
-from r3jax.geometry.cameras import Camera, sound
+from r3jax.geometry.cameras import Camera, nan_unless_valid
 from r3jax.geometry.selection import for_selected
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
 from r3jax.mapping.seen import seen_in_view
@@ -80,7 +80,7 @@ def explain_view(
     position = T_world_camera[:3, 3]
     shares, rendering = _divide_visible(state, shown, position, camera.focal, config.forms)
     exploration = config.lambda1 * jnp.sum(unseen, dtype=jnp.float32)
-    factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
+    factor = nan_unless_valid(camera, T_world_camera, state.voxel_size, grid.cell_size)
     return Explanation(
         totals=factor * jnp.concatenate([exploration[None], rendering]),
         shares=factor * shares,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.arguments import a_camera, a_point, checked
-from r3jax.geometry.cameras import Camera, pose_along, sound
+from r3jax.geometry.cameras import Camera, nan_unless_valid, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.kernels.calls import Cells
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
@@ -60,7 +60,7 @@ def panorama(
     """
     config = ScoringConfig() if config is None else config
     scores = panorama_of(state, cells_of(grid), camera, position, config)
-    factor = sound(camera, scores.T_world_camera, state.voxel_size, grid.cell_size)
+    factor = nan_unless_valid(camera, scores.T_world_camera, state.voxel_size, grid.cell_size)
     return jax.tree.map(lambda part: factor * part, scores)
 
 

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked
-from r3jax.geometry.cameras import Camera, is_traced, sound
+from r3jax.geometry.cameras import Camera, is_traced, nan_unless_valid
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.backend import mean_in_pixels, rows_in_pixels, terms_of_rows
 from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
@@ -103,7 +103,7 @@ def term_images(
     terms = score_voxels(
         voxels_of_rows(state, row), T_world_camera[:3, 3], camera.focal, config.forms
     )
-    factor = sound(camera, T_world_camera, state.voxel_size)
+    factor = nan_unless_valid(camera, T_world_camera, state.voxel_size)
     image: Callable[[Array], Array] = lambda term: factor * term.reshape(row.shape)
     return TermImages(
         row, image(terms.value), image(terms.bias), image(terms.noise), image(terms.resolution)
@@ -145,4 +145,4 @@ def renderability(
     config = ScoringConfig() if config is None else config
     view, position = pinhole_view(camera, T_world_camera, config), T_world_camera[:3, 3]
     mean = mean_in_pixels(state, view, position, camera.focal, config, config.forms)
-    return sound(camera, T_world_camera, state.voxel_size) * mean
+    return nan_unless_valid(camera, T_world_camera, state.voxel_size) * mean

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.geometry.arguments import a_camera, a_pose, checked
-from r3jax.geometry.cameras import Camera, sound
+from r3jax.geometry.cameras import Camera, nan_unless_valid
 from r3jax.geometry.selection import positions_of_set
 from r3jax.kernels.calls import Cells
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
@@ -133,7 +133,7 @@ def soft_utility(
     """
     config = ScoringConfig() if config is None else config
     made = soft_utility_near(state, cells_of(grid), camera, T_world_camera, config, softness)
-    factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
+    factor = nan_unless_valid(camera, T_world_camera, state.voxel_size, grid.cell_size)
     return eqx.tree_at(lambda u: u.count, made, factor * made.count)
 
 

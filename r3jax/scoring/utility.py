@@ -5,7 +5,7 @@ import jax
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.arguments import a_camera, a_pose, checked
-from r3jax.geometry.cameras import Camera, sound
+from r3jax.geometry.cameras import Camera, nan_unless_valid
 from r3jax.kernels.calls import Cells
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
 from r3jax.mapping.seen import seen_in_view
@@ -44,7 +44,7 @@ def view_utility(
     """
     config = ScoringConfig() if config is None else config
     utility = utility_of_view(state, cells_of(grid), camera, T_world_camera, config)
-    factor = sound(camera, T_world_camera, state.voxel_size, grid.cell_size)
+    factor = nan_unless_valid(camera, T_world_camera, state.voxel_size, grid.cell_size)
     return jax.tree.map(lambda part: factor * part, utility)
 
 

@@ -29,7 +29,7 @@ class Composite(eqx.Module):
     """Pairs of tile and Gaussian that the view needs."""
 
     overflow: Int[Array, ""]
-    """How many of them found no room in the budget."""
+    """How many of them were dropped as there was no room in the budget."""
 
 
 @runtime_checkable

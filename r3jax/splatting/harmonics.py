@@ -88,7 +88,7 @@ def _sum_harmonics_bwd(
     sh, x, y, z = residuals
     basis, pull_back = jax.vjp(lambda x, y, z: harmonics(x, y, z, _degree(sh)), x, y, z)
     by_sh = jnp.stack(basis, axis=-1)[:, :, None] * cotangent.T[:, None, :]
-    # Where nothing depends on the color, the coefficients need not be numbers.
+    # Where nothing depends on the color, the coefficients may be NaN: they are masked.
     rows = jnp.where((cotangent != 0.0).any(axis=0)[:, None, None], sh, 0.0)
     by_basis = [sum(cotangent[c] * rows[:, i, c] for c in range(3)) for i in range(len(basis))]
     return by_sh, *pull_back(by_basis)

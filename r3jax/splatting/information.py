@@ -49,7 +49,7 @@ def pixel_squares(
         source: which implementation.
 
     Returns:
-        A sum for every parameter, laid out as the scene; and how many intersections found no room:
+        A sum for every parameter, laid out as the scene; and how many intersections were dropped:
         all sums are 0 then.
     """
     if _is_compiled(source):
@@ -85,7 +85,7 @@ def pixel_tallies(
         source: which implementation.
 
     Returns:
-        Both sums of every Gaussian; and how many intersections found no room: all sums are 0 then.
+        Both sums of every Gaussian; and how many intersections were dropped: all sums are 0 then.
     """
     least = jnp.array([least_through, least_weight], dtype=jnp.float32)
     if _is_compiled(source):

@@ -160,7 +160,7 @@ def _check_hash(file: BinaryIO) -> None:
         while block := file.read(_BLOCK):
             digest.update(block)
         if digest.hexdigest() != found[1].decode():
-            raise ForeignFileError("it was damaged or changed: its SHA-256 is of another content")
+            raise ForeignFileError("checksum mismatch (SHA-256): the file was damaged or edited")
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:

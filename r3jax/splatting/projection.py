@@ -94,14 +94,14 @@ def without_nans(scene: GaussianScene) -> GaussianScene:
 
     Not drawing them is not enough: 0 x NaN would spoil the gradient of the pose.
     """
-    sound = ~jnp.isnan(scene.opacity_logits)
+    valid = ~jnp.isnan(scene.opacity_logits)
     for x in (scene.means, scene.quats, scene.log_scales):
-        sound &= jnp.isfinite(x).all(axis=1)
+        valid &= jnp.isfinite(x).all(axis=1)
     return GaussianScene(
-        means=jnp.where(sound[:, None], scene.means, 0.0),
-        quats=jnp.where(sound[:, None], scene.quats, 1.0),
-        log_scales=jnp.where(sound[:, None], scene.log_scales, 0.0),
-        opacity_logits=jnp.where(sound, scene.opacity_logits, DEAD_LOGIT),
+        means=jnp.where(valid[:, None], scene.means, 0.0),
+        quats=jnp.where(valid[:, None], scene.quats, 1.0),
+        log_scales=jnp.where(valid[:, None], scene.log_scales, 0.0),
+        opacity_logits=jnp.where(valid, scene.opacity_logits, DEAD_LOGIT),
         sh=scene.sh,
     )
 

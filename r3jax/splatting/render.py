@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked, one, or_none
-from r3jax.geometry.cameras import Camera, is_traced, sound
+from r3jax.geometry.cameras import Camera, is_traced, nan_unless_valid
 from r3jax.splatting.backend import Composite, find_backend
 from r3jax.splatting.config import RasterConfig, fitting_budget
 from r3jax.splatting.scene import GaussianScene, a_scene
@@ -29,7 +29,7 @@ class Rendering(eqx.Module):
     """Pairs of tile and Gaussian that the view needs."""
 
     overflow: Int[Array, ""]
-    """How many of them found no room; if any, the images are NaN."""
+    """How many of them were dropped; if any, the images are NaN."""
 
 
 @checked(
@@ -51,8 +51,8 @@ def render(
     """Renders one view by EWA splatting (Kerbl et al. 2023).
 
     Differentiable by the scene, the pose, the intrinsics and the background. The budget of
-    intersections is fixed while tracing: where a view needs more, `overflow` counts what found
-    no room and the images are NaN, because an image with missing Gaussians looks plausible.
+    intersections is fixed while tracing: where a view needs more, `overflow` counts what was
+    dropped and the images are NaN, because an image with missing Gaussians looks plausible.
     Outside jit (and if the config leaves the budget open) it is raised until the view fits. A pose
     that is not rigid is refused outside jit, and gives NaN under it.
 
@@ -85,7 +85,7 @@ def render(
         budget = fitting_budget(int(composite.num_intersections))
         config = dataclasses.replace(config, max_intersections=budget)
         composite = rasterize(scene, camera, T_world_camera, center_offsets, config)
-    return _finish(composite, background, sound(camera, T_world_camera))
+    return _finish(composite, background, nan_unless_valid(camera, T_world_camera))
 
 
 def _finish(

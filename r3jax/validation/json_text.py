@@ -106,8 +106,8 @@ def unsealed(plain: dict[str, Any]) -> dict[str, Any]:
     rest = {name: value for name, value in plain.items() if name != _SEAL}
     if plain[_SEAL] != _seal_of(rest):
         raise ForeignFileError(
-            f"it was damaged or changed: its `{_SEAL}` is of another content (who changes it by "
-            "hand must take that field out)"
+            f"checksum mismatch: the file was damaged or edited; if you edited it, remove its "
+            f"`{_SEAL}` field"
         )
     return rest
 
@@ -146,7 +146,11 @@ def build(kind: type[T], plain: Any, /, **ready: Any) -> T:
     ]
     unknown = sorted(set(plain) - set(fields))
     if missing or unknown:
-        what = f"lacks {', '.join(missing)}" if missing else f"has an unknown {_short(unknown[0])}"
+        what = (
+            f"is missing {', '.join(missing)}"
+            if missing
+            else f"has an unknown {_short(unknown[0])}"
+        )
         raise ForeignFileError(f"the {kind.__name__} {what}")
     hints = typing.get_type_hints(kind)
     for name, value in plain.items():
@@ -164,7 +168,7 @@ def check_fields(name: str, record: Any, kinds: Mapping[str, Any]) -> None:
     check_type(name, record, dict[str, Any])
     missing = sorted(kinds.keys() - record.keys())
     if missing:
-        raise ForeignFileError(f"`{name[:80]}` lacks {', '.join(missing)}")
+        raise ForeignFileError(f"`{name[:80]}` is missing {', '.join(missing)}")
     for field, kind in kinds.items():
         check_type(f"{name}.{field}", record[field], kind)
 

@@ -129,7 +129,7 @@ def depth_margin(view: View, place: Placement, limit: Float[Array, "h w"]) -> Fl
 def corner_margin(
     view: View, place: Placement, voxel_size: Float[Array, ""], limit: Float[Array, "h w"]
 ) -> Float[Array, " n"]:
-    """The same for voxels, at that of their corners, as they appear in the view, that shows most.
+    """Computes `depth_margin`, maximized over the corners of each voxel's projected square.
 
     Half of the voxels that a cluttered room hides in part show something beside the edge that
     hides their middle.

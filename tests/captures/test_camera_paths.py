@@ -95,11 +95,11 @@ SCALED = np.diag([2.0, 2.0, 2.0, 1.0]).ravel().tolist()
 
 DAMAGES = {
     "no cameras": (lambda c: change(c, camera_path=[]), "holds no cameras"),
-    "no size": (lambda c: {**{k: c[k] for k in c if k != "render_width"}}, "lacks render_width"),
+    "no size": (lambda c: {**{k: c[k] for k in c if k != "render_width"}}, "render_width"),
     "panorama": (lambda c: change(c, camera_type="equirectangular"), "only perspective paths"),
     "numbers": (lambda c: _first(c, camera_to_world=[1.0] * 12), "must be 16 numbers, got 12"),
     "scale": (lambda c: _first(c, camera_to_world=SCALED), "not rigid"),
-    "angle": (lambda c: _first(c, fov=180.0), "no angle of view"),
+    "angle": (lambda c: _first(c, fov=180.0), "fov"),
     "word": (lambda c: _first(c, fov="wide"), "must be float"),
     "image": (lambda c: change(c, render_height=0), "0 pixels|64 x 0"),
 }  # fmt: skip

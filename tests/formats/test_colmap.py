@@ -165,7 +165,7 @@ def test_a_binary_that_promises_too_much_is_refused_before_memory_is_taken(tmp_p
     write_binary(tmp_path, random_model(0))
     data = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes((10**12).to_bytes(8, "little") + data[8:])
-    with pytest.raises(FormatError, match=rf"{name}: it promises 1000000000000 .*but only"):
+    with pytest.raises(FormatError, match=rf"{name}: .*1000000000000 .*only \d+ bytes"):
         read_colmap(tmp_path)
 
 

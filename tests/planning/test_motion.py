@@ -32,7 +32,7 @@ from r3jax.runs.header import settings_of
         ({"speed": 0.0}, "speed must be positive and finite"),
         ({"speed": 1e-310}, "speed must be positive and finite, at least 0.001"),
         ({"turn_per_meter": math.nan}, "turn_per_meter must be positive and finite"),
-        ({"turn_rate": 30.0}, "turn_rate weighs turns against ways: give the speed"),
+        ({"turn_rate": 30.0}, "turn_rate needs speed"),
     ],
 )
 def test_what_nothing_can_move_with_is_refused(wrong, says):

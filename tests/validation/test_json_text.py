@@ -108,9 +108,9 @@ def test_another_type_is_named(change, reason):
 
 
 def test_a_missing_field_is_named():
-    with pytest.raises(ForeignFileError, match="the Record lacks name"):
+    with pytest.raises(ForeignFileError, match=r"the Record .* name"):
         build(Record, {k: v for k, v in PLAIN.items() if k != "name"})
-    with pytest.raises(ForeignFileError, match=r"`thing` lacks b"):
+    with pytest.raises(ForeignFileError, match=r"`thing` .* b"):
         check_fields("thing", {"a": 1}, {"a": int, "b": str | None})
     with pytest.raises(ForeignFileError, match="expected the fields of a Record, got"):
         build(Record, [1])

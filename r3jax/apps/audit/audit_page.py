@@ -97,7 +97,7 @@ def _cards(audit: Audit) -> dict[str, str]:
     if audit.source.is_dense:
         bad = (1.0 - found.fine_share) * found.is_seen.sum() * audit.survey.voxel_size**2
         cards["of the surface renders well"] = fine
-        cards["of surface to mend"] = sentences.area(audit, float(bad))
+        cards["of surface that needs more views"] = sentences.area(audit, float(bad))
     else:
         cards["of what they show renders well"] = fine
         cards["of it is not known"] = f"{100 * audit.shares['unseen']:.0f} %"
@@ -120,16 +120,16 @@ def picture_faults(audit: Audit) -> dict[str, Any]:
     notes: list[str] = []
     alone = faults.looked_at - faults.compared - len(faults.without_depth)
     if not faults.compared:
-        findings, remarks = [], ["Nobody can tell: no two pictures show the same surface."]
+        findings, remarks = [], ["Cannot check: no two pictures overlap."]
     elif alone > 0 and faults.fits:
         notes.append(
-            f"Nothing can be said of {alone} of the {faults.looked_at} pictures: no other one "
+            f"{alone} of the {faults.looked_at} pictures could not be checked: no other one "
             "shows the same surface."
         )
     unsaid = sum(value is None for value in faults.record.get("detail", []))
     if unsaid > alone:
         notes.append(
-            f"Nobody can tell whether {unsaid} of the {faults.looked_at} pictures are blurred: it "
+            f"{unsaid} of the {faults.looked_at} pictures could not be checked for blur: that "
             "takes two others of the same surface, from about the same side."
         )
     return {"findings": findings, "remarks": remarks, "notes": notes}

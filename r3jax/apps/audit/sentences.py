@@ -10,7 +10,7 @@ from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 from r3jax.captures.alignment import AXES
 
 MEANING = {
-    "fine": f"R of at least {FINE:g} for those who stand about",
+    "fine": f"R ≥ {FINE:g} from where a person would stand",
     "angle": "seen, but only from directions far from those in which one would look at it",
     "rare": f"seen in fewer than {FEW} pictures",
     "distance": "only seen from farther away than one would look at it",
@@ -107,7 +107,7 @@ def verdict(audit: Audit) -> list[str]:
     if audit.source.remark is not None:
         sentences.insert(first, audit.source.remark)
     if audit.survey.doubt is not None:
-        sentences.insert(0, f"Do not believe this page: {audit.survey.doubt}")
+        sentences.insert(0, f"Warning: these results are unreliable: {audit.survey.doubt}")
     if audit.faults.findings:
         said = " ".join(finding.what for finding in audit.faults.findings[:_MOST_SAID])
         sentences.append(f"The pictures themselves: {said}")
@@ -115,7 +115,7 @@ def verdict(audit: Audit) -> list[str]:
         sentences.append(CONTRADICTED)
     if audit.unseen:
         sentences.append(
-            f"Free space ends in about {area(audit, audit.unseen_area)} that no picture shows."
+            f"About {area(audit, audit.unseen_area)} bordering free space was never photographed."
         )
     return sentences if audit.survey.is_one_place else [*sentences, *_promises(audit)]
 
@@ -135,7 +135,7 @@ def _surfaces(audit: Audit) -> str:
     parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
     if audit.source.is_dense:
-        start = f"{fine} of the surface that one sees from where people could stand"
+        start = f"{fine} of the visible surface"
     else:
         start = f"{fine} of what the {'pictures' if audit.is_own_path else 'frames'} show"
         parts.append(f"{_unknown(audit)} is not known: no other picture has points there")
@@ -171,7 +171,7 @@ def _promises(audit: Audit) -> list[str]:
         sentences.append(
             f"{views} would raise the mean over all surfaces"
             f"{'' if audit.source.is_dense else ' with points'} from {found.mean:.2f} to "
-            f"{plan.after.mean:.2f}, as far as it can be foreseen; {drawn} "
+            f"{plan.after.mean:.2f}, as far as it can be predicted; {drawn} "
             f"{plan.random_mean[-1]:.2f}."
         )
     return sentences
@@ -219,8 +219,8 @@ def without_depth(audit: Audit) -> list[str]:
 def cause_share(audit: Audit, cause: str) -> float:
     """Share of what is evaluated that has this cause, or `fine`.
 
-    With depth images of the surface that one sees from where people could stand. Without, of what
-    the frames show: points are where pictures saw them, and say nothing of what has none.
+    With depth images: of the surface visible from where people could stand. Without: of what the
+    frames show, as points exist only where pictures saw them.
     """
     return audit.diagnosis.share(cause) if audit.source.is_dense else audit.shares[cause]
 
@@ -324,13 +324,13 @@ def method(audit: Audit) -> list[str]:
         f"which {100 * OVERLAP:.0f} % or more show what is known (or a picture could not be "
         "registered); "
         "of all these the one that raises the renderability of all surfaces most is imagined as "
-        "taken before the next one is chosen. What cannot be foreseen: surfaces that nobody has "
-        "seen, and colors."
+        "taken before the next one is chosen. Surfaces that were never seen, and "
+        "colors, cannot be predicted."
     )
     if (moved := origin(audit)) is not None:
         sentences.append(moved)
     if not source.is_metric:
-        sentences.append("Nobody knows what a unit of this capture is: u stands for one.")
+        sentences.append("The scale of this capture is unknown; lengths are in its own units (u).")
     if not source.has_images:
         sentences.append("The images are missing: nothing can be said about noise.")
     return sentences

@@ -184,7 +184,7 @@ class Suggestion:
     """Rows of the voxels that it shows."""
 
     num_mended: int
-    """Voxels that were not fine for those who stand about, and are fine after it."""
+    """Voxels that were not fine from where a person would stand, and are fine after it."""
 
     causes: dict[str, int]
     """Number of voxels that it shows and that were not fine, by cause."""
@@ -206,7 +206,7 @@ class SuggestedViews:
     """Diagnosis of the capture as it is."""
 
     after: Diagnosis
-    """Diagnosis once all views are taken, as far as it can be foreseen."""
+    """Diagnosis once all views are taken, as far as it can be predicted."""
 
     random_mean: tuple[float, ...]
     """Mean renderability of all surfaces after each of as many random views."""

@@ -83,7 +83,7 @@ class Conditions:
     """Range of the depth sensor [m]."""
 
     voxel_size: float = 0.05
-    """Edge of a voxel of the map [m]."""
+    """Voxel size [m]."""
 
     cell_size: float = 0.2
     """Edge of a cell of the coarse grid [m]."""
@@ -101,7 +101,7 @@ class Conditions:
     """Gaussians at the start of every training."""
 
     capacity: int = 40_000
-    """Gaussians that there may ever be."""
+    """Maximum number of Gaussians."""
 
     backend: Backend = "auto"
     """Rasterizer."""

@@ -250,7 +250,7 @@ def _begin_or_resume(path: Path, header: RunHeader) -> tuple[RunWriter, Run | No
         try:
             return RunWriter.resume(path)
         except RunError as error:  # of another version, damaged, not ours to write
-            raise CellError(f"{error}; move it away to explore anew") from None
+            raise CellError(f"{error}; move it away to explore again") from None
     try:
         return RunWriter(path, header), None
     except RunError as error:  # somebody else's folder

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from r3jax.apps.forecast.difficulty import difficulty_of_rows
 from r3jax.geometry.arguments import a_camera, a_pose, checked
-from r3jax.geometry.cameras import Camera, sound
+from r3jax.geometry.cameras import Camera, nan_unless_valid
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.backend import rows_in_pixels
 from r3jax.scoring.config import ScoringConfig, scoring_settings
@@ -130,7 +130,9 @@ def error_terms(
     deficit = jnp.where(hit, 1.0 - value, 0.0)
     unseen = jnp.where(hit, 0.0, mean_square_color(state))
     terms = jnp.stack([jnp.ones_like(value), unseen, contrast, deficit**2, contrast * deficit])
-    return sound(camera, T_world_camera, state.voxel_size) * terms.reshape(-1, *row.shape)
+    return nan_unless_valid(camera, T_world_camera, state.voxel_size) * terms.reshape(
+        -1, *row.shape
+    )
 
 
 def _difficulty_in_pixels(

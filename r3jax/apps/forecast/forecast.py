@@ -193,7 +193,7 @@ def stopping_rule(
         return (
             f"{state.counts}: the forecast of the PSNR of free-space views "
             f"({goal.statistic}) is {forecast.value(goal.statistic):.1f} dB, "
-            f"{low:.1f} to {high:.1f} in four of five places; {goal} was asked for"
+            f"{low:.1f} to {high:.1f} in four of five places; the goal is {goal}"
         )
 
     return is_enough

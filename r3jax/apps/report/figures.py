@@ -107,7 +107,7 @@ def _draw_path(axes: Axes, rows: Sequence[StepRow]) -> None:
 
 
 def _draw_views(axes: Axes, rows: Sequence[StepRow]) -> PathCollection:
-    """Draws where frames were taken, smaller on the way, and where the camera looked."""
+    """Draws where frames were taken, smaller while moving, and where the camera looked."""
     x, y, _ = np.array([row.pose[:3, 3] for row in rows]).T
     u, v, _ = np.array([row.pose[:3, 2] for row in rows]).T
     order, (low, high) = np.arange(len(rows)), _span(rows)

@@ -24,7 +24,7 @@ _TITLES = {
     "lpips": ("LPIPS", 3),
 }
 _TAIL = {"lpips": " (95th)"}
-"""Which percentile is the bad tail, where it is not the fifth."""
+"""The percentile of the worst views, where it is not the fifth."""
 
 _MAX_BYTES = 64 << 20
 
@@ -127,9 +127,9 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
     try:
         columns = {name: np.array([float(row[name]) for row in rows]) for name in _COLUMNS}
     except (KeyError, TypeError):
-        raise ForeignFileError(f"{path} lacks one of {', '.join(_COLUMNS)}") from None
+        raise ForeignFileError(f"{path} must have the columns {', '.join(_COLUMNS)}") from None
     if not all((np.abs(column) <= _LARGEST).all() for column in columns.values()):
-        raise ForeignFileError(f"{path} holds a value that is no number, or beyond all measure")
+        raise ForeignFileError(f"{path} holds a value that is not finite, or far out of range")
     return columns if rows else {}
 
 

@@ -12,9 +12,9 @@ STAGES = {
     "plan.candidates": "– candidates",
     "plan.travel": "– travel",
     "plan.scoring": "– scoring",
-    "plan ahead": "planning on the way",
+    "plan ahead": "planning while moving",
     "reconsider": "reconsidering on arrival",
-    "gaze": "gaze on the way",
+    "gaze": "gaze while moving",
     "map": "mapping",
     "map.voxels": "mapping: voxels",
     "map.grid": "mapping: grid",
@@ -73,7 +73,7 @@ def count_of_views(run: Run) -> str:
     """Counts views and, beside them, frames captured while moving."""
     captured = sum(row.captured for row in run.rows)
     views = str(len(run.rows) - captured)
-    return f"{views} + {captured} on the way" if captured else views
+    return f"{views} + {captured} while moving" if captured else views
 
 
 def summary(run: Run) -> dict[str, str]:

@@ -169,10 +169,10 @@ class Moment:
 def why_no_choice(row: StepRow) -> str:
     """Why no decision stands with a view."""
     if row.captured:
-        return "captured on the way"
+        return "captured while moving"
     if row.begins_run:
         return "the start: nothing was chosen"
-    return "the end of a path: what was chosen stands with its first frame"
+    return "the view at the end of a path: the choice is shown with the first frame of the path"
 
 
 class Timeline:

@@ -77,7 +77,9 @@ class _Cursor:
         count = int(self.take(_COUNT)[0])
         left = len(self._data) - self._at
         if count * size > left:
-            raise ForeignFileError(f"it promises {count} {what}, but only {left} bytes follow")
+            raise ForeignFileError(
+                f"it is truncated: it declares {count} {what}, and only {left} bytes follow"
+            )
         return count
 
     def table(self, kind: np.dtype, count: int) -> np.ndarray:

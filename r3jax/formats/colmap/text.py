@@ -163,7 +163,7 @@ _Point = tuple[int, list[float], list[int], float, list[int]]
 def _point(text: str) -> _Point:
     words = _words(text, 8, "a point")
     if len(words) % 2:
-        raise ForeignFileError("the last element of the track lacks its keypoint")
+        raise ForeignFileError("the last element of the track is missing its keypoint")
     rgb = [_id(word) for word in words[4:7]]
     if max(rgb) > 255:
         raise ForeignFileError(f"the color {' '.join(words[4:7])} is not 0 to 255")

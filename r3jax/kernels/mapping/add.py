@@ -23,7 +23,7 @@ from r3jax.kernels.native.compiled import (
 )
 
 _AHEAD = 8
-"""Voxels whose rows are on their way from memory while one is worked on: rows lie anywhere."""
+"""Prefetch distance [voxels]: rows lie anywhere in memory."""
 
 _EMPTY = np.uint32(EMPTY_WORD)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)

@@ -68,7 +68,7 @@ def _cosine(x, y, z, bin, lattice):
 def nearest_bin(x, y, z, cell, table, lattice):
     """Bin of a direction (`geometry.sphere.nearest_bin`): the best of the few in its cell."""
     cell, width = np.uint32(cell), table.shape[1]
-    # Two without a question: most cells have one candidate or two, and none guesses which.
+    # The first two are compared without a branch: most cells have one or two, unpredictably.
     chosen, second = table[cell, 0], table[cell, min(width - 1, 1)]
     best, cosine = _cosine(x, y, z, chosen, lattice), _cosine(x, y, z, second, lattice)
     is_padded = width < 3 or table[cell, 2] == chosen

@@ -24,7 +24,7 @@ _BLOCK = 1 << 12
 """Rows that a worker looks at before it takes the next."""
 
 _AHEAD = 16
-"""Rows whose pixels are on their way from memory while one is looked at: they lie anywhere."""
+"""Prefetch distance [rows]: their pixels lie anywhere in memory."""
 
 _EMPTY = np.uint32(EMPTY_WORD)
 _ZERO, _ONE, _NEAREST = np.float32(0.0), np.float32(1.0), np.float32(1e-3)

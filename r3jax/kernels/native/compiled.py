@@ -111,7 +111,7 @@ def inlined(function: _Function) -> _Function:
 
 
 def inlined_fast(function: _Function) -> _Function:
-    """The same for formulas that nothing has to repeat: LLVM may fuse and reorder them.
+    """Compiles like `inlined`, with fast-math: for results that need not be reproducible.
 
     NaN and infinity keep their meaning.
     """

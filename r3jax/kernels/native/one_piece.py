@@ -119,7 +119,7 @@ def _is_long(function: Any) -> bool:
 
 @contextlib.contextmanager
 def in_one_piece() -> Generator[None]:
-    """What Numba compiles meanwhile becomes machine code once; used as always afterwards.
+    """Compiles kernels inside of the block into machine code once, as a whole; calls stay the same.
 
     Other threads compile before or after. It may be entered again inside: kernels compile kernels.
     """

@@ -19,7 +19,7 @@ def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Call
     """A function that is `cpu` where a program runs on a CPU, and `default` elsewhere.
 
     Args:
-        cpu: calls kernels. Not asked where XLA's interface is another than theirs.
+        cpu: calls kernels. Not used if this jaxlib's FFI version is unsupported.
         default: the same in plain JAX.
     """
     if not can_call_kernels():

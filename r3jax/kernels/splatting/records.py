@@ -1,4 +1,4 @@
-"""What the passes tell each other of a Gaussian: 16 floats, one cache line.
+"""Per-Gaussian record shared by the passes: 16 floats, one cache line.
 
 Lengths are pixels. The conic is halved and in units of log 2, so that
 alpha = 2^(LOG_OPACITY - (A dx^2 + B dx dy + C dy^2)). The slots from SLOPE on describe the ellipse

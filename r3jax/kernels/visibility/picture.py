@@ -66,7 +66,7 @@ def shape_of(shape, level):
 
 @inlined
 def stands_for(row, column, shape, wraps):
-    """The pixel of an image for which one just outside of it stands (`visibility.views.wrap`).
+    """Maps a pixel just outside the image to where it continues (`visibility.views.wrap`).
 
     On an octahedral map, whose borders are glued to themselves, the one that it is glued to; in
     other images the nearest one.

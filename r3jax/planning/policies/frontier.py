@@ -84,7 +84,7 @@ class Frontier(GreedyPolicy):
         return candidates, {"lot": before}
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Minus the path length, or the lots."""
+        """Returns minus the path length, or random scores."""
         return utilities.get("lot", -utilities["path"])
 
     def conclude(

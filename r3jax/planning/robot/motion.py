@@ -96,7 +96,7 @@ class Motion:
                     "leave it out for no limit"
                 )
         if self.turn_rate is not None and self.speed is None:
-            raise ValueError("turn_rate weighs turns against ways: give the speed [m/s] too")
+            raise ValueError("turn_rate needs speed [m/s]: both together give the time of a path")
 
     @property
     def looks_anywhere(self) -> bool:

@@ -38,7 +38,7 @@ class TileLists(eqx.Module):
     """Pairs of tile and Gaussian, whether they found room or not."""
 
     overflow: Int[Array, ""]
-    """Pairs that found no room: those of the farthest Gaussians."""
+    """Dropped pairs: those of the farthest Gaussians."""
 
 
 class TileBoxes(eqx.Module):

@@ -165,7 +165,7 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) ->
             return _state_of(read_arrays(path), like)
         except (OSError, ForeignFileError) as error:
             failure = CheckpointError(
-                path, f"cannot be read ({error}), nor any before it: overwrite it to begin anew"
+                path, f"cannot be read ({error}), nor any before it: overwrite it to start again"
             )
     raise failure
 

@@ -98,7 +98,7 @@ class Progress(NamedTuple):
     """Rows in use."""
 
     dropped: int
-    """Gaussians that found no room so far."""
+    """Gaussians that were dropped so far."""
 
     seconds_left: float
     """At the mean pace of the latest hundred steps or so [s]; compilation is not counted in."""

@@ -113,7 +113,7 @@ def train_step(
     """One step of the optimizer.
 
     Args:
-        state: before; its buffers are given away.
+        state: the previous state; its buffers are donated.
         views: all training views.
         extent: of the cameras [m].
         config: traced but for its structure; `config.raster` holds the budget.

@@ -129,7 +129,6 @@ def test_views_are_explained_as_they_were_chosen(reported):
         np.testing.assert_array_equal(found, reason.totals)
     assert (utility[1:, 0] > 0.0).all()
     assert (utility[1:].sum(axis=1) > utility[1:, 0]).any()
-    assert "What the planner was after" in page.read_text()
     assert (page.parent / "reasons.png").exists()
 
 

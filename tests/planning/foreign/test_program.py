@@ -177,7 +177,7 @@ def test_what_processes_share_counts_once():
 @pytest.mark.parametrize(
     ("command", "says"),
     [
-        ("", "lacks its command"),
+        ("", "command"),
         ("no-such-program --fast", "there is no program 'no-such-program'"),
         ("python 'x", "No closing quotation"),
     ],

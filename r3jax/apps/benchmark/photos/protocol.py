@@ -56,13 +56,13 @@ class PhotoTerms:
     """Gaussians that photos bring in all; each brings the same share at most."""
 
     capacity: int = 40_000
-    """Gaussians that there may ever be."""
+    """Maximum number of Gaussians."""
 
     max_range: float = 5.0
     """Depth beyond it is no part of the map [m]."""
 
     voxel_size: float = 0.05
-    """Edge of a voxel of the map [m]."""
+    """Voxel size [m]."""
 
     backend: Backend = "auto"
     """Rasterizer."""
@@ -138,7 +138,7 @@ def run_photos(
     if terms.first + terms.choose > len(pool.on_offer):
         raise PhotosError(
             f"{pool.name} offers {len(pool.on_offer)} photos beside the {len(pool.test)} that "
-            f"judge, but {terms.first} + {terms.choose} are asked for: choose fewer"
+            f"judge, fewer than the {terms.first} + {terms.choose} requested: choose fewer"
         )
     choice = _Choice(pool, chooser, terms, seed)
     config = terms.train_config(seed)

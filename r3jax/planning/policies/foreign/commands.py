@@ -19,7 +19,7 @@ def words_of(command: str) -> list[str]:
     except ValueError as error:
         raise ValueError(f"policy {COMMAND}{command}: {error}") from None
     if not words:
-        raise ValueError(f"policy {COMMAND!r} lacks its command: {COMMAND}PROGRAM ARGUMENTS")
+        raise ValueError(f"policy {COMMAND!r} needs a command: {COMMAND}PROGRAM ARGUMENTS")
     if shutil.which(words[0]) is None:
         raise ValueError(
             f"policy {COMMAND}{command}: there is no program {words[0]!r}; a script needs its "

@@ -199,7 +199,9 @@ class Foreign:
             _check_view(answer, seen)
             chosen = _view_of(answer, offered, situation)
         except ForeignFileError as error:
-            raise self._refused(session, f"was asked for view {seen}: {error}") from None
+            raise self._refused(
+                session, f"received the question for view {seen}: {error}"
+            ) from None
         if chosen is None:
             nothing = replace(offered, valid=np.zeros_like(offered.valid))
             return nothing, {"utility": np.zeros(len(offered.valid))}
@@ -312,7 +314,7 @@ def _check_view(answer: Message, seen: int) -> None:
     """
     view: Any = answer.fields.get("view")
     if type(view) is not int or view != seen:
-        named = f"is for view {view!r:.20}" if "view" in answer.fields else "lacks `view`"
+        named = f"is for view {view!r:.20}" if "view" in answer.fields else "is missing `view`"
         raise ForeignFileError(
             f"its answer {named}: repeat the question's, and send one message for each question"
         )
