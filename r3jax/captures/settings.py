@@ -13,7 +13,7 @@ class SurveySettings:
     """
 
     voxel_size: float | None = None
-    """Edge of a voxel in the capture's units; by default 5 cm, or from the depths."""
+    """Voxel size in the capture's units; by default 5 cm, or from the depths."""
 
     max_range: float | None = None
     """Surfaces farther from a camera count as invisible, in the capture's units; by default 5 m,
