@@ -27,6 +27,17 @@ FAR = 50.0
 _MEDIAN_SIZE = 64
 """Side of the subsampled image whose median is taken [px]; it is the same to a few percent."""
 
+CONVENTIONS: dict[str, tuple[bool, np.ndarray]] = {
+    "opencv": (False, np.eye(4)),
+    "world-to-camera": (True, np.eye(4)),
+    "opengl": (False, np.diag([1.0, -1.0, -1.0, 1.0])),
+    "ros": (
+        False,
+        np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64),
+    ),
+}
+"""Poses of other programs: whether they are inverted, and the camera's OpenCV axes in theirs."""
+
 _ON_HOST = (1, 3)
 """DLPack's numbers of ordinary memory and of memory that CUDA has pinned."""
 
@@ -117,6 +128,8 @@ class Frame(eqx.Module):
         *,
         depth_scale: float | int | None = None,
         pixel_center: float | int = 0.0,
+        convention: str = "opencv",
+        ignore: Any = None,
         far: bool = False,
     ) -> "Frame":
         """A frame from the arrays of another program.
@@ -131,26 +144,39 @@ class Frame(eqx.Module):
             depth: z-depth, [H, W], not the length of the ray; 0 means no measurement and inf
                 that nothing lies within the sensor's range. Meters, or steps of `depth_scale`.
             T_world_camera: camera-to-world pose, [4, 4]; OpenCV axes (x right, y down, z
-                forward), world z up [m].
+                forward), world z up [m]; or a pose of another `convention`.
             camera: a `Camera`, or the 3x3 matrix of a pinhole for images of this size.
             depth_scale: meters per step of the depth, 0.001 for millimeters. None: meters, which
                 only floats can be.
             pixel_center: where the matrix has the center of the upper left pixel [px]: 0 in
                 OpenCV and ROS, 0.5 in COLMAP and nerfstudio. A `Camera` has it at 0.5.
+            convention: what the pose means. `opencv`: camera to world, OpenCV axes, as ROS'
+                optical frames have them. `world-to-camera`: its inverse, as COLMAP and OpenCV's
+                `solvePnP` give it. `opengl`: camera to world, x right, y up, z back (Blender,
+                nerfstudio, ARKit). `ros`: camera to world, x ahead, y left, z up (`camera_link`,
+                `base_link`). `observe` warns where depth shows that it is another one.
+            ignore: pixels that take no part, [H, W] bool: where a detector sees a person. Their
+                depth becomes 0, no measurement, and their color is not used. None: all take part.
             far: the median depth may exceed 50 m; otherwise that is taken for a wrong unit.
 
         Raises:
             ValueError: what `Frame` refuses; colors or depth of a type or shape that cannot be
-                meant, whole numbers as depth without `depth_scale`, a matrix of other images.
+                meant, whole numbers as depth without `depth_scale`, a matrix of other images, an
+                unknown convention, a mask of another shape or type.
             TypeError: what is not an array, or cannot be handed over.
         """
         # Colors come first: a bare matrix of intrinsics has no image size of its own.
         colors = color_image(rgb)
         height, width = colors.shape[:2]
+        own_depth = depth_image(depth, depth_scale)
+        if ignore is not None:
+            own_depth = without(own_depth, ignore)
         return Frame(
             rgb=colors,
-            depth=depth_image(depth, depth_scale),
-            T_world_camera=own_matrix("T_world_camera", T_world_camera),
+            depth=own_depth,
+            T_world_camera=to_camera_to_world(
+                own_matrix("T_world_camera", T_world_camera), convention
+            ),
             camera=pinhole_camera(camera, height, width, pixel_center),
             far=far,
         )
@@ -351,6 +377,50 @@ def pinhole_camera(camera: Any, height: int, width: int, pixel_center: float | i
             "the matrix for another resolution? (Of cropped images give an r3jax.Camera)"
         )
     return Camera(width, height, fx, fy, column, row)
+
+
+def without(depth: Float[Array, "H W"], ignore: Any) -> Float[Array, "H W"]:
+    """Depth without the pixels of a mask, which become 0: no measurement.
+
+    Args:
+        depth: z-depth [m].
+        ignore: True for pixels to leave out, [H, W]; bool, or 8-bit with 0 for False.
+
+    Raises:
+        ValueError: a mask of another shape or type.
+        TypeError: not an array.
+    """
+    mask = as_array("ignore", ignore)
+    if mask.shape != depth.shape or str(mask.dtype) not in ("bool", "uint8"):
+        raise ValueError(
+            f"ignore must be a mask of the depth's shape {depth.shape}, bool or uint8, got "
+            f"{mask.dtype} of shape {mask.shape}"
+        )
+    return jnp.where(jnp.asarray(mask).astype(bool), 0.0, depth)
+
+
+def to_camera_to_world(pose: Any, convention: str) -> Any:
+    """The camera-to-world pose in OpenCV axes of one in another convention.
+
+    Args:
+        pose: a matrix [4, 4], NumPy's or JAX's; of another shape it stays as it is, to be refused.
+        convention: one of `CONVENTIONS`.
+
+    Raises:
+        ValueError: an unknown convention.
+    """
+    if convention not in CONVENTIONS:
+        raise ValueError(f"convention must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
+    is_inverted, axes = CONVENTIONS[convention]
+    if pose.shape != (4, 4) or convention == "opencv":
+        return pose
+    if not is_inverted:
+        return pose @ axes.astype(pose.dtype)
+    # The transpose, not a solver: a matrix that is not rigid stays so, and is refused as such.
+    R, library = pose[:3, :3].T, jnp if isinstance(pose, jax.Array) else np
+    shift = -(R @ pose[:3, 3])
+    top = library.concatenate([R, shift[:, None]], axis=1)
+    return library.concatenate([top, pose[3:]], axis=0)
 
 
 def own_matrix(name: str, value: Any) -> np.ndarray | Array:

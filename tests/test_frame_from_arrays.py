@@ -132,6 +132,24 @@ def test_strided_and_flipped_images_are_read_as_they_look():
     assert_same_frame(Frame.from_arrays(**SOUND | {"rgb": wide[:, ::2, ::-1]}))
 
 
+@given(hnp.arrays(np.bool_, (HEIGHT, WIDTH)))
+def test_ignored_pixels_have_no_measurement(mask):
+    frame = Frame.from_arrays(**SOUND, ignore=mask)
+    np.testing.assert_array_equal(frame.depth, np.where(mask, 0.0, EXPECTED.depth))
+    eight_bit = Frame.from_arrays(**SOUND, ignore=255 * mask.astype(np.uint8))
+    np.testing.assert_array_equal(eight_bit.depth, frame.depth)
+
+
+@pytest.mark.parametrize("convention", ["world-to-camera", "opengl", "ros"])
+def test_conventions_are_converted_under_jit_too(convention):
+    build = lambda pose: Frame.from_arrays(
+        **SOUND | {"T_world_camera": pose}, convention=convention
+    )
+    expected = build(POSE).T_world_camera
+    assert not np.allclose(expected, POSE)
+    np.testing.assert_allclose(jax.jit(build)(POSE).T_world_camera, expected, atol=1e-6)
+
+
 def test_frames_are_made_under_jit_too():
     build = jax.jit(lambda rgb, depth: Frame.from_arrays(rgb, depth, POSE, K, depth_scale=0.001))
     assert_same_frame(build(RGB, STEPS))
@@ -167,6 +185,9 @@ BAD = {
     "matrix of large images": {"camera": K * [[80.0], [80.0], [1.0]]},
     "no focal length": {"camera": K * [[0.0, 1, 1], [1, 1, 1], [1, 1, 1]]},
     "another camera": {"camera": Camera.from_fov(16, 12)},
+    "mask of another shape": {"ignore": np.zeros((3, 8), bool)},
+    "mask of numbers": {"ignore": np.zeros((6, 8), np.float32)},
+    "no such convention": {"convention": "unity"},
 }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.planning.planner import Planner, observe
+from r3jax.planning.planner import Planner, take_in
 from r3jax.planning.policy import Decision, PlanInfo
 from r3jax.planning.robot.motion import Motion
 from r3jax.planning.turning import (
@@ -230,7 +230,7 @@ def observe_view(
     No decision follows a frame that was captured while moving: the cells that it failed to show
     are counted here.
     """
-    planner = observe(planner, frame)
+    planner = take_in(planner, frame)
     if not captured:
         return planner
     state = count_look(

@@ -12,7 +12,7 @@ import jax
 
 from r3jax.frame import Frame
 from r3jax.mapping.join import grow
-from r3jax.planning.planner import Planner, decide, observe
+from r3jax.planning.planner import Planner, decide, take_in
 
 _FROM = 0.1
 """Share of the rows in use from which on the next size is prepared; at 0.7 the table grows. Early:
@@ -53,5 +53,5 @@ class GrowthAhead:
 def _compile(planner: Planner, frame: Frame, capacity: int) -> None:
     """Observes and decides once with a larger table."""
     larger = replace(planner, map_state=grow(planner.map_state, capacity))
-    larger = observe(larger, frame)
+    larger = take_in(larger, frame)
     decide(larger, frame.T_world_camera, jax.random.key(0))

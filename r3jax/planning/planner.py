@@ -31,6 +31,7 @@ from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
 from r3jax.planning.decide import PlannerState
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PlansAhead, Policy
+from r3jax.planning.pose_check import Reference, check_poses
 from r3jax.planning.registry import make_policy
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.simulated import imagine_view
@@ -56,6 +57,9 @@ class Planner(eqx.Module):
 
     config: MappingConfig = eqx.field(static=True)
     """How frames join the map and the grid."""
+
+    reference: Reference | None = None
+    """An early frame, kept until the poses of the later ones have been found to fit the depth."""
 
 
 a_planner = one(Planner, "r3jax.start makes one")
@@ -103,12 +107,20 @@ def start(
 def observe(planner: Planner, frame: Frame) -> Planner:
     """Adds a frame to the map and to the grid, and tells the policy.
 
-    Not to be called under jit: the table of the map grows by itself.
+    Not to be called under jit: the table of the map grows by itself. Warns where the poses of the
+    first frames contradict their depth: they are then of another convention, or not rigid motions
+    of one camera at all.
 
     Args:
         planner: before the frame.
         frame: a posed RGB-D image.
     """
+    reference = check_poses(planner.reference, frame)
+    return replace(take_in(planner, frame), reference=reference)
+
+
+def take_in(planner: Planner, frame: Frame) -> Planner:
+    """Adds a frame as `observe` does, without a check of its pose: that of a simulator is right."""
     map_state, grid = add_frame(planner.map_state, planner.grid, frame, planner.config)
     return tell_policy(replace(planner, map_state=map_state, grid=grid), frame)
 

@@ -1,0 +1,174 @@
+"""Tests whether the poses of the first frames fit their depth: a wrong convention is noticed early.
+
+A world-to-camera matrix and a pose in OpenGL axes are rigid, so one frame does not give them away.
+Between two frames each convention implies another motion of the camera. The points of each frame
+are projected into the other by that motion: a point in front of the surface that is measured there
+lies in space that was seen through. The motion that leaves no such points names the convention.
+
+On the host in NumPy, about two milliseconds a frame, until one pair of frames settles the question.
+
+Shape symbols: h w pixels of a subsampled depth image; n points.
+"""
+
+import math
+import warnings
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from r3jax.frame import CONVENTIONS, Frame, to_camera_to_world
+
+_SIDE = 64
+"""Columns of a subsampled depth image, about."""
+
+_TOLERANCE = 0.05
+"""Depths agree up to this [m], and up to this share of the depth."""
+
+_MIN_OVERLAP = 0.15
+"""Share of the points that must lie where the other frame measures, or nothing is concluded."""
+
+_MIN_POINTS = 200
+"""Points that a frame must measure, or nothing is concluded."""
+
+_MAX_CONTRADICTED = 0.4
+"""From this share of contradicted points on, two frames do not fit."""
+
+_MAX_OF_FITTING = 0.25
+"""Up to this share of contradicted points, another convention fits."""
+
+_MAX_FRAMES = 200
+"""Frames after which the question is dropped: a camera that hardly moves settles nothing."""
+
+
+class Reference(eqx.Module):
+    """An earlier frame, subsampled, which the next ones are compared with."""
+
+    depth: np.ndarray
+    """z-depth, 0 where it is not known, [h, w] float32 [m]."""
+
+    T_world_camera: np.ndarray
+    """Its pose, [4, 4] float64."""
+
+    intrinsics: np.ndarray
+    """fx, fy, cx, cy of the subsampled image, whose pixel centers are whole numbers [px]."""
+
+    num_compared: int = 0
+    """Frames that were compared so far."""
+
+    suspect: str = ""
+    """Another convention, by which two frames overlapped that do not as given."""
+
+    is_settled: bool = False
+    """True: there is nothing left to compare."""
+
+
+def check_poses(reference: Reference | None, frame: Frame) -> Reference:
+    """Compares a frame with an earlier one, and warns if their poses contradict their depth.
+
+    Args:
+        reference: the earlier frame; None: this is the first one.
+        frame: the frame that is observed.
+
+    Returns:
+        The reference for the next frame.
+    """
+    if reference is None:
+        return reference_of(frame)
+    if reference.is_settled:
+        return reference
+    num = reference.num_compared + 1
+    now = replace(reference_of(frame), num_compared=num, is_settled=num >= _MAX_FRAMES)
+    shares = {name: contradicted(reference, now, name) for name in CONVENTIONS}
+    given = shares.pop("opencv")
+    fitting = min(shares, key=lambda name: shares[name] if shares[name] >= 0.0 else math.inf)
+    fits = shares[fitting] <= _MAX_OF_FITTING
+    if given > _MAX_CONTRADICTED:
+        _warn(
+            f"{given:.0%} of the points of two frames lie where the other saw through",
+            fitting,
+            fits,
+        )
+        return replace(reference, is_settled=True)
+    if math.isnan(given):
+        # As given, the frames do not overlap. That they do otherwise may be chance, but not twice;
+        # "ros" makes a roll of a look aside, by which any two walls fit.
+        suspect = fitting if fits and fitting != "ros" else ""
+        if suspect and suspect == reference.suspect:
+            _warn("frames overlap that should not", fitting, fits)
+            return replace(now, is_settled=True)
+        return replace(now, suspect=suspect or reference.suspect)
+    # Settled once every other convention would have been noticed in the same pair.
+    if all(not share <= _MAX_CONTRADICTED for share in shares.values()):
+        return replace(reference, is_settled=True)
+    return replace(reference, num_compared=num, is_settled=now.is_settled)
+
+
+def _warn(finding: str, fitting: str, fits: bool) -> None:
+    known = ", ".join(CONVENTIONS)
+    advice = (
+        f'convention="{fitting}" of Frame.from_arrays fits them, or was given without need'
+        if fits
+        else f"is their convention right (one of {known}), and the unit of the depth?"
+    )
+    text = f"the poses contradict the depth: {finding}; {advice}"
+    warnings.warn(text, UserWarning, stacklevel=5)
+
+
+def reference_of(frame: Frame) -> Reference:
+    """Subsamples a frame's depth."""
+    depth, camera = np.asarray(frame.depth), frame.camera
+    step = max(1, round(camera.width / _SIDE))
+    depth = depth[step // 2 :: step, step // 2 :: step]
+    # inf says that nothing is near, but not how near: it takes no part.
+    depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
+    lens[2:] -= step // 2 + 0.5
+    return Reference(depth, np.asarray(frame.T_world_camera, np.float64), lens / step)
+
+
+def contradicted(first: Reference, second: Reference, convention: str) -> float:
+    """Returns the share of points of two frames that lie in space the other frame saw through.
+
+    Args:
+        first: a frame.
+        second: another one.
+        convention: how their poses are read.
+
+    Returns:
+        Of the points that lie where the other frame has a measurement, and not behind it; NaN
+        where there are too few of them.
+    """
+    A, B = (to_camera_to_world(one.T_world_camera, convention) for one in (first, second))
+    T = np.linalg.inv(A) @ B
+    pairs = ((second, first, T), (first, second, np.linalg.inv(T)))
+    counts = np.array([_count(source, target, motion) for source, target, motion in pairs])
+    num_points, agreeing, opposed = counts.sum(axis=0)
+    is_known = num_points >= _MIN_POINTS and agreeing + opposed >= _MIN_OVERLAP * num_points
+    return float(opposed / (agreeing + opposed)) if is_known else math.nan
+
+
+def _count(source: Reference, target: Reference, T: np.ndarray) -> tuple[int, int, int]:
+    """Counts a frame's points: all, those on the other's surface, and those in front of it."""
+    fx, fy, cx, cy = source.intrinsics
+    row, column = np.nonzero(source.depth)
+    z = source.depth[row, column].astype(np.float64)
+    points = np.stack([(column - cx) / fx * z, (row - cy) / fy * z, z])
+    x, y, z = T[:3, :3] @ points + T[:3, 3:]
+    fx, fy, cx, cy = target.intrinsics
+    is_ahead = z > 0.1
+    z = np.where(is_ahead, z, 1.0)
+    u, v = np.rint(fx * x / z + cx), np.rint(fy * y / z + cy)
+    height, width = target.depth.shape
+    is_in = is_ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    at = v[is_in].astype(int), u[is_in].astype(int)
+    # On a slope and at an edge the depth changes within a sample: its neighbors' depths count too.
+    is_known = target.depth > 0.0
+    near = minimum_filter(np.where(is_known, target.depth, np.inf), 3)[at]
+    far = maximum_filter(target.depth, 3)[at]
+    z, known = z[is_in], is_known[at]
+    slack = _TOLERANCE * (1.0 + z)
+    opposed = known & (z < near - slack)
+    agreeing = known & ~opposed & (z <= far + slack)
+    return len(points[0]), int(agreeing.sum()), int(opposed.sum())
