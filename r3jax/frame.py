@@ -17,6 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from r3jax.errors import InputError
 from r3jax.geometry.arguments import one
 from r3jax.geometry.cameras import Camera, is_rigid, is_traced, rigid_error
 from r3jax.geometry.voxels import check_near_origin
@@ -74,7 +75,7 @@ def _refuse_far(depth: ArrayLike) -> None:
     measured = some[(some > 0.0) & np.isfinite(some)]
     # The median, not the maximum: a few stray pixels are no reason to refuse a frame.
     if len(measured) and (median := float(np.median(measured))) > FAR:
-        raise ValueError(
+        raise InputError(
             f"the median depth is {median:.4g} m: is it in millimeters? (Frame.from_arrays: "
             "depth_scale=0.001; transforms.json: depth_unit_scale_factor; Frame with far=True: it "
             "is so far indeed)"
@@ -191,21 +192,21 @@ class Frame(eqx.Module):
     def _check_structure(self) -> None:
         height, width = self.camera.height, self.camera.width
         if self.rgb.shape != (height, width, 3):
-            raise ValueError(
+            raise InputError(
                 f"rgb has shape {self.rgb.shape}, but the camera's image is {(height, width, 3)}"
             )
         if self.depth.shape != (height, width):
-            raise ValueError(
+            raise InputError(
                 f"depth has shape {self.depth.shape}, but the camera's image is {(height, width)}"
             )
         if self.T_world_camera.shape != (4, 4):
-            raise ValueError(
+            raise InputError(
                 f"T_world_camera is a 4x4 matrix, got shape {self.T_world_camera.shape}"
             )
         # Nothing is converted here: what an integer stands for, only the caller knows.
         for name, array in (("rgb", self.rgb), ("depth", self.depth)):
             if not jnp.issubdtype(array.dtype, jnp.floating):
-                raise ValueError(
+                raise InputError(
                     f"{name} must be float32, got {array.dtype}: convert it first "
                     "(8-bit color / 255, depth to meters)"
                 )
@@ -215,18 +216,18 @@ class Frame(eqx.Module):
         rgb, depth = np.asarray(self.rgb), np.asarray(self.depth)
         low, high = float(rgb.min()), float(rgb.max())  # NaN makes the comparison false
         if not (low >= 0.0 and high <= 1.0):
-            raise ValueError(f"rgb must lie in [0, 1], got values from {low:.4g} to {high:.4g}")
+            raise InputError(f"rgb must lie in [0, 1], got values from {low:.4g} to {high:.4g}")
         # Written as what must hold: NaN fails it, while `< 0` would let NaN pass.
         if not float(depth.min()) >= 0.0:
             bad = np.argwhere(~(depth >= 0.0))
             row, column = (int(i) for i in bad[0])
-            raise ValueError(
+            raise InputError(
                 f"depth must be >= 0 and not NaN; {len(bad)} pixels are not, the first at row "
                 f"{row}, column {column}: {depth[row, column]} (use 0 for no measurement)"
             )
         problem = rigid_error(np.asarray(self.T_world_camera))
         if problem is not None:
-            raise ValueError(f"T_world_camera: {problem}")
+            raise InputError(f"T_world_camera: {problem}")
         check_near_origin("T_world_camera", np.asarray(self.T_world_camera)[:3, 3])
 
     @property
@@ -290,13 +291,13 @@ def color_image(rgb: Any) -> Float[Array, "H W 3"]:
     """
     array = as_array("rgb", rgb)
     if array.ndim != 3 or array.shape[2] != 3:
-        raise ValueError(f"rgb must have shape [H, W, 3], got {array.shape}{_hint(array.shape)}")
+        raise InputError(f"rgb must have shape [H, W, 3], got {array.shape}{_hint(array.shape)}")
     if array.size == 0:
-        raise ValueError(f"rgb has no pixels: its shape is {array.shape}")
+        raise InputError(f"rgb has no pixels: its shape is {array.shape}")
     if array.dtype == np.uint8:
         return jnp.asarray(_float32(array) / 255.0)
     if not jnp.issubdtype(array.dtype, jnp.floating):
-        raise ValueError(
+        raise InputError(
             f"rgb must be uint8 (0 to 255) or floating (0 to 1), got {array.dtype}: divide it by "
             "its white first"
         )
@@ -324,17 +325,17 @@ def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float
     array = as_array("depth", depth)
     is_whole = jnp.issubdtype(array.dtype, jnp.integer)
     if not (is_whole or jnp.issubdtype(array.dtype, jnp.floating)):
-        raise ValueError(f"depth must be numbers, got {array.dtype}")
+        raise InputError(f"depth must be numbers, got {array.dtype}")
     if metres_per_step is None:
         if is_whole:
-            raise ValueError(
+            raise InputError(
                 f"depth is {array.dtype}: say how many meters one step is, depth_scale=0.001 for "
                 "millimeters"
             )
         return jnp.asarray(_float32(array))
     scale = float(metres_per_step)
     if not 0.0 < scale < np.inf or (is_whole and scale >= 1.0):
-        raise ValueError(
+        raise InputError(
             "depth_scale is how many meters one step of the depth is, such as 0.001 for "
             f"millimeters, got {scale:g}"
         )
@@ -360,19 +361,19 @@ def pinhole_camera(camera: Any, height: int, width: int, pixel_center: float | i
         return camera
     K = np.asarray(as_array("camera", camera))
     if K.shape != (3, 3):
-        raise ValueError(
+        raise InputError(
             f"camera must be an r3jax.Camera or a 3x3 matrix of intrinsics, got shape {K.shape}"
         )
     fx, fy, cx, cy = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     wanted = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     if not (np.isfinite(wanted).all() and np.array_equal(K, wanted)):
-        raise ValueError(
+        raise InputError(
             "camera must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], finite and without skew, got "
             f"{K.tolist()}"
         )
     column, row = (value + 0.5 - float(pixel_center) for value in (cx, cy))
     if not (0.0 <= column <= width and 0.0 <= row <= height):
-        raise ValueError(
+        raise InputError(
             f"the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} images: is "
             "the matrix for another resolution? (Of cropped images give an r3jax.Camera)"
         )
@@ -392,7 +393,7 @@ def without(depth: Float[Array, "H W"], ignore: Any) -> Float[Array, "H W"]:
     """
     mask = as_array("ignore", ignore)
     if mask.shape != depth.shape or str(mask.dtype) not in ("bool", "uint8"):
-        raise ValueError(
+        raise InputError(
             f"ignore must be a mask of the depth's shape {depth.shape}, bool or uint8, got "
             f"{mask.dtype} of shape {mask.shape}"
         )
@@ -410,7 +411,7 @@ def to_camera_to_world(pose: Any, convention: str) -> Any:
         ValueError: an unknown convention.
     """
     if convention not in CONVENTIONS:
-        raise ValueError(f"convention must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
+        raise InputError(f"convention must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
     is_inverted, axes = CONVENTIONS[convention]
     if pose.shape != (4, 4) or convention == "opencv":
         return pose

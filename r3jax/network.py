@@ -3,6 +3,8 @@
 import errno
 import socket
 
+from r3jax.errors import InputError
+
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 """Addresses that no other machine can reach."""
 
@@ -26,7 +28,7 @@ def check_free(host: str, port: int) -> None:
             says what to do.
     """
     if not 0 <= port <= 65535:
-        raise ValueError(f"--port must lie between 0 and 65535, got {port}")
+        raise InputError(f"--port must lie between 0 and 65535, got {port}")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

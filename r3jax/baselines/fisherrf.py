@@ -32,6 +32,7 @@ from jaxtyping import Array, Float
 
 from r3jax.baselines.online_map import BALLS
 from r3jax.baselines.policy import OnlineConfig, OnlinePolicy, memory_of
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.candidates import Candidates, draw_lots
 from r3jax.planning.policy import Situation
@@ -221,9 +222,9 @@ class FisherConfig(OnlineConfig):
         """Refuses values that would fail later, and says which."""
         super().__post_init__()
         if self.criterion not in ("ratio", "d-opt"):
-            raise ValueError(f"criterion must be 'ratio' or 'd-opt', got {self.criterion!r}")
+            raise InputError(f"criterion must be 'ratio' or 'd-opt', got {self.criterion!r}")
         if not 0.0 < self.damping < np.inf:
-            raise ValueError(f"damping must be a finite number > 0, got {self.damping}")
+            raise InputError(f"damping must be a finite number > 0, got {self.damping}")
 
     @property
     def form(self) -> Form:

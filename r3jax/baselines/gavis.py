@@ -51,6 +51,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
 from r3jax.baselines.pixels import PixelView, score_pixels
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera, pixel_rays
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import fibonacci_lattice
@@ -243,9 +244,9 @@ class GavisConfig(PlannerConfig):
         for name in ("kappa", "color_entropy"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} must be a finite number >= 0, got {value}")
+                raise InputError(f"{name} must be a finite number >= 0, got {value}")
         if not 0.0 <= self.cell_opacity <= 1.0:
-            raise ValueError(f"cell_opacity must lie in [0, 1], got {self.cell_opacity}")
+            raise InputError(f"cell_opacity must lie in [0, 1], got {self.cell_opacity}")
 
     def beliefs(self) -> Beliefs:
         """The three of them, traced, so that a sweep compiles once."""

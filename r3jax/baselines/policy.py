@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array
 
 from r3jax.baselines.online_map import BALLS, MapSettings, OnlineMap, add_frame, empty_online_map
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -31,7 +32,7 @@ class OnlineConfig(PlannerConfig):
         super().__post_init__()
         for name in ("score_width", "train_width"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.kernels.calls import Cells
@@ -66,10 +67,10 @@ class R3conConfig(PlannerConfig):
         """Refuses values that would fail later, and says which."""
         super().__post_init__()
         if not (math.isfinite(self.cell_weight) and self.cell_weight >= 0.0):
-            raise ValueError(f"cell_weight must be a finite number >= 0, got {self.cell_weight}")
+            raise InputError(f"cell_weight must be a finite number >= 0, got {self.cell_weight}")
         weight = self.path_weight
         if weight is not None and not (math.isfinite(weight) and weight >= 0.0):
-            raise ValueError(f"path_weight must be a finite number >= 0 or none, got {weight}")
+            raise InputError(f"path_weight must be a finite number >= 0 or none, got {weight}")
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 
 from r3jax.captures.alignment import evenly_spaced
 from r3jax.captures.source import ray_lengths, taken, thinned
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 
 _TOLERANCE = 0.05
@@ -278,14 +279,14 @@ def check_agreement(images: Sequence[DepthImage]) -> None:
         mistake, size, better = explained
         if mistake.is_small(size):
             return
-        raise ValueError(
+        raise InputError(
             f"the depth images contradict the poses: {100 * found.there:.0f} % of what one shows "
             f"is where others see it, but {100 * better.there:.0f} % if "
             f"{mistake.fits.format(*size)}: {mistake.todo.format(*size)}; --trust-depth audits "
             "it as it is"
         )
     if found.compared >= _FEWEST_POINTS and found.through > _SEE_THROUGH_RATIO * found.there:
-        raise ValueError(
+        raise InputError(
             f"the frames contradict each other: {100 * found.through:.0f} % of what one shows is "
             f"where others look through, and {100 * found.there:.0f} % where others see it: are "
             "the poses and the depth images of one recording, and do the axes fit? --trust-depth "

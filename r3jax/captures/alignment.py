@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r3jax.errors import InputError
+
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 """Names of the axes; `-y` is the opposite of `y`."""
 
@@ -74,7 +76,7 @@ def up_of(name: str) -> np.ndarray:
         up = np.zeros(0)
     length = float(np.linalg.norm(up))
     if up.shape != (3,) or not 0.0 < length < np.inf:
-        raise ValueError(
+        raise InputError(
             f"--up must be one of {', '.join([*AXES, *(f'-{axis}' for axis in AXES)])}, or a "
             f"direction such as 0.1,-0.9,0.4, got {name!r}"
         )

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from r3jax.captures.source import Source
 from r3jax.captures.survey import MARGIN, RANGE, Survey
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.mapping.join import combine_moments
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
@@ -126,7 +127,7 @@ def _grown(state: MapState, frame: Frame, drop_edges: bool) -> MapState:
     try:
         return update_growing(lambda now: _integrate_pixels(now, *arguments), state, _MOST_ROWS)
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             f"the capture fills more than {_MOST_ROWS} voxels: choose a larger --voxel-size"
         ) from error
 

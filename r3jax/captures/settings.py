@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from r3jax.errors import InputError
+
 
 @dataclass(frozen=True)
 class SurveySettings:
@@ -42,7 +44,7 @@ class SurveySettings:
         for name in ("voxel_size", "max_range"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(f"--{name.replace('_', '-')} must be positive, got {value}")
+                raise InputError(f"--{name.replace('_', '-')} must be positive, got {value}")
         at_least(self, {"max_frames": 2})
 
 
@@ -55,4 +57,4 @@ def at_least(settings: object, least: dict[str, int]) -> None:
     for name, value in least.items():
         if getattr(settings, name) < value:
             option = name.replace("_", "-")
-            raise ValueError(f"--{option} must be at least {value}, got {getattr(settings, name)}")
+            raise InputError(f"--{option} must be at least {value}, got {getattr(settings, name)}")

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.captures.alignment import Alignment
+from r3jax.errors import InputError
 from r3jax.formats.colmap.reader import find_model
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens
@@ -292,10 +293,10 @@ class Source:
             ValueError: depth comes from points; or a scale that is not positive.
         """
         if not self.is_dense:
-            raise ValueError("--depth-scale and --depth-along-ray are for depth images: here "
+            raise InputError("--depth-scale and --depth-along-ray are for depth images: here "
                              "depth comes from points")  # fmt: skip
         if not 0.0 < scale < np.inf:
-            raise ValueError(f"--depth-scale must be positive, got {scale}")
+            raise InputError(f"--depth-scale must be positive, got {scale}")
 
         def read(index: int) -> Picture:
             rgb, depth = self.read(index)

@@ -29,6 +29,7 @@ from r3jax.captures.alignment import Alignment, evenly_spaced, rotation_to_z, up
 from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import Source
 from r3jax.captures.vertical import Vertical, block_normals, estimated_up
+from r3jax.errors import InputError
 from r3jax.formats.errors import FormatError
 from r3jax.frame import FAR
 from r3jax.geometry.voxels import INDEX_LIMIT
@@ -276,7 +277,7 @@ def _check_depth(images: list[DepthImage], median: float) -> None:
     """Refuses depth that no indoor camera measures, or that the poses contradict."""
     if not _NEAREST < median < FAR:
         factor = 10.0 ** round(np.log10(_TYPICAL / median))
-        raise ValueError(
+        raise InputError(
             f"the median depth is {median:.4g} m: is its unit right? --depth-scale {factor:g} "
             f"multiplies by {factor:g} (in a transforms.json: depth_unit_scale_factor); "
             "--trust-depth audits it as it is"
@@ -288,7 +289,7 @@ def _range(far: float, is_metric: bool, wanted: float | None) -> float:
     """How far images show things [capture units]."""
     if wanted is not None:
         if wanted > _FARTHEST * far:
-            raise ValueError(
+            raise InputError(
                 f"--max-range {wanted:g} is far beyond what the pictures show (95 % lies within "
                 f"{far:.3g}): everything would lie in a few voxels"
             )
@@ -329,12 +330,12 @@ def _check_voxel(voxel: float, bounds: np.ndarray, scale: float) -> None:
     """Refuses sizes at which a map means nothing."""
     across = float(np.abs(bounds).max()) / voxel
     if across > _MOST_ACROSS:
-        raise ValueError(
+        raise InputError(
             f"voxels of {voxel / scale:.3g} would be {across:.3g} voxels along an axis: choose a "
             "larger --voxel-size"
         )
     if voxel > _LARGEST_VOXEL:
-        raise ValueError(
+        raise InputError(
             f"voxels of {voxel / scale:.3g} are larger than a fifth of the range "
             f"({RANGE / scale:.3g}): choose a smaller --voxel-size"
         )

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import r3jax
-from r3jax.cli.errors import UserError
 from r3jax.cli.options.audit import AuditOptions
 from r3jax.cli.options.benchmark import BenchmarkOptions
 from r3jax.cli.options.explore import DemoOptions, ExploreOptions, TeamOptions
@@ -22,6 +21,7 @@ from r3jax.cli.options.runs import (
 )
 from r3jax.cli.options.splats import EvaluateOptions, TrainOptions
 from r3jax.cli.parsing import parse
+from r3jax.errors import InputError
 from r3jax.kernels.native.ahead import cache_folder, compile_ahead
 from r3jax.validation.errors import did_you_mean
 
@@ -57,7 +57,7 @@ def run_command(args: Sequence[str]) -> int:
     neither `--help` nor a slip of the keyboard waits for JAX.
 
     Raises:
-        UserError: something that the user can mend.
+        InputError: something that the user can mend.
     """
     words = list(args)
     if words == ["--version"]:
@@ -65,7 +65,7 @@ def run_command(args: Sequence[str]) -> int:
         return 0
     if words and not words[0].startswith("-") and words[0] not in COMMANDS:
         hint = did_you_mean(words[0], COMMANDS)
-        raise UserError(f"there is no command {words[0]!r}{hint}; `r3jax --help` lists them")
+        raise InputError(f"there is no command {words[0]!r}{hint}; `r3jax --help` lists them")
     options = parse(COMMANDS, words, _DESCRIPTION)
     (name,) = (name for name, kind in COMMANDS.items() if isinstance(options, kind))
     _keep_compilations()

@@ -6,22 +6,20 @@ import shlex
 from collections.abc import Generator
 from pathlib import Path
 
+from r3jax.errors import InputError
+
 _BLANKS = "\n\u00a0"
 """What is not printable by name, but harmless."""
-
-
-class UserError(Exception):
-    """Something that the user can mend, in one line."""
 
 
 def check_viser() -> None:
     """Refuses to go on without viser, which shows pages.
 
     Raises:
-        UserError: it is not installed; the message says how to get it.
+        InputError: it is not installed; the message says how to get it.
     """
     if importlib.util.find_spec("viser") is None:
-        raise UserError(
+        raise InputError(
             "the viewer needs viser, which is not installed: pip install 'r3jax[viewer]'"
         )
 

@@ -2,9 +2,11 @@
 
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 
-from r3jax.cli.errors import UserError, one_line, printable
+from r3jax.cli.errors import one_line, printable
+from r3jax.errors import InputError
 from r3jax.extras import naming_extras
 from r3jax.interrupts import (
     INTERRUPTED,
@@ -15,14 +17,22 @@ from r3jax.interrupts import (
 )
 
 USER_ERROR = 2
-"""Exit code where the user can mend it: an unknown name, a folder that exists, a broken file."""
+"""Exit code of wrong input: an unknown name, a folder that exists, a broken file."""
 
 NO_READER = 141
 """Exit code where whoever read the output has gone (`r3jax info | head`), as shells have it."""
 
 
-_MENDABLE = (UserError, ValueError, OSError, ImportError)
-"""Errors that are told in one line: wrong input, a broken file, a full disk, a missing package."""
+BUG = 1
+"""Exit code where the fault is in r3jax, or in a policy of the user's: the traceback is printed."""
+
+_MENDABLE = (InputError, OSError, ImportError)
+"""Errors printed as one line: wrong input, a broken file, a full disk, a missing package."""
+
+
+_REPORT = """
+r3jax: this is a bug in r3jax, or in a policy or program that it was given. Please report it to the
+maintainers with the lines above, the command and the output of `r3jax info`."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -32,8 +42,8 @@ def main(args: Sequence[str] | None = None) -> int:
         args: the words after `r3jax`; None: those of this process, which ends with the command.
 
     Returns:
-        The exit code: 0 done, 1 stopped by the disk, a cell failed or a replay differed, 2 wrong
-        input, 130 interrupted, 141 nobody reads the output any more.
+        The exit code: 0 done, 1 stopped by the disk, a cell failed, a replay differed, or a bug,
+        2 wrong input, 130 interrupted, 141 nobody reads the output any more.
     """
     with caught_interrupts(stays=args is None):
         code = _main(args)
@@ -61,7 +71,9 @@ def _main(args: Sequence[str] | None) -> int:
         if isinstance(error, KeyboardInterrupt) or is_interrupted():
             return _interrupted(error)
         if not isinstance(error, _MENDABLE):
-            raise
+            traceback.print_exc()
+            print(_REPORT, file=sys.stderr)
+            return BUG
         print(f"r3jax: {printable(one_line(error))}", file=sys.stderr)
         return USER_ERROR
 

@@ -25,7 +25,8 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.errors import one_line
+from r3jax.errors import InputError
 
 _DIGITS = 30
 """More than any setting needs; 1e999999999 is not written out."""
@@ -45,7 +46,7 @@ def parse(commands: Mapping[str, type], words: Sequence[str], description: str) 
         process, as `argparse` does.
 
     Raises:
-        UserError: a value that an option's dataclass refuses.
+        InputError: a value that an option's dataclass refuses.
     """
     is_list = not words or words[0] not in commands
     kinds: list[Any] = []
@@ -144,8 +145,8 @@ def _group_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
     def make(**values: Any) -> Any:
         try:
             return kind(**values)  # pyright: ignore[reportCallIssue]
-        except (ValueError, OSError) as error:
-            raise UserError(one_line(error)) from error
+        except (InputError, OSError) as error:
+            raise InputError(one_line(error)) from error
 
     return StructConstructorSpec(make, tuple(fields))
 
@@ -208,14 +209,14 @@ def whole_number(text: str) -> int:
         value = Decimal("nan")
     if value.is_finite() and value.adjusted() < _DIGITS and int(value) == value:
         return int(value)
-    raise ValueError(f"it takes one whole number, such as 512 or 1e5, got {text!r}")
+    raise InputError(f"it takes one whole number, such as 512 or 1e5, got {text!r}")
 
 
 def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"it takes one number, such as 0.05, got {text!r}") from None
+        raise InputError(f"it takes one number, such as 0.05, got {text!r}") from None
 
 
 _READERS: dict[Any, Callable[[str], int | float]] = {int: whole_number, float: _number}

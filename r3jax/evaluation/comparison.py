@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.errors import InputError
+
 Cell = Mapping[str, Any]
 """One record: the parsed JSON object."""
 
@@ -84,14 +86,14 @@ def check_equal_terms(cells: Sequence[Cell], *, one_snapshot: bool = True) -> No
         ValueError: there are no records, or two of them differ; names both and what differs.
     """
     if not cells:
-        raise ValueError("there are no records")
+        raise InputError("there are no records")
     _check_same(cells, terms_of, () if one_snapshot else ("the snapshot",))
     for scene in scenes_of(cells):
         _check_same([cell for cell in cells if cell["scene"] == scene], terms_in_scene)
     seen: set[str] = set()
     for cell in cells:
         if (name := _describe(cell)) in seen:
-            raise ValueError(f"{name} occurs twice: leave one of the records out")
+            raise InputError(f"{name} occurs twice: leave one of the records out")
         seen.add(name)
 
 
@@ -136,7 +138,7 @@ def _check_same(
         other = terms(cell)
         for name in differing(first, other):
             if name not in left_out:
-                raise ValueError(
+                raise InputError(
                     f"records cannot be compared: {name} is {_short(first.get(name))} for "
                     f"{_describe(cells[0])}, but {_short(other.get(name))} for {_describe(cell)}. "
                     "Make one table for each, or run the cells again on equal terms."

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from r3jax.errors import InputError
 from r3jax.evaluation.scores import ViewRow
 from r3jax.plots import style
 from r3jax.plots.pictures import BEYOND
@@ -67,7 +68,7 @@ def contact_sheet(views: Sequence[SheetView], title: str) -> Figure:
         ValueError: there are no views.
     """
     if not views:
-        raise ValueError("a contact sheet needs at least one view")
+        raise InputError("a contact sheet needs at least one view")
     has_map = any(view.renderability is not None for view in views)
     titles = ["ground truth", "render", "error"] + ["renderability"] * has_map
     height, width = views[0].truth.shape[:2]

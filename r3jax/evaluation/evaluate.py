@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from r3jax.errors import InputError
 from r3jax.evaluation.image_metrics import in_batches, psnr, ssim, to_8_bits
 from r3jax.evaluation.scores import ViewRow
 from r3jax.splatting.config import RasterConfig, fitting_budget
@@ -73,10 +74,10 @@ def evaluate(
     """
     count = len(views)
     if count == 0:
-        raise ValueError("there are no views to evaluate")
+        raise InputError("there are no views to evaluate")
     for name, given in (("renderability", renderability), ("numbers", numbers)):
         if given is not None and len(given) != count:
-            raise ValueError(f"{name} has {len(given)} entries for {count} views")
+            raise InputError(f"{name} has {len(given)} entries for {count} views")
     _check_scene(scene)
     config = RasterConfig() if config is None else config
     background = jnp.zeros(3) if background is None else background
@@ -112,7 +113,7 @@ def _check_scene(scene: GaussianScene) -> None:
     for values in jax.tree.leaves(scene):
         finite &= np.isfinite(np.asarray(values)).reshape(scene.capacity, -1).all(axis=1)
     if not finite.all():
-        raise ValueError(
+        raise InputError(
             f"{np.sum(~finite)} of {scene.capacity} Gaussians have parameters that are not finite, "
             f"the first in row {np.argmin(finite)}: did the training diverge?"
         )
@@ -165,14 +166,14 @@ def _render_all(
         while int(drawn.overflow) > 0:
             needed = int(drawn.num_intersections)
             if not is_open:
-                raise ValueError(
+                raise InputError(
                     f"view {name} needs {needed} intersections, but max_intersections is "
                     f"{config.max_intersections}: raise it, or leave it open"
                 )
             config = dataclasses.replace(config, max_intersections=fitting_budget(needed))
             drawn = _draw(scene, views, jnp.asarray(i), background, config)
         if int(drawn.num_broken) > 0:
-            raise ValueError(
+            raise InputError(
                 f"view {name} renders to values that are not finite at {int(drawn.num_broken)} "
                 "pixels: look at the background and at the largest colors of the scene"
             )

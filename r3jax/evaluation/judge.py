@@ -11,6 +11,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.evaluation.contact_sheet import SheetView, contact_sheet
 from r3jax.evaluation.evaluate import Evaluation, evaluate
 from r3jax.evaluation.image_metrics import load_lpips
@@ -83,7 +84,7 @@ def choose_views(
         title = "views (all)" if step == 1 else f"views (one in {step})"
         return TestSet(capture, numbers, title, _overlap(numbers, seen))
     if not Path(spec).is_dir():
-        raise ValueError(
+        raise InputError(
             f"--views takes heldout, all, every:N or the folder of another run, got {spec!r}"
         )
     other = open_capture(Path(spec), up)
@@ -121,7 +122,7 @@ def _held_out(capture: Capture, model: TrainedModel) -> list[int]:
 def _whole_number(spec: str) -> int:
     text = spec.removeprefix("every:")
     if not text.isdecimal() or int(text) < 1:
-        raise ValueError(f"--views every:N takes a whole number of at least 1, got {spec!r}")
+        raise InputError(f"--views every:N takes a whole number of at least 1, got {spec!r}")
     return int(text)
 
 

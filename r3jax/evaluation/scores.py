@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from r3jax.errors import InputError
 from r3jax.files import write_atomic
 
 POOR_PSNR = 20.0
@@ -117,7 +118,7 @@ def summarize(rows: Sequence[ViewRow], *, seed: int = 0) -> tuple[Summary, ...]:
         ValueError: there are no rows.
     """
     if not rows:
-        raise ValueError("there is no view to summarize")
+        raise InputError("there is no view to summarize")
     summaries: list[Summary] = []
     for metric in METRICS:
         known = [(row.view, value) for row in rows if _has(value := getattr(row, metric.name))]
@@ -184,7 +185,7 @@ def write_rows(path: Path, rows: Sequence[ViewRow]) -> None:
     elif path.suffix == ".parquet":
         write_atomic(path, _to_parquet(rows))
     else:
-        raise ValueError(f"{path}: rows are written as .csv or .parquet, not {path.suffix!r}")
+        raise InputError(f"{path}: rows are written as .csv or .parquet, not {path.suffix!r}")
 
 
 def _columns() -> list[str]:

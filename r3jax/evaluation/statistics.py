@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r3jax.errors import InputError
+
 RESAMPLES = 1000
 """Drawn for an interval unless told."""
 
@@ -58,7 +60,7 @@ def mean_over_scenes(scores: Scores, *, seed: int = 0, resamples: int = RESAMPLE
         ValueError: no scene, a scene without values, or a view that only some seeds have.
     """
     if not scores:
-        raise ValueError("there is no scene to average over")
+        raise InputError("there is no scene to average over")
     rng = np.random.default_rng(seed)
     means: list[float] = []
     drawn, count = np.zeros(resamples), 0
@@ -87,10 +89,10 @@ def paired_difference(
         ValueError: other scenes, seeds or views in one than in the other.
     """
     if set(first) != set(second):
-        raise ValueError(f"the methods were run in {sorted(first)} and in {sorted(second)}")
+        raise InputError(f"the methods were run in {sorted(first)} and in {sorted(second)}")
     for scene in first:
         if first[scene].shape != second[scene].shape:
-            raise ValueError(
+            raise InputError(
                 f"{scene}: [seeds, views] is {first[scene].shape} for one method and "
                 f"{second[scene].shape} for the other; compare the seeds and views both have"
             )
@@ -101,7 +103,7 @@ def paired_difference(
 def _known_views(scene: str, values: np.ndarray) -> np.ndarray:
     unknown = np.isnan(values)
     if values.ndim != 2 or unknown.all():
-        raise ValueError(f"{scene}: needs values [seeds, views], got shape {values.shape}")
+        raise InputError(f"{scene}: needs values [seeds, views], got shape {values.shape}")
     if np.any(unknown.any(axis=0) != unknown.all(axis=0)):
-        raise ValueError(f"{scene}: a view has a value for some seeds only")
+        raise InputError(f"{scene}: a view has a value for some seeds only")
     return values[:, ~unknown.any(axis=0)]

@@ -20,6 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.files import make_folder, write_atomic
 from r3jax.frame import Frame
 from r3jax.geometry.axis_views import LOOKS, poses_at
@@ -143,7 +144,7 @@ def compute_view_set(
         ValueError: settings out of range, fewer than six views requested, or none found.
     """
     if max_views is not None and max_views < len(LOOKS):
-        raise ValueError(
+        raise InputError(
             f"max_views must be at least {len(LOOKS)}, the views of one position; got {max_views}"
         )
     positions = truth.free_positions(spacing, margin)
@@ -154,7 +155,7 @@ def compute_view_set(
     if len(looks):
         shows_something = truth.seen_share(poses_at(centers, looks)) >= _LEAST_SEEN
     if not shows_something.any():
-        raise ValueError(
+        raise InputError(
             f"{truth.scene}: no test views: of a lattice of {tuple(spacing)} m, "
             f"{len(positions)} points keep {margin} m from every surface and can be reached from "
             "the start, and from none of them is there something to see; try a finer lattice or "
@@ -205,7 +206,7 @@ def load_view_set(
     view_set = read_view_set(path)
     _check_scene(view_set, truth, str(path))
     if (view_set.spacing, view_set.margin, view_set.max_views) != wanted:
-        raise ValueError(f"{path} was stored for other settings than {wanted}: {_AGAIN}")
+        raise InputError(f"{path} was stored for other settings than {wanted}: {_AGAIN}")
     return view_set
 
 
@@ -241,11 +242,11 @@ def read_view_set(path: str | Path) -> ViewSet:
         view_set = _from_record(record)
         matches = view_set.hash == record["hash"]
     except VersionError as error:
-        raise ValueError(f"{path} has {error}, or {_AGAIN}") from None
+        raise InputError(f"{path} has {error}, or {_AGAIN}") from None
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is not a set of test views ({error!r:.300}): {_AGAIN}") from error
+        raise InputError(f"{path} is not a set of test views ({error!r:.300}): {_AGAIN}") from error
     if not matches:
-        raise ValueError(f"{path} was changed: its content does not give its hash; {_AGAIN}")
+        raise InputError(f"{path} was changed: its content does not give its hash; {_AGAIN}")
     return view_set
 
 
@@ -275,7 +276,7 @@ def _settings(view_set: ViewSet) -> list[Any]:
 def _check_scene(view_set: ViewSet, truth: Truth, what: str) -> None:
     """Refuses views of another scene."""
     if view_set.scene_hash != truth.scene_hash:
-        raise ValueError(
+        raise InputError(
             f"{what}: made for the scene {view_set.scene!r} with hash "
             f"{view_set.scene_hash[:12]}, but {truth.scene!r} has {truth.scene_hash[:12]}: the "
             "scene was changed, or these are another scene's views; compute them again"

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
+from r3jax.errors import InputError
 from r3jax.mapping.config import MappingConfig
 from r3jax.planning.robot.motion import LEAST_RATE
 
@@ -86,15 +87,15 @@ def parse_budget(text: str) -> Budget:
     if unit == "meters":
         unit = "metres"  # as recorded runs and submissions spell it
     if not separator or unit not in get_args(Unit):
-        raise ValueError(f"budget {text!r} is not understood: {example}")
+        raise InputError(f"budget {text!r} is not understood: {example}")
     try:
         amount = float(amount_text)
     except ValueError:
-        raise ValueError(f"budget {text!r}: {amount_text!r} is not a number; {example}") from None
+        raise InputError(f"budget {text!r}: {amount_text!r} is not a number; {example}") from None
     if not (math.isfinite(amount) and amount > 0.0):
-        raise ValueError(f"budget {text!r}: the amount must be positive and finite; {example}")
+        raise InputError(f"budget {text!r}: the amount must be positive and finite; {example}")
     if unit in ("views", "frames") and amount != int(amount):
-        raise ValueError(f"budget {text!r}: {unit} are counted in whole numbers; {example}")
+        raise InputError(f"budget {text!r}: {unit} are counted in whole numbers; {example}")
     return Budget(cast(Unit, unit), amount)
 
 
@@ -109,7 +110,7 @@ def check_voxel_size(voxel_size: float, max_range: float) -> None:
         ValueError: they are larger than a fifth of the range.
     """
     if voxel_size > 0.2 * max_range:
-        raise ValueError(
+        raise InputError(
             f"voxel_size must be at most a fifth of the range of {max_range:g} m, got "
             f"{voxel_size:g}"
         )
@@ -189,7 +190,7 @@ class ExplorationConfig(MappingConfig):
                 them tells nothing.
         """
         if self.max_range > LARGEST_DEPTH:
-            raise ValueError(
+            raise InputError(
                 f"max_range must be at most {LARGEST_DEPTH:.1f} m, which a depth image can hold, "
                 f"got {self.max_range:g}"
             )
@@ -200,18 +201,18 @@ class ExplorationConfig(MappingConfig):
         super().__post_init__()
         # Written so that NaN fails, too: it would make every flight time and the clock NaN.
         if not LEAST_RATE <= self.speed < math.inf:
-            raise ValueError(
+            raise InputError(
                 f"speed must be positive and finite, at least {LEAST_RATE:g}, got {self.speed}"
             )
         # Two of them divide the number of views: a zero would fail a run after its first view.
         for name in ("num_probes", "checkpoint_every", "max_still_views", "until_every"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.clock not in ("wall", "model"):
-            raise ValueError(f"clock must be `wall` or `model`, got {self.clock!r}")
+            raise InputError(f"clock must be `wall` or `model`, got {self.clock!r}")
         for name in ("planning_seconds", "mapping_seconds"):
             if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(
+                raise InputError(
                     f"{name} must be a finite time >= 0 [s], got {getattr(self, name)}"
                 )
         self._check_captures()
@@ -220,16 +221,16 @@ class ExplorationConfig(MappingConfig):
         """Refuses captures that cannot work."""
         every, rate = self.capture_every, self.capture_rate
         if every is not None and rate is not None:
-            raise ValueError("give capture_every or capture_rate, not both")
+            raise InputError("give capture_every or capture_rate, not both")
         if every is not None and not LEAST_PIECE <= every < math.inf:
-            raise ValueError(f"capture_every must be at least {LEAST_PIECE:g} m, got {every}")
+            raise InputError(f"capture_every must be at least {LEAST_PIECE:g} m, got {every}")
         if rate is not None and not 0.0 < rate < math.inf:
-            raise ValueError(f"capture_rate must be positive and finite [Hz], got {rate}")
+            raise InputError(f"capture_rate must be positive and finite [Hz], got {rate}")
         if self.gaze in RETIRED_GAZES:
-            raise ValueError(f"gaze {self.gaze!r} has left the package: {RETIRED_GAZES[self.gaze]}")
+            raise InputError(f"gaze {self.gaze!r} has left the package: {RETIRED_GAZES[self.gaze]}")
         if self.gaze not in get_args(GazeName):
-            raise ValueError(f"gaze must be one of {get_args(GazeName)}, got {self.gaze!r}")
+            raise InputError(f"gaze must be one of {get_args(GazeName)}, got {self.gaze!r}")
         if not 0.0 <= self.exposure < math.inf:
-            raise ValueError(f"exposure must be a finite time >= 0 [s], got {self.exposure}")
+            raise InputError(f"exposure must be a finite time >= 0 [s], got {self.exposure}")
         if not 0.0 < self.blur < math.inf:
-            raise ValueError(f"blur must be positive and finite [px], got {self.blur}")
+            raise InputError(f"blur must be positive and finite [px], got {self.blur}")

@@ -6,6 +6,7 @@ A policy never gets a simulator. Should one reach the loop's nevertheless, it fi
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import MAX_CELLS
@@ -41,7 +42,7 @@ def first_pose(simulator: Simulator, motion: Motion, cell_size: float) -> np.nda
     lower, upper = np.asarray(simulator.bounds, dtype=np.float64)
     # The grid ends just beyond the box: outside it no cell is there to fly through.
     if not np.all((pose[:3, 3] >= lower) & (pose[:3, 3] <= upper)):
-        raise ValueError(
+        raise InputError(
             f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
             f"{lower.round(3).tolist()} .. {upper.round(3).tolist()}"
         )
@@ -70,13 +71,13 @@ def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-siz
     hint = hints[0] if hints else ""
     # Each check is written so that NaN fails it, too.
     if not extent.max() >= _LEAST_EXTENT:
-        raise ValueError(f"{size}: too small for a camera with {_LEAST_EXTENT / 2:g} m free{hint}")
+        raise InputError(f"{size}: too small for a camera with {_LEAST_EXTENT / 2:g} m free{hint}")
     if not extent.min() >= _LEAST_HEIGHT:
-        raise ValueError(f"{size}: it is flat, there is no space to explore")
+        raise InputError(f"{size}: it is flat, there is no space to explore")
     # The grid has a cell more on every side, as walls lie on the faces of the box.
     cells = float(np.prod(extent / cell_size + 2.0))
     if not cells <= MAX_CELLS:
-        raise ValueError(
+        raise InputError(
             f"{size}: {cells:.2g} cells of {cell_size:g} m, more than {MAX_CELLS:.0e}"
             f"{hint or f'; give a larger {setting}, or cut the mesh'}"
         )

@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import jax
 
+from r3jax.errors import InputError
 from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
@@ -121,7 +122,7 @@ def explore(
     config = config or ExplorationConfig()
     # run.json records the goal as text: a rule without it could not be repeated by a resume.
     if (config.until is None) != (is_enough is None):
-        raise ValueError(
+        raise InputError(
             f"config.until is {config.until!r}, is_enough is "
             f"{'given' if is_enough else 'not given'}: r3jax.apps.forecast.forecast.stopping_rule "
             "makes the one of the other"

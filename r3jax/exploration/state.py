@@ -3,12 +3,12 @@
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from r3jax.errors import PathError
 from r3jax.exploration.captures import CaptureSettings, Leg
 from r3jax.exploration.clock import Clock
 from r3jax.exploration.config import Budget, ExplorationConfig
@@ -62,13 +62,8 @@ COMPLETE = frozenset(
 """Ends that belong to the result; after any other an exploration is not over."""
 
 
-class RecordingStopped(ValueError):
+class RecordingStopped(PathError):
     """A run folder refused a write in the middle of a run; everything before it stays readable."""
-
-    def __init__(self, path: Path, reason: str):
-        super().__init__(f"{path}: {reason}")
-        self.path = path
-        self.reason = reason
 
 
 def describe_counts(rows: Sequence[StepRow]) -> str:

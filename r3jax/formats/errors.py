@@ -4,17 +4,13 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from r3jax.errors import PathError
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import check_regular
 
 
-class FormatError(ValueError):
+class FormatError(PathError):
     """A file or folder that cannot be read; names it and the reason."""
-
-    def __init__(self, path: Path, reason: str):
-        super().__init__(f"{path}: {reason}")
-        self.path = path
-        self.reason = reason
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
 from r3jax.mapping.state import MapState
@@ -194,7 +195,7 @@ def write_points(
         OSError: the disk is full, not writable, ...
     """
     if points.shape != colors.shape or points.shape[1:] != (3,):
-        raise ValueError(f"points {points.shape} and colors {colors.shape} must both be [n, 3]")
+        raise InputError(f"points {points.shape} and colors {colors.shape} must both be [n, 3]")
     properties = {} if properties is None else properties
     kind = "<f8" if points.dtype == np.float64 else "<f4"
     fields = [(name, kind) for name in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")]
@@ -202,7 +203,7 @@ def write_points(
     table = np.empty(len(points), dtype=fields)
     for name, values in properties.items():
         if values.shape != (len(points),):
-            raise ValueError(f"{name} has the shape {values.shape} for {len(points)} points")
+            raise InputError(f"{name} has the shape {values.shape} for {len(points)} points")
         table[name] = values
     for axis, name in enumerate("xyz"):
         table[name] = points[:, axis]

@@ -11,6 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera, is_traced, rigid_error
 
 P = ParamSpec("P")
@@ -71,7 +72,7 @@ def one(kind: type, hint: str, leaf: str = "", ndim: int = 0) -> Check:
             )
         # A vmapped constructor makes one object of stacked arrays: only the axes give it away.
         if leaf and (found := np.ndim(getattr(value, leaf))) != ndim:
-            raise ValueError(
+            raise InputError(
                 f"{name} must be one {kind.__name__}, but its {leaf} has {found} axes instead of "
                 f"{ndim}: use jax.vmap over several"
             )
@@ -101,12 +102,12 @@ def a_pose(name: str, value: Any) -> None:
     """
     shape = _shape(name, value, "[4, 4]")
     if shape != (4, 4):
-        raise ValueError(
+        raise InputError(
             f"{name} must be one pose, a 4x4 matrix, got shape {shape}{_stacked(shape, (4, 4))}"
         )
     # Under jit the value is not known: there `nan_unless_valid` makes the score NaN instead.
     if not is_traced(value) and (problem := rigid_error(np.asarray(value))) is not None:
-        raise ValueError(f"{name}: {problem}")
+        raise InputError(f"{name}: {problem}")
 
 
 def a_point(name: str, value: Any) -> None:
@@ -118,9 +119,9 @@ def a_point(name: str, value: Any) -> None:
     """
     shape = _shape(name, value, "[3]")
     if shape != (3,):
-        raise ValueError(f"{name} must have shape [3], got {shape}{_stacked(shape, (3,))}")
+        raise InputError(f"{name} must have shape [3], got {shape}{_stacked(shape, (3,))}")
     if not is_traced(value) and not np.isfinite(point := np.asarray(value)).all():
-        raise ValueError(f"{name} is not finite: {point.tolist()}")
+        raise InputError(f"{name} is not finite: {point.tolist()}")
 
 
 def points_of_3(name: str, value: Any) -> None:
@@ -132,7 +133,7 @@ def points_of_3(name: str, value: Any) -> None:
     """
     shape = _shape(name, value, "[..., 3]")
     if shape[-1:] != (3,):
-        raise ValueError(f"{name} must have shape [..., 3], got {shape}")
+        raise InputError(f"{name} must have shape [..., 3], got {shape}")
 
 
 def describe(value: Any) -> str:

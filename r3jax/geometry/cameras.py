@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
+from r3jax.errors import InputError
 from r3jax.geometry.numerics import safe_norm
 
 
@@ -51,23 +52,23 @@ class Camera(eqx.Module):
     def __check_init__(self) -> None:
         """Refuses intrinsics whose rays would be infinite or NaN."""
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"a camera's image needs pixels, got {self.width} x {self.height}")
+            raise InputError(f"a camera's image needs pixels, got {self.width} x {self.height}")
         # Under jit values are not known; `nan_unless_valid` marks what they spoil.
         if is_traced(self.fx, self.fy, self.cx, self.cy):
             return
         for name, value in (("fx", float(self.fx)), ("fy", float(self.fy))):
             # Written as what must hold: NaN fails it, too.
             if not 0.0 < value < np.inf:
-                raise ValueError(f"{name} must be positive and finite [px], got {value}")
+                raise InputError(f"{name} must be positive and finite [px], got {value}")
         for name, value in (("cx", float(self.cx)), ("cy", float(self.cy))):
             if not np.isfinite(value):
-                raise ValueError(f"{name} must be finite [px], got {value}")
+                raise InputError(f"{name} must be finite [px], got {value}")
 
     @staticmethod
     def from_fov(width: int, height: int, horizontal_fov_deg: float | int = 60.0) -> "Camera":
         """A camera with square pixels, centered, with the given horizontal field of view [deg]."""
         if not 0.0 < horizontal_fov_deg < 180.0:
-            raise ValueError(
+            raise InputError(
                 f"horizontal_fov_deg must lie between 0 and 180, got {horizontal_fov_deg}"
             )
         # The angle spans the image's edges; the outermost pixel centers lie half a pixel inside.
@@ -167,7 +168,7 @@ def pose_along(
     """
     position, direction = _point("position", position), _point("direction", direction)
     if not is_traced(direction) and not np.any(np.asarray(direction)):
-        raise ValueError("direction has no length: there is nothing to look at")
+        raise InputError("direction has no length: there is nothing to look at")
     # Only jit lets a zero direction pass: its pose is finite but not rigid, which
     # `nan_unless_valid` notices.
     forward = direction / jnp.maximum(safe_norm(direction), 1e-12)
@@ -197,7 +198,7 @@ def look_at(
     position, target = _point("position", position), _point("target", target)
     # Refused here, where both points can be named: `pose_along` would see a zero direction only.
     if not is_traced(position, target) and np.array_equal(position, target):
-        raise ValueError("position and target are the same point: there is nothing to look at")
+        raise InputError("position and target are the same point: there is nothing to look at")
     return pose_along(position, target - position)
 
 
@@ -205,9 +206,9 @@ def _point(name: str, value: ArrayLike) -> Float[Array, " 3"]:
     point = _as_float32(value)
     if point.shape != (3,):
         several = ": use jax.vmap over several" if point.shape[1:] == (3,) else ""
-        raise ValueError(f"{name} must have shape [3], got {point.shape}{several}")
+        raise InputError(f"{name} must have shape [3], got {point.shape}{several}")
     if not is_traced(point) and not np.isfinite(np.asarray(point)).all():
-        raise ValueError(f"{name} is not finite: {np.asarray(point).tolist()}")
+        raise InputError(f"{name} is not finite: {np.asarray(point).tolist()}")
     return point
 
 

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from r3jax.errors import InputError
+
 # Larger blocks cost more additions per element, smaller ones more levels of recursion.
 _BLOCK = 64
 
@@ -35,7 +37,7 @@ def running_count(flags: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Number of set flags up to and including each place. n < 2^24."""
     # float32 has every integer up to 2^24; beyond, counts would be rounded.
     if flags.shape[0] >= 1 << 24:
-        raise ValueError(f"running_count is exact below 2^24 flags, got {flags.shape[0]}")
+        raise InputError(f"running_count is exact below 2^24 flags, got {flags.shape[0]}")
     return _inclusive_sum(flags.astype(jnp.float32)).astype(jnp.int32)
 
 

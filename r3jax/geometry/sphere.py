@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from r3jax.errors import InputError
+
 GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 
 
@@ -35,7 +37,7 @@ def fibonacci_lattice(num: int) -> np.ndarray:
     whose k = 1..num would leave the sphere).
     """
     if num < 1:
-        raise ValueError(f"a lattice needs at least one direction, got {num}")
+        raise InputError(f"a lattice needs at least one direction, got {num}")
     return _lattice(num)
 
 
@@ -45,7 +47,7 @@ def bins_for_angle(angle_deg: float | int) -> int:
     A = 2 pi (1 - cos(angle / 2)), num = ceil(4 pi / A); 10 degrees give 526.
     """
     if not 0.0 < angle_deg <= 360.0:
-        raise ValueError(f"angle_deg must lie in (0, 360], got {angle_deg}")
+        raise InputError(f"angle_deg must lie in (0, 360], got {angle_deg}")
     cap = 2.0 * math.pi * (1.0 - math.cos(0.5 * math.radians(angle_deg)))
     # Rounding must not add a bin where the quotient is whole (120 degrees: 4).
     return math.ceil(4.0 * math.pi / cap - 1e-9)

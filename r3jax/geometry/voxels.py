@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
+from r3jax.errors import InputError
+
 INDEX_LIMIT = 1 << 20
 """Voxel indices lie in [-INDEX_LIMIT, INDEX_LIMIT)."""
 
@@ -28,7 +30,7 @@ def check_near_origin(name: str, points: np.ndarray, limit: float = MAX_COORDINA
     """
     largest = float(np.abs(points).max(initial=0.0))
     if largest > limit:
-        raise ValueError(
+        raise InputError(
             f"{name} has the coordinate {largest:,.0f} m, {limit:,.0f} m is the most: subtract an "
             "origin near the cameras from all coordinates, in float64"
         )

@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from r3jax.errors import InputError
+
 MAX_CAPACITY = 1 << 27
 """Rows of a map: 5 GB."""
 
@@ -46,16 +48,16 @@ class MappingConfig:
         """Refuses what cannot work."""
         for name in ("voxel_size", "cell_size", "max_range"):
             if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("voxel_size", "cell_size"):
             if not 1e-3 <= getattr(self, name) <= 1e3:
-                raise ValueError(
+                raise InputError(
                     f"{name} must lie between 0.001 and 1000 m, got {getattr(self, name)}"
                 )
         if self.num_bins < 1:
-            raise ValueError(f"num_bins must be at least 1, got {self.num_bins}")
+            raise InputError(f"num_bins must be at least 1, got {self.num_bins}")
         # Hashes are masked with capacity - 1, and probes visit all slots of such sizes only.
         if self.capacity < 2 or self.capacity & (self.capacity - 1):
-            raise ValueError(f"capacity must be a power of two >= 2, got {self.capacity}")
+            raise InputError(f"capacity must be a power of two >= 2, got {self.capacity}")
         if self.capacity > MAX_CAPACITY:
-            raise ValueError(f"capacity must be at most {MAX_CAPACITY}, got {self.capacity}")
+            raise InputError(f"capacity must be at most {MAX_CAPACITY}, got {self.capacity}")

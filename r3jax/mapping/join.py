@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from r3jax.errors import InputError
 from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import is_traced
 from r3jax.kernels.constants import JOINED
@@ -137,11 +138,11 @@ def merge(a: MapState, b: MapState) -> MapState:
         ValueError: voxel sizes or numbers of bins that differ.
     """
     if a.num_bins != b.num_bins:
-        raise ValueError(f"the maps have {a.num_bins} and {b.num_bins} direction bins")
+        raise InputError(f"the maps have {a.num_bins} and {b.num_bins} direction bins")
     # Other lattices cannot be joined exactly: no nearest voxel would be the right one.
     sizes = (a.voxel_size, b.voxel_size)
     if not is_traced(*sizes) and float(sizes[0]) != float(sizes[1]):
-        raise ValueError(f"the maps have voxels of {float(sizes[0])} m and {float(sizes[1])} m")
+        raise InputError(f"the maps have voxels of {float(sizes[0])} m and {float(sizes[1])} m")
     return _join_map(a, b)
 
 
@@ -153,7 +154,7 @@ def grow(state: MapState, capacity: int) -> MapState:
         ValueError: a capacity that is not a power of two or smaller than the present one.
     """
     if capacity < state.capacity:
-        raise ValueError(f"cannot shrink a map of {state.capacity} rows to {capacity}")
+        raise InputError(f"cannot shrink a map of {state.capacity} rows to {capacity}")
     larger = empty_map(capacity, float(state.voxel_size), state.num_bins)
     # The very bits: a rounded edge would move voxel borders.
     larger = eqx.tree_at(lambda m: m.voxel_size, larger, state.voxel_size)

@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked, one
 from r3jax.geometry.cameras import Camera, invert_pose, nan_unless_valid, pixel_rays
@@ -145,18 +146,18 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
     """
     box = np.asarray(bounds, dtype=np.float64)
     if box.shape != (2, 3) or not np.all(np.isfinite(box)) or not np.all(box[1] > box[0]):
-        raise ValueError(
+        raise InputError(
             "bounds are a lower and an upper corner, [2, 3] in meters, finite, each upper value "
             f"above the lower one; got {box.tolist()}"
         )
     check_near_origin("bounds", box)
     if not (math.isfinite(cell_size) and cell_size > 0.0):
-        raise ValueError(f"cell_size must be positive [m], got {cell_size}")
+        raise InputError(f"cell_size must be positive [m], got {cell_size}")
     # The small tolerance keeps a side of exactly 12 cells from becoming 13 by rounding.
     cells = np.ceil((box[1] - box[0]) / cell_size - 1e-6) + 2.0
     # Counted in floats: the product of absurd bounds would overflow integers.
     if float(np.prod(cells)) > MAX_CELLS:
-        raise ValueError(
+        raise InputError(
             f"bounds {box.tolist()} at {cell_size} m make {np.prod(cells):.3g} cells, more than "
             f"{MAX_CELLS:.0e}: are the bounds in meters?"
         )

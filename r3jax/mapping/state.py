@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from r3jax.errors import InputError
 from r3jax.geometry.arguments import one
 from r3jax.geometry.voxels import EMPTY_WORD, unpack, voxel_center
 from r3jax.kernels.calls import MapRows
@@ -145,11 +146,11 @@ def empty_map(
             finite, no bins.
     """
     if capacity < 2 or capacity & (capacity - 1):
-        raise ValueError(f"capacity must be a power of two >= 2, got {capacity}")
+        raise InputError(f"capacity must be a power of two >= 2, got {capacity}")
     if not 0.0 < voxel_size < float("inf"):
-        raise ValueError(f"voxel_size must be positive and finite [m], got {voxel_size}")
+        raise InputError(f"voxel_size must be positive and finite [m], got {voxel_size}")
     if num_bins < 1:
-        raise ValueError(f"num_bins must be at least 1, got {num_bins}")
+        raise InputError(f"num_bins must be at least 1, got {num_bins}")
     return _empty_map(capacity, float(voxel_size), num_bins)
 
 

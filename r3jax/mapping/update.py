@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import invert_pose, is_traced, nan_unless_valid
@@ -219,7 +220,7 @@ def integrate(
     """
     # Only where values are known can they be refused.
     if not is_traced(max_range) and not float(max_range) > 0.0:
-        raise ValueError(f"max_range must be positive [m], got {float(max_range)}")
+        raise InputError(f"max_range must be positive [m], got {float(max_range)}")
     if not is_traced(frame.T_world_camera, state.voxel_size):
         _check_in_reach(state, frame)
     max_range = jnp.asarray(max_range, dtype=jnp.float32)
@@ -280,7 +281,7 @@ def update_growing(
         state.dropped
     ):
         if most_rows is not None and state.capacity >= most_rows:
-            raise ValueError(f"the map would need more than {most_rows} rows")
+            raise InputError(f"the map would need more than {most_rows} rows")
         # From the state before the update: what was dropped is then not lost.
         state = grow(state, 2 * state.capacity)
         after = update(state)
@@ -348,7 +349,7 @@ def integrate_points(
     mask = jnp.ones(num, dtype=bool) if valid is None else jnp.asarray(valid)
     # Integers are refused: indices of points would pass for a mask otherwise.
     if mask.shape != (num,) or mask.dtype != jnp.bool_:
-        raise ValueError(f"valid must be [{num}] bool, got {mask.dtype} of shape {mask.shape}")
+        raise InputError(f"valid must be [{num}] bool, got {mask.dtype} of shape {mask.shape}")
     if not is_traced(points_world, rgb, camera_position, focal, mask):
         _check_values(points_world, rgb, camera_position, focal, np.asarray(mask))
     # Chunks of no points would divide by zero.
@@ -360,15 +361,15 @@ def integrate_points(
 
 def _check_shapes(points: Array, rgb: Array, camera_position: Array, focal: Array) -> None:
     if focal.ndim != 0:
-        raise ValueError(f"focal must be one number [px], got shape {focal.shape}")
+        raise InputError(f"focal must be one number [px], got shape {focal.shape}")
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points_world must have shape [M, 3], got {points.shape}")
+        raise InputError(f"points_world must have shape [M, 3], got {points.shape}")
     if rgb.shape != points.shape:
-        raise ValueError(f"rgb must have the points' shape {points.shape}, got {rgb.shape}")
+        raise InputError(f"rgb must have the points' shape {points.shape}, got {rgb.shape}")
     if not jnp.issubdtype(rgb.dtype, jnp.floating):
-        raise ValueError(f"rgb must be float32 in [0, 1], got {rgb.dtype}: divide by 255 first")
+        raise InputError(f"rgb must be float32 in [0, 1], got {rgb.dtype}: divide by 255 first")
     if camera_position.shape not in ((3,), points.shape):
-        raise ValueError(
+        raise InputError(
             f"camera_position must have shape [3] or the points' {points.shape}, got "
             f"{camera_position.shape}"
         )
@@ -379,20 +380,20 @@ def _check_values(
 ) -> None:
     is_bad = valid & ~np.isfinite(np.asarray(points)).all(axis=1)
     if is_bad.any():
-        raise ValueError(
+        raise InputError(
             f"{is_bad.sum()} of {len(is_bad)} points are not finite, the first is number "
             f"{int(is_bad.argmax())}: leave out points without a measurement"
         )
     # Padding may hold anything: only what counts is checked.
     colors = np.asarray(rgb)[valid]
     if colors.size and not (colors.min() >= 0.0 and colors.max() <= 1.0):
-        raise ValueError(
+        raise InputError(
             f"rgb must lie in [0, 1], got values from {colors.min():.4g} to {colors.max():.4g}"
         )
     positions = np.asarray(camera_position)
     used = positions[valid] if positions.ndim == 2 else positions[None]
     is_bad = ~np.isfinite(used).all(axis=1)
     if is_bad.any():
-        raise ValueError(f"camera_position is not finite: {used[is_bad.argmax()]}")
+        raise InputError(f"camera_position is not finite: {used[is_bad.argmax()]}")
     if not (np.isfinite(float(focal)) and float(focal) > 0.0):
-        raise ValueError(f"focal must be positive [px], got {float(focal)}")
+        raise InputError(f"focal must be positive [px], got {float(focal)}")

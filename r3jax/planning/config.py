@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
+from r3jax.errors import InputError
 from r3jax.planning.robot.motion import Motion
 from r3jax.scoring.config import ScoringConfig
 
@@ -61,16 +62,16 @@ class PlannerConfig:
         """Refuses values that would fail later, and says which."""
         # Refused here, where the setting still has a name, not in a shape deep in a kernel.
         if not 1 <= self.num_candidates <= MAX_CANDIDATES:
-            raise ValueError(
+            raise InputError(
                 f"num_candidates must lie between 1 and {MAX_CANDIDATES}, got {self.num_candidates}"
             )
         if not 0 <= self.num_frontier <= self.num_candidates:
-            raise ValueError(
+            raise InputError(
                 f"num_frontier must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.num_frontier}"
             )
         if not 0 <= self.refine <= self.num_candidates:
-            raise ValueError(
+            raise InputError(
                 f"refine must lie between 0 and num_candidates ({self.num_candidates}), "
                 f"got {self.refine}"
             )
@@ -78,4 +79,4 @@ class PlannerConfig:
         for name in ("radius", "refine_radius", "lambda2", "safety_margin"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} must be a finite number >= 0, got {value}")
+                raise InputError(f"{name} must be a finite number >= 0, got {value}")

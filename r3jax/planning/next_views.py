@@ -17,6 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from r3jax.errors import InputError
 from r3jax.geometry.arguments import a_camera, checked
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.kernels.calls import Cells
@@ -82,7 +83,7 @@ def next_views(
     free = np.asarray(grid.free)
     safe = safe_cells(free, float(grid.cell_size), config.safety_margin)
     if k < 1:
-        raise ValueError(f"k must be at least 1, got {k}")
+        raise InputError(f"k must be at least 1, got {k}")
     checked = None if poses is None else _checked(poses, k)
     positions = _positions_in(grid, safe, config) if checked is None else checked[:, :3, 3]
     # Without any safe cell nothing can be reached, and the mask would leave nothing to see.
@@ -104,7 +105,7 @@ def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) 
     """Positions [C, 3] float64 [m], spread over the cells that keep the margin."""
     cells = np.argwhere(safe)
     if len(cells) == 0:
-        raise ValueError(
+        raise InputError(
             "the grid knows no free cell that keeps the safety margin of "
             f"{config.safety_margin} m: integrate a frame with depth, or give poses"
         )
@@ -116,13 +117,13 @@ def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) 
 def _checked(poses: ArrayLike, k: int) -> np.ndarray:
     checked = np.asarray(poses, dtype=np.float64)
     if checked.ndim != 3 or checked.shape[1:] != (4, 4):
-        raise ValueError(f"poses must have shape [C, 4, 4], got {checked.shape}")
+        raise InputError(f"poses must have shape [C, 4, 4], got {checked.shape}")
     if len(checked) < k:
-        raise ValueError(f"{k} views cannot be chosen from {len(checked)} poses, each at most once")
+        raise InputError(f"{k} views cannot be chosen from {len(checked)} poses, each at most once")
     # A pose that is not rigid would be scored, too, and the number would mean nothing.
     for i, pose in enumerate(checked):
         if (error := rigid_error(pose)) is not None:
-            raise ValueError(f"pose {i}: {error}")
+            raise InputError(f"pose {i}: {error}")
     return checked
 
 

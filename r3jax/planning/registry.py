@@ -5,6 +5,7 @@ import inspect
 from dataclasses import fields
 from typing import Any, TypeVar
 
+from r3jax.errors import InputError
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policies import HOMES, REGISTERED, current_name, home_of, known_names
 from r3jax.planning.policies.foreign.commands import COMMAND
@@ -28,10 +29,10 @@ def register_policy(policy_class: PolicyClass) -> PolicyClass:
     """
     name = getattr(policy_class, "name", None)
     if not isinstance(name, str) or not name:
-        raise ValueError(f"{policy_class.__qualname__} needs a class attribute `name`")
+        raise InputError(f"{policy_class.__qualname__} needs a class attribute `name`")
     # A policy of this package cannot be replaced: recorded runs name it.
     if current_name(name) in HOMES:
-        raise ValueError(f"a policy of this package is called {name!r}: choose another name")
+        raise InputError(f"a policy of this package is called {name!r}: choose another name")
     REGISTERED[name] = policy_class
     return policy_class
 
@@ -86,7 +87,7 @@ def make_policy(name: str, **settings: Any) -> Policy:
     known = [field.name for field in fields(config)]
     unknown = [setting for setting in settings if setting not in known]
     if unknown:
-        raise ValueError(
+        raise InputError(
             f"policy {name!r} has no setting {', '.join(unknown)}; known: {', '.join(known)}"
         )
     return policy_class(name)(config(**settings))
@@ -106,7 +107,7 @@ def policy_class(name: str) -> Any:
     try:
         found = getattr(importlib.import_module(module), kind)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"policy {name!r} cannot be imported: {error}") from error
+        raise InputError(f"policy {name!r} cannot be imported: {error}") from error
     if not isinstance(getattr(found, "name", None), str):
-        raise ValueError(f"policy {name!r}: {module}:{kind} has no class attribute `name`")
+        raise InputError(f"policy {name!r}: {module}:{kind} has no class attribute `name`")
     return found

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.exploration.guard import first_pose
 from r3jax.exploration.taken_views import StepRow, unit_of
 from r3jax.mapping.state import MapState
@@ -74,9 +75,9 @@ def resume_run(path: Path, budget: str | None = None, until: str | None = None) 
     """
     run = read_run(path)
     if run.header.is_merged:
-        raise ValueError(f"{path} was merged from other runs: fork it with --fork and --at")
+        raise InputError(f"{path} was merged from other runs: fork it with --fork and --at")
     if run.header.is_of_team:
-        raise ValueError(
+        raise InputError(
             f"{path} flew in a team: go on with `r3jax team --resume {path.parent}`, or fork it "
             "with --fork and --at"
         )
@@ -108,7 +109,7 @@ def fork_run(
             that is there.
     """
     if not 1 <= at <= len(run.rows):
-        raise ValueError(
+        raise InputError(
             f"--at must lie between 1 and the run's {len(run.rows)} {unit_of(run.rows)}, got {at}"
         )
     simulator = open_run_scene(run)
@@ -146,7 +147,7 @@ def _refuse_half_a_fork(run: Run) -> None:
     parent = run.header.parent or {}
     wanted = parent.get("views", 0) if "forked" in parent else 0
     if len(run.rows) < wanted:
-        raise ValueError(
+        raise InputError(
             f"{run.path} was cut off when it had {len(run.rows)} of the {wanted} "
             f"{unit_of(run.rows)} that it takes over from {parent['forked']}: fork again, with "
             "--overwrite"

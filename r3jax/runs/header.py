@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from r3jax.errors import PathError
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.policy import LivesOutside, Policy
@@ -44,13 +45,8 @@ _PACKAGES = (
 )
 
 
-class RunError(ValueError):
+class RunError(PathError):
     """A run folder that cannot be read or written; names the file and the reason."""
-
-    def __init__(self, path: Path, reason: str):
-        super().__init__(f"{path}: {reason}")
-        self.path = path
-        self.reason = reason
 
 
 @dataclass(frozen=True)

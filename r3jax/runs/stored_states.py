@@ -25,6 +25,7 @@ from r3jax.checkpoints import (
     read_arrays,
     write_checkpoint,
 )
+from r3jax.errors import InputError
 from r3jax.exploration.state import LoopState
 from r3jax.exploration.taken_views import StepRow
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -238,12 +239,12 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
     # Not `policy`: a policy that remembers nothing has no such table.
     missing = sorted({"map", "grid", "loop"} - set(tables))
     if missing:
-        raise ValueError(f"the checkpoint is missing {', '.join(missing)}")
+        raise InputError(f"the checkpoint is missing {', '.join(missing)}")
     arrays = dict(tables["map"])
     # No array of the map, so `fill` would not notice: with other bins the visited bits of a row
     # stand for other directions.
     if int(arrays.pop("num_bins", -1)) != like.map_state.num_bins:
-        raise ValueError("the checkpoint's map has other direction bins than the run")
+        raise InputError("the checkpoint's map has other direction bins than the run")
     # Through `fill`, so that totals come back as plain numbers and are summed as before.
     rest = {name: getattr(like, name) for name in _LOOP}
     planner = replace(
@@ -278,7 +279,7 @@ def fill(template: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     # One array too many means another version of the policy: its memory would be half understood.
     if set(names) != set(arrays):
         odd = sorted(set(names) ^ set(arrays))
-        raise ValueError(f"these arrays are missing or of no use: {', '.join(odd)}")
+        raise InputError(f"these arrays are missing or of no use: {', '.join(odd)}")
     filled = [
         _like(leaf, arrays[name], name) for name, (_, leaf) in zip(names, leaves, strict=True)
     ]
@@ -294,7 +295,7 @@ def _like(leaf: Any, array: np.ndarray, name: str) -> Any:
     wanted = np.asarray(leaf)
     # Sizes may differ, as tables double; a type or an axis may not, as compiled code rests on them.
     if array.dtype != wanted.dtype or array.ndim != wanted.ndim:
-        raise ValueError(
+        raise InputError(
             f"{name} is {array.dtype} with {array.ndim} axes, expected {wanted.dtype} with "
             f"{wanted.ndim}"
         )

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from r3jax.errors import InputError
 from r3jax.geometry.arguments import one, or_none
 from r3jax.kernels.calls import Forms
 from r3jax.visibility.config import VisibilityConfig, as_float32
@@ -38,9 +39,9 @@ class ScoringConfig(VisibilityConfig):
     def __check_init__(self) -> None:
         """Refuses settings that no formula knows."""
         if self.kappa not in ("box", "one"):
-            raise ValueError(f"kappa must be 'box' or 'one', got {self.kappa!r}")
+            raise InputError(f"kappa must be 'box' or 'one', got {self.kappa!r}")
         if self.delta not in ("trace", "pairwise"):
-            raise ValueError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
+            raise InputError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
 
 
 RETIRED = {"sample": "it was off, and no table rests on it; commit 4fa1d20 has it"}
@@ -55,7 +56,7 @@ def scoring_config_of(settings: dict[str, Any]) -> ScoringConfig:
     """
     for name in settings:
         if name in RETIRED:
-            raise ValueError(f"setting scoring.{name} has left the package: {RETIRED[name]}")
+            raise InputError(f"setting scoring.{name} has left the package: {RETIRED[name]}")
     return ScoringConfig(**settings)
 
 

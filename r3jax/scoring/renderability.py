@@ -15,6 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from r3jax.errors import InputError
 from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked
 from r3jax.geometry.cameras import Camera, is_traced, nan_unless_valid
 from r3jax.mapping.state import MapState, a_map
@@ -58,11 +59,11 @@ def voxel_renderability(
     focal = jnp.asarray(focal, dtype=jnp.float32)
     a_point("camera_position", position)
     if focal.ndim != 0:
-        raise ValueError(f"focal must be one number [px], got shape {focal.shape}")
+        raise InputError(f"focal must be one number [px], got shape {focal.shape}")
     if kappa not in ("box", "one"):
-        raise ValueError(f"kappa must be 'box' or 'one', got {kappa!r}")
+        raise InputError(f"kappa must be 'box' or 'one', got {kappa!r}")
     if not is_traced(focal) and not 0.0 < float(focal) < np.inf:
-        raise ValueError(f"focal must be positive and finite [px], got {float(focal)}")
+        raise InputError(f"focal must be positive and finite [px], got {float(focal)}")
     return _voxel_renderability(state, position, focal, Forms(kappa))
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 
@@ -62,12 +63,12 @@ class NoisySimulator:
             ValueError: a share outside [0, 0.2], or a negative seed.
         """
         if not 0.0 <= relative_sigma <= 0.2:
-            raise ValueError(
+            raise InputError(
                 f"relative_sigma is a share of the depth and must lie in [0, 0.2], "
                 f"got {relative_sigma}"
             )
         if seed < 0:
-            raise ValueError(f"seed must be 0 or more, got {seed}")
+            raise InputError(f"seed must be 0 or more, got {seed}")
         self.simulator = simulator
         self._sigma = relative_sigma
         self._seed = seed

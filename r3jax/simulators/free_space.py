@@ -18,6 +18,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
@@ -58,7 +59,7 @@ class GroundTruth:
         """
         inner = simulator.simulator if isinstance(simulator, NoisySimulator) else simulator
         if not isinstance(inner, RaycastSimulator):
-            raise ValueError(f"a {type(inner).__name__} has no mesh to take ground truth from")
+            raise InputError(f"a {type(inner).__name__} has no mesh to take ground truth from")
         self._simulator = inner
 
     @property
@@ -97,13 +98,13 @@ class GroundTruth:
         """
         sides = np.asarray(spacing, dtype=np.float64)
         if sides.shape != (3,) or not (np.isfinite(sides) & (sides > 0.0)).all():
-            raise ValueError(f"spacing must be three lengths > 0 [m], got {spacing}")
+            raise InputError(f"spacing must be three lengths > 0 [m], got {spacing}")
         if not _MIN_MARGIN <= margin < math.inf:
-            raise ValueError(f"margin must be at least {_MIN_MARGIN} m, got {margin}")
+            raise InputError(f"margin must be at least {_MIN_MARGIN} m, got {margin}")
         start = self._simulator.start_pose[:3, 3]
         room = float(self._simulator.clearance(start[None])[0])
         if room < margin - _TOLERANCE:
-            raise ValueError(
+            raise InputError(
                 f"{self.scene}: the start at {np.round(start, 2).tolist()} has only {room:.2f} m "
                 f"free all round, less than the margin of {margin} m: lower the margin, or give "
                 "the simulator another start_pose"
@@ -249,7 +250,7 @@ def _nodes(bounds: np.ndarray, spacing: np.ndarray, margin: float) -> _Nodes:
     after = np.floor((bounds[1] - first) / step + 1e-9).astype(int)
     shape = tuple(int(n) for n in np.maximum(before + after + 1, 1))
     if math.prod(shape) > _MAX_NODES:
-        raise ValueError(
+        raise InputError(
             f"the world extends {np.round(bounds[1] - bounds[0], 1).tolist()} m: its free space "
             f"needs {math.prod(shape):.2g} nodes, over {_MAX_NODES:.0g}; is the unit meters? "
             "Otherwise cut the mesh"

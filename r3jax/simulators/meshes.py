@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.simulators.mesh_files import GLTF_SUFFIXES, MeshFile
 from r3jax.simulators.world import Material, World
 from r3jax.validation.errors import ForeignFileError
@@ -65,13 +66,13 @@ def load_world(path: str | Path, up: str | None = None, scale: float | int = 1.0
     path = Path(path)
     turn = scaled_turn(path, up, scale)
     if not path.is_file():
-        raise ValueError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
+        raise InputError(f"no such mesh file: {path} (give a GLB, glTF, PLY or OBJ file)")
     _refuse_splat(path)
     try:
         file = MeshFile(path)
         nodes = [_part_of(file, T, name) for T, name in file.placed]
     except (ForeignFileError, OSError) as error:
-        raise ValueError(
+        raise InputError(
             f"cannot read the mesh file {path}: {error} (is it damaged, or a format other than "
             "GLB, glTF, PLY, OBJ?)"
         ) from error
@@ -119,7 +120,7 @@ def world_from_file(path: Path, up: str | None = None) -> np.ndarray:
         ValueError: `up` is neither.
     """
     if up not in (None, "y", "z"):
-        raise ValueError(f"up must be 'y' or 'z', got {up!r}")
+        raise InputError(f"up must be 'y' or 'z', got {up!r}")
     is_gltf = path.suffix.lower() in GLTF_SUFFIXES
     return _Z_UP_FROM_Y_UP if up == "y" or (up is None and is_gltf) else np.eye(3)
 
@@ -131,7 +132,7 @@ def scaled_turn(path: Path, up: str | None, scale: Any) -> np.ndarray:
         ValueError: `up` is no axis, or `scale` no positive number.
     """
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0.0 < scale < math.inf:
-        raise ValueError(f"scale must be a number > 0, the meters in a unit, got {scale!r}")
+        raise InputError(f"scale must be a number > 0, the meters in a unit, got {scale!r}")
     return scale * world_from_file(path, up)
 
 
@@ -142,7 +143,7 @@ def _refuse_splat(path: Path) -> None:
     with open(path, "rb") as file:
         header = file.read(_HEADER_BYTES).partition(b"end_header")[0]
     if b" f_dc_0" in header or b" packed_position" in header:
-        raise ValueError(
+        raise InputError(
             f"{path} is a Gaussian splat and no mesh: it has no surfaces to look at; give the mesh "
             "of the place, or export one (2D Gaussian splatting and SuGaR write meshes)"
         )
@@ -152,11 +153,11 @@ def _refuse_empty(path: Path, scene: Any) -> None:
     """Says why a scene has nothing to look at."""
     points = sum(len(getattr(g, "vertices", ())) for g in scene.geometry.values())
     if points:
-        raise ValueError(
+        raise InputError(
             f"{path} has {points} points but no faces: a point cloud cannot be ray cast; "
             "reconstruct a surface first (for example Poisson reconstruction)"
         )
-    raise ValueError(f"{path} holds an empty mesh: no vertices, no faces; export it again")
+    raise InputError(f"{path} holds an empty mesh: no vertices, no faces; export it again")
 
 
 def _part_of(file: MeshFile, T: np.ndarray, name: str) -> _Part | None:
@@ -278,12 +279,12 @@ def _check(path: Path, world: World) -> None:
     """Refuses geometry that no ray can meet."""
     bad = np.flatnonzero(~np.isfinite(world.vertices).all(axis=1))
     if len(bad):
-        raise ValueError(
+        raise InputError(
             f"{path}: {len(bad)} of {len(world.vertices)} vertices are not finite, the first is "
             f"number {bad[0]}: {world.vertices[bad[0]].tolist()}; repair the mesh first"
         )
     if not np.abs(world.face_uv).max() <= _MAX_UV:
-        raise ValueError(
+        raise InputError(
             f"{path}: texture coordinates are not finite, or beyond {_MAX_UV:g}; repair the mesh "
             "first"
         )
@@ -291,12 +292,12 @@ def _check(path: Path, world: World) -> None:
     corners = world.vertices[world.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if not np.linalg.norm(cross, axis=1).max() > 0.0:
-        raise ValueError(
+        raise InputError(
             f"{path}: every face has zero area (the mesh extends {extent.tolist()} m); "
             "there is no surface to see"
         )
     if extent.max() > _MAX_EXTENT:
-        raise ValueError(
+        raise InputError(
             f"{path} extends {extent.max():.6g} m; the unit is meters: scale the mesh first, with "
             "--scale 0.001 if it is in millimeters"
         )

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, Int
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.native.platform import can_call_kernels
 from r3jax.splatting.config import RasterConfig
@@ -70,7 +71,7 @@ def find_backend(name: str) -> Rasterize:
     elif name == "reference":
         from r3jax.splatting.backends.reference import rasterize
     else:
-        raise ValueError(
+        raise InputError(
             f"there is no rasterizer backend {name!r}: choose auto, numba, xla, splax or reference"
         )
     return rasterize

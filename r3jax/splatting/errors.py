@@ -2,31 +2,23 @@
 
 from pathlib import Path
 
+from r3jax.errors import InputError, PathError
 
-class SceneFileError(ValueError):
+
+class SceneFileError(PathError):
     """A file of Gaussians that cannot be read or written; names it and the reason."""
 
-    def __init__(self, path: Path, reason: str):
-        super().__init__(f"{path}: {reason}")
-        self.path = path
-        self.reason = reason
 
-
-class ViewsError(ValueError):
+class ViewsError(InputError):
     """Views that nothing can be trained on; says which and why."""
 
 
-class TooLargeError(ValueError):
+class TooLargeError(InputError):
     """A training that would not fit in memory; says how much it needs and what would fit."""
 
 
-class CheckpointError(ValueError):
+class CheckpointError(PathError):
     """A training that cannot go on from what is stored; names the folder and the reason."""
-
-    def __init__(self, path: Path, reason: str):
-        super().__init__(f"{path}: {reason}")
-        self.path = path
-        self.reason = reason
 
 
 class TrainingDiverged(ArithmeticError):

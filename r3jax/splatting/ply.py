@@ -14,6 +14,7 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.files import write_atomic
 from r3jax.geometry.arguments import checked
 from r3jax.splatting.errors import SceneFileError
@@ -188,7 +189,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:
             elif words[0] == "property":
                 elements[-1] = _with_property(elements[-1], words[1:])
             else:
-                raise ValueError
+                raise InputError
         except (KeyError, IndexError, ValueError):
             raise SceneFileError(
                 path, f"the header has a line that no PLY has: {' '.join(words)[:80]!r}"
@@ -199,7 +200,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:
 def _as_count(word: str) -> int:
     count = int(word)
     if count < 0:
-        raise ValueError
+        raise InputError
     return count
 
 
@@ -209,7 +210,7 @@ def _with_property(element: _Element, words: list[str]) -> _Element:
         return _Element(element.name, element.count, element.fields, has_lists=True)
     column = (words[1], _TYPES[words[0]])
     if column[0] in dict(element.fields):
-        raise ValueError
+        raise InputError
     return _Element(element.name, element.count, [*element.fields, column], element.has_lists)
 
 
@@ -285,7 +286,7 @@ def _words(file: BinaryIO) -> Iterator[list[bytes]]:
         # The last word may go on in the next block.
         rest = words.pop() if words and not block[-1:].isspace() else b""
         if len(rest) > _LONGEST_WORD:
-            raise ValueError(f"a word has more than {_LONGEST_WORD} characters")
+            raise InputError(f"a word has more than {_LONGEST_WORD} characters")
         yield words
     yield [rest] if rest else []
 

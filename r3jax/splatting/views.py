@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.errors import ViewsError
@@ -103,7 +104,7 @@ def load_views(frames: Iterable[Frame], resolution: int | None = None) -> Views:
     if isinstance(frames, Frame):
         raise TypeError("frames must be several, got one Frame: put it into a list")
     if resolution is not None and resolution < 1:
-        raise ValueError(f"resolution is the longer side in pixels, at least 1, got {resolution}")
+        raise InputError(f"resolution is the longer side in pixels, at least 1, got {resolution}")
     rgb: list[np.ndarray] = []
     depth: list[np.ndarray] = []
     poses: list[np.ndarray] = []
@@ -156,7 +157,7 @@ def split_views(count: int, every: int = 8) -> tuple[np.ndarray, np.ndarray]:
         ValueError: `every` is negative or 1 (nothing would be left to train on).
     """
     if every < 0 or every == 1:
-        raise ValueError(f"every must be 0 (hold out nothing) or at least 2, got {every}")
+        raise InputError(f"every must be 0 (hold out nothing) or at least 2, got {every}")
     index = np.arange(count)
     is_test = index % every == 0 if every else np.zeros(count, dtype=bool)
     return index[~is_test], index[is_test]

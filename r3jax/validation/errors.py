@@ -6,8 +6,10 @@ The reader that knows which file it is adds its name.
 import difflib
 from collections.abc import Iterable
 
+from r3jax.errors import InputError
 
-class ForeignFileError(ValueError):
+
+class ForeignFileError(InputError):
     """A reason not to read on."""
 
 

@@ -4,6 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from r3jax.errors import InputError
+
 
 def as_float32(value: float | Array) -> Float[Array, ""]:
     """Converts a setting, so that Python numbers and arrays compile to the same program."""
@@ -31,4 +33,4 @@ class VisibilityConfig(eqx.Module):
         """Refuses a side that the octahedral map cannot have."""
         # Powers of two halve exactly, so that the borders of every level of the pyramid wrap alike.
         if self.panorama_size < 2 or self.panorama_size & (self.panorama_size - 1):
-            raise ValueError(f"panorama_size must be a power of two, got {self.panorama_size}")
+            raise InputError(f"panorama_size must be a power of two, got {self.panorama_size}")

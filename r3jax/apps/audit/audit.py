@@ -26,6 +26,7 @@ from r3jax.captures.faults.faults import Faults, find_faults, stray_finding
 from r3jax.captures.source import Source, thinned
 from r3jax.captures.standpoints import standpoints_of
 from r3jax.captures.survey import RANGE, Survey, survey_of
+from r3jax.errors import InputError
 from r3jax.formats.lenses import Lens
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -174,7 +175,7 @@ def audit(
     unknown = np.array([*faults.left_out, *faults.without_depth], dtype=np.int64)
     survey = dataclasses.replace(survey, chosen=np.setdiff1d(survey.chosen, unknown))
     if len(survey.chosen) < 2:
-        raise ValueError(
+        raise InputError(
             f"{source.name}: {len(survey.chosen)} of its {len(source)} pictures shows a surface "
             "of known depth: an audit judges each picture by the others, so it needs at least two"
         )

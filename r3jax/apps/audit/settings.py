@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from r3jax.captures.settings import SurveySettings, at_least
+from r3jax.errors import InputError
 
 _MOST_VIEWS = 200
 """More would make the report too long to read."""
@@ -36,4 +37,4 @@ class AuditSettings(SurveySettings):
         super().__post_init__()
         at_least(self, {"folds": 2, "views": 0, "seed": 0})
         if self.views > _MOST_VIEWS:
-            raise ValueError(f"--views must be at most {_MOST_VIEWS}, got {self.views}")
+            raise InputError(f"--views must be at most {_MOST_VIEWS}, got {self.views}")

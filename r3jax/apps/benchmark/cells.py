@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from r3jax.errors import InputError
 from r3jax.exploration.config import Budget, ClockName, ExplorationConfig, parse_budget
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.config import FORMER_SETTINGS
@@ -123,14 +124,14 @@ class Conditions:
         parsed = [parse_budget(text) for text in self.snapshots]
         for snapshot in parsed:
             if snapshot.unit == budget.unit and snapshot.amount > budget.amount:
-                raise ValueError(f"the snapshot {snapshot} lies beyond the budget {budget}")
+                raise InputError(f"the snapshot {snapshot} lies beyond the budget {budget}")
         if len(set(parsed)) < len(parsed):
-            raise ValueError(f"a snapshot is given twice: {', '.join(self.snapshots)}")
+            raise InputError(f"a snapshot is given twice: {', '.join(self.snapshots)}")
         for name in ("resolution", "train_resolution"):
             if not 16 <= getattr(self, name) <= 4096:
-                raise ValueError(f"{name} must lie between 16 and 4096, got {getattr(self, name)}")
+                raise InputError(f"{name} must lie between 16 and 4096, got {getattr(self, name)}")
         if self.train_resolution > self.resolution:
-            raise ValueError(
+            raise InputError(
                 f"train_resolution {self.train_resolution} is more than the images have: "
                 f"resolution is {self.resolution}"
             )
@@ -186,7 +187,7 @@ class Conditions:
         unknown = [name for name in scoring if name not in known and name not in RETIRED]
         if unknown or "scoring" in planner:
             wrong = ", ".join(unknown) or "scoring"
-            raise ValueError(
+            raise InputError(
                 f"there is no setting {wrong} of the scores: give scoring.NAME, one of "
                 f"{', '.join(known)}"
             )
@@ -196,7 +197,7 @@ class Conditions:
         try:
             return make_policy(name, scoring=scoring_config_of(scoring), **planner)
         except TypeError as error:  # a text where a number belongs
-            raise ValueError(f"policy {name!r} with {settings}: {error}") from None
+            raise InputError(f"policy {name!r} with {settings}: {error}") from None
 
 
 def _motion(given: Any) -> Motion:
@@ -208,7 +209,7 @@ def _further(given: dict[str, Any], config: type, own: tuple[str, ...]) -> dict[
     known = {field.name: field.default for field in fields(config) if field.name not in own}
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise ValueError(
+        raise InputError(
             f"{config.__name__} has no further setting {', '.join(unknown)}; there are "
             f"{', '.join(known)}"
         )

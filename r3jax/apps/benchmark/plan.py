@@ -15,6 +15,7 @@ from r3jax.apps.benchmark.reference_images import (
     reference_path,
     save_reference_images,
 )
+from r3jax.errors import InputError
 from r3jax.evaluation.test_views import ViewSet, load_view_set, render_view_set
 from r3jax.exploration.guard import check_world
 from r3jax.simulators.free_space import GroundTruth
@@ -71,9 +72,9 @@ def make_plan(
     for name in ("scenes", "policies", "seeds"):
         given = getattr(request, name)
         if not given:
-            raise ValueError(f"there is nothing to do: no {name} are given")
+            raise InputError(f"there is nothing to do: no {name} are given")
         if len(set(given)) < len(given):
-            raise ValueError(f"{name} holds something twice: {', '.join(map(str, given))}")
+            raise InputError(f"{name} holds something twice: {', '.join(map(str, given))}")
     for policy in request.policies:  # what can be checked quickly comes before the scenes
         request.conditions.policy(policy, request.settings)
     sources = {policy: sources_of(policy) for policy in request.policies}

@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from r3jax.apps.benchmark.cells import Cell, paths_of, snapshot_order
+from r3jax.errors import InputError
 from r3jax.evaluation.scores import METRICS, ViewRow, summarize
 from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic
@@ -181,9 +182,9 @@ def _read_record(path: Path) -> dict[str, Any]:
     try:
         return _parse_record(read_bytes(path, _MAX_BYTES))
     except VersionError as error:
-        raise ValueError(f"{path} has {error}") from None
+        raise InputError(f"{path} has {error}") from None
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             f"{path} is no record of a benchmark ({error!s:.300}): delete it and start the "
             "benchmark again, it makes what is missing"
         ) from None
@@ -242,7 +243,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
         try:
             records.append(_parse_record(line))
         except ValueError as error:
-            raise ValueError(
+            raise InputError(
                 f"{path}, line {number}, is no record of a benchmark ({error!s:.300})"
             ) from None
     return records

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.apps.benchmark.cells import Cell, Conditions
+from r3jax.errors import InputError
 from r3jax.files import make_folder, write_atomic
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.splatting.views import Views
@@ -93,7 +94,7 @@ def read_reference_images(path: Path) -> ReferenceImages:
         stored = read_npz(path, _KINDS)
         _check(stored)
     except ForeignFileError as error:
-        raise ValueError(
+        raise InputError(
             f"{path} does not hold test views ({error}): delete it and start the benchmark again"
         ) from None
     height, width = stored["rgb"].shape[1:3]

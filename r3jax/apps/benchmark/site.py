@@ -12,6 +12,7 @@ from r3jax.apps.benchmark.cells import snapshot_slug
 from r3jax.apps.benchmark.record import machine, read_records
 from r3jax.apps.benchmark.reference_images import path_of_images, read_reference_images
 from r3jax.apps.benchmark.tables import full_title, headed_groups, notes
+from r3jax.errors import InputError
 from r3jax.evaluation.comparison import (
     Cell,
     methods_of,
@@ -55,7 +56,7 @@ def write_site(
     check_own(path.parent, "site")
     records = read_records(root)
     if not records:
-        raise ValueError(
+        raise InputError(
             f"{root} holds no records of explorations: run the benchmark first (those of --photos "
             "are no part of the page)"
         )

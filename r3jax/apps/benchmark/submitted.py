@@ -12,6 +12,7 @@ import numpy as np
 
 from r3jax.apps.benchmark.cells import OWN_OF_LOOP, Cell, Conditions
 from r3jax.apps.benchmark.plan import Request, prepare_scene
+from r3jax.errors import InputError
 from r3jax.exploration.clock import model_clock
 from r3jax.exploration.config import ExplorationConfig, format_budget, parse_budget
 from r3jax.exploration.coverage import measure_coverage, view_renderability
@@ -95,7 +96,7 @@ def problems_of(submission: Submission) -> list[Problem]:
     """Lists what keeps a submission from being judged: rules of the protocol that it breaks."""
     try:
         if len(submission.frames) < 2:
-            raise ValueError("a model is trained on two frames at least, and there is one")
+            raise InputError("a model is trained on two frames at least, and there is one")
         submission.config.check_scales()
         _ = conditions_of(submission, Conditions(train_resolution=16)).train_config(submission.seed)
         simulator = open_submitted(submission)
@@ -285,7 +286,7 @@ def _square(submission: Submission) -> tuple[int, float]:
     # As people write it: the focal length is stored in float32.
     fov = round(math.degrees(2.0 * math.atan(half / camera["fx"])), 4)
     if camera_fields(Camera.from_fov(width, width, fov)) != camera:
-        raise ValueError(
+        raise InputError(
             "`camera`: the benchmark has square images and pixels with the principal point in the "
             f"middle, got {camera}"
         )
@@ -318,7 +319,7 @@ def plan_submission(
     on_stage(f"checking {submission.name}")
     if problems := problems_of(submission):
         more = f"; {len(problems) - 1} more: --check lists all" if len(problems) > 1 else ""
-        raise ValueError(f"{problems[0]}{more}")
+        raise InputError(f"{problems[0]}{more}")
     conditions = conditions_of(submission, base, snapshots)
     scene, settings = submission.scene, _settings_of(submission)
     opened: dict[str, Any] = {name: scene[name] for name in ("up", "scale", "cull_backfaces")}
@@ -365,7 +366,7 @@ def load_submission(root: Path, digest: str) -> Submission:
     path = stored_submission(root, digest)
     submission = read_submission(path)
     if content_hash(submission) != digest:
-        raise ValueError(f"{path} is not what was planned: start the benchmark again")
+        raise InputError(f"{path} is not what was planned: start the benchmark again")
     return submission
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.evaluation.comparison import (
     Cell,
     check_equal_terms,
@@ -98,7 +99,7 @@ def metric_named(name: str) -> Metric:
         if metric.name == name:
             return metric
     known = ", ".join(metric.name for metric in METRICS)
-    raise ValueError(f"no metric {name!r}; there are {known}")
+    raise InputError(f"no metric {name!r}; there are {known}")
 
 
 def full_title(metric: Metric) -> str:

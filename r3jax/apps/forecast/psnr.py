@@ -26,6 +26,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.files import write_atomic
 from r3jax.validation.errors import ForeignFileError, check_version
 from r3jax.validation.files import read_bytes
@@ -86,10 +87,10 @@ def fit(coverage: np.ndarray, renderability: np.ndarray, psnr: np.ndarray) -> Ps
         ValueError: fewer than 100 views, or numbers that are not finite.
     """
     if len(psnr) < 100:
-        raise ValueError(f"a calibration needs at least 100 views, got {len(psnr)}")
+        raise InputError(f"a calibration needs at least 100 views, got {len(psnr)}")
     for name, values in (("coverage", coverage), ("renderability", renderability), ("psnr", psnr)):
         if not np.isfinite(values).all():
-            raise ValueError(f"{name} must be finite, view {np.argmin(np.isfinite(values))} is not")
+            raise InputError(f"{name} must be finite, view {np.argmin(np.isfinite(values))} is not")
     terms, scale_terms = (f(coverage, renderability) for f in (_location_terms, _scale_terms))
     scale, location, log_scale = np.ones(len(psnr)), np.zeros(4), np.zeros(3)
     for _ in range(_PASSES):
@@ -119,7 +120,7 @@ def percent_of(name: str) -> float:
     except ValueError:
         percent = -1.0
     if not (name.startswith("p") and 0.0 < percent < 100.0):
-        raise ValueError(f"{name!r} is no statistic of views: use mean, or p10 for a percentile")
+        raise InputError(f"{name!r} is no statistic of views: use mean, or p10 for a percentile")
     return percent
 
 
@@ -167,7 +168,7 @@ def leave_one_out(
     """
     scene_of, model_of = np.asarray(scenes), np.asarray(models)
     if len(set(scenes)) < 2:
-        raise ValueError("to leave a scene out, two are needed")
+        raise InputError("to leave a scene out, two are needed")
     fits = {
         scene: fit(*(x[scene_of != scene] for x in (coverage, renderability, psnr)))
         for scene in dict.fromkeys(scenes)
@@ -238,7 +239,7 @@ def read_calibration(path: Path) -> Calibration:
     try:
         return _parse(read_bytes(path, _MAX_BYTES))
     except ForeignFileError as error:
-        raise ValueError(
+        raise InputError(
             f"{path}: {error}; `python -m experiments.forecast` writes calibrations"
         ) from None
 
@@ -301,17 +302,17 @@ def parse_goal(text: str) -> Goal:
     quantity, separator, rest = text.strip().partition(":")
     amount_text, _, name = rest.partition("@")
     if quantity != "psnr" or not separator:
-        raise ValueError(f"goal {text!r} is not understood: {_EXAMPLE}")
+        raise InputError(f"goal {text!r} is not understood: {_EXAMPLE}")
     try:
         amount = float(amount_text)
     except ValueError:
-        raise ValueError(f"goal {text!r}: {amount_text!r} is not a number; {_EXAMPLE}") from None
+        raise InputError(f"goal {text!r}: {amount_text!r} is not a number; {_EXAMPLE}") from None
     if not math.isfinite(amount):
-        raise ValueError(f"goal {text!r}: the PSNR must be a finite number; {_EXAMPLE}")
+        raise InputError(f"goal {text!r}: the PSNR must be a finite number; {_EXAMPLE}")
     name = name or MEAN
     if name != MEAN:
         try:
             percent_of(name)
         except ValueError as error:
-            raise ValueError(f"goal {text!r}: {error}") from None
+            raise InputError(f"goal {text!r}: {error}") from None
     return Goal(amount, name)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from r3jax.apps.team.team import Member, TeamResult
+from r3jax.errors import InputError
 from r3jax.exploration.guard import check_world, first_pose
 from r3jax.files import (
     check_own,
@@ -116,7 +117,7 @@ def resume_team(folder: Path, stack: contextlib.ExitStack, budget: str | None = 
     _only_writer(folder, stack)
     first = read_run(folder / "0")
     if not first.header.is_of_team:
-        raise ValueError(f"{first.path} did not fly in a team: `r3jax explore --resume` it")
+        raise InputError(f"{first.path} did not fly in a team: `r3jax explore --resume` it")
     parent: dict[str, Any] = first.header.parent or {}
     members: list[Member] = []
     recorders: list[RunWriter] = []
@@ -140,7 +141,7 @@ def _only_writer(folder: Path, stack: contextlib.ExitStack) -> None:
     try:
         stack.enter_context(lock_folder(folder))
     except BlockingIOError:
-        raise ValueError(f"{folder}: another process is writing this team") from None
+        raise InputError(f"{folder}: another process is writing this team") from None
     clear_partial(folder)
 
 
@@ -166,7 +167,7 @@ def _with_starts(
             placed.append(scene)
             break
         else:
-            raise ValueError(
+            raise InputError(
                 f"there is no room for {len(scenes)} cameras {APART} m apart beside the start "
                 f"{simulators[0].start_pose[:3, 3].round(2).tolist()}: give a roomier --start"
             )
@@ -177,7 +178,7 @@ def _check_leftovers(folder: Path, cameras: int) -> None:
     """A smaller team must not be written over a larger one: whose run would the last one be?"""
     check_own(folder, "team", "give another --name")
     if (folder / str(cameras)).exists():
-        raise ValueError(f"{folder} holds a team of more than {cameras}: give another --name")
+        raise InputError(f"{folder} holds a team of more than {cameras}: give another --name")
 
 
 def write_team_data(

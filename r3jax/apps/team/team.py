@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.apps.team.reserved_views import PromisedView, ReservedViews
+from r3jax.errors import InputError
 from r3jax.exploration.clock import make_clock, timed
 from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
@@ -256,13 +257,13 @@ def _check(members: Sequence[Member], meet_every: float) -> None:
         ValueError: says what is wrong.
     """
     if not members:
-        raise ValueError("a team needs at least one member")
+        raise InputError("a team needs at least one member")
     if not meet_every >= 0.0:
-        raise ValueError(f"meet_every must be a time >= 0 [s], got {meet_every}")
+        raise InputError(f"meet_every must be a time >= 0 [s], got {meet_every}")
     box = np.asarray(members[0].simulator.bounds)
     for number, member in enumerate(members):
         if not np.array_equal(member.simulator.bounds, box):
-            raise ValueError(
+            raise InputError(
                 f"member {number} is in another world than member 0: its box is "
                 f"{np.asarray(member.simulator.bounds).tolist()}, not {box.tolist()}"
             )

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from r3jax.apps.viewer.color_maps import CAUSE_COLORS, UNSEEN, paint
 from r3jax.apps.viewer.preview import TERMS
 from r3jax.apps.viewer.story import Moment
+from r3jax.errors import InputError
 from r3jax.exploration.coverage import probe_poses
 from r3jax.exploration.taken_views import StepRow
 from r3jax.geometry.cameras import Camera
@@ -192,7 +193,7 @@ def blocks_of(map_state: MapState, budget: int = BUDGET) -> Blocks:
         ValueError: a budget without a block.
     """
     if budget < 1:
-        raise ValueError(f"budget must be at least 1 block, got {budget}")
+        raise InputError(f"budget must be at least 1 block, got {budget}")
     rows = np.flatnonzero(np.asarray(map_state.occupied))
     # All rows, used or not: another number of them would make JAX recompile.
     index = np.asarray(jnp.stack(unpack(map_state.key[0], map_state.key[1])))[:, rows]

@@ -16,6 +16,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from r3jax.apps.viewer.color_maps import linear_light
+from r3jax.errors import InputError
 from r3jax.simulators.world import Material, World
 
 MAX_FACES = 500_000
@@ -39,7 +40,7 @@ def world_glb(world: World, top: float = math.inf) -> bytes:
         ValueError: more triangles than `MAX_FACES`.
     """
     if len(world.faces) > MAX_FACES:
-        raise ValueError(
+        raise InputError(
             f"the mesh has {len(world.faces)} triangles, more than the {MAX_FACES} that a "
             "browser is given"
         )

@@ -14,6 +14,7 @@ from r3jax.apps.viewer.overlays import recorded_points
 from r3jax.apps.viewer.queries import Extras, Sources, picture_camera
 from r3jax.apps.viewer.server import close_server, open_server, url_of
 from r3jax.apps.viewer.story import Offer, RecordedStory, decide_again
+from r3jax.errors import InputError
 from r3jax.runs.reader import Run
 from r3jax.runs.settings import scene_of_run, settings_of_run
 from r3jax.simulators.base import Simulator
@@ -136,7 +137,7 @@ class RecordedScene:
         from r3jax.apps.viewer.glb import world_glb  # loads trimesh, which few pages need
 
         if not isinstance(self._simulator, RaycastSimulator):
-            raise ValueError(self.remark or "the simulator of this scene has no mesh to show")
+            raise InputError(self.remark or "the simulator of this scene has no mesh to show")
         return world_glb(self._simulator.world, top)
 
     @functools.cached_property

@@ -15,10 +15,10 @@ from r3jax.apps.audit.settings import AuditSettings
 from r3jax.captures.camera_paths import CameraPath, path_of
 from r3jax.captures.source import Source, source_of
 from r3jax.cli.console import Console, Table
-from r3jax.cli.errors import UserError
 from r3jax.cli.options.audit import AuditOptions
 from r3jax.cli.parsing import given_words
 from r3jax.cli.progress import Stages
+from r3jax.errors import InputError
 from r3jax.files import check_own, own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.bags import parse_topics
@@ -54,7 +54,7 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
     """Guides until Ctrl-C, then audits what came in; the page stays up until that is done.
 
     Raises:
-        UserError: nothing came in.
+        InputError: nothing came in.
         ValueError, OSError: as `follow`, `open_guide` and `_audit`.
     """
     if warning := exposure_warning(options.guide.host):
@@ -68,7 +68,7 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         source = follow(options.capture, page, scratch, up=options.terms.up, topics=topics)
         settle_interrupt()  # it has ended the scan
         if source is None:
-            raise UserError(f"{options.capture}: no frame came in")
+            raise InputError(f"{options.capture}: no frame came in")
         page.say("The scan has ended.", "its audit is being written")
         _audit(options, source, None, progress)
 
@@ -85,7 +85,7 @@ def _audit(
         progress: where progress is told.
 
     Raises:
-        UserError: a folder that holds something else.
+        InputError: a folder that holds something else.
         ValueError, OSError: as `audit` and `write_outputs`.
     """
     folder = options.out or Path("runs") / "audit" / source.name
@@ -109,7 +109,7 @@ def _check_folder(folder: Path, capture: Path) -> None:
     check_own(folder, "audit", "give another --out")
     audited = audited_capture(folder)
     if audited is not None and audited != capture.resolve():
-        raise UserError(f"{folder} holds the audit of {audited}: give another --out")
+        raise InputError(f"{folder} holds the audit of {audited}: give another --out")
 
 
 def _show(console: Console, found: Audit, written: dict[str, Path]) -> None:

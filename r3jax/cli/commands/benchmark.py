@@ -34,10 +34,11 @@ from r3jax.cli.console import (
     progress_bar,
 )
 from r3jax.cli.console import Table as ConsoleTable
-from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.errors import one_line
 from r3jax.cli.options.benchmark import BenchmarkOptions, parse_settings, words
 from r3jax.cli.parsing import settings_for
 from r3jax.cli.progress import Bar
+from r3jax.errors import InputError
 from r3jax.files import MARKER, lock_folder, own_folder, remove_own
 from r3jax.formats.submissions import Submission, read_submission
 from r3jax.interrupts import check_interrupt, settle_interrupt
@@ -98,7 +99,7 @@ def _only_one(folder: Path) -> ExitStack:
     try:
         return lock_folder(folder)
     except BlockingIOError:
-        raise UserError(
+        raise InputError(
             f"{folder}: another process runs this benchmark: wait for it, or give another --out"
         ) from None
 
@@ -171,12 +172,12 @@ def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[C
                 on_stage=on_stage,
             )
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise InputError(f"{path}: {error}") from None
         cells.append(cell)
     names = [(cell.scene, cell.policy, cell.seed, str(cell.settings)) for cell in cells]
     for name, path in zip(names, options.submissions.submission, strict=True):
         if names.count(name) > 1:
-            raise ValueError(
+            raise InputError(
                 f"{path}: another submission is called {name[1]!r}, too, in {name[0]} with the "
                 f"seed {name[2]}: rename `policy.name` in one of them"
             )

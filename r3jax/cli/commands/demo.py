@@ -30,7 +30,7 @@ def run_demo(options: DemoOptions) -> int:
         The exit code of the first step that failed, or 0.
 
     Raises:
-        UserError: a setting that cannot work.
+        InputError: a setting that cannot work.
     """
     path = options.out / "demo"
     return _explore(options) or _train(options, path) or _evaluate(path)

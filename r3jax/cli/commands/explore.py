@@ -9,10 +9,11 @@ from typing import Any
 from r3jax.apps.forecast.forecast import stopping_rule
 from r3jax.apps.report.report import write_report
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, check_viser, one_line, resumable, resume_command
+from r3jax.cli.errors import check_viser, one_line, resumable, resume_command
 from r3jax.cli.options.explore import DEFAULT_POLICY, ExploreOptions, PageOptions
 from r3jax.cli.parsing import settings_for
 from r3jax.cli.progress import RunProgress, Stages
+from r3jax.errors import InputError
 from r3jax.exploration.config import parse_budget
 from r3jax.exploration.loop import Result, explore
 from r3jax.exploration.state import StopReason, describe_counts
@@ -81,7 +82,7 @@ def run_explore(options: ExploreOptions) -> int:
                 on_stage=progress.on_stage,
             )
         except PolicyError as error:
-            raise UserError(one_line(error)) from error
+            raise InputError(one_line(error)) from error
     with resumable("explore", recorder.path):
         _conclude(console, recorder.path, result)
     return EXIT_CODES.get(result.reason, 0)
@@ -94,7 +95,7 @@ def _open_page(options: PageOptions, stack: contextlib.ExitStack) -> Callable[[E
         Makes the `viewer.live.LiveFeed` of the expedition, once there is one.
 
     Raises:
-        UserError: viser is not installed.
+        InputError: viser is not installed.
         OSError: the port is in use.
     """
     check_viser()

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from r3jax.apps.report.summary import stage_times, summary
 from r3jax.cli.console import Console, Table
-from r3jax.cli.errors import UserError
 from r3jax.cli.options.runs import InfoOptions
+from r3jax.errors import InputError
 from r3jax.files import check_replaceable, write_atomic
 from r3jax.formats.recordings import is_recording, read_recording
 from r3jax.interrupts import check_interrupt
@@ -16,7 +16,7 @@ def run_info(options: InfoOptions) -> int:
     """Prints what is asked for.
 
     Raises:
-        UserError, ValueError, OSError: neither a run nor a recording, or a broken one.
+        InputError, ValueError, OSError: neither a run nor a recording, or a broken one.
     """
     console = Console()
     path = options.path
@@ -27,7 +27,7 @@ def run_info(options: InfoOptions) -> int:
     elif is_recording(path):
         _show_recording(console, options, path)
     else:
-        raise UserError(
+        raise InputError(
             f"{path}: neither a run (no run.json) nor a recording (no poses.txt and images/)"
         )
     return 0

@@ -13,9 +13,10 @@ from r3jax.cli.commands.explore import (
     warn_of_versions,
 )
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, one_line, resumable, resume_command
+from r3jax.cli.errors import one_line, resumable, resume_command
 from r3jax.cli.options.explore import TeamOptions
 from r3jax.cli.progress import RunProgress, Stages
+from r3jax.errors import InputError
 from r3jax.interrupts import settle_interrupt
 from r3jax.planning.policy import PolicyError
 from r3jax.runs.header import RunError
@@ -46,7 +47,7 @@ def run_team(options: TeamOptions) -> int:
                 on_stage=progress.on_stage,
             )
         except PolicyError as error:
-            raise UserError(one_line(error)) from error
+            raise InputError(one_line(error)) from error
     with resumable("team", folder):
         _conclude(console, folder, result)
     return max(EXIT_CODES.get(member.reason, 0) for member in result.members)

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, one_line
+from r3jax.cli.errors import one_line
 from r3jax.cli.options.splats import ModelFolderOptions, TrainOptions
 from r3jax.cli.parsing import given_words, settings_for
 from r3jax.cli.progress import Stages, TrainProgress
+from r3jax.errors import InputError
 from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
 from r3jax.formats.points import write_points
@@ -27,7 +28,7 @@ def run_train(options: TrainOptions) -> int:
         0 done, 130 interrupted (it can be resumed).
 
     Raises:
-        UserError: training that diverged.
+        InputError: training that diverged.
         ValueError, OSError, ImportError: bad input, a model that exists, too little memory.
     """
     console = Console(stderr=True)
@@ -60,7 +61,7 @@ def run_train(options: TrainOptions) -> int:
             write_points(folder / "points.ply", *scene_points(result.scene))
             write_model(folder, result, options.path, views, split, config, package_versions())
     except TrainingDiverged as error:
-        raise UserError(one_line(error)) from error
+        raise InputError(one_line(error)) from error
     _conclude(console, options, folder, result)
     return 130 if result.interrupted else 0
 

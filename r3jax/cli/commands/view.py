@@ -6,9 +6,10 @@ from pathlib import Path
 
 from r3jax.apps.viewer.film import export_film, load_av
 from r3jax.cli.console import Console
-from r3jax.cli.errors import UserError, check_viser
+from r3jax.cli.errors import check_viser
 from r3jax.cli.options.runs import ViewOptions
 from r3jax.cli.progress import Stages
+from r3jax.errors import InputError
 from r3jax.interrupts import deferred_interrupt, end_process
 from r3jax.network import exposure_warning
 from r3jax.runs.reader import Run, read_run
@@ -19,14 +20,14 @@ def run_view(options: ViewOptions) -> int:
     """Shows a run until Ctrl-C, or writes its images.
 
     Raises:
-        UserError: no views yet.
+        InputError: no views yet.
         ValueError, OSError, ImportError: not a run, a port that is in use, a folder that holds
             something, a missing package.
     """
     console = Console(stderr=True)
     run = read_run(options.path)
     if not run.rows:
-        raise UserError(f"{run.path}: the run has no views yet: there is nothing to see")
+        raise InputError(f"{run.path}: the run has no views yet: there is nothing to see")
     config_of(run)  # says what is wrong with it
     if options.export is not None:
         return _export(run, options.export, options.video, console)
@@ -38,7 +39,7 @@ def _show(options: ViewOptions, run: Run, console: Console) -> None:
     """Shows the page until Ctrl-C.
 
     Raises:
-        UserError: viser is not installed.
+        InputError: viser is not installed.
         ValueError, OSError: as `open_run_page`.
     """
     check_viser()

@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.cli.options.groups import check_folder
 from r3jax.cli.parsing import FieldsOf
+from r3jax.errors import InputError
 from r3jax.files import check_own
 from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.bags import parse_topics
@@ -40,9 +41,9 @@ class GuideOptions:
     def __post_init__(self) -> None:
         """Refuses a page that would not be shown, or could not be."""
         if not self.live and (self.port, self.host) != (GuideOptions.port, GuideOptions.host):
-            raise ValueError("--port and --host are for the page of --live")
+            raise InputError("--port and --host are for the page of --live")
         if not 0 <= self.port <= 65535:
-            raise ValueError(f"--port must lie between 0 and 65535, got {self.port}")
+            raise InputError(f"--port must lie between 0 and 65535, got {self.port}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,11 +83,11 @@ class AuditOptions:
         if self.guide.live:
             _check_live(self.capture)
             if self.path is not None:
-                raise ValueError(
+                raise InputError(
                     "--live follows a capture, --path judges a path in one: give one of them"
                 )
             if self.terms.depth_scale != 1.0 or self.terms.depth_along_ray:
-                raise ValueError(
+                raise InputError(
                     "--depth-scale and --depth-along-ray cannot be used with --live: audit the "
                     "capture with them once it is finished"
                 )
@@ -96,7 +97,7 @@ class AuditOptions:
             check_folder(self.out)
             check_own(self.out, "audit", "give another --out")
         if self.path is not None and not self.path.exists():
-            raise ValueError(f"{self.path}: there is no such folder or file")
+            raise InputError(f"{self.path}: there is no such folder or file")
 
 
 def _check_live(path: Path) -> None:
@@ -106,12 +107,12 @@ def _check_live(path: Path) -> None:
         ValueError: says what can be followed.
     """
     if path.is_file() and path.suffix not in _GROWING:
-        raise ValueError(
+        raise InputError(
             f"{path}: --live needs a growing recording; drop --live for a finished file"
         )
     if path.exists() or path.absolute().parent.is_dir():
         return
-    raise ValueError(
+    raise InputError(
         f"{path}: there is no such capture, and no folder in which it could be recorded. Topics of "
         "a running ROS 2 are followed by the node, which shows the same page: python "
         f"examples/ros2_node.py --ros-args -p page_port:=8080 -r color:={path} -r depth:=... -r "

@@ -15,6 +15,7 @@ from r3jax.cli.options.groups import (
     check_scene,
     refuse_others,
 )
+from r3jax.errors import InputError
 from r3jax.exploration.config import parse_budget
 from r3jax.formats.errors import check_capture
 
@@ -128,7 +129,7 @@ class MachineOptions:
     def __post_init__(self) -> None:
         """Refuses fewer cells at a time than none, and parameters without a name."""
         if self.jobs < (1 if self.engine == "slurm" else 0):
-            raise ValueError(f"--jobs must not be negative (slurm: at least 1), got {self.jobs}")
+            raise InputError(f"--jobs must not be negative (slurm: at least 1), got {self.jobs}")
         _ = self.parameters
 
     @property
@@ -152,12 +153,12 @@ class SubmissionOptions:
     def __post_init__(self) -> None:
         """Refuses what is no file."""
         if self.check and not self.submission:
-            raise ValueError("--check belongs to --submission FILE")
+            raise InputError("--check belongs to --submission FILE")
         for path in self.submission:
             if not path.is_file():
                 is_folder = path.is_dir()
                 what = "this is a folder; a submission is a file" if is_folder else "no such file"
-                raise ValueError(f"{path}: {what}")
+                raise InputError(f"{path}: {what}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,10 +248,10 @@ class BenchmarkOptions:
         try:
             seeds = tuple(int(seed) for seed in words(self.seeds))
         except ValueError:
-            raise ValueError(f"--seeds are whole numbers with commas, got {self.seeds!r}") from None
+            raise InputError(f"--seeds are whole numbers with commas, got {self.seeds!r}") from None
         for seed in seeds:
             if not 0 <= seed < 1 << 31:
-                raise ValueError(f"--seeds must lie between 0 and 2^31 - 1, got {seed}")
+                raise InputError(f"--seeds must lie between 0 and 2^31 - 1, got {seed}")
         return seeds
 
     def __post_init__(self) -> None:
@@ -261,7 +262,7 @@ class BenchmarkOptions:
         if self.submissions.submission:
             refuse_others(self, "--submission", "submission", _WITH_SUBMISSION)
             if self.scenes != BenchmarkOptions.scenes and not self.scenes.startswith("mesh:"):
-                raise ValueError("--scenes locates the mesh of a submission: mesh:<file>")
+                raise InputError("--scenes locates the mesh of a submission: mesh:<file>")
         if self.pool.photos:
             refuse_others(self, "--photos", "captures", _WITH_PHOTOS)
             check_resolution(self.training.train_resolution)
@@ -290,7 +291,7 @@ def parse_settings(option: str, given: Iterable[str]) -> dict[str, Any]:
     for word in given:
         name, separator, text = word.partition("=")
         if not (name and separator):
-            raise ValueError(f"--{option} takes NAME=VALUE, got {word!r}")
+            raise InputError(f"--{option} takes NAME=VALUE, got {word!r}")
         try:
             settings[name] = json.loads(text)
         except ValueError:

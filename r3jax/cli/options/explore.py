@@ -19,6 +19,7 @@ from r3jax.cli.options.groups import (
     refuse_others,
 )
 from r3jax.cli.parsing import FieldsOf, settings_for
+from r3jax.errors import InputError
 from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig, parse_budget
 from r3jax.planning.policies.foreign.commands import short_name
 from r3jax.planning.robot.motion import Motion, make_motion
@@ -92,11 +93,11 @@ class ContinueOptions:
     def __post_init__(self) -> None:
         """Refuses both at once, and a fork from nowhere."""
         if self.resume is not None and self.fork is not None:
-            raise ValueError(
+            raise InputError(
                 "--resume goes on with a run, --fork begins another one: give one of them"
             )
         if (self.at is None) != (self.fork is None):
-            raise ValueError("--fork RUN and --at FRAME belong together")
+            raise InputError("--fork RUN and --at FRAME belong together")
         for path in (self.resume, self.fork):
             if path is not None:
                 check_run(path)
@@ -235,7 +236,7 @@ class ExploreOptions:
         elif self.earlier.fork is not None:
             refuse_others(self, "--fork", "recorded run", _WITH_FORK)
         elif self.scene is None:
-            raise ValueError("give a --scene, or --resume RUN; `r3jax info` lists the scenes")
+            raise InputError("give a --scene, or --resume RUN; `r3jax info` lists the scenes")
         else:
             check_scene(self.scene, self.world.scale)
             check_free(self.path(self.policy or DEFAULT_POLICY), self.folder.overwrite)
@@ -244,7 +245,7 @@ class ExploreOptions:
         if self.budget is not None:
             parse_budget(self.budget)
         if not 0 <= self.seed < 1 << 32:
-            raise ValueError(f"--seed must lie between 0 and 2^32 - 1, got {self.seed}")
+            raise InputError(f"--seed must lie between 0 and 2^32 - 1, got {self.seed}")
         if self.loop.until is not None:
             from r3jax.apps.forecast.psnr import parse_goal  # imports NumPy
 
@@ -257,17 +258,17 @@ class ExploreOptions:
         loop, default = self.loop, ExplorationConfig()
         for name in ("gaze", "exposure", "blur"):
             if getattr(loop, name) != getattr(default, name) and not loop.captures:
-                raise ValueError(
+                raise InputError(
                     f"--{name} is for frames captured while moving: add --capture-every or "
                     "--capture-rate, or leave it out"
                 )
         if loop.blur != default.blur and loop.exposure == 0.0:
-            raise ValueError(
+            raise InputError(
                 "--blur does nothing while nothing blurs: add --exposure, or leave it out"
             )
         largest = (self.robot.of_robot.speed or loop.speed) / LEAST_PIECE
         if loop.capture_rate is not None and loop.capture_rate > largest * (1.0 + 1e-9):
-            raise ValueError(
+            raise InputError(
                 f"--capture-rate must be at most {largest:g} Hz at this speed, one frame every "
                 f"{LEAST_PIECE:g} m, got {loop.capture_rate:g}"
             )
@@ -338,11 +339,11 @@ class TeamOptions:
                 alone could not have.
         """
         if not 1 <= self.cameras <= 16:
-            raise ValueError(f"--cameras must lie between 1 and 16, got {self.cameras}")
+            raise InputError(f"--cameras must lie between 1 and 16, got {self.cameras}")
         for name in ("policy", "fov", "resolution"):
             num = len(getattr(self, name))
             if num not in (1, self.cameras):
-                raise ValueError(
+                raise InputError(
                     f"--{name} takes one value for all {self.cameras} cameras or one for each, "
                     f"got {num}"
                 )
@@ -376,7 +377,7 @@ class TeamOptions:
             check_run(self.resume / "0")
             return
         if self.scene is None:
-            raise ValueError("give a --scene, or --resume TEAM; `r3jax info` lists the scenes")
+            raise InputError("give a --scene, or --resume TEAM; `r3jax info` lists the scenes")
         if not self.meet_every >= 0.0:
-            raise ValueError(f"--meet-every must be a time >= 0 [s], got {self.meet_every}")
+            raise InputError(f"--meet-every must be a time >= 0 [s], got {self.meet_every}")
         _ = self.singles()

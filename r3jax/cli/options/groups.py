@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from r3jax.cli.parsing import flat
+from r3jax.errors import InputError
 from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.bags import parse_topics
 from r3jax.planning.policies import check_policy
@@ -107,7 +108,7 @@ def refuse_others(options: Any, flag: str, source: str, allowed: tuple[str, ...]
     given = [field.name for field, value in flat(options) if value != field.default]
     names = ", ".join(f"--{name.replace('_', '-')}" for name in given if name not in allowed)
     if names:
-        raise ValueError(f"{flag} takes these from the {source}, leave them out: {names}")
+        raise InputError(f"{flag} takes these from the {source}, leave them out: {names}")
 
 
 def check_policy_here(name: str) -> None:
@@ -140,7 +141,7 @@ def check_folder_name(name: str) -> None:
         ValueError: the name is a path.
     """
     if Path(name).name != name or name == "..":
-        raise ValueError(f"--name is the name of one folder, without a path, got {name!r}")
+        raise InputError(f"--name is the name of one folder, without a path, got {name!r}")
 
 
 def check_resolution(pixels: int | None, most: int | None = None) -> None:
@@ -152,7 +153,7 @@ def check_resolution(pixels: int | None, most: int | None = None) -> None:
     if pixels is None or 16 <= pixels <= (most or pixels):
         return
     bounds = "be at least 16" if most is None else f"lie between 16 and {most}"
-    raise ValueError(f"--resolution must {bounds}, got {pixels}")
+    raise InputError(f"--resolution must {bounds}, got {pixels}")
 
 
 def check_run(path: Path) -> None:
@@ -163,9 +164,9 @@ def check_run(path: Path) -> None:
     """
     if not path.is_dir():
         what = "this is a file; a run is a folder" if path.exists() else "there is no such folder"
-        raise ValueError(f"{path}: {what}")
+        raise InputError(f"{path}: {what}")
     if not (path / "run.json").exists():
-        raise ValueError(f"{path}: this folder is not a run (it has no run.json)")
+        raise InputError(f"{path}: this folder is not a run (it has no run.json)")
 
 
 def check_free(folder: Path, overwrite: bool) -> None:
@@ -175,7 +176,7 @@ def check_free(folder: Path, overwrite: bool) -> None:
         ValueError: names the folder.
     """
     if (folder / "run.json").exists() and not overwrite:
-        raise ValueError(
+        raise InputError(
             f"{folder}: the run exists already: choose another name or give --overwrite"
         )
 
@@ -187,9 +188,9 @@ def check_folder(path: Path) -> None:
         ValueError: names the path.
     """
     if "\0" in str(path):
-        raise ValueError("--out: this cannot be the name of a folder")
+        raise InputError("--out: this cannot be the name of a folder")
     if path.exists() and not path.is_dir():
-        raise ValueError(f"{path}: this is a file, --out is a folder")
+        raise InputError(f"{path}: this is a file, --out is a folder")
 
 
 def check_model(path: Path, name: str, resolution: int | None) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from r3jax.cli.options.groups import check_folder, check_folder_name, check_run
+from r3jax.errors import InputError
 from r3jax.formats.errors import check_capture
 
 
@@ -78,7 +79,7 @@ class MergeOptions:
         for path in (self.first, self.second):
             check_run(path)
         if self.first.samefile(self.second):
-            raise ValueError(
+            raise InputError(
                 f"{self.first}: a run is not merged with itself: give two different runs"
             )
 
@@ -132,11 +133,11 @@ class ExportOptions:
         check_run(self.path)
         if self.format == "submission":
             if self.out.exists():
-                raise ValueError(f"{self.out}: something is there already: give another file")
+                raise InputError(f"{self.out}: something is there already: give another file")
             return
         check_folder(self.out)
         if self.out.is_dir() and any(self.out.iterdir()):
-            raise ValueError(f"{self.out}: something is there already: give another folder")
+            raise InputError(f"{self.out}: something is there already: give another folder")
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class ViewOptions:
         if self.name is not None:
             check_folder_name(self.name)
         if self.video and self.export is None:
-            raise ValueError("--video belongs to --export FOLDER")
+            raise InputError("--video belongs to --export FOLDER")
 
 
 @dataclass(frozen=True)

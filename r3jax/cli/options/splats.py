@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from r3jax.cli.options.groups import ReadingOptions, check_model
+from r3jax.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +99,7 @@ class ResultOptions:
     def __post_init__(self) -> None:
         """Refuses fewer views than none."""
         if self.worst < 0:
-            raise ValueError(f"--worst must not be negative, got {self.worst}")
+            raise InputError(f"--worst must not be negative, got {self.worst}")
 
 
 @dataclass(frozen=True, kw_only=True)

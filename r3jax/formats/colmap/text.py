@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.files import write_atomic
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints
 from r3jax.formats.errors import naming
@@ -55,7 +56,7 @@ def write_text(folder: Path, model: ColmapModel) -> None:
     """
     for image in model.images:
         if image.name != image.name.strip() or len(image.name.splitlines()) != 1:
-            raise ValueError(f"the text format cannot hold the name {image.name!r}: use binary")
+            raise InputError(f"the text format cannot hold the name {image.name!r}: use binary")
     for name, lines in (
         ("cameras.txt", _camera_lines(model)),
         ("images.txt", _image_lines(model)),

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+from r3jax.errors import InputError
 from r3jax.formats.errors import FormatError, naming
 from r3jax.validation.database import check_database
 from r3jax.validation.errors import ForeignFileError, why_not_imported
@@ -385,7 +386,7 @@ def parse_topics(text: str | None) -> Topics | None:
     for word in filter(None, (word.strip() for word in text.split(","))):
         key, _, name = (part.strip() for part in word.partition("="))
         if key not in known or not name:
-            raise ValueError(
+            raise InputError(
                 f"topics are named like color=/camera/color/image_raw,pose=/odom with "
                 f"{', '.join(known)}; got {word!r}"
             )

@@ -10,6 +10,7 @@ import importlib.util
 import re
 from importlib.metadata import entry_points
 
+from r3jax.errors import InputError
 from r3jax.planning.policies.foreign.commands import COMMAND, words_of
 from r3jax.validation.errors import did_you_mean
 
@@ -85,7 +86,7 @@ def home_of(name: str) -> str:
         return FOREIGN
     # Before all others: who asks for a policy that has left wants the reason, not a similar name.
     if name in RETIRED:
-        raise ValueError(f"policy {name!r} has left the package: {RETIRED[name]}")
+        raise InputError(f"policy {name!r} has left the package: {RETIRED[name]}")
     # Before plug-ins: in recorded runs these names mean policies of this package.
     name = current_name(name)
     if name in HOMES:
@@ -95,7 +96,7 @@ def home_of(name: str) -> str:
     if _CLASS.fullmatch(name):
         return name
     names = known_names()
-    raise ValueError(
+    raise InputError(
         f"unknown policy {name!r}{did_you_mean(name, names)}; known: {', '.join(names)}, a class "
         "as package.module:Class, or a program as exec:COMMAND"
     )
@@ -120,4 +121,4 @@ def check_policy(name: str) -> None:
     except ImportError:
         found = None
     if found is None:
-        raise ValueError(f"policy {name!r}: there is no module {module}")
+        raise InputError(f"policy {name!r}: there is no module {module}")

@@ -33,6 +33,7 @@ from jaxtyping import Array
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import shortest_path
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.calls import Cells
 from r3jax.kernels.native.platform import num_cores
@@ -93,12 +94,12 @@ class AheadConfig(PlannerConfig):
         """Refuses values that would fail later, and says which."""
         super().__post_init__()
         if self.refine:
-            raise ValueError("r3-ahead has no refinement: leave refine at 0, or take r3-pano")
+            raise InputError("r3-ahead has no refinement: leave refine at 0, or take r3-pano")
         for name, least in (("horizon", 1), ("num_spread", 0), ("beam", 1), ("branching", 1)):
             if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+                raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not (math.isfinite(self.view_seconds) and self.view_seconds >= 0.0):
-            raise ValueError(f"view_seconds must be a finite number >= 0, got {self.view_seconds}")
+            raise InputError(f"view_seconds must be a finite number >= 0, got {self.view_seconds}")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
+from r3jax.errors import InputError
 from r3jax.validation.errors import did_you_mean
 
 UNLIMITED = (-math.inf, math.inf)
@@ -23,9 +24,9 @@ _LEVEL = 90.0
 
 def _check_range(name: str, values: tuple[float, float], unit: str) -> None:
     if len(values) != 2 or not all(math.isfinite(value) for value in values):
-        raise ValueError(f"{name} must be two finite numbers {unit}, got {values}")
+        raise InputError(f"{name} must be two finite numbers {unit}, got {values}")
     if values[0] > values[1]:
-        raise ValueError(f"{name} {_range(values)} are upside down: give the lower one first")
+        raise InputError(f"{name} {_range(values)} are upside down: give the lower one first")
 
 
 def _range(values: tuple[float, float]) -> str:
@@ -72,31 +73,31 @@ class Motion:
         if self.heights is not None:
             _check_range("heights", self.heights, "[m]")
             if self.heights_above not in ("start", "world"):
-                raise ValueError(
+                raise InputError(
                     f"heights_above must be `start` or `world`, got {self.heights_above!r}"
                 )
             if self.heights_above == "start" and not self.heights[0] <= 0.0 <= self.heights[1]:
-                raise ValueError(
+                raise InputError(
                     f"heights {_range(self.heights)} m above the start leave out the start itself: "
                     "let them hold 0, or count them from the world's z = 0 (heights_above)"
                 )
         _check_range("elevations", self.elevations, "[degrees]")
         if not -_LEVEL <= self.elevations[0] <= self.elevations[1] <= _LEVEL:
-            raise ValueError(
+            raise InputError(
                 f"elevations must lie between -90 (straight down) and 90 degrees (straight up), "
                 f"got {_range(self.elevations)}"
             )
         if not (math.isfinite(self.body) and self.body >= 0.0):
-            raise ValueError(f"body must be a finite length >= 0 [m], got {self.body}")
+            raise InputError(f"body must be a finite length >= 0 [m], got {self.body}")
         for name in ("speed", "turn_rate", "turn_per_meter"):
             value = getattr(self, name)
             if value is not None and not LEAST_RATE <= value < math.inf:
-                raise ValueError(
+                raise InputError(
                     f"{name} must be positive and finite, at least {LEAST_RATE:g}, got {value}; "
                     "leave it out for no limit"
                 )
         if self.turn_rate is not None and self.speed is None:
-            raise ValueError("turn_rate needs speed [m/s]: both together give the time of a path")
+            raise InputError("turn_rate needs speed [m/s]: both together give the time of a path")
 
     @property
     def looks_anywhere(self) -> bool:
@@ -150,11 +151,11 @@ def make_motion(name: str = "free", **changes: Any) -> Motion:
     """
     if name not in MOTIONS:
         hint = did_you_mean(name, MOTIONS)
-        raise ValueError(f"unknown motion {name!r}{hint}; known: {', '.join(MOTIONS)}")
+        raise InputError(f"unknown motion {name!r}{hint}; known: {', '.join(MOTIONS)}")
     known = [field.name for field in fields(Motion)]
     unknown = [field for field in changes if field not in known]
     if unknown:
-        raise ValueError(f"a motion has no setting {', '.join(unknown)}; known: {', '.join(known)}")
+        raise InputError(f"a motion has no setting {', '.join(unknown)}; known: {', '.join(known)}")
     return replace(MOTIONS[name], **changes)
 
 
@@ -167,7 +168,7 @@ def check_height(height: float, heights: tuple[float, float]) -> None:
     low, high = heights
     # A millimeter of grace: the pose may have been rounded to float32.
     if not low - 1e-3 <= height <= high + 1e-3:
-        raise ValueError(
+        raise InputError(
             f"the camera is at a height of {height:.3f} m, but its motion's heights are {low:.3f} "
             f"to {high:.3f} m above the world's z = 0: start within them, or change `heights`"
         )
@@ -180,7 +181,7 @@ def motion_of_record(record: Any) -> Motion:
         ValueError: an unknown field, a value of another kind, or one that cannot work.
     """
     if not isinstance(record, dict | None):
-        raise ValueError(f"a motion must be an object with its settings, got {record!r}")
+        raise InputError(f"a motion must be an object with its settings, got {record!r}")
     # JSON has no tuples, and a list never equals one: `looks_anywhere` would be wrong.
     plain = {k: tuple(v) if isinstance(v, list) else v for k, v in (record or {}).items()}
     return make_motion("free", **plain)

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.kernels.robot.shortest_paths import shortest_paths
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.planning.robot.motion import UNLIMITED, check_height
@@ -141,7 +142,7 @@ class Travel:
         goal = np.asarray(position, dtype=np.float64)
         cell = self.cell_of(goal)
         if not (self.contains(cell) and self.reachable[cell]):
-            raise ValueError(f"no safe path leads from {self.start} to {goal} (cell {cell})")
+            raise InputError(f"no safe path leads from {self.start} to {goal} (cell {cell})")
         # From the goal back to the robot: each cell knows only the one before it.
         way = [int(np.ravel_multi_index(cell, self.usable.shape))]
         previous = self.previous.reshape(-1)
@@ -225,7 +226,7 @@ def plan_travel(
     origin = np.asarray(grid.origin, dtype=np.float64)
     start = np.asarray(position, dtype=np.float64)
     if start.shape != (3,) or not np.all(np.isfinite(start)):
-        raise ValueError(f"the position must be three finite numbers [m], got {start}")
+        raise InputError(f"the position must be three finite numbers [m], got {start}")
     check_height(float(start[2]), heights)
     safe = safe_cells(free, cell_size, safety_margin)
     if heights != UNLIMITED:

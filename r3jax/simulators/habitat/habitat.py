@@ -34,6 +34,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.habitat.stage import (
@@ -182,7 +183,7 @@ class HabitatSimulator:
         try:
             position, rotation = agent_from_pose(T, self._habitat_from_world)
         except ValueError as error:
-            raise ValueError(f"cannot render: {error}") from None
+            raise InputError(f"cannot render: {error}") from None
         return self._habitat.observe(position, rotation.as_matrix())
 
     def _check_same_world(self, pose: np.ndarray) -> None:
@@ -190,7 +191,7 @@ class HabitatSimulator:
         found = self._observe(pose)[1]
         agreement = self._agreement(found, pose, cull_back_faces=True)
         if agreement < _MIN_AGREEMENT:
-            raise ValueError(
+            raise InputError(
                 f"Habitat and the mesh file agree on {agreement:.0%} of the start's view: "
                 "Habitat shows another world, or the same turned. Do up and front in the stage "
                 "config name the axes of a GLB (a PLY is never turned), and do the faces have "
@@ -198,7 +199,7 @@ class HabitatSimulator:
             )
         agreement = self._agreement(found, pose, cull_back_faces=False)
         if agreement < _MIN_AGREEMENT:
-            raise ValueError(
+            raise InputError(
                 f"Habitat shows {agreement:.0%} of the surfaces around the start: it draws faces "
                 "from their front only, and here most fronts face outward. Flip the normals of "
                 "the mesh, or use the ray caster, which sees both sides: mesh:<file>"

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import check_regular, read_bytes
@@ -71,9 +72,9 @@ def read_stage(path: str | Path) -> HabitatStage:
             raise ForeignFileError(f"Habitat scenes are .glb, .ply or {_CONFIG} files")
         check_regular(path)
     except FileNotFoundError:
-        raise ValueError(f"no such file for Habitat: {path}") from None
+        raise InputError(f"no such file for Habitat: {path}") from None
     except (ForeignFileError, OSError) as error:
-        raise ValueError(f"{path}: {error!s:.500}") from error
+        raise InputError(f"{path}: {error!s:.500}") from error
     return HabitatStage(path, path, turn)
 
 
@@ -137,12 +138,12 @@ def habitat_from_axes(up: Sequence[float | int], front: Sequence[float | int]) -
     """
     y, z = np.asarray(up, np.float64), -np.asarray(front, np.float64)
     if y.shape != (3,) or z.shape != (3,):
-        raise ValueError(f"up and front are 3 numbers each, got {y.size} and {z.size}")
+        raise InputError(f"up and front are 3 numbers each, got {y.size} and {z.size}")
     with np.errstate(all="ignore"):  # numbers of any size may stand in a file
         rotation = np.stack([np.cross(y, z), y, z])
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not error <= 1e-6:
-        raise ValueError(
+        raise InputError(
             f"up {list(up)} and front {list(front)} must have unit length and be at right angles"
         )
     return rotation
@@ -170,7 +171,7 @@ def agent_from_pose(
     """
     problem = rigid_error(T_world_camera)
     if problem is not None:
-        raise ValueError(problem)
+        raise InputError(problem)
     T = np.asarray(T_world_camera, np.float64)
     rotation = habitat_from_world @ T[:3, :3] @ _OPENGL_FROM_OPENCV
     return habitat_from_world @ T[:3, 3], Rotation.from_matrix(rotation)
@@ -185,13 +186,13 @@ def horizontal_fov_deg(camera: Camera) -> float:
     """
     fx, fy, cx, cy = (float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     if abs(fx - fy) > _MAX_STRETCH * fx:
-        raise ValueError(
+        raise InputError(
             f"Habitat's cameras have square pixels, but fx is {fx:.6g} and fy {fy:.6g} px: give "
             "a camera with fx = fy (Camera.from_fov), or use the ray caster (mesh:<file>)"
         )
     center = 0.5 * camera.width, 0.5 * camera.height
     if max(abs(cx - center[0]), abs(cy - center[1])) > _MAX_OFF_CENTER:
-        raise ValueError(
+        raise InputError(
             f"Habitat's cameras look through the image's center {center}, but the principal point "
             f"is ({cx:.6g}, {cy:.6g}) px: give a centered camera (Camera.from_fov), or use the "
             "ray caster (mesh:<file>)"

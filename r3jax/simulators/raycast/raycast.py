@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, rigid_error
 from r3jax.simulators import start
@@ -59,7 +60,7 @@ class RaycastSimulator:
             ValueError: settings out of range, or a start inside or too close to the mesh.
         """
         if not 0 <= supersample <= len(_SUBPIXELS):
-            raise ValueError(f"supersample must be 0 to {len(_SUBPIXELS)}, got {supersample}")
+            raise InputError(f"supersample must be 0 to {len(_SUBPIXELS)}, got {supersample}")
         self.world = world
         self._camera = Camera.from_fov(512, 512, 60.0) if camera is None else camera
         self._max_depth = _depth_limit(max_range)
@@ -102,7 +103,7 @@ class RaycastSimulator:
         if self._start is None:
             self._start = start.find_start(self._bounds, self._scene, self._distance, self._seed)
         if self._start is None:
-            raise ValueError(
+            raise InputError(
                 f"{self.world.name}: found no place with {start.PROMISED_CLEARANCE} m free all "
                 "round to start from; is the scale meters and the up axis right? Otherwise give "
                 "a start_pose"
@@ -156,7 +157,7 @@ class RaycastSimulator:
         T = np.asarray(T_world_camera, dtype=np.float64)
         problem = rigid_error(T)
         if problem is not None:
-            raise ValueError(f"cannot render: {problem}")
+            raise InputError(f"cannot render: {problem}")
         from r3jax.simulators.raycast.shading import turned  # not before: it needs Numba
 
         height, width = self._camera.height, self._camera.width
@@ -196,7 +197,7 @@ class RaycastSimulator:
             pose = np.array(start_pose, dtype=np.float64)
             problem = rigid_error(pose)
             if problem is not None:
-                raise ValueError(f"start_pose: {problem}")
+                raise InputError(f"start_pose: {problem}")
             least = start.MIN_CLEARANCE
         elif self.world.start_position is not None:
             pose = start.level_pose(self.world.start_position, self.world.start_yaw)
@@ -209,7 +210,7 @@ class RaycastSimulator:
             return pose
         free = start.find_start(self._bounds, self._scene, self._distance, self._seed)
         place = "" if free is None else f", for example {np.round(free[:3, 3], 2).tolist()}"
-        raise ValueError(
+        raise InputError(
             f"{self.world.name}: the start at {np.round(position, 3).tolist()} {problem}. "
             f"Choose a free place{place}, or leave the start out and one is searched for"
         )
@@ -290,5 +291,5 @@ class RaycastSimulator:
 def _depth_limit(max_range: float | int | None) -> np.float32:
     """The depth beyond which nothing is measured [m]."""
     if max_range is not None and not max_range > 0.0:
-        raise ValueError(f"max_range must be positive or None, got {max_range}")
+        raise InputError(f"max_range must be positive or None, got {max_range}")
     return np.float32(np.inf if max_range is None else max_range)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
+from r3jax.errors import InputError
 from r3jax.kernels.native.platform import num_cores
 from r3jax.simulators.world import World
 
@@ -54,7 +55,7 @@ def build_atlas(images: list[np.ndarray]) -> TextureAtlas:
     areas[is_repeat] = 0
     total = int(areas.sum())
     if total >= 2**31:
-        raise ValueError(
+        raise InputError(
             f"the world's textures hold {total:.3g} texels, more than the 2^31 that can be "
             "indexed: halve the texture sizes"
         )

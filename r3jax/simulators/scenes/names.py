@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from r3jax.errors import InputError
 from r3jax.simulators.scenes import procedural, replica
 from r3jax.validation.errors import did_you_mean
 
@@ -36,7 +37,7 @@ def split_name(spec: str) -> tuple[str, str]:
     kind, colon, rest = spec.partition(":")
     if colon and kind in OUTSIDE:
         if not rest:
-            raise ValueError(f"{spec} needs {OUTSIDE[kind][1]}")
+            raise InputError(f"{spec} needs {OUTSIDE[kind][1]}")
         return kind, rest
     if spec not in procedural.names():
         if Path(spec).suffix.lower() in MESH_SUFFIXES and not colon:
@@ -44,7 +45,7 @@ def split_name(spec: str) -> tuple[str, str]:
         else:
             outside = [f"{known}:{rest}" for known in OUTSIDE if colon]
             hint = did_you_mean(spec, [*procedural.names(), *outside])
-        raise ValueError(
+        raise InputError(
             f"unknown scene {spec!r}{hint}; known are {', '.join(procedural.names())}, and "
             f"{', '.join(outside_scenes())}"
         )
@@ -61,8 +62,8 @@ def check_scale(spec: str, scale: float | int) -> None:
     if scale == 1.0 or kind == "mesh":
         return
     if kind == "habitat":
-        raise ValueError(f"scale={scale!r}: Habitat scales nothing, apply it to the mesh file")
-    raise ValueError(f"scale={scale!r} is for mesh files (mesh:<file>); {spec!r} is in meters")
+        raise InputError(f"scale={scale!r}: Habitat scales nothing, apply it to the mesh file")
+    raise InputError(f"scale={scale!r} is for mesh files (mesh:<file>); {spec!r} is in meters")
 
 
 def check_scene(spec: str, scale: float | int = 1.0) -> None:
@@ -74,11 +75,11 @@ def check_scene(spec: str, scale: float | int = 1.0) -> None:
     check_scale(spec, scale)
     kind, rest = split_name(spec)
     if kind == "mesh" and not Path(rest).is_file():
-        raise ValueError(f"no such mesh file: {rest} (give a GLB, glTF, PLY or OBJ file)")
+        raise InputError(f"no such mesh file: {rest} (give a GLB, glTF, PLY or OBJ file)")
     if kind == "replica":
         replica.mesh_file(rest)
     elif kind == "habitat" and not habitat_file(rest).is_file():
-        raise ValueError(f"no such file for Habitat: {rest}")
+        raise InputError(f"no such file for Habitat: {rest}")
 
 
 def habitat_file(rest: str) -> Path:

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.extras import naming_extras
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.native.ahead import compile_ahead
@@ -62,7 +63,7 @@ def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> Wo
     if kind == "habitat":
         return load_world(read_stage(habitat_file(rest)).mesh, up)
     if up not in (None, "z"):
-        raise ValueError(f"up={up!r} is for mesh files; the scene {spec!r} is z-up")
+        raise InputError(f"up={up!r} is for mesh files; the scene {spec!r} is z-up")
     if kind == "replica":
         return dataclasses.replace(load_world(replica.mesh_file(rest)), name=spec)
     return procedural.build(spec)
@@ -138,5 +139,5 @@ def scene_hash(simulator: Simulator) -> str:
     """
     inner = simulator.simulator if isinstance(simulator, NoisySimulator) else simulator
     if not isinstance(inner, HabitatSimulator | RaycastSimulator):
-        raise ValueError(f"a {type(inner).__name__} has no world that could be hashed")
+        raise InputError(f"a {type(inner).__name__} has no world that could be hashed")
     return inner.content_hash

@@ -12,6 +12,8 @@ searched for in the mesh, the same one for the same seed, in the ray caster and 
 import os
 from pathlib import Path
 
+from r3jax.errors import InputError
+
 ROOT = "R3JAX_REPLICA_ROOT"
 """Environment variable with the dataset's folder."""
 
@@ -45,7 +47,7 @@ def mesh_file(name: str) -> Path:
     """
     path = _folder(name) / "mesh.ply"
     if not path.is_file():
-        raise ValueError(f"replica:{name} needs {path}, which is missing; {_HOW_TO_GET}")
+        raise InputError(f"replica:{name} needs {path}, which is missing; {_HOW_TO_GET}")
     return path
 
 
@@ -59,7 +61,7 @@ def stage_file(name: str) -> Path:
     for stage in _STAGES:
         if (folder / stage).is_file():
             return folder / stage
-    raise ValueError(
+    raise InputError(
         f"habitat:{name} needs {folder / _STAGES[0]}, which is missing (nor is there a "
         f"{_STAGES[1]}); it is one of Habitat's additional configs for Replica, which download.sh "
         f"fetches too; {_HOW_TO_GET}"
@@ -69,8 +71,8 @@ def stage_file(name: str) -> Path:
 def _folder(name: str) -> Path:
     """The folder of a scene; it may be missing."""
     if name not in _FOLDERS:
-        raise ValueError(f"unknown Replica scene {name!r}; known are {', '.join(_FOLDERS)}")
+        raise InputError(f"unknown Replica scene {name!r}; known are {', '.join(_FOLDERS)}")
     root = os.environ.get(ROOT)
     if not root:
-        raise ValueError(f"Replica scenes need the variable {ROOT}; {_HOW_TO_GET}")
+        raise InputError(f"Replica scenes need the variable {ROOT}; {_HOW_TO_GET}")
     return Path(root).expanduser() / _FOLDERS[name]

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.backend import Composite
 from r3jax.splatting.backends.tiles import TileLists, grid_shape, list_tiles
@@ -90,7 +91,7 @@ def rasterize(
     """
     for name in ("tiles_per_batch", "gaussians_per_chunk"):
         if getattr(config, name) < 1:
-            raise ValueError(f"RasterConfig.{name} must be at least 1, got {getattr(config, name)}")
+            raise InputError(f"RasterConfig.{name} must be at least 1, got {getattr(config, name)}")
     projected = project_gaussians(scene, camera, T_world_camera, center_offsets)
     layout = Layout(camera.width, camera.height, config.tiles_per_batch, config.gaussians_per_chunk)
     lists = _list_tiles(

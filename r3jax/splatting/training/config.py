@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 
+from r3jax.errors import InputError
 from r3jax.splatting.config import RasterConfig
 
 
@@ -140,34 +141,34 @@ class TrainConfig(eqx.Module):
         """Refuses what cannot work."""
         for name in ("iterations", "num_gaussians", "views_per_step", "refine_every"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not 0 <= self.seed < 1 << 31:
-            raise ValueError(f"seed must lie between 0 and 2^31 - 1, got {self.seed}")
+            raise InputError(f"seed must lie between 0 and 2^31 - 1, got {self.seed}")
         if self.iterations * self.views_per_step >= 1 << 31:
-            raise ValueError(
+            raise InputError(
                 f"{self.iterations} iterations of {self.views_per_step} views each are more than "
                 "2^31 renderings: lower iterations or views_per_step"
             )
         for name in ("sh_every", "reset_every"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+                raise InputError(f"{name} must be at least 1, got {value}")
         if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
+            raise InputError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         if self.rows < self.num_gaussians:
-            raise ValueError(
+            raise InputError(
                 f"capacity {self.rows} has no room for the {self.num_gaussians} Gaussians of the "
                 "start: raise capacity or lower num_gaussians"
             )
         if self.strategy not in ("vanilla", "mcmc"):
-            raise ValueError(f"strategy must be vanilla or mcmc, got {self.strategy!r}")
+            raise InputError(f"strategy must be vanilla or mcmc, got {self.strategy!r}")
         if self.background not in ("black", "white", "random"):
-            raise ValueError(f"background must be black, white or random, got {self.background!r}")
+            raise InputError(f"background must be black, white or random, got {self.background!r}")
         for name, value in vars(self).items():
             if isinstance(value, float) and not 0.0 <= value < float("inf"):
-                raise ValueError(f"{name} must be finite and not negative, got {value}")
+                raise InputError(f"{name} must be finite and not negative, got {value}")
         if min(self.rate_means, self.rate_means_last) <= 0.0:
-            raise ValueError(
+            raise InputError(
                 "rate_means and rate_means_last must be positive: one decays to the "
                 "other exponentially"
             )

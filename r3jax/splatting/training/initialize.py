@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 from scipy.spatial import KDTree
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.splatting.errors import ViewsError
 from r3jax.splatting.harmonics import C0
@@ -68,12 +69,12 @@ def initialize(
         ValueError: settings out of range, or more Gaussians than the capacity.
     """
     if num_gaussians < 1 or not 0 <= sh_degree <= 3:
-        raise ValueError(
+        raise InputError(
             "num_gaussians must be at least 1 and sh_degree 0 to 3, got "
             f"{num_gaussians} and {sh_degree}"
         )
     if voxel_size is not None and not 0.0 < voxel_size < np.inf:
-        raise ValueError(f"voxel_size must be positive [m], got {voxel_size}")
+        raise InputError(f"voxel_size must be positive [m], got {voxel_size}")
     points, colors = surface_points(views)
     if len(points) == 0:
         if key is None:
@@ -87,7 +88,7 @@ def initialize(
         points, colors = thin(points, colors, size)
     capacity = len(points) if capacity is None else capacity
     if len(points) > capacity:
-        raise ValueError(
+        raise InputError(
             f"{len(points)} Gaussians do not fit in a capacity of {capacity}: ask for fewer, "
             "for larger voxels or for more capacity"
         )
@@ -184,7 +185,7 @@ def _voxel_keys(points: np.ndarray, voxel_size: float) -> np.ndarray:
         size = int(index.max()) + 1
         num_cells *= size
         if num_cells >= 1 << 62:
-            raise ValueError(
+            raise InputError(
                 f"voxels of {voxel_size:g} m are too small for points that span "
                 f"{np.ptp(points, axis=0).max():g} m"
             )

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r3jax.errors import InputError
 from r3jax.geometry.arguments import checked, one, or_none
 from r3jax.interrupts import deferred_interrupt
 from r3jax.splatting.config import fitting_budget
@@ -169,11 +170,11 @@ def fit(
     check_memory(views, config)
     folder = None if folder is None else Path(folder)
     if resume and folder is None:
-        raise ValueError("resume needs the folder with the checkpoints")
+        raise InputError("resume needs the folder with the checkpoints")
     if resume and overwrite:
-        raise ValueError("resume goes on with the checkpoints, overwrite deletes them: choose one")
+        raise InputError("resume goes on with the checkpoints, overwrite deletes them: choose one")
     if growth is not None and folder is not None:
-        raise ValueError("growth leaves no checkpoints: give no folder")
+        raise InputError("growth leaves no checkpoints: give no folder")
     extent = scene_extent(views)
     settings = settings_record(config, views, extent)
     run = _Run(views, jnp.asarray(extent, dtype=jnp.float32), config, config.schedule())
@@ -208,13 +209,13 @@ def _first_scene(views: Views, config: TrainConfig, scene: GaussianScene | None)
         key = jax.random.key(config.seed)
         return initialize(views, config.num_gaussians, config.rows, config.sh_degree, key=key)
     if scene.sh_degree != config.sh_degree:
-        raise ValueError(
+        raise InputError(
             f"the scene has harmonics of degree {scene.sh_degree}, the config says "
             f"{config.sh_degree}"
         )
     missing = config.rows - scene.capacity
     if missing < 0:
-        raise ValueError(
+        raise InputError(
             f"the scene has {scene.capacity} rows, more than the capacity {config.rows}: "
             "raise capacity"
         )

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from r3jax.captures.source import Picture, Source, source_of
+from r3jax.errors import InputError
 from r3jax.formats.captures import open_capture
 from r3jax.formats.recordings import is_recording
 from r3jax.formats.ros.bags import Topics
@@ -210,7 +211,7 @@ class GrowingCapture:
             self.waiting_for, self._is_pending = str(error), True
             return self._source, [], False
         if not source.is_dense:
-            raise ValueError("guidance needs depth images: this capture has none")
+            raise InputError("guidance needs depth images: this capture has none")
         self._seen, self._source = now, source
         return source, self._arrivals(source), self._has_moved(source)
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from r3jax.apps.benchmark.cells import Cell
+from r3jax.errors import InputError
 from r3jax.kernels.native.platform import num_cores
 
 Kind = Literal["started", "stage", "done", "failed"]
@@ -73,7 +74,7 @@ def run_in_processes(cells: Sequence[Cell], root: Path, report: Report, *, jobs:
         KeyboardInterrupt: Ctrl-C; the processes are ended, what is complete stays.
     """
     if jobs < 1:
-        raise ValueError(f"jobs must be at least 1, got {jobs}")
+        raise InputError(f"jobs must be at least 1, got {jobs}")
     waiting = deque(cells)
     environments = worker_environments(min(jobs, len(cells)))
     workers = [_Worker(environment) for environment in environments]

@@ -14,6 +14,7 @@ from r3jax.apps.benchmark.photos.known import Known
 from r3jax.baselines.active_gamer import ActiveGamer, empty_share
 from r3jax.baselines.fisherrf import Form, known_information, scores
 from r3jax.baselines.pixels import score_pixels
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.planning.candidates import candidates_along
 from r3jax.planning.policy import Situation
@@ -135,7 +136,7 @@ def check_chooser(name: str) -> None:
     """
     if name not in SCORED and name not in MODEL_CHOOSERS:
         known = ", ".join((*SCORED, *MODEL_CHOOSERS))
-        raise ValueError(f"{name} cannot choose among photos; known: {known}")
+        raise InputError(f"{name} cannot choose among photos; known: {known}")
 
 
 def make_chooser(name: str, num_candidates: int, max_range: float) -> Chooser:

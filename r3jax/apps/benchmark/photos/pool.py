@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.formats.captures import Capture, open_capture
 from r3jax.formats.posed_images import PosedImages
 from r3jax.frame import Frame
@@ -17,7 +18,7 @@ from r3jax.runs.reader import Run
 from r3jax.splatting.views import Views, load_views, split_views
 
 
-class PhotosError(ValueError):
+class PhotosError(InputError):
     """A capture that the protocol cannot be run on, and why."""
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from r3jax.apps.benchmark.photos.choosers import Chooser
 from r3jax.apps.benchmark.photos.known import nothing_known
 from r3jax.apps.benchmark.photos.pool import PhotoPool, PhotosError, first_photos, nearest_photos
+from r3jax.errors import InputError
 from r3jax.evaluation.evaluate import ImageMetric, evaluate
 from r3jax.evaluation.scores import ViewRow
 from r3jax.exploration.config import ExplorationConfig
@@ -71,9 +72,9 @@ class PhotoTerms:
         """Refuses what no choice could be made of."""
         for name in ("choose", "first", "nearest", "every", "iterations", "gaussians"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.gaussians < self.first + self.choose:
-            raise ValueError(f"{self.gaussians} Gaussians are fewer than the photos")
+            raise InputError(f"{self.gaussians} Gaussians are fewer than the photos")
 
     @property
     def per_photo(self) -> int:

@@ -4,6 +4,8 @@ import shlex
 import shutil
 from pathlib import Path
 
+from r3jax.errors import InputError
+
 COMMAND = "exec:"
 """What the names of such policies begin with."""
 
@@ -17,11 +19,11 @@ def words_of(command: str) -> list[str]:
     try:
         words = shlex.split(command)
     except ValueError as error:
-        raise ValueError(f"policy {COMMAND}{command}: {error}") from None
+        raise InputError(f"policy {COMMAND}{command}: {error}") from None
     if not words:
-        raise ValueError(f"policy {COMMAND!r} needs a command: {COMMAND}PROGRAM ARGUMENTS")
+        raise InputError(f"policy {COMMAND!r} needs a command: {COMMAND}PROGRAM ARGUMENTS")
     if shutil.which(words[0]) is None:
-        raise ValueError(
+        raise InputError(
             f"policy {COMMAND}{command}: there is no program {words[0]!r}; a script needs its "
             f"interpreter, as in {COMMAND}python my_policy.py"
         )

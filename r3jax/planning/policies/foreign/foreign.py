@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
@@ -71,7 +72,7 @@ class ForeignConfig(PlannerConfig):
         super().__post_init__()
         for name in ("answer_seconds", "memory"):
             if not 0.0 <= getattr(self, name) < 1e6:
-                raise ValueError(f"{name} must be a number >= 0, got {getattr(self, name)}")
+                raise InputError(f"{name} must be a number >= 0, got {getattr(self, name)}")
 
 
 @dataclass

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.json_text import check_type, parse_json
 
@@ -30,7 +31,7 @@ DTYPES = {"uint8": "|u1", "int32": "<i4", "int64": "<i8", "float32": "<f4", "flo
 """Kinds of numbers that arrays may hold, and how NumPy calls them."""
 
 
-class MessageError(ValueError):
+class MessageError(InputError):
     """Bytes that are no message."""
 
 
@@ -58,7 +59,7 @@ def encode(message: Message) -> bytes:
     arrays = {name: np.ascontiguousarray(array) for name, array in message.arrays.items()}
     for name, array in arrays.items():
         if array.dtype.name not in DTYPES:
-            raise ValueError(f"the array {name!r} is {array.dtype}, not one of {', '.join(DTYPES)}")
+            raise InputError(f"the array {name!r} is {array.dtype}, not one of {', '.join(DTYPES)}")
     listed = [
         {"name": name, "dtype": array.dtype.name, "shape": list(array.shape)}
         for name, array in arrays.items()
@@ -69,7 +70,7 @@ def encode(message: Message) -> bytes:
         array.astype(DTYPES[array.dtype.name], copy=False).tobytes() for array in arrays.values()
     )
     if len(header) > MAX_HEADER or len(data) >= 1 << 32:
-        raise ValueError(f"a message of {len(header)} + {len(data)} bytes is not sent")
+        raise InputError(f"a message of {len(header)} + {len(data)} bytes is not sent")
     return PREFIX.pack(len(header), len(data)) + header + data
 
 

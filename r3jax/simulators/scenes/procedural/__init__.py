@@ -10,6 +10,7 @@ radius passes. World: z up, meters; one room's floor has a corner at the origin.
 
 import importlib
 
+from r3jax.errors import InputError
 from r3jax.simulators.world import World
 from r3jax.validation.errors import did_you_mean
 
@@ -35,7 +36,7 @@ def names() -> tuple[str, ...]:
 def _scene(name: str):
     if name not in _SCENES:
         hint = did_you_mean(name, _SCENES)
-        raise ValueError(f"unknown procedural scene {name!r}{hint}; known: {', '.join(_SCENES)}")
+        raise InputError(f"unknown procedural scene {name!r}{hint}; known: {', '.join(_SCENES)}")
     return importlib.import_module(f"r3jax.simulators.scenes.procedural.catalog.{_SCENES[name]}")
 
 

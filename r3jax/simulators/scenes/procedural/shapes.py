@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.simulators.scenes.procedural.materials.textures import Real
 
 _UNIT_QUAD = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], dtype=np.float64)
@@ -112,7 +113,7 @@ def box(low: Point, high: Point, upright: bool = False, step: Real = 10.0) -> Sh
     (x0, y0, z0), (x1, y1, z1) = low, high
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
     if min(dx, dy, dz) <= 0.0:
-        raise ValueError(f"a box needs positive edges, got {(dx, dy, dz)} from {low} to {high}")
+        raise InputError(f"a box needs positive edges, got {(dx, dy, dz)} from {low} to {high}")
     faces = (
         quad((x0, y0, z0), (dx, 0, 0), (0, 0, dz), step),
         quad((x1, y0, z0), (0, dy, 0), (0, 0, dz), step),

@@ -7,6 +7,7 @@ import functools
 
 import numpy as np
 
+from r3jax.errors import InputError
 from r3jax.simulators.scenes.procedural.materials import artwork, patterns, textures
 from r3jax.simulators.scenes.procedural.materials.textures import Color, Real
 from r3jax.simulators.scenes.procedural.model import Finish
@@ -238,7 +239,7 @@ def picture(kind: str, seed: int, wide: bool = False) -> Finish:
         "poster": lambda: artwork.poster(seed, *size),
     }
     if kind not in makers:
-        raise ValueError(f"unknown kind of picture {kind!r}; known: {sorted(makers)}")
+        raise InputError(f"unknown kind of picture {kind!r}; known: {sorted(makers)}")
     return _flat(makers[kind](), gloss=0.2)
 
 

@@ -8,6 +8,7 @@ import functools
 import numpy as np
 from PIL import Image, ImageDraw
 
+from r3jax.errors import InputError
 from r3jax.simulators.scenes.procedural.materials.textures import (
     Color,
     Ink,
@@ -149,7 +150,7 @@ def wallpaper(
     """
     draws = {"botanical": _botanical, "damask": _damask, "trellis": _trellis, "lines": _lines}
     if motif not in draws:
-        raise ValueError(f"unknown wallpaper motif {motif!r}; known: {sorted(draws)}")
+        raise InputError(f"unknown wallpaper motif {motif!r}; known: {sorted(draws)}")
     image = Image.new("RGB", (2 * size, 2 * size), _bytes(ground))
     draws[motif](ImageDraw.Draw(image), 2 * size, np.random.default_rng(seed), inks)
     printed = np.asarray(image.resize((size, size), Image.Resampling.BOX), dtype=np.float32) / 255
