@@ -18,7 +18,7 @@ def test_only_a_bug_is_told_with_its_traceback(error, monkeypatch, capsys):
     def fail(options):
         raise error("seven")
 
-    command = importlib.import_module("r3jax.cli.commands.policies")
+    command = importlib.import_module("r3jax.cli.commands.runs")
     monkeypatch.setattr(command, "run_policies", fail)
     is_bug = error in (ValueError, KeyError)
     assert main(["policies"]) == (BUG if is_bug else USER_ERROR)

@@ -13,9 +13,8 @@ import pytest
 
 from r3jax import interrupts
 from r3jax.cli import command_line
-from r3jax.cli.console import Console
+from r3jax.cli.console import Console, RunProgress, Stages
 from r3jax.cli.main import main
-from r3jax.cli.progress import RunProgress, Stages
 from r3jax.exploration.config import Budget
 from r3jax.interrupts import (
     caught_interrupts,

@@ -3,13 +3,15 @@
 import importlib
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import r3jax
 from r3jax.cli.options.audit import AuditOptions
 from r3jax.cli.options.benchmark import BenchmarkOptions
 from r3jax.cli.options.explore import DemoOptions, ExploreOptions, TeamOptions
+from r3jax.cli.options.models import EvaluateOptions, TrainOptions
 from r3jax.cli.options.runs import (
     ExportOptions,
     ForecastOptions,
@@ -19,7 +21,6 @@ from r3jax.cli.options.runs import (
     ReplayOptions,
     ViewOptions,
 )
-from r3jax.cli.options.splats import EvaluateOptions, TrainOptions
 from r3jax.cli.parsing import parse
 from r3jax.errors import InputError
 from r3jax.kernels.native.ahead import cache_folder, compile_ahead
@@ -53,11 +54,12 @@ _DECIDES = ("demo", "explore", "team", "benchmark")
 def run_command(args: Sequence[str]) -> int:
     """Runs the command that the words after `r3jax` name, and returns its exit code.
 
-    It is `run_NAME` of `r3jax.cli.commands.NAME`, imported once the options are known to be right:
-    neither `--help` nor a slip of the keyboard waits for JAX.
+    The command is `run_NAME` in the module of `r3jax.cli.commands` that is called as the module of
+    its options, and is imported once the options are valid: neither `--help` nor a mistyped option
+    waits for JAX.
 
     Raises:
-        InputError: something that the user can mend.
+        InputError: wrong input.
     """
     words = list(args)
     if words == ["--version"]:
@@ -72,7 +74,13 @@ def run_command(args: Sequence[str]) -> int:
     warnings.formatwarning = _format_warning
     if name in _DECIDES:
         compile_ahead()
-    return getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}")(options)
+    return find_command(name)(options)
+
+
+def find_command(name: str) -> Callable[[Any], int]:
+    """Imports what runs a command."""
+    home = COMMANDS[name].__module__.replace(".options.", ".commands.")
+    return getattr(importlib.import_module(home), f"run_{name}")
 
 
 def _format_warning(

@@ -1,10 +1,12 @@
-"""How the commands print: text that may come from a file or a name is shown, never obeyed.
+"""How the commands print: safe text, tables, and progress on a terminal or in a log.
 
-Only this module imports rich, whose own classes read square brackets in any string as markup.
+Only this module imports rich, whose own classes read square brackets in any string as markup. All
+long loops report here between their steps, which is where a Ctrl-C that got lost is obeyed.
 """
 
 import shlex
-from typing import Any
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich.console
 import rich.progress
@@ -22,19 +24,18 @@ from rich.table import Table
 from rich.text import Text
 
 from r3jax.cli.errors import printable
+from r3jax.exploration.config import Budget
+from r3jax.exploration.taken_views import StepRow
 from r3jax.interrupts import check_interrupt
 
 __all__ = [
     "BarColumn",
     "Console",
-    "Progress",
     "SpinnerColumn",
     "Table",
     "TaskID",
     "Text",
     "TextColumn",
-    "TimeElapsedColumn",
-    "TimeRemainingColumn",
     "progress_bar",
 ]
 
@@ -91,3 +92,167 @@ class TextColumn(rich.progress.TextColumn):
 def progress_bar(console: Console, *columns: ProgressColumn, transient: bool = False) -> Progress:
     """A bar that shows on a terminal only."""
     return Progress(*columns, console=console, disable=not console.is_terminal, transient=transient)
+
+
+if TYPE_CHECKING:  # training imports what an exploration does not need
+    from r3jax.splatting.training import train
+
+T = TypeVar("T")
+B = TypeVar("B", bound="Bar")
+
+_STAGES = {
+    "forecast": "forecasting the quality",
+    "plan": "planning",
+    "plan ahead": "planning the view after",
+    "gaze": "finding where to look on the way",
+    "render": "rendering",
+    "map": "mapping",
+    "measure": "measuring coverage",
+    "record": "writing to disk",
+}
+_LOG_LINES = 10
+"""Lines that a run or a training leaves in a log."""
+
+
+class Bar:
+    """A bar that is shown inside of a `with`; it has the attribute `_bar`."""
+
+    _bar: Progress
+
+    def __enter__(self: B) -> B:
+        """Shows the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Takes the bar down."""
+        self._bar.stop()
+
+
+class RunProgress(Bar):
+    """Follows a run; hand its methods to `explore`."""
+
+    def __init__(self, console: Console, budget: Budget, captured: int = 0):
+        """Shows nothing before it is entered.
+
+        Args:
+            console: where to.
+            budget: of the run.
+            captured: frames on the way that were recorded before the run goes on.
+        """
+        self._console = console
+        self._budget = budget
+        self._views = 0
+        self._captured = captured
+        self._logged = -1
+        self._bar = progress_bar(
+            console,
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TextColumn("{task.fields[facts]}", style="dim"),
+            TextColumn("elapsed", style="dim"),
+            TimeElapsedColumn(),
+            TextColumn("left", style="dim"),
+            TimeRemainingColumn(),
+        )
+        self._task = self._bar.add_task("starting", total=1.0, facts="")
+
+    def on_stage(self, stage: str) -> None:
+        """A stage begins."""
+        check_interrupt()
+        what = _STAGES.get(stage, stage)
+        if self._views < 2 and stage in ("plan", "map", "measure"):
+            what += " (compiling on first use)"
+        total = f"/{self._budget.amount:.0f}" if self._budget.unit == "views" else ""
+        self._bar.update(self._task, description=f"view {self._views + 1}{total}: {what}")
+
+    def on_row(self, row: StepRow) -> None:
+        """A view is done."""
+        self._captured += row.captured
+        self._views = row.step + 1 - self._captured
+        share = self._budget.spent_share(
+            views=self._views, frames=row.step + 1, seconds=row.seconds, metres=row.metres
+        )
+        facts = (
+            f"{100 * row.coverage.known_share:.0f} % explored, "
+            f"R {row.coverage.mean_renderability:.2f}, {row.seconds:.0f} s on the clock"
+        )
+        self._bar.update(self._task, completed=share, facts=facts)
+        line = int(share * _LOG_LINES)
+        if not self._console.is_terminal and line > self._logged:
+            self._logged = line
+            self._console.print(f"view {self._views}: {facts}")
+
+
+class Stages(Bar):
+    """A bar on a terminal, a line for each stage in a log."""
+
+    def __init__(self, console: Console):
+        """Shows nothing before it is entered."""
+        self._console, self._stage = console, ""
+        self._bar = progress_bar(
+            console,
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[count]}"),
+            TimeElapsedColumn(),
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=None, count="")
+
+    def on_progress(self, stage: str, steps: int) -> None:
+        """A stage of so many steps begins (0: nobody knows), or some are done (no name)."""
+        check_interrupt()
+        if not stage:
+            task = self._bar.tasks[0]
+            self.at(self._stage, int(task.completed) + steps, int(task.total or 0))
+            return
+        self._stage = stage
+        self._bar.reset(self._task, description=stage, total=steps or None, count="")
+        if not self._console.is_terminal:
+            self._console.say(stage)
+
+    def at(self, stage: str, done: int, total: int) -> None:
+        """So many steps of a stage are done; it begins if it has not."""
+        check_interrupt()
+        if stage != self._stage:
+            self.on_progress(stage, total)
+        count = f"{done}/{total}" if total else ""
+        self._bar.update(self._task, completed=done, total=total or None, count=count)
+
+    def each(self, stage: str, items: Iterable[T], total: int) -> Iterator[T]:
+        """Passes items on, each a step of a stage."""
+        for done, item in enumerate(items):
+            self.at(stage, done, total)
+            yield item
+
+
+class TrainProgress(Bar):
+    """A bar on a terminal, ten lines in a log; hand `on_progress` to `fit`."""
+
+    def __init__(self, console: Console, iterations: int):
+        """Shows nothing before it is entered."""
+        self._console, self._logged = console, -1
+        self._bar = progress_bar(
+            console,
+            SpinnerColumn(),
+            TextColumn("step {task.completed:.0f}/{task.total:.0f}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[facts]}", style="dim"),
+        )
+        self._task = self._bar.add_task("", total=iterations, facts="compiling on first use")
+
+    def on_progress(self, progress: "train.Progress") -> None:
+        """Some steps are done."""
+        facts = (
+            f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, "
+            f"{progress.num_gaussians} Gaussians, {progress.seconds_left:.0f} s left"
+        )
+        self._bar.update(self._task, completed=progress.step, facts=facts)
+        line = progress.step * _LOG_LINES // progress.iterations
+        if not self._console.is_terminal and line > self._logged:
+            self._logged = line
+            self._console.print(f"step {progress.step}: {facts}")

@@ -32,6 +32,10 @@ _DIGITS = 30
 """More than any setting needs; 1e999999999 is not written out."""
 
 
+class _Refused(Exception):
+    """A refusal on its path through tyro, which prints a usage message for every ValueError."""
+
+
 def parse(commands: Mapping[str, type], words: Sequence[str], description: str) -> Any:
     """Reads the words after `r3jax`, of which the first is a command.
 
@@ -56,14 +60,17 @@ def parse(commands: Mapping[str, type], words: Sequence[str], description: str) 
         told = tyro.conf.subcommand(name, description=text, prefix_name=False)
         kinds.append(Annotated[(kind, told)])
     union: Any = Union[tuple(kinds)]  # noqa: UP007
-    return tyro.cli(
-        union,
-        prog="r3jax",
-        description=description,
-        args=words,
-        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-        registry=_registry(),
-    )
+    try:
+        return tyro.cli(
+            union,
+            prog="r3jax",
+            description=description,
+            args=words,
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+            registry=_registry(),
+        )
+    except _Refused as error:
+        raise InputError(str(error)) from error
 
 
 class FieldsOf:
@@ -146,7 +153,7 @@ def _group_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
         try:
             return kind(**values)  # pyright: ignore[reportCallIssue]
         except (InputError, OSError) as error:
-            raise InputError(one_line(error)) from error
+            raise _Refused(one_line(error)) from error
 
     return StructConstructorSpec(make, tuple(fields))
 

@@ -1,6 +1,5 @@
 """The command line, as a user meets it: help, mistakes, a run, an interrupt, a recording."""
 
-import importlib
 import json
 import os
 import subprocess
@@ -9,7 +8,7 @@ import sys
 import pytest
 import trimesh
 
-from r3jax.cli.command_line import COMMANDS
+from r3jax.cli.command_line import COMMANDS, find_command
 from r3jax.cli.main import main
 from r3jax.cli.options.benchmark import PhotoOptions, SubmissionOptions
 from r3jax.cli.parsing import parse
@@ -38,7 +37,7 @@ def run_folder(room, tmp_path_factory):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_what_runs_it(name):
-    assert callable(getattr(importlib.import_module(f"r3jax.cli.commands.{name}"), f"run_{name}"))
+    assert callable(find_command(name))
 
 
 def test_a_run_leaves_data_set_and_report(run_folder):
@@ -247,8 +246,7 @@ def test_output_that_nobody_reads_is_no_traceback():
 def test_progress_says_what_is_happening():
     import io
 
-    from r3jax.cli.console import Console
-    from r3jax.cli.progress import RunProgress
+    from r3jax.cli.console import Console, RunProgress
 
     terminal = Console(file=io.StringIO(), force_terminal=True, width=160)
     with RunProgress(terminal, parse_budget("views:4")) as progress:

@@ -247,7 +247,7 @@ def test_an_interrupt_that_nobody_catches_is_no_traceback(part, monkeypatch, cap
     def interrupted(run, on_frame):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("r3jax.cli.commands.replay.differences", interrupted)
+    monkeypatch.setattr("r3jax.cli.commands.runs.differences", interrupted)
     assert main(["replay", str(part)]) == 130
     assert "r3jax: interrupted" in capsys.readouterr().err
 

@@ -12,10 +12,11 @@ import re
 import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from r3jax.apps.benchmark.terms import ExplorationTerms, TrainingTerms
 from r3jax.errors import InputError
-from r3jax.exploration.config import Budget, ClockName, ExplorationConfig, parse_budget
+from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.config import FORMER_SETTINGS
 from r3jax.planning.policies.foreign.commands import COMMAND, words_of
@@ -24,7 +25,7 @@ from r3jax.planning.registry import make_policy, policy_class
 from r3jax.planning.robot.motion import Motion, make_motion, motion_of_record
 from r3jax.runs.header import plain_settings, settings_of
 from r3jax.scoring.config import RETIRED, ScoringConfig, scoring_config_of
-from r3jax.splatting.config import Backend, RasterConfig
+from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.training.config import TrainConfig
 
 IDENTITY_VERSION = 1
@@ -54,8 +55,8 @@ OWN_OF_TRAINER = ("iterations", "num_gaussians", "capacity", "raster", "seed")
 """The same of `TrainConfig`; the seed is the cell's."""
 
 
-@dataclass(frozen=True)
-class Conditions:
+@dataclass(frozen=True, kw_only=True)
+class Conditions(ExplorationTerms, TrainingTerms):
     """Budget, sensor, maps, clock, training and evaluating: the same for every policy.
 
     Raises:
@@ -68,47 +69,11 @@ class Conditions:
     snapshots: tuple[str, ...] = ()
     """Where a model is trained and evaluated, in any of these units; by default at the budget."""
 
-    clock: ClockName = "wall"
-    """`wall`: measured planning and mapping. `model`: fixed costs, the same run every time."""
-
-    resolution: int = 256
-    """Width and height of the explored images [px]."""
-
-    fov: float = 60.0
-    """Field of view [degrees]."""
-
-    noise: float = 0.01
-    """Standard deviation of the explored depth as a share of the depth; test views have none."""
-
-    max_range: float = 5.0
-    """Range of the depth sensor [m]."""
-
-    voxel_size: float = 0.05
-    """Voxel size [m]."""
-
     cell_size: float = 0.2
     """Edge of a cell of the coarse grid [m]."""
 
     map_capacity: int = 1 << 17
     """Rows of the map at the start, a power of two."""
-
-    train_resolution: int = 128
-    """Width and height of the images that are trained on and evaluated [px]."""
-
-    iterations: int = 2000
-    """Steps of every training."""
-
-    gaussians: int = 20_000
-    """Gaussians at the start of every training."""
-
-    capacity: int = 40_000
-    """Maximum number of Gaussians."""
-
-    backend: Backend = "auto"
-    """Rasterizer."""
-
-    lpips: Literal["alex", "vgg", "none"] = "alex"
-    """Network of LPIPS; `none` leaves it out."""
 
     loop: dict[str, Any] = field(default_factory=dict[str, Any])
     """Further settings of `ExplorationConfig` by name; those at their defaults are left out."""
@@ -127,9 +92,8 @@ class Conditions:
                 raise InputError(f"the snapshot {snapshot} lies beyond the budget {budget}")
         if len(set(parsed)) < len(parsed):
             raise InputError(f"a snapshot is given twice: {', '.join(self.snapshots)}")
-        for name in ("resolution", "train_resolution"):
-            if not 16 <= getattr(self, name) <= 4096:
-                raise InputError(f"{name} must lie between 16 and 4096, got {getattr(self, name)}")
+        ExplorationTerms.__post_init__(self)
+        TrainingTerms.__post_init__(self)
         if self.train_resolution > self.resolution:
             raise InputError(
                 f"train_resolution {self.train_resolution} is more than the images have: "

@@ -1,1 +1,1 @@
-"""One module for each command: it parses, calls the library, and prints."""
+"""What runs the commands; a module is named as that of their options."""

@@ -14,10 +14,9 @@ from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_out
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.captures.camera_paths import CameraPath, path_of
 from r3jax.captures.source import Source, source_of
-from r3jax.cli.console import Console, Table
+from r3jax.cli.console import Console, Stages, Table
 from r3jax.cli.options.audit import AuditOptions
 from r3jax.cli.parsing import given_words
-from r3jax.cli.progress import Stages
 from r3jax.errors import InputError
 from r3jax.files import check_own, own_folder
 from r3jax.formats.captures import open_capture

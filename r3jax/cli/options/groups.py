@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
+from r3jax.apps.benchmark.terms import check_size
 from r3jax.cli.parsing import flat
 from r3jax.errors import InputError
 from r3jax.formats.errors import check_capture
@@ -37,11 +38,8 @@ class FolderOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldOptions:
-    """How a scene is opened."""
-
-    start: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z")] = None
-    """Start position in the z-up world [m]; by default the scene's own, or a search."""
+class MeshOptions:
+    """How mesh files are opened."""
 
     up: Literal["y", "z"] | None = None
     """Vertical axis of a mesh file; by default y for GLB and glTF, z for the others."""
@@ -51,6 +49,14 @@ class WorldOptions:
 
     cull_backfaces: bool = False
     """Look through faces seen from behind, as Habitat-Sim always does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldOptions(MeshOptions):
+    """How a scene is opened."""
+
+    start: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z")] = None
+    """Start position in the z-up world [m]; by default the scene's own, or a search."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +74,7 @@ class CameraOptions:
 
     def __post_init__(self) -> None:
         """Refuses images that no run is made of."""
-        check_resolution(self.resolution, most=4096)
+        check_size("resolution", self.resolution)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,18 +150,6 @@ def check_folder_name(name: str) -> None:
         raise InputError(f"--name is the name of one folder, without a path, got {name!r}")
 
 
-def check_resolution(pixels: int | None, most: int | None = None) -> None:
-    """Refuses a --resolution that leaves nothing to compare, or is too large; None is the default.
-
-    Raises:
-        ValueError: fewer than 16 pixels, or more than the most.
-    """
-    if pixels is None or 16 <= pixels <= (most or pixels):
-        return
-    bounds = "be at least 16" if most is None else f"lie between 16 and {most}"
-    raise InputError(f"--resolution must {bounds}, got {pixels}")
-
-
 def check_run(path: Path) -> None:
     """Refuses what is no folder of a run.
 
@@ -200,5 +194,5 @@ def check_model(path: Path, name: str, resolution: int | None) -> None:
         ValueError: names the option or the path.
     """
     check_folder_name(name)
-    check_resolution(resolution)
+    check_size("resolution", resolution, most=None)
     check_capture(path)

@@ -1,14 +1,15 @@
-"""`r3jax evaluate`: judges a model by test views and writes what came out."""
+"""Commands that train a model and evaluate it."""
 
 from pathlib import Path
 
 import numpy as np
 
 from r3jax.apps.report.report import write_report
-from r3jax.cli.console import Console, Table, Text
-from r3jax.cli.options.splats import EvaluateOptions
+from r3jax.cli.console import Console, Stages, Table, Text, TrainProgress
+from r3jax.cli.errors import one_line
+from r3jax.cli.options.models import EvaluateOptions, ModelFolderOptions, TrainOptions
 from r3jax.cli.parsing import given_words, settings_for
-from r3jax.cli.progress import Stages
+from r3jax.errors import InputError
 from r3jax.evaluation.judge import (
     NETWORKS,
     JudgeSettings,
@@ -22,8 +23,88 @@ from r3jax.evaluation.judge import (
 from r3jax.evaluation.scores import Summary
 from r3jax.files import own_folder
 from r3jax.formats.captures import open_capture
+from r3jax.formats.points import write_points
 from r3jax.formats.ros.bags import parse_topics
-from r3jax.splatting.model import find_model
+from r3jax.runs.header import package_versions
+from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.errors import TrainingDiverged
+from r3jax.splatting.model import check_free, find_model, only_writer, scene_points, write_model
+from r3jax.splatting.training import train
+from r3jax.splatting.training.config import TrainConfig
+from r3jax.splatting.views import load_views, split_views
+
+
+def run_train(options: TrainOptions) -> int:
+    """Trains a model and writes it.
+
+    Returns:
+        0 done, 130 interrupted (it can be resumed).
+
+    Raises:
+        InputError: training that diverged.
+        ValueError, OSError, ImportError: bad input, a model that exists, too little memory.
+    """
+    console = Console(stderr=True)
+    config = TrainConfig(
+        num_gaussians=options.model.gaussians,
+        raster=RasterConfig(backend=options.reading.backend),
+        **settings_for(TrainConfig, options),
+    )
+    capture = open_capture(options.path, options.reading.up, parse_topics(options.reading.topics))
+    folder = (options.folder.out or capture.models) / options.folder.name
+    resume, overwrite = options.folder.resume, options.folder.overwrite
+    check_free(folder, replace=overwrite or resume)
+    split = split_views(len(capture), options.hold_out)
+    with Stages(console) as stages:
+        frames = stages.each("reading the views", capture.frames(), len(capture))
+        views = load_views(frames, options.resolution).take(split[0])
+    if capture.run is not None and options.folder.out is None:
+        own_folder(capture.path, "run")
+    try:
+        with only_writer(folder, replace=overwrite or resume):
+            with TrainProgress(console, config.iterations) as progress:
+                result = train.fit(
+                    views,
+                    config,
+                    folder=folder / "checkpoints",
+                    resume=resume,
+                    overwrite=overwrite,
+                    on_progress=progress.on_progress,
+                )
+            write_points(folder / "points.ply", *scene_points(result.scene))
+            write_model(folder, result, options.path, views, split, config, package_versions())
+    except TrainingDiverged as error:
+        raise InputError(one_line(error)) from error
+    _conclude_training(console, options, folder, result)
+    return 130 if result.interrupted else 0
+
+
+def _conclude_training(
+    console: Console, options: TrainOptions, folder: Path, result: train.FitResult
+) -> None:
+    history = result.history
+    done = history.first_step + len(history.loss) - 1
+    if result.interrupted:
+        console.say(f"interrupted after step {done}; add --resume to the same command to go on")
+    if len(history.psnr):
+        latest = history.psnr[-100:].mean()
+        console.say(
+            f"{done} steps, {int(history.num_gaussians[-1])} Gaussians, PSNR of the latest "
+            f"training views {latest:.2f} dB",
+        )
+    if result.dropped:
+        console.say(
+            f"Capacity reached, {result.dropped} Gaussians dropped; "
+            "increase --capacity for more detail"
+        )
+    console.say(f"model     {folder / 'scene.ply'}")
+    if result.interrupted:
+        return
+    name = options.folder.name
+    which = () if name == ModelFolderOptions.name else ("--name", name)
+    where = which if options.folder.out is None else ("--model", folder)
+    how = () if options.hold_out else ("--views", "all")
+    console.next("evaluate", options.path, *where, *how, *given_words(options, ("up", "topics")))
 
 
 def run_evaluate(options: EvaluateOptions) -> int:
@@ -52,7 +133,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
         if capture.run is not None and folder == default:
             _, state, grid = capture.run.checkpoint()
             written["report"] = write_report(capture.run, state, grid, stages.on_progress)
-    _show(Console(), judgment, written)
+    _show_judgment(Console(), judgment, written)
     if capture.run is not None:
         which = () if options.name == EvaluateOptions.name else ("--name", options.name)
         progress.next("view", options.path, *which)
@@ -61,11 +142,11 @@ def run_evaluate(options: EvaluateOptions) -> int:
     return 0
 
 
-def _show(console: Console, judgment: Judgment, written: dict[str, Path]) -> None:
+def _show_judgment(console: Console, judgment: Judgment, written: dict[str, Path]) -> None:
     rows, network = judgment.evaluation.rows, judgment.settings.lpips
     console.say(judgment.described)
     console.say(f"model: {judgment.model.path}, {judgment.num_gaussians} Gaussians")
-    console.print(_table(judgment.summaries))
+    console.print(_metric_table(judgment.summaries))
     lpips = "no LPIPS" if network == "none" else f"LPIPS v0.1 with {NETWORKS[network]} on [-1, 1]"
     console.print(
         "Renders rounded to 8 bits; SSIM with an 11x11 Gaussian window, sigma 1.5, data range 1; "
@@ -86,7 +167,7 @@ def _show(console: Console, judgment: Judgment, written: dict[str, Path]) -> Non
         console.say(f"warning: {warning}", style="yellow")
 
 
-def _table(summaries: tuple[Summary, ...]) -> Table:
+def _metric_table(summaries: tuple[Summary, ...]) -> Table:
     table = Table("", "mean", "", "median", "5th %", "worst (view)", "<20 dB", box=None)
     for column in table.columns:
         column.no_wrap = True
