@@ -24,10 +24,7 @@ from r3jax.evaluation.comparison import (
     with_short_names,
 )
 from r3jax.evaluation.scores import METRICS, Metric
-from r3jax.evaluation.statistics import (
-    Estimate,
-    Scores,
-)
+from r3jax.evaluation.statistics import Estimate, Scores, mean_over_scenes
 
 FEWEST_SEEDS = 3
 """That the protocol asks for in each cell of a table."""
@@ -186,7 +183,7 @@ PAPER_METRICS = ("ssim", "psnr", "lpips")
 """Lines of a method in the paper's tables."""
 
 
-def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
+def quality_table(cells: Sequence[Cell], title: str = "", *, with_intervals: bool = False) -> Table:
     """The paper's table: methods x (SSIM, PSNR, LPIPS) by scenes and their mean.
 
     A field is the mean over seeds of the mean over the scene's test views. The last column is the
@@ -196,6 +193,7 @@ def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
     Args:
         cells: records of one snapshot; rows go in the order of `equal_terms.POLICIES`.
         title: of the table; none given: the snapshot.
+        with_intervals: also gives each field its 95 % interval over views and seeds.
 
     Raises:
         ValueError: the records were not made on equal terms (`check_equal_terms`).
@@ -208,8 +206,15 @@ def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
         metric, scores = metric_named(name), scores_by_method(cells, name)
         columns: list[list[Entry]] = []
         for scene in [*scenes, None]:
-            means = [_mean(scores.get(method, {}), scene, scenes) for method in methods]
-            columns.append(ranked(means, metric))
+            parts = [_part(scores.get(method, {}), scene, scenes) for method in methods]
+            entries = ranked([_mean(part) if part else None for part in parts], metric)
+            if with_intervals:
+                pairs = zip(entries, parts, strict=True)
+                entries = [
+                    with_bounds(entry, mean_over_scenes(part), metric) if part else entry
+                    for entry, part in pairs
+                ]
+            columns.append(entries)
         for method, entries in zip(methods, zip(*columns, strict=True), strict=True):
             rows[method, name] = Row((method, metric.title), seeds[method], entries)
     return Table(
@@ -221,12 +226,14 @@ def quality_table(cells: Sequence[Cell], title: str = "") -> Table:
     )
 
 
-def _mean(scores: Scores, scene: str | None, scenes: Sequence[str]) -> float | None:
-    """Mean of one scene, or (None) of all if there are values for all."""
+def _part(scores: Scores, scene: str | None, scenes: Sequence[str]) -> Scores:
+    """The scores of one scene, or (None) of all if there are some for all; empty if not."""
     if scene is not None:
-        return float(np.nanmean(scores[scene])) if scene in scores else None
-    if set(scores) != set(scenes):
-        return None
+        return {scene: scores[scene]} if scene in scores else {}
+    return scores if set(scores) == set(scenes) else {}
+
+
+def _mean(scores: Scores) -> float:
     return float(np.mean([np.nanmean(values) for values in scores.values()]))
 
 

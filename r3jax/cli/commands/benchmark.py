@@ -117,8 +117,8 @@ def _show(console: Console, options: BenchmarkOptions, cells: Sequence[Cell]) ->
 
 def _write_site(console: Console, root: Path, folder: Path) -> int:
     """Writes the page of all records."""
-    with console.status("reading the records ...") as status:
-        page = write_site(root, folder, lambda what: status.update(f"{what} ..."))
+    with console.status("reading the records, and rendering the worst views ..."):
+        page = write_site(root, folder)
     console.say(f"page     {page}")
     return 0
 

@@ -9,12 +9,11 @@ from PIL import Image
 
 from r3jax.apps.benchmark.record import read_records
 from r3jax.apps.benchmark.reference_images import load_reference_images
-from r3jax.apps.benchmark.site import probe, write_site
-from r3jax.apps.benchmark.tables import full_title
+from r3jax.apps.benchmark.site import write_site
+from r3jax.apps.benchmark.tables import PAPER_METRICS, metric_named
 from r3jax.cli.main import main
 from r3jax.evaluation.comparison import scores_by_method
-from r3jax.evaluation.scores import METRICS
-from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
+from r3jax.evaluation.statistics import mean_over_scenes
 from tests.evaluation.records import benchmark, record
 
 
@@ -61,17 +60,12 @@ def test_records_that_lie_alone_make_a_page_without_pictures(tmp_path):
     text = page.read_text()
     assert "<script>" not in text
     assert "&lt;script&gt;" in text
-    assert "its model or image is gone" in text
-    chosen = scores_by_method(records, "psnr")
-    lead = paired_difference(chosen["r3-pano"], chosen["active-gs"])
-    assert f"{lead.value:+.2f} [{lead.low:+.2f}, {lead.high:+.2f}]" in text
-    assert "arXiv 2601.07484" in text
-    for metric in METRICS:
+    assert "<img" not in text
+    for metric in map(metric_named, PAPER_METRICS):
         found = mean_over_scenes(scores_by_method(records, metric.name)["r3-pano"])
-        assert full_title(metric) in text
+        assert metric.title in text
         low, high = (f"{end:.{metric.decimals}f}" for end in (found.low, found.high))
         assert f"{found.value:.{metric.decimals}f} [{low}, {high}]" in text
-    assert "+2.9" in text
 
 
 def test_tables_of_other_terms_are_told_apart(tmp_path):
@@ -85,10 +79,6 @@ def test_tables_of_other_terms_are_told_apart(tmp_path):
         "views:30, the clock: wall",
         "views:30, the clock: model, table 2 on the same terms: it has a record of the same name",
     ]
-
-
-def test_a_probe_takes_some_time():
-    assert all(0.0 < seconds < 10.0 for seconds in probe(repeats=1).values())
 
 
 def test_a_page_is_not_written_over_something_else(tmp_path, capsys):
