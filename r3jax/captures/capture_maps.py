@@ -27,7 +27,13 @@ from r3jax.captures.survey import MARGIN, RANGE, Survey
 from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.mapping.join import combine_moments
-from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
+from r3jax.mapping.occupancy import (
+    LOG_ODDS_LIMIT,
+    OccupancyGrid,
+    empty_grid,
+    integrate_depth,
+    mark_free_ball,
+)
 from r3jax.mapping.seen import mark_seen
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_pixels, update_growing
@@ -51,7 +57,7 @@ class Seen:
     """Map of all images."""
 
     grid: OccupancyGrid
-    """Free and occupied space; all unexplored where no depth images say what is free."""
+    """Free and occupied space: by depth images, or by the rays to single points."""
 
     folds: tuple[MapState, ...]
     """Maps of the images of each fold, on the rows of `state`."""
@@ -84,7 +90,10 @@ def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: 
     is_dense = jnp.asarray(source.is_dense)
     for fold, index in zip(fold_of.tolist(), survey.chosen.tolist(), strict=True):
         frame = source.frame(index, survey.alignment)
-        parts[fold] = _join_fold(parts[fold], whole, frame, _reach(source, frame), is_dense)
+        if source.kind == "tracks":  # a point was seen by the images of its track, and no other
+            parts[fold] = _integrate_pixels(parts[fold], frame, jnp.float32(RANGE), is_dense)
+        else:
+            parts[fold] = _join_fold(parts[fold], whole, frame, _reach(source, frame), is_dense)
         on_frame()
     return Seen(united(parts), grid, tuple(parts), fold_of)
 
@@ -105,12 +114,76 @@ def map_surfaces(
         state = _grown(state, frame, source.is_dense)
         if source.is_dense:
             grid = update_grid(grid, frame, jnp.float32(RANGE))
+        else:
+            grid = integrate_rays(grid, np.asarray(frame.position), _measured_points(frame))
         on_frame()
-    if source.is_dense:
-        # The camera itself was there, whatever the sensor says of places so near.
-        for position in survey.alignment.points(source.poses[survey.chosen, :3, 3]):
-            grid = _free_ball(grid, jnp.asarray(position, dtype=jnp.float32))
+    # The camera itself was there, whatever the sensor says of places so near.
+    for position in survey.alignment.points(source.poses[survey.chosen, :3, 3]):
+        grid = _free_ball(grid, jnp.asarray(position, dtype=jnp.float32))
     return state, grid
+
+
+_MOST_RAYS = 1000
+"""Rays of an image that mark free space."""
+
+_SAMPLES_PER_CELL = 4
+"""Samples of a ray in a cell's edge."""
+
+_LEAST_SAMPLES = 2
+"""A cell is passed by an image whose rays have so many samples in it: half of its edge."""
+
+
+def integrate_rays(grid: OccupancyGrid, eye: np.ndarray, points: np.ndarray) -> OccupancyGrid:
+    """Adds what an image says of space by single points: the rays to them are free.
+
+    Depth images ask the cells (`integrate_depth`); between single points most cells have no answer.
+
+    Args:
+        grid: the grid before.
+        eye: the camera's center, [3] [audit units].
+        points: what it sees, [m, 3] [audit units].
+    """
+    cell, shape = float(grid.cell_size), np.array(grid.log_odds.shape)
+    if len(points) > _MOST_RAYS:
+        points = points[np.random.default_rng(0).choice(len(points), _MOST_RAYS, replace=False)]
+    offset = points - eye
+    length = np.linalg.norm(offset, axis=1)
+    is_near = (length > 1e-6) & (length <= RANGE)
+    offset, length = offset[is_near], length[is_near]
+    origin = np.asarray(grid.origin, np.float64)
+
+    def inside(positions: np.ndarray) -> np.ndarray:
+        """Flat indices of the cells that hold positions, those outside left out."""
+        index = np.floor((positions - origin) / cell).astype(np.int64)
+        index = index[np.all((index >= 0) & (index < shape), axis=1)]
+        return (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+
+    steps = np.arange(0.5 * cell / _SAMPLES_PER_CELL, RANGE, cell / _SAMPLES_PER_CELL)
+    # Short of the point by half a cell: there is its surface.
+    is_before = steps < length[:, None] - 0.5 * cell
+    along = eye + (steps[:, None] / np.maximum(length, 1e-6)[:, None, None]) * offset[:, None, :]
+    count = int(shape.prod())
+    passed = np.bincount(inside(along[is_before]), minlength=count) >= _LEAST_SAMPLES
+    hit = np.zeros(count, dtype=bool)
+    hit[inside(eye + offset)] = True
+    step = np.where(hit, _RAY_STEP, np.where(passed, -_RAY_STEP, 0.0)).reshape(grid.log_odds.shape)
+    log_odds = np.clip(np.asarray(grid.log_odds) + step, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
+    return eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(log_odds, dtype=jnp.float32))
+
+
+_RAY_STEP = 1.4
+"""Log-odds of a look by single rays: one decides, as a depth image does from 5 m."""
+
+
+def _measured_points(frame: Frame) -> np.ndarray:
+    """The points of a frame's pixels that have a depth, [m, 3] [audit units]."""
+    depth, camera = np.asarray(frame.depth), frame.camera
+    row, column = np.nonzero(depth > 0.0)
+    z = depth[row, column].astype(np.float64)
+    x = (column + 0.5 - float(camera.cx)) / float(camera.fx)
+    y = (row + 0.5 - float(camera.cy)) / float(camera.fy)
+    T = np.asarray(frame.T_world_camera, np.float64)
+    return (z * np.stack([x, y, np.ones_like(x)])).T @ T[:3, :3].T + T[:3, 3]
 
 
 @jax.jit

@@ -278,6 +278,14 @@ class Source:
         """True if depth images say where space is free."""
         return self.kind == "depth"
 
+    @property
+    def is_complete(self) -> bool:
+        """True if a depth camera measured the surfaces: what it does not show was not in view.
+
+        Otherwise a surface may be in view of many images and have no point: it is not known.
+        """
+        return self.kind == "depth"
+
     def camera(self, index: int) -> Camera:
         """The pinhole of a thinned image."""
         return thinned(self.lenses[index].camera, self.stride)

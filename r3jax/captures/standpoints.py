@@ -2,7 +2,8 @@
 
 With depth images the places lie in known free space, a margin from everything that is not known to
 be free, connected to where the camera was, at heights at which it was held. Without, they lie
-within the hull of the camera's positions and a margin round it, and a margin from every voxel.
+within the hull of the camera's positions and a margin round it, a margin from every voxel, and
+where a camera was or a ray to a point passed: not inside of walls.
 
 Shape symbols: n cameras; m voxels; c places.
 """
@@ -46,9 +47,18 @@ def standpoints_of(
     else:
         centers = np.asarray(state.center, np.float64).T[np.asarray(state.occupied)]
         places = places_in_hull(cameras, centers)
+        places = places[is_free_at(grid, places)]
     if not len(places):
         places = cameras
     return places[spread(places, num)]
+
+
+def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:
+    """Which places [c, 3] lie in a cell known to be free, [c] bool; outside of the grid none do."""
+    shape = np.array(grid.log_odds.shape)
+    cells = np.floor((places - np.asarray(grid.origin)) / float(grid.cell_size)).astype(np.int64)
+    is_inside = np.all((cells >= 0) & (cells < shape), axis=1)
+    return is_inside & np.asarray(grid.free)[tuple(np.where(is_inside[:, None], cells, 0).T)]
 
 
 def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray:

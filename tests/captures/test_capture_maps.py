@@ -7,16 +7,20 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from r3jax.captures import capture_maps as real
-from r3jax.captures.capture_maps import Seen, see
+from r3jax.captures.capture_maps import Seen, integrate_rays, see
 from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import Source, source_of
 from r3jax.captures.survey import RANGE, Survey, survey_of
+from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.recordings import read_recording
+from r3jax.mapping.occupancy import centers_on_host, empty_grid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate
-from tests.apps.audit.room import round_poses, write_recording
+from tests.apps.audit.room import round_poses, write_colmap, write_recording
 
 SETTINGS = SurveySettings(voxel_size=0.1)
 NUM = 8
@@ -134,3 +138,42 @@ def test_more_folds_than_pictures_leave_one_each():
     found = see(source, survey, folds=99)
     assert len(found.folds) == NUM
     jax.tree.map(np.testing.assert_array_equal, found.state.key, seen().state.key)
+
+
+@given(
+    eye=st.tuples(*[st.floats(0.3, 1.7)] * 3),
+    seed=st.integers(0, 99),
+)
+def test_rays_to_points_free_what_lies_before_them_and_nothing_else(eye, seed):
+    """By the geometry alone: a cell that is freed lies near a ray, and none of them behind one."""
+    rng = np.random.default_rng(seed)
+    eye, points = np.array(eye), rng.uniform(0.0, 2.0, (6, 3))
+    grid = integrate_rays(empty_grid(np.array([[0.0] * 3, [2.0] * 3]), 0.2), eye, points)
+    centers = centers_on_host(grid, np.argwhere(np.asarray(grid.free)))
+    offset = points - eye
+    length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+    along = np.einsum("cd,pd->cp", centers - eye, offset / length[:, None])
+    nearest = eye + np.clip(along, 0, length)[..., None] * (offset / length[:, None])
+    off = np.linalg.norm(centers[:, None] - nearest, axis=-1)
+    assert (off.min(axis=1) <= 0.2 * np.sqrt(3) / 2 + 1e-6).all()
+    holds = np.floor((points - np.asarray(grid.origin)) / 0.2).astype(int)
+    assert not np.asarray(grid.free)[tuple(holds.T)].any()
+
+
+def test_a_point_was_seen_by_the_images_of_its_track_and_by_no_other(tmp_path):
+    """Against the tracks themselves: observations of voxels, and their directions."""
+    poses = round_poses(NUM)
+    model = read_colmap(write_colmap(tmp_path / "model", poses))
+    source = source_of(model, "model")
+    survey = survey_of(source, SurveySettings(voxel_size=1e-3))  # a voxel to each point
+    found = see(source, survey, folds=4)
+    tracks = np.bincount(model.points.seen_point, minlength=len(model.points))
+    count = np.asarray(found.state.count)
+    # Two points in one pixel are one, and some lie out of range; none are invented.
+    pixels = sum(int((source.read(i)[1] > 0.0).sum()) for i in range(NUM))
+    assert pixels <= tracks.sum()
+    assert 0.9 * pixels <= count.sum() <= pixels
+    bits = np.unpackbits(np.asarray(found.state.visited).view(np.uint8)).sum()
+    assert bits <= count.sum()
+    assert count.max() <= tracks.max()
+    assert np.asarray(found.grid.free).any()

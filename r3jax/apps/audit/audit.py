@@ -11,11 +11,21 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.apps.audit.bad_regions import Region, bad_regions, unseen_edges, unseen_regions
+from r3jax.apps.audit.bad_regions import (
+    Region,
+    bad_regions,
+    blank_points,
+    blank_regions,
+    unseen_edges,
+    unseen_regions,
+)
 from r3jax.apps.audit.diagnosis import (
+    NOT_KNOWN,
+    Demand,
     Diagnosis,
     ViewScore,
     demand_of,
+    known_rows,
     view_score,
 )
 from r3jax.apps.audit.settings import AuditSettings
@@ -94,6 +104,9 @@ class Audit:
     unseen: tuple[Region, ...]
     """Where the capture ends although one could look on; none without depth images."""
 
+    blank: tuple[Region, ...]
+    """Places that pictures show and of which no surface is known; none with a depth camera."""
+
     unseen_area: float
     """Area of all such places [square audit units]."""
 
@@ -116,24 +129,43 @@ class Audit:
     @property
     def is_saturated(self) -> bool:
         """True where frames render so well, as far as R can tell, that R does not rank them."""
-        return float(self.renderability.mean()) >= SATURATED
+        return self.mean_renderability >= SATURATED
+
+    @property
+    def all_regions(self) -> tuple[Region, ...]:
+        """Every region, in the order of their letters."""
+        return (*self.regions, *self.blank, *self.unseen)
+
+    @property
+    def unknown(self) -> str:
+        """Name of the share of pixels without a known surface."""
+        return "unseen" if self.source.is_complete else NOT_KNOWN
 
     @property
     def shares(self) -> dict[str, float]:
-        """Share of what the frames show of each cause, and `unseen`; they sum to 1.
+        """Share of what the frames show of each cause, and of what is unseen or not known.
 
-        Of the capture's own pictures those without depth are counted, as unseen.
+        They sum to 1. Of the capture's own pictures those without depth are counted, as unseen.
         """
         blank = len(self.faults.without_depth) if self.is_own_path else 0
         total = len(self.frames) + blank
         names = self.frames[0].score.shares
         shares = {name: sum(f.score.shares[name] for f in self.frames) / total for name in names}
-        return shares | {"unseen": shares["unseen"] + blank / total}
+        return shares | {self.unknown: shares[self.unknown] + blank / total}
 
     @property
     def renderability(self) -> np.ndarray:
-        """Renderability of every frame of the path, [n]."""
+        """Renderability of every frame of the path, [n]; NaN where nothing it shows is known."""
         return np.array([frame.score.renderability for frame in self.frames])
+
+    @property
+    def mean_renderability(self) -> float:
+        """Mean over the frames; without a depth camera over all their pixels that are known."""
+        value = self.renderability
+        if self.source.is_complete:
+            return float(value.mean())
+        weight = np.array([frame.score.coverage for frame in self.frames])
+        return float(np.nansum(value * weight) / max(weight.sum(), 1e-9))
 
 
 Progress = Callable[[str, int], None]
@@ -192,7 +224,9 @@ def audit(
     frames = tuple(_evaluated_frames(source, survey, seen, config, path, step, on_progress))
     open_grid = _open_grid(source, survey, seen, cameras, config)
     on_progress("choosing views", settings.views)
-    task = Task(camera, demand_of(seen.state, standpoints, config), config)
+    demand = demand_of(seen.state, standpoints, config)
+    known = jnp.asarray(known_rows(seen.state, source.is_complete))
+    task = Task(camera, Demand(demand.position, demand.visible & known[None]), config)
     plan = suggest(
         seen.state, open_grid, task, places, settings.views, seed=settings.seed, on_view=step
     )
@@ -209,6 +243,7 @@ def audit(
         is_own_path=path is None,
         regions=tuple(bad_regions(seen.state, plan.before)),
         unseen=tuple(unseen_regions(seen.grid, edges)),
+        blank=() if source.is_complete else _blank_regions(source, survey, seen, config),
         unseen_area=float(edges.sum()) * survey.cell_size**2,
         plan=plan,
         faults=faults,
@@ -225,12 +260,13 @@ def _evaluated_frames(
     on_progress: Progress,
 ) -> Iterator[EvaluatedFrame]:
     """The frames of the path; the capture's own are evaluated without the fold that they are in."""
+    known = None if source.is_complete else known_rows(seen.state, is_complete=False)
     if path is not None:
         on_progress("evaluating frames", len(path.poses))
         poses = survey.alignment.poses(path.poses)
         for index, (pose, lens) in enumerate(zip(poses, path.lenses, strict=True)):
             camera = thinned(lens.camera, source.stride)
-            score = view_score(seen.state, camera, pose, config)
+            score = view_score(seen.state, camera, pose, config, known)
             yield EvaluatedFrame(index, f"frame {index + 1}", pose, score)
             step()
         return
@@ -241,10 +277,22 @@ def _evaluated_frames(
         others = seen.without(fold)
         for place in np.flatnonzero(seen.fold_of == fold).tolist():
             index = int(survey.chosen[place])
-            score = view_score(others, source.camera(index), poses[place], config)
+            score = view_score(others, source.camera(index), poses[place], config, known)
             found[place] = EvaluatedFrame(index, source.labels[index], poses[place], score)
             step()
     yield from (found[place] for place in sorted(found))
+
+
+def _blank_regions(
+    source: Source, survey: Survey, seen: Seen, config: ScoringConfig
+) -> tuple[Region, ...]:
+    known = known_rows(seen.state, is_complete=False)
+    poses = survey.alignment.poses(source.poses[survey.chosen])
+    points = [
+        blank_points(seen.state, known, source.camera(index), pose, config)
+        for index, pose in zip(survey.chosen.tolist(), poses, strict=True)
+    ]
+    return tuple(blank_regions(seen.state, points))
 
 
 def _open_grid(

@@ -10,6 +10,7 @@ from matplotlib.patches import Circle
 
 from r3jax.apps.audit.audit import Audit, EvaluatedFrame
 from r3jax.apps.audit.bad_regions import BLOCK, Region
+from r3jax.apps.audit.diagnosis import known_rows
 from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, region_label
 from r3jax.apps.audit.suggest import Suggestion
 from r3jax.captures.source import projected
@@ -39,7 +40,8 @@ def frames_figure(audit: Audit) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=[2.6, 1.0], sharey=True)
     value = audit.renderability
     causes = [frame.score.cause for frame in audit.frames]
-    style.dress(left, "Frame by frame", "frame", "renderability R")
+    label = "renderability R" + ("" if audit.source.is_complete else ", where known")
+    style.dress(left, "Frame by frame", "frame", label)
     left.plot(value, color="#9ca3af", linewidth=1.0, zorder=1)
     colors = [COLOR_OF_CAUSE[cause] for cause in causes]
     left.scatter(np.arange(len(value)), value, c=colors, s=18, zorder=2)
@@ -53,8 +55,9 @@ def frames_figure(audit: Audit) -> Figure:
     style.dress(right, "How many frames", "frames")
     right.hist(value, bins=np.linspace(0.0, 1.0, 21).tolist(), orientation="horizontal",
                color=style.ACCENT, alpha=0.75)  # fmt: skip
-    right.axhline(float(value.mean()), color=style.SECOND, linewidth=1.5)
-    right.annotate(f"mean {value.mean():.2f}", (0.98, float(value.mean())), fontsize=9, ha="right",
+    mean = audit.mean_renderability
+    right.axhline(mean, color=style.SECOND, linewidth=1.5)
+    right.annotate(f"mean {mean:.2f}", (0.98, mean), fontsize=9, ha="right",
                    xycoords=("axes fraction", "data"), va="bottom", color=style.SECOND)  # fmt: skip
     return figure
 
@@ -149,7 +152,9 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
         style.caption(upper, _short(frame.label))
         lower.set_facecolor("#e5e7eb")
         lower.imshow(value, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
-        style.caption(lower, f"R {frame.score.renderability:.2f}, {frame.score.cause}", style.INK)
+        beside = "" if audit.source.is_complete else f", {100 * frame.score.coverage:.0f} % known"
+        said = f"R {frame.score.renderability:.2f}, {frame.score.cause}{beside}"
+        style.caption(lower, said, style.INK)
     return figure
 
 
@@ -180,6 +185,7 @@ def _pictures(
     row = np.asarray(seen.row)
     is_hit = row < state.capacity
     row = np.where(is_hit, row, 0)
+    is_hit &= known_rows(audit.seen.state, audit.source.is_complete)[row]
     colors = np.where(is_hit[..., None], np.asarray(state.mean).T[row], _EMPTY)
     return colors, np.where(is_hit, np.asarray(seen.value), np.nan)
 

@@ -9,6 +9,7 @@ import numpy as np
 from r3jax.apps.audit import audit_figures, sentences
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import Region
+from r3jax.apps.audit.diagnosis import NOT_KNOWN
 from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, plan_figure, region_label
 from r3jax.apps.audit.outputs import suggested_poses
 from r3jax.apps.audit.suggest import Suggestion
@@ -65,7 +66,7 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         lead=sentences.verdict(audit),
         cards=_cards(audit),
         colors=COLOR_OF_CAUSE,
-        is_dense=audit.source.is_dense,
+        is_complete=audit.source.is_complete,
         is_own_path=audit.is_own_path,
         pictures=picture_faults(audit),
         plan=to_png(plan_figure(audit)),
@@ -94,18 +95,18 @@ def _cards(audit: Audit) -> dict[str, str]:
     fine = f"{100 * sentences.cause_share(audit, 'fine'):.0f} %"
     what = "pictures" if audit.source.has_images else "poses without pictures"
     cards = {what: str(len(audit.survey.chosen))}
-    if audit.source.is_dense:
+    if audit.source.is_complete:
         bad = (1.0 - found.fine_share) * found.is_seen.sum() * audit.survey.voxel_size**2
         cards["of the surface renders well"] = fine
         cards["of surface that needs more views"] = sentences.area(audit, float(bad))
     else:
         cards["of what they show renders well"] = fine
-        cards["of it is not known"] = f"{100 * audit.shares['unseen']:.0f} %"
-    zero = "" if audit.source.is_dense else ", what is not known as 0"
-    cards[f"mean R of the frames{zero}"] = f"{audit.renderability.mean():.2f}"
+        cards["of it is not known"] = f"{100 * audit.shares[audit.unknown]:.0f} %"
+    where = "" if audit.source.is_complete else ", where it is known"
+    cards[f"mean R of the frames{where}"] = f"{audit.mean_renderability:.2f}"
     if plan.views:
         gain = f"{found.mean:.2f} → {plan.after.mean:.2f}"
-        where = "" if audit.source.is_dense else " with points"
+        where = "" if audit.source.is_complete else " that are known"
         cards[f"mean R of the surfaces{where} after {len(plan.views)} views"] = gain
     return cards
 
@@ -142,7 +143,7 @@ def _nothing_found(audit: Audit) -> str:
     good = [
         word for word, name in (("sharp", "detail"), ("evenly lit", "brightness")) if known(name)
     ]
-    if audit.source.is_dense and known("pose_off_by"):
+    if audit.source.is_complete and known("pose_off_by"):
         good.append("where they say")
     if not audit.source.has_images:
         return "None of them is there" + (", the depth images are where they say." if good else ".")
@@ -175,18 +176,18 @@ def _thumbnail(audit: Audit, index: int) -> bytes:
 
 def _causes(audit: Audit) -> list[dict[str, Any]]:
     """A row for each cause."""
-    found, is_dense = audit.diagnosis, audit.source.is_dense
+    found, is_complete = audit.diagnosis, audit.source.is_complete
     whole = float(found.is_seen.sum()) * audit.survey.voxel_size**2
     rows: list[dict[str, Any]] = []
     for cause, meaning in sentences.MEANING.items():
-        is_edge = cause == "unseen" and is_dense  # where free space ends, which has an area only
+        if cause == NOT_KNOWN and is_complete:
+            continue
+        is_edge = cause == "unseen"  # where free space ends, which has an area only
         if is_edge and not audit.unseen:
             continue
         share = None if is_edge else sentences.cause_share(audit, cause)
         covers = audit.unseen_area if share is None else share * whole
-        name, remedy = cause, sentences.REMEDY[cause]
-        if cause == "unseen" and not is_dense:
-            name, meaning, remedy = sentences.NOT_KNOWN
+        name, remedy = cause.replace("_", " "), sentences.REMEDY[cause]
         row = {"cause": cause, "name": name, "meaning": meaning, "remedy": remedy}
         if cause == "noise" and not audit.source.has_images:
             rows.append(row | {"share": "not known", "width": None, "about": ""})
@@ -196,7 +197,7 @@ def _causes(audit: Audit) -> list[dict[str, Any]]:
             | {
                 "share": "" if share is None else f"{100 * share:.0f} %",
                 "width": None if share is None else round(_BAR * share),
-                "about": sentences.area(audit, covers) if is_dense else "",
+                "about": sentences.area(audit, covers) if is_edge or is_complete else "",
             }
         )
     return rows
@@ -205,16 +206,16 @@ def _causes(audit: Audit) -> list[dict[str, Any]]:
 def _regions(audit: Audit) -> list[dict[str, Any]]:
     """A row for each bad region, and for each place where the capture ends."""
     rows: list[dict[str, Any]] = []
-    for number, region in enumerate((*audit.regions, *audit.unseen)):
-        is_unseen = region.cause == "unseen"
+    for number, region in enumerate(audit.all_regions):
         center = audit.survey.alignment.points_back(region.center[None])[0]
         rows.append(
             {
                 "letter": region_label(number),
                 "cause": region.cause,
                 "area": sentences.area(audit, region.area),
-                "share": "" if is_unseen else f"{100 * region.bad_share:.0f} %",
-                "value": "" if is_unseen else f"{region.renderability:.2f}",
+                "name": region.cause.replace("_", " "),
+                "share": f"{100 * region.bad_share:.0f} %" if region.is_known else "",
+                "value": f"{region.renderability:.2f}" if region.is_known else "",
                 "middle": sentences.point(center),
                 "views": [i for i, view in enumerate(audit.plan.views, 1) if _shows(view, region)],
             }
@@ -232,7 +233,7 @@ def _views(audit: Audit) -> list[dict[str, Any]]:
     """Every suggested view: the way to it, why it is suggested, where it is, what it shows."""
     described: list[dict[str, Any]] = []
     figures = audit_figures.view_figures(audit)
-    regions = (*audit.regions, *audit.unseen)
+    regions = audit.all_regions
     for view, pose, figure in zip(audit.plan.views, suggested_poses(audit), figures, strict=True):
         like, gap = audit_figures.likest_picture(audit, view)
         letters = [region_label(i) for i, region in enumerate(regions) if _shows(view, region)]

@@ -3,14 +3,20 @@
 Shape symbols: N rows of the map; m bad voxels; X Y Z cells of the coarse grid.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import KDTree
 
-from r3jax.apps.audit.diagnosis import CAUSES, FINE, Diagnosis
+from r3jax.apps.audit.diagnosis import CAUSES, FEWEST_PICTURES, FINE, NOT_KNOWN, Diagnosis
+from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
+from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.renderability import term_images
 
 BLOCK = 1.0
 """Regions are as large, and their middles as far apart [audit units]."""
@@ -38,7 +44,7 @@ class Region:
     """Area of its bad voxels or cells, a face each [square audit units]."""
 
     cause: str
-    """What most of its bad voxels suffer from; `unseen` where there are none yet."""
+    """What most of its bad voxels suffer from; `unseen` or `not_known` where there are none yet."""
 
     renderability: float
     """Mean over its bad voxels; 0 where nothing is known."""
@@ -47,7 +53,13 @@ class Region:
     """Bad voxels among those of the block that can be seen; 1 where nothing is known."""
 
     rows: np.ndarray
-    """Rows of its bad voxels in the map; where nothing is known flat indices of its cells."""
+    """Rows of its bad voxels in the map; of `unseen` flat indices of its cells; of `not_known`
+    none."""
+
+    @property
+    def is_known(self) -> bool:
+        """True if it has surfaces."""
+        return self.cause not in ("unseen", NOT_KNOWN)
 
 
 def bad_regions(state: MapState, diagnosis: Diagnosis, most: int = MOST) -> list[Region]:
@@ -128,3 +140,69 @@ def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST_UNSE
         found.append(Region(points[is_near].mean(axis=0), area, "unseen", 0.0, 1.0, flat[is_near]))
         left &= ~is_near
     return found
+
+
+def blank_points(
+    state: MapState, known: np.ndarray, camera: Camera, pose: np.ndarray, config: ScoringConfig
+) -> np.ndarray:
+    """Where the pixels of an image without a known surface look, [k, 3] [audit units].
+
+    Their depth is that of the nearest pixel with a known surface: a guess, good for a wall between
+    its edges. An image without any says nothing.
+
+    Args:
+        state: the map of all images.
+        known: rows that are known surfaces, [N].
+        camera: of the image.
+        pose: `T_world_camera`, [4, 4] [audit units].
+        config: range and size of the depth buffer.
+    """
+    row = np.asarray(term_images(state, camera, jnp.asarray(pose, jnp.float32), config).row)
+    is_known = (row < state.capacity) & known[np.where(row < state.capacity, row, 0)]
+    if not is_known.any():
+        return np.zeros((0, 3))
+    near = np.zeros((2, *row.shape), dtype=np.int32)
+    ndimage.distance_transform_edt(
+        ~is_known, return_distances=False, return_indices=True, indices=near
+    )
+    centers = np.asarray(state.center, np.float64).T
+    depth = (centers[row[near[0], near[1]]] - pose[:3, 3]) @ pose[:3, 2]
+    height, width = row.shape
+    x = ((np.arange(width) + 0.5) * (camera.width / width) - float(camera.cx)) / float(camera.fx)
+    y = ((np.arange(height) + 0.5) * (camera.height / height) - float(camera.cy)) / float(camera.fy)
+    rays = np.stack([*np.meshgrid(x, y), np.ones_like(depth)], axis=-1)
+    points = (depth[..., None] * rays) @ pose[:3, :3].T + pose[:3, 3]
+    return points[~is_known]
+
+
+def blank_regions(
+    state: MapState, points: Sequence[np.ndarray], most: int = MOST_UNSEEN
+) -> list[Region]:
+    """Places that images show and of which no surface is known, the largest first.
+
+    Args:
+        state: the map of all images; of it, the voxels' size.
+        points: `blank_points` of every image.
+        most: regions at most.
+    """
+    size = float(state.voxel_size)
+    voxels = [np.unique(np.floor(part / size).astype(np.int64), axis=0) for part in points]
+    if not sum(len(part) for part in voxels):
+        return []
+    found, count = np.unique(np.concatenate(voxels), axis=0, return_counts=True)
+    taken = np.floor(np.asarray(state.center).T[np.asarray(state.present)] / size).astype(np.int64)
+    blank = (found[count >= FEWEST_PICTURES] + 0.5) * size
+    if len(taken) and len(blank):  # beside a surface that is known it is known well enough
+        distance, _ = KDTree((taken + 0.5) * size).query(blank)
+        blank = blank[np.asarray(distance) > 1.5 * size]
+    left = np.ones(len(blank), dtype=bool)
+    regions: list[Region] = []
+    none = np.zeros(0, dtype=np.int64)
+    while len(regions) < most and left.any():
+        middle = _worst_block(blank[left], np.ones(int(left.sum())))
+        is_near = left & (np.abs(blank - middle).max(axis=1) <= 0.5 * BLOCK)
+        area = float(is_near.sum()) * size**2
+        if area >= _SMALLEST:
+            regions.append(Region(blank[is_near].mean(axis=0), area, NOT_KNOWN, 0.0, 1.0, none))
+        left &= ~is_near
+    return sorted(regions, key=lambda region: -region.area)

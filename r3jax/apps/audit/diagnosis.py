@@ -38,10 +38,11 @@ class ViewScore:
     """How well one view would render, and why not better."""
 
     renderability: float
-    """Mean over all pixels; a pixel without a voxel counts 0."""
+    """Mean over all pixels; a pixel without a voxel counts 0. Where surfaces may be not known, mean
+    over the pixels that show a known one; NaN where there is none."""
 
     coverage: float
-    """Share of the pixels that show a voxel."""
+    """Share of the pixels that show a known voxel."""
 
     bias: float
     """Mean over the pixels that show a voxel."""
@@ -53,18 +54,40 @@ class ViewScore:
     """Mean over the pixels that show a voxel."""
 
     cause: str
-    """What costs most: `unseen` (pixels without a voxel), `angle`, `noise` or `distance`."""
+    """What costs most: `unseen` (pixels without a voxel), `angle`, `noise` or `distance`;
+    `not_known` where no pixel shows a known surface."""
 
     shares: dict[str, float]
-    """Share of all pixels of each of `CAUSES`, and `unseen`; they sum to 1."""
+    """Share of all pixels of each of `CAUSES`, and `unseen` or `not_known`; they sum to 1."""
 
 
 CAUSE_OF_TERM = {"bias": "angle", "noise": "noise", "resolution": "distance"}
 """What a low factor means."""
 
 
+NOT_KNOWN = "not_known"
+"""Cause of pixels without a known surface, in captures without a depth camera."""
+
+FEWEST_PICTURES = 2
+"""A voxel that fewer pictures have measured is not known, where depth is inferred from pictures."""
+
+
+def known_rows(state: MapState, is_complete: bool) -> np.ndarray:
+    """Which rows of the map of all images are known surfaces, [N].
+
+    Args:
+        state: the map.
+        is_complete: True if a depth camera measured it: then all are.
+    """
+    return np.asarray(state.count) >= (1 if is_complete else FEWEST_PICTURES)
+
+
 def view_score(
-    state: MapState, camera: Camera, pose: np.ndarray, config: ScoringConfig
+    state: MapState,
+    camera: Camera,
+    pose: np.ndarray,
+    config: ScoringConfig,
+    known: np.ndarray | None = None,
 ) -> ViewScore:
     """Evaluates one view.
 
@@ -73,9 +96,14 @@ def view_score(
         camera: of the view; its focal length in the unit that the map was made with.
         pose: `T_world_camera`, [4, 4] [audit units].
         config: range and size of the depth buffer.
+        known: rows that are known surfaces, [N]: pixels without one are not known. None: all are,
+            and pixels without a voxel show what was never seen.
     """
     seen = term_images(state, camera, jnp.asarray(pose, dtype=jnp.float32), config)
-    value, is_hit = np.asarray(seen.value), np.asarray(seen.row) < state.capacity
+    row, value = np.asarray(seen.row), np.asarray(seen.value)
+    is_hit = row < state.capacity
+    if known is not None:
+        is_hit &= known[np.where(is_hit, row, 0)]
     coverage = float(is_hit.mean())
     images = {name: np.asarray(getattr(seen, name))[is_hit] for name in TERMS}
     mean = {name: float(x.mean()) if x.size else 0.0 for name, x in images.items()}
@@ -87,9 +115,15 @@ def view_score(
     }
     count = np.asarray(state.count)[np.asarray(seen.row)[is_hit]]
     pixels = np.bincount(cause_of(value[is_hit], costs, count), minlength=len(CAUSES))
-    cost["unseen"] = (1.0 - coverage) * -np.log(LEAST)
+    if known is None:
+        cost["unseen"] = (1.0 - coverage) * -np.log(LEAST)
+        mean_value = float(np.where(is_hit, value, 0.0).mean())
+    else:
+        if not is_hit.any():
+            cost = {NOT_KNOWN: 0.0}
+        mean_value = float(value[is_hit].mean()) if is_hit.any() else float("nan")
     return ViewScore(
-        renderability=float(value.mean()),
+        renderability=mean_value,
         coverage=coverage,
         bias=mean["bias"],
         noise=mean["noise"],
@@ -97,7 +131,7 @@ def view_score(
         cause=max(cost, key=lambda name: cost[name]),
         shares={
             **dict(zip(CAUSES, (pixels / is_hit.size).tolist(), strict=True)),
-            "unseen": 1.0 - coverage,
+            "unseen" if known is None else NOT_KNOWN: 1.0 - coverage,
         },
     )
 

@@ -12,7 +12,7 @@ from matplotlib.patheffects import withStroke
 
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import BLOCK, Region
-from r3jax.apps.audit.diagnosis import CAUSES, Diagnosis
+from r3jax.apps.audit.diagnosis import CAUSES, NOT_KNOWN, Diagnosis
 from r3jax.captures.alignment import Alignment
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture
@@ -24,6 +24,7 @@ COLOR_OF_CAUSE = {
     "distance": style.TOO_FAR,
     "noise": style.INCONSISTENT,
     "unseen": style.NEVER_SEEN,
+    NOT_KNOWN: "#9ca3af",
 }
 """Hexadecimal, by cause."""
 
@@ -188,9 +189,9 @@ def _draw_path(axes: Axes, audit: Audit, unit: float) -> None:
 
 def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
     """Bad regions as lettered circles in the color of their cause; unseen ones dotted."""
-    regions = (*audit.regions, *audit.unseen)
+    regions = audit.all_regions
     for region in regions:
-        is_unseen = region.cause == "unseen"
+        is_unseen = not region.is_known
         center, color = unit * region.center[:2], COLOR_OF_CAUSE[region.cause]
         radius = 0.5 * unit * BLOCK
         axes.add_patch(

@@ -16,7 +16,7 @@ import numpy as np
 
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import Region
-from r3jax.apps.audit.diagnosis import CAUSES, FEW, FINE, Diagnosis
+from r3jax.apps.audit.diagnosis import CAUSES, FEW, FINE, NOT_KNOWN, ViewScore
 from r3jax.apps.audit.ground_plan import cause_colors, score_colors
 from r3jax.captures.camera_paths import write_camera_path, write_path_transforms
 from r3jax.files import write_atomic
@@ -114,9 +114,8 @@ def _write_clouds(audit: Audit, values: Path, causes: Path) -> None:
 
 def record_of(audit: Audit) -> dict[str, Any]:
     """The content of audit.json."""
-    survey, found, plan = audit.survey, audit.diagnosis, audit.plan
+    survey, plan = audit.survey, audit.plan
     square = survey.length(1.0) ** 2
-    renderability = audit.renderability
     return {
         "format": FORMAT,
         "capture": audit.source.name,
@@ -141,20 +140,20 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "fine_from": FINE,
         "rare_below": FEW,
         "surfaces": {
-            **_surfaces(found, survey.voxel_size**2 * square),
+            **_surfaces(audit, survey.voxel_size**2 * square),
             "unseen_area": audit.unseen_area * square,
         },
-        "regions": [_region(audit, region) for region in (*audit.regions, *audit.unseen)],
+        "regions": [_region(audit, region) for region in audit.all_regions],
         "path": {
             "own": audit.is_own_path,
-            "mean": float(renderability.mean()),
+            "mean": audit.mean_renderability,
             "share": audit.shares,
             "frames": [
                 {
                     "index": frame.index,
                     "label": frame.label,
                     "fold": int(audit.seen.fold_of[i]) if audit.is_own_path else None,
-                    **dataclasses.asdict(frame.score),
+                    **_score(frame.score),
                 }
                 for i, frame in enumerate(audit.frames)
             ],
@@ -182,16 +181,30 @@ def record_of(audit: Audit) -> dict[str, Any]:
     }
 
 
-def _surfaces(found: Diagnosis, face: float) -> dict[str, Any]:
-    """Shares and areas by cause; `face` is the area of a voxel's face in the capture's units."""
+def _surfaces(audit: Audit, face: float) -> dict[str, Any]:
+    """Shares by cause, as on the page, and areas of what is known.
+
+    Args:
+        audit: what was found.
+        face: area of a voxel's face in the capture's units.
+    """
+    found = audit.diagnosis
     evaluated = int(found.is_seen.sum())
+    whole = {name: found.share(name) for name in CAUSES} | {NOT_KNOWN: 0.0}
     return {
         "voxels_judged": evaluated,
         "area_judged": evaluated * face,
         "mean": found.mean,
-        "share": {name: found.share(name) for name in CAUSES},
+        "share_of": "surfaces" if audit.source.is_complete else "pixels of the frames",
+        "share": whole if audit.source.is_complete else audit.shares,
         "area": {name: found.share(name) * evaluated * face for name in CAUSES},
     }
+
+
+def _score(score: ViewScore) -> dict[str, Any]:
+    """The numbers of a frame; null where nothing that it shows is known."""
+    known = None if np.isnan(score.renderability) else score.renderability
+    return {**dataclasses.asdict(score), "renderability": known}
 
 
 def _region(audit: Audit, region: Region) -> dict[str, Any]:
@@ -200,6 +213,6 @@ def _region(audit: Audit, region: Region) -> dict[str, Any]:
         "center": back(region.center[None])[0].tolist(),
         "area": region.area * audit.survey.length(1.0) ** 2,
         "cause": region.cause,
-        "renderability": region.renderability,
+        "renderability": region.renderability if region.is_known else None,
         "bad_share": region.bad_share,
     }

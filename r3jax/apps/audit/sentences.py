@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from r3jax.apps.audit.audit import SATURATED, Audit
-from r3jax.apps.audit.diagnosis import FEW, FINE
+from r3jax.apps.audit.diagnosis import FEW, FINE, NOT_KNOWN
 from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 from r3jax.captures.alignment import AXES
 
@@ -16,6 +16,7 @@ MEANING = {
     "distance": "only seen from farther away than one would look at it",
     "noise": "its color differs from picture to picture: reflections, exposure, poses that are off",
     "unseen": "free space ends there in something that no picture shows",
+    NOT_KNOWN: "no points here: plain, dark, glossy, or never seen from two sides",
 }
 """Remedy of every cause, for the table."""
 
@@ -26,15 +27,9 @@ REMEDY = {
     "distance": "go nearer",
     "noise": "lock exposure and white balance; avoid reflections; check the poses",
     "unseen": "look into it, if it belongs to the place",
+    NOT_KNOWN: "let pictures overlap more, from more sides; plain walls need depth images",
 }
 """What one can do."""
-
-NOT_KNOWN = (
-    "not known",
-    "no other picture has points there",
-    "let pictures overlap more; plain walls need depth images",
-)
-"""Name, meaning and remedy of what no voxel shows, where there are no depth images."""
 
 _SHORT = {
     "angle": "only from other angles",
@@ -97,10 +92,6 @@ def verdict(audit: Audit) -> list[str]:
     """What the audit comes to, a sentence each."""
     sentences = [_surfaces(audit)]
     first = int(audit.survey.is_one_place)  # nothing goes before that
-    if not audit.source.is_dense:
-        sentences.append(
-            "Without depth images only surfaces with points are judged; plain walls may have none."
-        )
     if (audit.survey.up.within or 0.0) > _DOUBTFUL:
         sentences.insert(first, vertical(audit))
     sentences[first:first] = [*unread(audit), *without_depth(audit)]
@@ -134,11 +125,12 @@ def _surfaces(audit: Audit) -> str:
     ordered = sorted(shares, key=lambda cause: -shares[cause])
     parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
-    if audit.source.is_dense:
+    if audit.source.is_complete:
         start = f"{fine} of the visible surface"
     else:
         start = f"{fine} of what the {'pictures' if audit.is_own_path else 'frames'} show"
-        parts.append(f"{_unknown(audit)} is not known: no other picture has points there")
+        unknown = f"{100 * audit.shares[NOT_KNOWN]:.0f} %"
+        parts.append(f"{unknown} is not known ({MEANING[NOT_KNOWN]})")
     well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
     return f"{start} would render well ({well})" + (f"; {listed(parts)}." if parts else ".")
 
@@ -147,18 +139,17 @@ def _promises(audit: Audit) -> list[str]:
     """How the frames would render, and what further views would add."""
     found, plan = audit.diagnosis, audit.plan
     sentences: list[str] = []
-    mean = float(audit.renderability.mean())
-    worst = min(audit.frames, key=lambda frame: frame.score.renderability)
+    mean = audit.mean_renderability
+    worst = audit.frames[int(np.nanargmin(np.r_[audit.renderability, np.inf])) % len(audit.frames)]
     what = (
         "From the other pictures alone, a picture" if audit.is_own_path else "A frame of the path"
     )
-    known = mean / max(float(np.mean([frame.score.coverage for frame in audit.frames])), 1e-9)
-    beside = "" if audit.source.is_dense else f" ({known:.2f} where it is known, else 0)"
+    beside = "" if audit.source.is_complete else ", where it is known"
     if audit.is_saturated:
         sentences.append(f"{what} renders with R {mean:.2f} on average. {saturation()}")
     else:
         sentences.append(
-            f"{what} renders with R {mean:.2f} on average{beside}, the worst "
+            f"{what} renders with R {mean:.2f} on average{beside}; the worst "
             f"({worst.label}) {worst.score.renderability:.2f}."
         )
     if plan.views:
@@ -170,7 +161,7 @@ def _promises(audit: Audit) -> list[str]:
         )
         sentences.append(
             f"{views} would raise the mean over all surfaces"
-            f"{'' if audit.source.is_dense else ' with points'} from {found.mean:.2f} to "
+            f"{'' if audit.source.is_complete else ' that are known'} from {found.mean:.2f} to "
             f"{plan.after.mean:.2f}, as far as it can be predicted; {drawn} "
             f"{plan.random_mean[-1]:.2f}."
         )
@@ -209,7 +200,7 @@ def without_depth(audit: Audit) -> list[str]:
     count = len(audit.faults.without_depth)
     if not count:
         return []
-    what = "have no depth" if audit.source.is_dense else "show no point"
+    what = "have no depth" if audit.source.is_complete else "show no point"
     return [
         f"{count} of the {audit.faults.looked_at} pictures {what}: they are left out, and what "
         "they show is not known."
@@ -219,15 +210,10 @@ def without_depth(audit: Audit) -> list[str]:
 def cause_share(audit: Audit, cause: str) -> float:
     """Share of what is evaluated that has this cause, or `fine`.
 
-    With depth images: of the surface visible from where people could stand. Without: of what the
+    With a depth camera: of the surface visible from where people could stand. Without: of what the
     frames show, as points exist only where pictures saw them.
     """
-    return audit.diagnosis.share(cause) if audit.source.is_dense else audit.shares[cause]
-
-
-def _unknown(audit: Audit) -> str:
-    """Share of what the frames show of which nothing is known."""
-    return f"{100 * audit.shares['unseen']:.0f} %"
+    return audit.diagnosis.share(cause) if audit.source.is_complete else audit.shares[cause]
 
 
 def saturation() -> str:
@@ -300,24 +286,29 @@ def method(audit: Audit) -> list[str]:
         "Areas count a face of a voxel each; where depth is noisy, walls are several voxels thick, "
         "and areas too large by that.",
     ]
+    pixels = (
+        "; one that shows no voxel counts 0"
+        if source.is_complete
+        else " that show a known surface: a voxel that two pictures or more have measured"
+    )
     if audit.is_own_path:
         count = len(audit.seen.folds)
         sentences.append(
             f"Frames: the capture's own, each scored by a map without every {_ordinal(count)} "
             "picture, itself among them: what a model trained without these would have to invent. "
-            "R of a frame is the mean over its pixels; one that shows no voxel counts 0."
+            f"R of a frame is the mean over its pixels{pixels}."
         )
     else:
         sentences.append(
             "Frames: the path's, scored by the map of all pictures. R of a frame is the mean over "
-            "its pixels; one that shows no voxel counts 0."
+            f"its pixels{pixels}."
         )
     where = (
         f"in space known to be free, {length(audit, 0.3)} from everything else, connected to where "
         "the camera was and at its heights"
         if source.is_dense
         else f"within the hull of the camera's positions and {length(audit, 0.3)} round it, "
-        f"{length(audit, 0.3)} from every voxel"
+        f"{length(audit, 0.3)} from every voxel, where a camera was or a ray to a point passed"
     )
     sentences.append(
         f"Views: of {len(audit.places)} places {where}, {DIRECTIONS} directions each, those of "

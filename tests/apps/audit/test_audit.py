@@ -9,7 +9,14 @@ import pytest
 
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.audit_page import picture_faults
-from r3jax.apps.audit.diagnosis import CAUSES, FINE, cause_of
+from r3jax.apps.audit.diagnosis import (
+    CAUSES,
+    FINE,
+    NOT_KNOWN,
+    cause_of,
+    known_rows,
+    view_score,
+)
 from r3jax.apps.audit.ground_plan import _value_picture
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
 from r3jax.apps.audit.sentences import (
@@ -271,25 +278,60 @@ def test_tracks_of_a_model_are_as_good_as_a_cloud(folder, cloud):
 def test_without_depth_images_what_no_point_shows_is_not_known(cloud, corner):
     """One measure for the headline and the frames: nothing is fine that no pixel shows."""
     shares = cloud.shares
-    assert shares.keys() == {*CAUSES, "unseen"}
-    assert sum(shares.values()) == pytest.approx(1.0)
-    assert shares["unseen"] == pytest.approx(
-        1.0 - np.mean([frame.score.coverage for frame in cloud.frames])
-    )
-    assert cloud.renderability.mean() <= 1.0 - shares["unseen"]
-    assert shares["fine"] * FINE <= cloud.renderability.mean()
+    assert shares.keys() == {*CAUSES, NOT_KNOWN}
+    assert 0.0 < shares[NOT_KNOWN] < 1.0
     said = " ".join(verdict(cloud))
     assert re.search(rf"\b{100 * shares['fine']:.0f}\s% of what the pictures show", said)
-    assert re.search(rf"\b{100 * shares['unseen']:.0f}\s% is not known", said)
+    assert re.search(rf"\b{100 * shares[NOT_KNOWN]:.0f}\s% is not known", said)
     assert "not known" not in " ".join(verdict(corner))
-    assert record_of(cloud)["path"]["share"] == shares
+
+
+@pytest.mark.parametrize("name", ["corner", "cloud"])
+def test_no_two_numbers_of_an_audit_contradict_each_other(name, request):
+    """Shares sum to 1 everywhere; the mean over frames is that of their pixels."""
+    found: Audit = request.getfixturevalue(name)
+    record = record_of(found)
+    path, surfaces = record["path"], record["surfaces"]
+    scores = path["frames"]
+    for share in (path["share"], surfaces["share"], *(score["shares"] for score in scores)):
+        assert sum(share.values()) == pytest.approx(1.0)
+        assert min(share.values()) >= 0.0
+    for cause in path["share"]:
+        mean = np.mean([score["shares"][cause] for score in scores])
+        assert path["share"][cause] == pytest.approx(mean)
+    covered = np.array([score["coverage"] for score in scores])
+    of_pixels = [score["renderability"] for score in scores]
+    if found.source.is_complete:
+        assert NOT_KNOWN not in path["share"]
+        assert path["mean"] == pytest.approx(np.mean(of_pixels))
+        return
+    assert surfaces["share"] == path["share"]
+    np.testing.assert_allclose([s["shares"][NOT_KNOWN] for s in scores], 1.0 - covered, atol=1e-6)
+    assert path["mean"] == pytest.approx(np.average(of_pixels, weights=covered))
+    # What is fine has R of FINE or more, and the rest has less: the mean lies between.
+    fine = path["share"]["fine"] / (1.0 - path["share"][NOT_KNOWN])
+    assert fine * FINE <= path["mean"] <= fine + (1.0 - fine) * FINE
+
+
+def test_a_frame_of_which_nothing_is_known_has_no_number(cloud):
+    away = np.eye(4)
+    away[:3, 3] = 100.0
+    known = known_rows(cloud.seen.state, is_complete=False)
+    score = view_score(cloud.seen.state, cloud.camera, away, cloud.config, known)
+    assert (score.cause, score.coverage) == (NOT_KNOWN, 0.0)
+    assert np.isnan(score.renderability)
+    blank = replace(cloud.frames[0], score=score)
+    found = replace(cloud, frames=(blank, *cloud.frames[1:]))
+    assert record_of(found)["path"]["frames"][0]["renderability"] is None
+    assert "nan" not in " ".join(verdict(found))
+    json.dumps(record_of(found), allow_nan=False)
 
 
 def test_pictures_without_a_point_are_not_known_either(cloud):
     blank = replace(cloud.faults, without_depth=(3, 5, 7, 9))
     fewer = replace(cloud, faults=blank)
-    known = 1.0 - cloud.shares["unseen"]
-    assert 1.0 - fewer.shares["unseen"] == pytest.approx(known * 16 / 20)
+    known = 1.0 - cloud.shares[NOT_KNOWN]
+    assert 1.0 - fewer.shares[NOT_KNOWN] == pytest.approx(known * 16 / 20)
     assert sum(fewer.shares.values()) == pytest.approx(1.0)
 
 
@@ -341,7 +383,7 @@ def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
         assert np.median(off) < 0.6 * cloud.survey.length(cloud.survey.voxel_size)
     record = record_of(cloud)
     assert len(record["path"]["frames"]) == 16
-    assert record["surfaces"]["share"].keys() == set(CAUSES)
+    assert record["surfaces"]["share"].keys() == {*CAUSES, NOT_KNOWN}
     assert record["up"] == [0.0, 0.0, 1.0]
 
 
