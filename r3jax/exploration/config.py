@@ -64,9 +64,15 @@ class Budget:
         return f"{self.unit}:{short if float(short) == self.amount else repr(self.amount)}"
 
     @property
-    def shown(self) -> str:
-        """As a user writes it."""
-        return format_budget(str(self))
+    def words(self) -> str:
+        """As a sentence has it: `16 views`."""
+        return budget_words(str(self))
+
+
+def budget_words(text: str) -> str:
+    """Spells a budget as a sentence has it: `views:16` as `16 views`."""
+    unit, _, amount = format_budget(text).partition(":")
+    return f"{amount} {unit}".strip()
 
 
 def format_budget(text: str) -> str:

@@ -237,9 +237,7 @@ def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float)
         seconds=state.seconds + seconds,
         metres=state.metres + metres,
     ):
-        return Stop(
-            StopReason.BUDGET, f"{spent}: the next view would exceed {mission.budget.shown}"
-        )
+        return Stop(StopReason.BUDGET, f"{spent}: the budget of {mission.budget.words} is used up")
     # A policy that only turns spends no meters: such a budget alone would never end the run.
     if state.still_views >= mission.config.max_still_views:
         return Stop(

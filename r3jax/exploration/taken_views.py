@@ -131,6 +131,11 @@ def unit_of(rows: Iterable[StepRow]) -> str:
     return "frames" if any(row.captured for row in rows) else "views"
 
 
+def name_of(row: StepRow, rows: Iterable[StepRow]) -> str:
+    """Names a row by its number: `view 3`, or `frame 12` in runs with frames between views."""
+    return f"{unit_of(rows)[:-1]} {row.step + 1}"
+
+
 @dataclass(frozen=True)
 class TakenView:
     """A view that was taken: what to record beside the state."""

@@ -72,7 +72,7 @@ def test_the_model_clock_makes_a_run_repeatable(room, run_folder, tmp_path):
 def test_info_tells_what_a_run_did(run_folder, capsys):
     assert main(["info", str(run_folder)]) == 0
     text = capsys.readouterr().out
-    assert "budget: 3 views" in text
+    assert "budget of 3 views" in text
     assert "planning" in text
     assert "report.html" in text.replace("\n", "")
 

@@ -16,8 +16,8 @@ def test_the_text_of_a_budget_reads_back(unit, amount):
 def test_meters_are_spelled_as_here_or_as_in_files():
     assert parse_budget("meters:25") == parse_budget("metres:25")
     assert str(parse_budget("meters:25")) == "metres:25"
-    assert parse_budget("metres:25").shown == "meters:25"
-    assert parse_budget("frames:25").shown == "frames:25"
+    assert parse_budget("metres:25").words == "25 meters"
+    assert parse_budget("frames:25").words == "25 frames"
 
 
 NONSENSE = """

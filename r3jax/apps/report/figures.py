@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from r3jax.apps.forecast.forecast import Outlook
 from r3jax.apps.report.summary import map_row_bytes, stage_times
-from r3jax.exploration.taken_views import StepRow, unit_of
+from r3jax.exploration.taken_views import StepRow, name_of, unit_of
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.plots import style
@@ -147,7 +147,7 @@ def cost_figure(run: Run) -> Figure:
     figure = style.new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=[1.4, 1.0])
     table = stage_times(run)
-    style.dress(left, "Step times: median, and 95th percentile as a line", "milliseconds")
+    style.dress(left, "Step times: median, and 95th percentile as a line", "time [ms]")
     names = [stage.name for stage in table]
     median = np.array([1e3 * stage.median for stage in table])
     p95 = np.array([1e3 * stage.p95 for stage in table])
@@ -159,7 +159,7 @@ def cost_figure(run: Run) -> Figure:
     left.invert_yaxis()
     left.tick_params(axis="y", labelcolor=style.INK)
     left.grid(visible=False, axis="y")
-    style.dress(right, "Memory of the map", "views", "MB")
+    style.dress(right, "Memory of the map", unit_of(run.rows), "memory [MB]")
     views = np.arange(1, len(run.rows) + 1)
     used = np.array([row.coverage.voxels * map_row_bytes(run) for row in run.rows]) / 1e6
     allocated = np.array([row.coverage.map_bytes for row in run.rows]) / 1e6
@@ -167,7 +167,9 @@ def cost_figure(run: Run) -> Figure:
     right.plot(views, used, color=style.ACCENT, linewidth=2.0, label="rows in use")
     right.step(views, allocated, color=style.SECOND, where="post", label="allocated")
     right.set_ylim(0.0, 1.15 * allocated.max())
-    right.legend(fontsize=8, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    # Below the axes: inside it covers a curve, above them the title.
+    handles = right.get_legend_handles_labels()
+    figure.legend(*handles, fontsize=8, frameon=False, ncols=2, loc="outside lower right")
     return figure
 
 
@@ -184,7 +186,7 @@ def strip_figure(run: Run, count: int = 12) -> Figure:
         image = Image.fromarray(run.images(int(step))[0])
         image.thumbnail((256, 256))
         axes.imshow(np.asarray(image))
-        style.caption(axes, f"view {step + 1}")
+        style.caption(axes, name_of(run.rows[int(step)], run.rows))
     return figure
 
 
@@ -261,11 +263,13 @@ def shares_of(utility: np.ndarray) -> np.ndarray:
 def reasons_figure(utility: np.ndarray) -> Figure:
     """The utility of each chosen view by cause: shares, and below how much on a logarithmic axis.
 
-    Where much is unexplored, that hides the other causes in the shares.
+    Where much is unexplored, that hides the other causes in the shares. Only chosen views count:
+    the start and the frames captured while moving are left out.
 
     Args:
         utility: by view and cause, [views, 4]; NaN for views that no policy chose.
     """
+    utility = utility[~np.isnan(utility).any(axis=1)]
     figure = style.new_figure(10.0, 5.2)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.6, 1.0])
     views = np.arange(1, len(utility) + 1)
@@ -282,7 +286,7 @@ def reasons_figure(utility: np.ndarray) -> Figure:
         *upper.get_legend_handles_labels(), fontsize=9, frameon=False, ncols=4,
         loc="outside lower center",
     )  # fmt: skip
-    style.dress(lower, "What it promised", "views", "part of its utility U")
+    style.dress(lower, "What it promised", "chosen views, in order", "part of its utility U")
     lower.set_yscale("log")
     for color, amount in zip(
         style.CAUSE_COLORS, np.where(utility > 0.0, utility, np.nan).T, strict=True

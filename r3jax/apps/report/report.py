@@ -21,7 +21,7 @@ from r3jax.apps.report.model_report import (
     read_evaluated_model,
     training_figure,
 )
-from r3jax.apps.report.summary import count_of_views, stage_times, summary
+from r3jax.apps.report.summary import outcome, stage_times, summary
 from r3jax.files import make_folder, own_folder, write_atomic
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
@@ -31,6 +31,39 @@ from r3jax.plots.pictures import panorama_figure, panorama_picture
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run
 from r3jax.runs.replay import states_of
+
+HINTS = {
+    "PSNR of test views": "Peak signal-to-noise ratio of renders against images that were not "
+    "trained on; higher is better, 25 dB is good for a place.",
+    "mean renderability": "How well images from fixed probe views in the free space could be "
+    "rendered from the frames so far: 0 not at all, 1 perfectly.",
+    "explored": "Cells of the scene's box that are known to be free or occupied. The insides of "
+    "walls cannot be seen, so 100 % is out of reach.",
+    "views": "Views that the policy chose, the start included.",
+    "views + frames while moving": "Views that the policy chose, the start included, and frames "
+    "captured on the paths between them.",
+    "path": "Length of the path of the camera.",
+    "mission clock": "Time of a real mission: planning, mapping and moving count; the simulator "
+    "and the disk do not.",
+    "PSNR": "Peak signal-to-noise ratio [dB]: higher is better.",
+    "SSIM": "Structural similarity, at most 1: higher is better.",
+    "LPIPS": "Learned perceptual distance from 0: lower is better.",
+    "mean": "Mean over the test views.",
+    "95 % interval": "Bootstrap interval of the mean over the test views.",
+    "median": "Half of the test views are better.",
+    "5th percentile": "5 % of the test views are worse (of LPIPS: the 95th percentile).",
+    "worst": "The worst test view, and its number.",
+    "< 20 dB": "Share of test views with a PSNR under 20 dB: visibly broken.",
+    "p50": "Median over the steps of the run.",
+    "p95": "95 % of the steps took less.",
+    "total": "Sum over the run.",
+    "budget": "At which the run ends.",
+    "seed": "Determines all random numbers of the run.",
+    "mission": "Time on the mission clock, see above.",
+    "map": "Voxels with at least one measurement, and the memory of their table.",
+    "dropped observations": "Measurements that did not fit into the map; 0 is as it should be.",
+}
+"""Tooltips of the numbers on the page."""
 
 T = TypeVar("T")
 
@@ -83,13 +116,14 @@ def write_report(
         on_progress("", 1)
         shown[name] = figure if isinstance(figure, str) else _saved(folder / f"{name}.png", figure)
     model = read_evaluated_model(run)
-    path = folder / "report.html"
+    path, ended = folder / "report.html", outcome(run)
     page = render(
         "apps/report/report.html",
         kind="run",
         title=f"{run.header.policy.get('name')} in {run.header.scene.get('name')}",
-        lead=[f"{run.outcome}."],
+        lead=[f"{ended[:1].upper()}{ended[1:]}."],
         cards=_cards(run, model),
+        hints=HINTS,
         model=None if model is None else _model(folder, model),
         drawn=shown,
         outlook=outlook_lines(outlook),
@@ -141,15 +175,20 @@ def _model(folder: Path, model: EvaluatedModel) -> dict[str, Any]:
 
 
 def _cards(run: Run, model: EvaluatedModel | None) -> dict[str, str]:
-    """At most six large numbers, so that they fit one row: what came out of the run first."""
-    last = run.rows[-1]
+    """A few large numbers: what came out of the run first."""
+    last, captured = run.rows[-1], sum(row.captured for row in run.rows)
+    views = str(len(run.rows) - captured)
     cards: dict[str, str] = {}
     if model is not None:
         cards["PSNR of test views"] = f"{model.evaluation['metrics']['psnr']['mean']:.1f} dB"
     return cards | {
         "mean renderability": f"{last.coverage.mean_renderability:.2f}",
         "explored": f"{100 * last.coverage.known_share:.0f} %",
-        "views": count_of_views(run),
+        **(
+            {"views + frames while moving": f"{views} + {captured}"}
+            if captured
+            else {"views": views}
+        ),
         "path": f"{last.metres:.1f} m",
         "mission clock": f"{last.seconds:.1f} s",
     }

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.exploration.config import format_budget
+from r3jax.exploration.config import budget_words, format_budget
+from r3jax.exploration.state import StopReason
 from r3jax.runs.reader import Run
 
 STAGES = {
@@ -76,6 +77,14 @@ def count_of_views(run: Run) -> str:
     return f"{views} + {captured} while moving" if captured else views
 
 
+def outcome(run: Run) -> str:
+    """Tells how a run ended; of a budget that is used up, what it was and what was done with it."""
+    if run.end is None or run.end.outcome != StopReason.BUDGET.value:
+        return run.outcome
+    spent = run.end.message.partition(": ")[0]
+    return f"the budget of {budget_words(run.header.budget)} is used up: {spent}"
+
+
 def summary(run: Run) -> dict[str, str]:
     """What happened, as short texts under short names."""
     header = run.header
@@ -84,7 +93,7 @@ def summary(run: Run) -> dict[str, str]:
         "policy": str(header.policy.get("name", "?")),
         "budget": format_budget(header.budget),
         "seed": str(header.seed),
-        "outcome": run.outcome,
+        "outcome": outcome(run),
         "views": count_of_views(run),
     }
     if not run.rows:

@@ -159,7 +159,9 @@ def note_html(text: str) -> str:
     return _part("note", text=text)
 
 
-def view_html(row: StepRow, num_views: int, image: np.ndarray, reason: Reason | str) -> str:
+def view_html(
+    row: StepRow, num_views: int, image: np.ndarray, reason: Reason | str, unit: str = "view"
+) -> str:
     """The photo of a view, what the trace says of it, and why it was chosen.
 
     Args:
@@ -167,9 +169,11 @@ def view_html(row: StepRow, num_views: int, image: np.ndarray, reason: Reason | 
         num_views: of the run so far.
         image: the photo, [H, W, 3] uint8.
         reason: what the view promised, or why that is not known.
+        unit: `view`, or `frame` in runs with frames between views.
     """
     return _part(
         "view",
+        unit=unit,
         view_number=row.step + 1,
         num_views=num_views,
         photo=_picture(image),

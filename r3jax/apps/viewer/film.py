@@ -31,6 +31,7 @@ from r3jax.apps.viewer.color_maps import SCORES, UNSEEN, css_color
 from r3jax.apps.viewer.facts import facts_of_view
 from r3jax.apps.viewer.overlays import frustum_segments, path_segments
 from r3jax.apps.viewer.story import Timeline
+from r3jax.exploration.taken_views import unit_of
 from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic
 from r3jax.formats.errors import FormatError
 from r3jax.plots import style
@@ -173,7 +174,8 @@ class Film:
         run = self.run
         photo = style.blank(figure.add_axes((_RIGHT, 0.56, _SIDE, 0.40)))
         photo.imshow(run.images(step)[0])
-        facts = {"view": f"{step + 1} of {len(run.rows)}", **facts_of_view(run.rows[step])}
+        number = f"{step + 1} of {len(run.rows)}"
+        facts = {unit_of(run.rows)[:-1]: number, **facts_of_view(run.rows[step])}
         for line, (name, value) in enumerate(facts.items()):
             y = 0.52 - 0.031 * line
             figure.text(_RIGHT, y, name, fontsize=10, color=style.MUTED)

