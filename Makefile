@@ -64,6 +64,7 @@ lint: setup
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 	$(BIN)/codespell r3jax tests experiments examples docs README.md CONTRIBUTING.md
+	$(BIN)/python docs/hooks/words.py
 
 # The pages, into build/site; a reference that leads nowhere fails.
 docs: setup

@@ -130,7 +130,7 @@ _SAMPLES_PER_CELL = 4
 """Samples of a ray in a cell's edge."""
 
 _LEAST_SAMPLES = 2
-"""A cell is passed by an image whose rays have so many samples in it: half of its edge."""
+"""A cell is passed by an image whose rays have this number of samples in it: half of its edge."""
 
 
 def integrate_rays(grid: OccupancyGrid, eye: np.ndarray, points: np.ndarray) -> OccupancyGrid:

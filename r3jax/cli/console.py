@@ -104,7 +104,7 @@ _STAGES = {
     "forecast": "forecasting the quality",
     "plan": "planning",
     "plan ahead": "planning the view after",
-    "gaze": "finding where to look on the way",
+    "gaze": "choosing directions while moving",
     "render": "rendering",
     "map": "mapping",
     "measure": "measuring coverage",
@@ -138,7 +138,7 @@ class RunProgress(Bar):
         Args:
             console: where to.
             budget: of the run.
-            captured: frames on the way that were recorded before the run goes on.
+            captured: frames captured while moving that were recorded before the run goes on.
         """
         self._console = console
         self._budget = budget
@@ -204,7 +204,7 @@ class Stages(Bar):
         self._task = self._bar.add_task("", total=None, count="")
 
     def on_progress(self, stage: str, steps: int) -> None:
-        """A stage of so many steps begins (0: nobody knows), or some are done (no name)."""
+        """Begins a stage of `steps` (0: not known), or counts steps as done (no name)."""
         check_interrupt()
         if not stage:
             task = self._bar.tasks[0]
@@ -216,7 +216,7 @@ class Stages(Bar):
             self._console.say(stage)
 
     def at(self, stage: str, done: int, total: int) -> None:
-        """So many steps of a stage are done; it begins if it has not."""
+        """Counts steps of a stage as done; the stage begins if it has not."""
         check_interrupt()
         if stage != self._stage:
             self.on_progress(stage, total)

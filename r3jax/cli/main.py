@@ -20,7 +20,7 @@ USER_ERROR = 2
 """Exit code of wrong input: an unknown name, a folder that exists, a broken file."""
 
 NO_READER = 141
-"""Exit code where whoever read the output has gone (`r3jax info | head`), as shells have it."""
+"""Exit code where the reader of the output has gone (`r3jax info | head`), as shells have it."""
 
 
 BUG = 1
@@ -43,7 +43,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0 done, 1 stopped by the disk, a cell failed, a replay differed, or a bug,
-        2 wrong input, 130 interrupted, 141 nobody reads the output any more.
+        2 wrong input, 130 interrupted, 141 the reader of the output is gone.
     """
     with caught_interrupts(stays=args is None):
         code = _main(args)

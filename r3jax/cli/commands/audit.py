@@ -1,4 +1,4 @@
-"""`r3jax audit`: what a capture lacks, how its frames would render, which views would help."""
+"""`r3jax audit`: where a capture fails, how its frames would render, which views would help."""
 
 import dataclasses
 import tempfile

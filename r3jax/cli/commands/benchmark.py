@@ -219,7 +219,7 @@ def beside(
             for record in records
             if all(record[name] == other[name] for name in ("scene", "snapshot", "budget"))
         ]
-        # Others would be in a table of their own, which nobody asked for.
+        # Others would be in a table of their own, which was not requested.
         if other not in chosen and any(on_equal_terms(record, other) for record in alike):
             chosen.append(other)
     return chosen

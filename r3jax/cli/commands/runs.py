@@ -40,7 +40,7 @@ from r3jax.runs.settings import config_of
 
 
 def run_info(options: InfoOptions) -> int:
-    """Prints what is asked for.
+    """Prints a run, a recording, or what is installed.
 
     Raises:
         InputError, ValueError, OSError: neither a run nor a recording, or a broken one.

@@ -35,7 +35,7 @@ class GuideOptions:
     """Port of the page that --live shows; 0 takes any free one."""
 
     host: str = "127.0.0.1"
-    """Address that --live listens at. By default nobody but this machine can see the page; 0.0.0.0
+    """Address that --live listens at. By default only this machine can see the page; 0.0.0.0
     shows it to everybody who can reach the machine, such as a phone."""
 
     def __post_init__(self) -> None:
@@ -48,7 +48,7 @@ class GuideOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class AuditOptions:
-    """Audit a capture: what it lacks for splats, how frames would render, which views to add.
+    """Audit a capture: where splats of it would fail, how frames would render, which views to add.
 
     For example
         r3jax audit scans/kitchen

@@ -158,11 +158,11 @@ class ViewOptions:
     """Port of the page; 0 takes any free one."""
 
     host: str = "127.0.0.1"
-    """Address to listen at. By default nobody but this machine can see the page; 0.0.0.0 shows it
+    """Address to listen at. By default only this machine can see the page; 0.0.0.0 shows it
     to everybody who can reach the machine."""
 
     allow: Annotated[tuple[str, ...], arg(metavar="NAME")] = ()
-    """Names under which the page may be asked for, and whose web pages may use it, beside this
+    """Host names under which the page may be requested, and whose web pages may use it, beside this
     machine's own: of a proxy, or of a name server's."""
 
     name: Annotated[str | None, arg(metavar="MODEL")] = None
