@@ -14,7 +14,7 @@ import numpy as np
 
 
 def receive():
-    """The next message: its header and its arrays by name; None at the end."""
+    """Returns the next message: its header and its arrays by name; None at the end."""
     prefix = sys.stdin.buffer.read(8)
     if len(prefix) < 8:
         return None

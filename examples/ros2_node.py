@@ -121,7 +121,7 @@ class NextViewNode(Node):
             self.decide()
 
     def key_frame(self, color, depth) -> KeyFrame | None:
-        """A key frame; None where the camera or its pose is not known."""
+        """Returns a key frame; None where the camera or its pose is not known."""
         if self.info is None:
             return None
         try:
@@ -136,12 +136,12 @@ class NextViewNode(Node):
         return KeyFrame(stamp_of(color), rgb, z, T)
 
     def look_up(self, parent: str, child: str, time) -> np.ndarray:
-        """`T_parent_child` [4, 4] of tf."""
+        """Returns `T_parent_child` [4, 4] of tf."""
         move = self.tf.lookup_transform(parent, child, time).transform
         return matrix_of(move.translation, move.rotation)
 
     def to_frame(self, key_frame: KeyFrame) -> r3jax.Frame:
-        """The frame of every `stride`-th pixel."""
+        """Returns the frame of every `stride`-th pixel."""
         fx, fy, cx, cy = lens_of(self.info).intrinsics
         height, width = key_frame.depth.shape
         center = [(c - 0.5) / self.stride + 0.5 for c in (cx, cy)]
@@ -176,7 +176,7 @@ class NextViewNode(Node):
         self.planner = r3jax.start(camera, self.bounds, policy, starts=starts, config=config)
 
     def is_due(self) -> bool:
-        """True without a goal, at the goal, and where the robot does not get there."""
+        """Returns True without a goal, at the goal, and where the robot does not get there."""
         if self.goal is None:
             return True
         here = self.frames[-1]
@@ -227,13 +227,13 @@ class NextViewNode(Node):
 
 
 def has_moved(before: np.ndarray, now: np.ndarray) -> bool:
-    """True from 5 cm or 5 degrees on: a robot that stands still adds nothing but memory."""
+    """Returns True from 5 cm or 5 degrees on: a robot that stands still adds nothing but memory."""
     turned = np.degrees(Rotation.from_matrix(before[:3, :3].T @ now[:3, :3]).magnitude())
     return bool(np.linalg.norm(now[:3, 3] - before[:3, 3]) > 0.05 or turned > 5.0)
 
 
 def matrix_of(position, turn) -> np.ndarray:
-    """The matrix [4, 4] of a message's position and quaternion."""
+    """Returns the matrix [4, 4] of a message's position and quaternion."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     T[:3, 3] = position.x, position.y, position.z
@@ -241,7 +241,7 @@ def matrix_of(position, turn) -> np.ndarray:
 
 
 def pose_of(T: np.ndarray) -> Pose:
-    """The message of a matrix [4, 4]."""
+    """Returns the message of a matrix [4, 4]."""
     pose = Pose()
     pose.position.x, pose.position.y, pose.position.z = T[:3, 3].tolist()
     turn = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
@@ -250,7 +250,7 @@ def pose_of(T: np.ndarray) -> Pose:
 
 
 def upright(T_world_base: np.ndarray) -> np.ndarray:
-    """The pose of a robot that stands on the floor: its x axis ahead, z up."""
+    """Returns the pose of a robot that stands on the floor: its x axis ahead, z up."""
     T = np.eye(4)
     yaw = np.arctan2(T_world_base[1, 0], T_world_base[0, 0])
     T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -259,7 +259,7 @@ def upright(T_world_base: np.ndarray) -> np.ndarray:
 
 
 def track_of(path) -> TransformTree:
-    """Where the robot was at each stamp of a path."""
+    """Returns where the robot was at each stamp of a path."""
     tree = TransformTree()
     for stamped in path.poses:
         T = matrix_of(stamped.pose.position, stamped.pose.orientation)
@@ -284,7 +284,7 @@ def corrected(
 
 
 def cloud_of(header: Header, points: np.ndarray, colors: np.ndarray) -> PointCloud2:
-    """Points [n, 3] with colors [n, 3] uint8, packed into `rgb` as RViz shows them."""
+    """Returns points [n, 3] with colors [n, 3] uint8, packed into `rgb` as RViz shows them."""
     packed = np.zeros(len(points), [("xyz", "<f4", 3), ("bgr", "u1", 3), ("pad", "u1")])
     packed["xyz"], packed["bgr"] = points, colors[:, ::-1]
     fields = [PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1) for
@@ -296,7 +296,7 @@ def cloud_of(header: Header, points: np.ndarray, colors: np.ndarray) -> PointClo
 
 
 def markers_of(header: Header, decision: r3jax.Decision) -> MarkerArray:
-    """The path to the goal, and all candidates: the greener, the better."""
+    """Returns the path to the goal, and all candidates: the greener, the better."""
     to_point = lambda xyz: Point(x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
     line = Marker(header=header, ns="path", type=Marker.LINE_STRIP, action=Marker.ADD)
     line.points = [to_point(xyz) for xyz in decision.waypoints]

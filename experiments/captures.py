@@ -265,7 +265,7 @@ def rows_of(options: Options) -> dict[str, Row]:
 
 
 def cells_of(options: Options, row: Row, root: Path) -> list[Cell]:
-    """A row's cells: every scene and seed."""
+    """Returns a row's cells: every scene and seed."""
     request = request_of(replace(options, policies=(row.policy,)), options.budget)
     conditions = replace(
         request.conditions, clock=options.clock, loop=dict(row.loop), **row.training
@@ -308,7 +308,7 @@ def records_of(root: Path, cells: Sequence[Cell]) -> list[dict[str, Any]]:
 
 
 def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> dict[str, Any]:
-    """A record under its row's name; what rows differ in on purpose is no unequal term."""
+    """Returns a record under its row's name; what rows differ in on purpose is no unequal term."""
     compared = {name for row in rows.values() for name in (*row.loop, *row.training)}
     parts = {
         part: {name: value for name, value in record[part].items() if name not in compared}

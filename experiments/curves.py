@@ -87,7 +87,7 @@ def sparsification(quality: np.ndarray, error: np.ndarray) -> Sparsification:
 
 
 def _mean_of_rest(error: np.ndarray) -> np.ndarray:
-    """Mean of error[k:] for every k."""
+    """Returns the mean of error[k:] for every k."""
     return np.cumsum(error[::-1])[::-1] / np.arange(len(error), 0, -1)
 
 
@@ -99,7 +99,7 @@ def ause(
     seed: int = 0,
     resamples: int = RESAMPLES,
 ) -> Estimate:
-    """`Sparsification.relative` (0 perfect, 1 chance) with an interval over views.
+    """Returns `Sparsification.relative` (0 perfect, 1 chance) with an interval over views.
 
     Arguments as in `sparsification` and `rank_statistics.spearman`; views with a NaN are left out.
     """
@@ -148,7 +148,7 @@ def area_under(
 
 
 def common_range(budgets: Sequence[np.ndarray]) -> tuple[float, float]:
-    """The widest range that every curve spans: the last start to the first end.
+    """Returns the widest range that every curve spans: the last start to the first end.
 
     Raises:
         ValueError: no curves, or they share no range.
@@ -164,7 +164,7 @@ def common_range(budgets: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def snapshot_kind(cells: Sequence[Cell]) -> str:
-    """What the snapshots count: views, seconds or meters.
+    """Returns what the snapshots count: views, seconds or meters.
 
     Raises:
         ValueError: the kinds differ; then they are no points of one curve.
@@ -176,7 +176,7 @@ def snapshot_kind(cells: Sequence[Cell]) -> str:
 
 
 def values_by_seed(cells: Sequence[Cell], quantity: str) -> np.ndarray:
-    """A quantity of one method in one scene, [seeds, snapshots]; NaN where there is none.
+    """Returns a quantity of one method in one scene, [seeds, snapshots]; NaN where there is none.
 
     Args:
         cells: of one method and scene.

@@ -54,7 +54,7 @@ def revisit_rate(poses: np.ndarray) -> float:
 
 
 def missions(root: Path, records: Records) -> list[dict[str, Any]]:
-    """One row per cell: its poses, and what the last snapshot says of it."""
+    """Returns one row per cell: its poses, and what the last snapshot says of it."""
     last = snapshots_of(records)[-1]
     rows = []
     for record in (record for record in records if record["snapshot"] == last):
@@ -92,7 +92,7 @@ def write_page(folder: Path, root: Path, records: Records, source: Origin) -> No
 
 
 def table_rows(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row per cell, numbers only."""
+    """Returns one row per cell, numbers only."""
     return [
         {"scene": mission["record"]["scene"], "policy": method_name(mission["record"])}
         | {
@@ -107,7 +107,7 @@ def table_rows(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mean_rows(rows: list[dict[str, Any]], policies: list[str]) -> list[dict[str, Any]]:
-    """Means over scenes and seeds, a line per policy."""
+    """Returns means over scenes and seeds, a line per policy."""
     names = {
         "revisit_rate": "revisit rate",
         "known_share": "share of the box explored",

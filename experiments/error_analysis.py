@@ -82,13 +82,13 @@ class SceneModels:
     _samples: dict[tuple[str, ...], np.ndarray] = field(default_factory=dict, repr=False)
 
     def errors(self) -> list[str]:
-        """The errors that were measured."""
+        """Returns the errors that were measured."""
         return [name for name in ERRORS if name in self.columns]
 
     def estimate(
         self, statistic: str, predictor: str, error: str, *, given: str = "", snapshot: str = ""
     ) -> Estimate:
-        """Mean over models of a statistic of their views.
+        """Returns the mean over models of a statistic of their views.
 
         On seen pixels a prediction is its mean over seen voxels. LPIPS changes its sign, so that
         a positive correlation is always a right prediction.
@@ -105,17 +105,17 @@ class SceneModels:
         return mean_over_models(samples, self.explorations, self.draws, models=of_snapshot)
 
     def difference(self, error: str, first: str, second: str) -> Estimate:
-        """Spearman of the first prediction minus that of the second, model by model."""
+        """Returns the Spearman correlation of the first prediction minus the second's, by model."""
         one, other = (self.sample("spearman", name, error) for name in (first, second))
         return mean_over_models(one - other, self.explorations, self.draws)
 
     def prediction(self, predictor: str, error: str) -> np.ndarray:
-        """The column that is held against an error, [M, V]."""
+        """Returns the column that is held against an error, [M, V]."""
         name = on_seen(predictor) if error == SEEN_ERROR and predictor != COVERAGE else predictor
         return self.columns[name]
 
     def sample(self, statistic: str, predictor: str, error: str, given: str = "") -> np.ndarray:
-        """The statistic of every model and draw, [M, D]; arguments as in `estimate`."""
+        """Returns the statistic of every model and draw, [M, D]; arguments as in `estimate`."""
         key = (statistic, predictor, error, given)
         if key not in self._samples:
             self._samples[key] = self._sample(*key)
@@ -132,7 +132,7 @@ class SceneModels:
 def scene_models(
     root: Path, records: Records, *, resamples: int = RESAMPLES
 ) -> Iterator[SceneModels]:
-    """Every scene's models, with all that is known of their views.
+    """Yields every scene's models, with all that is known of their views.
 
     Args:
         root: folder of the benchmark.
@@ -181,7 +181,7 @@ def from_columns(
 
 
 def snapshots_of_models(models: SceneModels) -> list[str]:
-    """The budgets, smallest first."""
+    """Returns the budgets, smallest first."""
     return snapshots_of([{"snapshot": name} for name in models.snapshots])
 
 
@@ -209,7 +209,7 @@ def correlation_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
 
 
 def _statistics(predictor: str) -> list[tuple[str, str]]:
-    """Names of statistics and what is given: all of them for R and coverage."""
+    """Returns names of statistics and what is given: all of them for R and coverage."""
     if predictor == SCORE:
         return [("spearman", ""), ("kendall", ""), ("ause", ""), ("partial", COVERAGE)]
     if predictor == COVERAGE:

@@ -52,7 +52,7 @@ def draw(
 def mean_over_models(
     samples: np.ndarray, explorations: np.ndarray, draws: Draws, *, models: np.ndarray | None = None
 ) -> Estimate:
-    """Mean over models of a statistic, with its interval; NaN are left out.
+    """Returns the mean over models of a statistic, with its interval; NaN are left out.
 
     Args:
         samples: the statistic of every model and draw, [M, D].
@@ -77,7 +77,7 @@ def mean_over_models(
 
 
 def _known(weights: np.ndarray, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The columns without the views where one is NaN, and the weights of the others."""
+    """Returns the columns without the views where one is NaN, and the weights of the others."""
     table = np.stack([np.asarray(column, np.float64) for column in columns])
     keep = ~np.isnan(table).any(axis=0)
     return table[:, keep], weights[:, keep]
@@ -95,7 +95,7 @@ def ranks(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _pearson(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Correlation of columns [D, V] in every draw; NaN where one is constant."""
+    """Returns the correlation of columns [D, V] in every draw; NaN where one is constant."""
     num = np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
     center = lambda a: a - (weights * a).sum(axis=1, keepdims=True) / num
     moment = lambda a, b: np.einsum("dv,dv,dv->d", weights, a, b)
@@ -106,7 +106,7 @@ def _pearson(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def spearman(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Spearman's rank correlation of two columns [V] in every draw, [D]."""
+    """Returns Spearman's rank correlation of two columns [V] in every draw, [D]."""
     (x, y), weights = _known(weights, (x, y))
     return _pearson(ranks(x, weights), ranks(y, weights), weights)
 
@@ -114,7 +114,7 @@ def spearman(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def partial_spearman(
     x: np.ndarray, y: np.ndarray, given: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
-    """Spearman's correlation of x and y that remains once `given` is known, [D].
+    """Returns Spearman's correlation of x and y that remains once `given` is known, [D].
 
     (r_xy - r_xz r_yz) / sqrt((1 - r_xz^2) (1 - r_yz^2)); what is constant explains nothing; NaN
     where `given` determines the ranks of x or y.
@@ -130,7 +130,7 @@ def partial_spearman(
 
 
 def kendall(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Kendall's tau-b of two columns [V] in every draw, [D]."""
+    """Returns Kendall's tau-b of two columns [V] in every draw, [D]."""
     (x, y), weights = _known(weights, (x, y))
     signs = [np.sign(column[:, None] - column[None, :]) for column in (x, y)]
     pairs = lambda matrix: np.einsum("dv,dv->d", weights @ matrix, weights)
@@ -140,7 +140,7 @@ def kendall(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def ause(quality: np.ndarray, error: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """`evaluation.areas.Sparsification.relative` in every draw, [D]: 0 perfect, 1 chance.
+    """Returns `evaluation.areas.Sparsification.relative` in every draw, [D]: 0 perfect, 1 chance.
 
     Args:
         quality: predicted, [V], higher is better.
@@ -157,7 +157,7 @@ def ause(quality: np.ndarray, error: np.ndarray, weights: np.ndarray) -> np.ndar
 
 
 def _mean_of_rest(quality: np.ndarray, error: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Mean over k of the mean error of the n - k views predicted best, [D].
+    """Returns the mean over k of the mean error of the n - k views predicted best, [D].
 
     Where w equal errors e leave one by one and N views with the sum S stay behind them, their
     part is the sum over j = 1 ... w of (S + j e) / (N + j) = w e + (S - N e) (H(N + w) - H(N)),

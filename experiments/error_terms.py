@@ -69,12 +69,12 @@ FOLDER = "renderability_vs_error"
 
 
 def column(product: str, kappa: str) -> str:
-    """Name of a prediction: `bias`, and `bias, kappa=1` without the box test."""
+    """Returns the name of a prediction: `bias`, and `bias, kappa=1` without the box test."""
     return product if kappa == "box" else f"{product}, kappa=1"
 
 
 def on_seen(name: str) -> str:
-    """Name of a prediction's mean over the pixels that show a voxel."""
+    """Returns the name of a prediction's mean over the pixels that show a voxel."""
     return f"{name} | seen"
 
 
@@ -96,7 +96,7 @@ class Expected(eqx.Module):
 def expect(
     state: MapState, camera: Camera, T_world_camera: Float[Array, "4 4"], config: ScoringConfig
 ) -> Expected:
-    """Every prediction of one view, pixel by pixel as `renderability_image` has it."""
+    """Returns every prediction of one view, pixel by pixel as `renderability_image` has it."""
     view = pinhole_view(camera, T_world_camera, config)
     row = rows_in_pixels(state, view, config)
     seen = voxels_of_rows(state, row)
@@ -126,7 +126,7 @@ def _product_means(scores: Renderability) -> Float[Array, " P"]:
 def prediction_columns(
     state: MapState, camera: Camera, poses: np.ndarray, config: ScoringConfig
 ) -> dict[str, np.ndarray]:
-    """Predictions of all views by name, each [V] in [0, 1].
+    """Returns predictions of all views by name, each [V] in [0, 1].
 
     Args:
         state: map of the frames that the model was trained on.
@@ -183,7 +183,7 @@ def _psnr(render, truth, seen):
 
 
 def columns_of(root: Path, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """All columns of one model's test views, from the run and the model of its cell.
+    """Returns all columns of one model's test views, from the run and the model of its cell.
 
     They are kept beside the cells, and not computed again for the same record.
 
@@ -225,7 +225,7 @@ def _compute(root: Path, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def reference_images(root: Path, record: Mapping[str, Any]) -> ReferenceImages:
-    """The test images of a cell, by its record."""
+    """Returns the test images of a cell, by its record."""
     conditions = Conditions(
         resolution=record["resolution"],
         fov=record["sensing"]["fov"],

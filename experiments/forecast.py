@@ -71,7 +71,7 @@ class Known:
     models: list[str]
 
     def without(self, scene: str) -> "Known":
-        """All views but those of a scene."""
+        """Returns all views but those of a scene."""
         keep = np.array([name != scene for name in self.scenes])
         return Known(
             *(column[keep] for column in (self.coverage, self.renderability, self.psnr)),
@@ -80,18 +80,18 @@ class Known:
         )
 
     def pairs(self) -> list[Pair]:
-        """Forecast and truth of every model, its scene left out."""
+        """Returns the forecast and truth of every model, its scene left out."""
         return leave_one_out(self.coverage, self.renderability, self.psnr, self.scenes, self.models)
 
     def calibration(self) -> Calibration:
-        """Calibration on all these views; the errors are those of `pairs`."""
+        """Returns the calibration on all these views; the errors are those of `pairs`."""
         count, scenes = len(set(self.models)), sorted(set(self.scenes))
         source = f"{len(self.psnr)} views of {count} models in {', '.join(scenes)}"
         model = fit(self.coverage, self.renderability, self.psnr)
         return Calibration(model, errors_of(self.pairs()), source)
 
     def scene_of_models(self) -> list[str]:
-        """Scene of each model, in the order of `pairs`."""
+        """Returns the scene of each model, in the order of `pairs`."""
         return list(dict(zip(self.models, self.scenes, strict=True)).values())
 
 
@@ -144,7 +144,7 @@ def write_page(folder: Path, known: Known, from_runs: Sequence[dict[str, Any]]) 
 
 
 def read_views(path: Path) -> Known:
-    """The table that `experiments.renderability_vs_error` writes.
+    """Returns the table that `experiments.renderability_vs_error` writes.
 
     Raises:
         SystemExit: it is not there.
@@ -183,14 +183,14 @@ def error_row(
 
 
 def _rms_of_constant(name: str, pairs: Sequence[Pair], scenes: Sequence[str]) -> float:
-    """Error of the guess that a scene comes out as the others did on average [dB]."""
+    """Returns the error of the guess that a scene comes out as the others did on average [dB]."""
     truth, scene_of = np.array([pair[name][1] for pair in pairs]), np.array(scenes)
     guesses = np.array([truth[scene_of != scene].mean() for scene in scenes])
     return float(np.sqrt(np.mean((guesses - truth) ** 2)))
 
 
 def _half_width(others: Known, name: str) -> float:
-    """Half the width of an interval for a scene, by the errors among the other scenes."""
+    """Returns half the width of an interval for a scene, by the errors among the other scenes."""
     if len(set(others.scenes)) < 2:
         return float("nan")
     return float(np.quantile(errors_of(others.pairs())[name], LEVEL))
@@ -199,7 +199,7 @@ def _half_width(others: Known, name: str) -> float:
 def run_rows(
     root: Path, records: Sequence[Mapping[str, Any]], known: Known
 ) -> list[dict[str, Any]]:
-    """Forecast from the map alone and truth of every cell at every budget.
+    """Returns the forecast from the map alone and truth of every cell at every budget.
 
     Args:
         root: folder of the benchmark.
@@ -232,7 +232,7 @@ def run_rows(
 
 
 def truth_figure(pairs: Sequence[Pair], scenes: Sequence[str]) -> Figure:
-    """Truth against forecast, a dot for each model, for the mean and p10."""
+    """Returns the truth against forecast, a dot for each model, for the mean and p10."""
     figure = style.new_figure(10.0, 4.6)
     for axes, name in zip(figure.subplots(1, 2), ("mean", "p10"), strict=True):
         style.dress(axes, f"{name} of the test views", "forecast [dB]", "truth [dB]")

@@ -81,7 +81,7 @@ def main(options: Options) -> int:
 
 
 def steps_of(options: Options, timings: Path) -> list[Step]:
-    """The commands, in order: what is wrong shows before what is slow."""
+    """Returns the commands, in order: what is wrong shows before what is slow."""
     python, pytest = sys.executable, (sys.executable, "-m", "pytest", "-q")
     smoke = ("--size", "smoke", "--work", str(options.out / NAME), "--out", str(options.out / NAME))
     return [
@@ -114,7 +114,7 @@ def run(step: Step, folder: Path) -> dict[str, Any]:
 
 
 def benchmark_rows(report: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The medians of a report of pytest-benchmark [ms]."""
+    """Returns the medians of a report of pytest-benchmark [ms]."""
     return [
         {
             "benchmark": found["fullname"].removeprefix("tests/benchmarks/"),

@@ -109,7 +109,7 @@ def main(options: Options) -> Path:
 
 
 def _page(size: Size, records: list[dict[str, Any]]) -> list[str]:
-    """The tables: each capture, and all."""
+    """Returns the tables: each capture, and all."""
     num_seeds = len({record["seed"] for record in records})
     terms, captures = size.terms, list(dict.fromkeys(record["capture"] for record in records))
     page = [

@@ -50,7 +50,7 @@ def main(options: Options) -> Path:
 
 
 def step_rows(records: Records) -> list[dict[str, Any]]:
-    """One row per decision, in milliseconds."""
+    """Returns one row per decision, in milliseconds."""
     return [
         {key: record["flight"][key] for key in ("policy", "scene", "seed")}
         | {"key_frames": row["key_frames"]}
@@ -61,7 +61,7 @@ def step_rows(records: Records) -> list[dict[str, Any]]:
 
 
 def samples_of(records: Records, policy: str, name: str) -> list[tuple[int, float]]:
-    """Key frames and milliseconds of every step of a policy."""
+    """Returns the key frames and milliseconds of every step of a policy."""
     return [
         (row["key_frames"], row[f"{name}_ms"])
         for record in records
@@ -76,7 +76,7 @@ def policies_of(records: Records) -> list[str]:
 
 
 def percentile_rows(records: Records, bucket: int) -> list[dict[str, Any]]:
-    """p50, p95 and p99 of every part of a step, per policy and group of key frames."""
+    """Returns p50, p95 and p99 of every part of a step, per policy and group of key frames."""
     rows = []
     for policy in policies_of(records):
         for name in _COLUMNS:
@@ -93,7 +93,7 @@ def percentile_rows(records: Records, bucket: int) -> list[dict[str, Any]]:
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float]:
-    """p50, p95 and p99, rounded to what can be measured [ms]."""
+    """Returns p50, p95 and p99, rounded to what can be measured [ms]."""
     return {f"p{p}_ms": round(float(np.percentile(values, p)), 4) for p in (50, 95, 99)}
 
 
@@ -114,7 +114,7 @@ def decide_samples(records: Records, bucket: int) -> dict[str, tuple[np.ndarray,
 
 
 def page(records: Records, bucket: int, size: str) -> list[str]:
-    """The table of a decision, the table of a frame, and how to read them."""
+    """Returns the table of a decision, the table of a frame, and how to read them."""
     decisions, frames = [], []
     for policy in policies_of(records):
         decide = samples_of(records, policy, "decide")

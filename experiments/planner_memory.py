@@ -69,7 +69,7 @@ def main(options: Options) -> Path:
 
 
 def step_rows(records: Records) -> list[dict[str, Any]]:
-    """One row per decision, in bytes; empty where the machine does not say."""
+    """Returns one row per decision, in bytes; empty where the machine does not say."""
     return [
         {key: record["flight"][key] for key in ("policy", "scene", "seed")}
         | {"key_frames": row["key_frames"]}
@@ -81,7 +81,7 @@ def step_rows(records: Records) -> list[dict[str, Any]]:
 
 
 def held(row: dict[str, Any]) -> int:
-    """Bytes of the arrays that outlive a step."""
+    """Returns bytes of the arrays that outlive a step."""
     return row["map_bytes"] + row["grid_bytes"] + row["policy_bytes"]
 
 
@@ -92,12 +92,12 @@ def growth(record: dict[str, Any], row: dict[str, Any]) -> int | None:
 
 
 def held_curves(records: Records) -> Curves:
-    """Bytes of the arrays against key frames: the largest over a policy's missions."""
+    """Returns bytes of the arrays against key frames: the largest over a policy's missions."""
     return _largest(records, lambda record, row: held(row))
 
 
 def total_curves(records: Records) -> tuple[str, Curves]:
-    """What the device holds at its peak, or the process where there is no other device."""
+    """Returns what the device holds at its peak, or the process where there is no other device."""
     device = _largest(records, lambda record, row: row["device_peak_bytes"])
     return ("device", device) if device else ("process", _largest(records, growth))
 

@@ -184,14 +184,14 @@ def _rows(state: LoopState, mission: Mission) -> Iterator[dict[str, Any]]:
 
 
 def _milliseconds(view: TakenView) -> dict[str, float]:
-    """What the parts of a step took [ms]; 0 for parts that a policy does not have."""
+    """Returns what the parts of a step took [ms]; 0 for parts that a policy does not have."""
     stages = {name: view.stages[stage] for name, stage in STAGES.items()}
     parts = {f"decide.{part}": view.stages.get(f"plan.{part}", 0.0) for part in PLANNING}
     return {f"{name}_ms": 1e3 * seconds for name, seconds in (stages | parts).items()}
 
 
 def _bytes(state: LoopState) -> dict[str, int | None]:
-    """What a state holds, and what the device and the process hold altogether [bytes]."""
+    """Returns what a state holds, and what the device and the process hold altogether [bytes]."""
     map_state = state.map_state
     device = jax.local_devices()[0].memory_stats() or {}
     return {
@@ -206,7 +206,7 @@ def _bytes(state: LoopState) -> dict[str, int | None]:
 
 
 def size_of(tree: Any) -> int:
-    """Bytes of all arrays in a pytree."""
+    """Returns bytes of all arrays in a pytree."""
     return sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
 
 
@@ -228,7 +228,7 @@ def compiled_memory() -> int | None:
 
 
 def _memory_in_use() -> int | None:
-    """Resident memory without what the allocator only keeps for later."""
+    """Returns the resident memory without what the allocator only keeps for later."""
     gc.collect()
     if platform.libc_ver()[0] == "glibc":
         ctypes.CDLL(None).malloc_trim(0)
@@ -236,6 +236,6 @@ def _memory_in_use() -> int | None:
 
 
 def bucket_of(key_frames: int, width: int) -> tuple[int, int]:
-    """The group of key frames that a number belongs to: first and last, from 1 on."""
+    """Returns the group of key frames that a number belongs to: first and last, from 1 on."""
     first = (key_frames - 1) // width * width + 1
     return first, first + width - 1

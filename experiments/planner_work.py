@@ -100,7 +100,7 @@ def main(options: Options) -> Path:
 
 
 def grown_maps(size: Size) -> Iterator[tuple[int, Planner, np.ndarray]]:
-    """The planner and the latest pose after each number of views."""
+    """Yields the planner and the latest pose after each number of views."""
     edge = size.resolution
     simulator = open_scene(SCENE, camera=Camera.from_fov(edge, edge, 60.0))
     rooms, rng = list(procedural.rooms(SCENE).values()), np.random.default_rng(0)
@@ -174,7 +174,7 @@ def work_figure(rows: Rows) -> Figure:
 
 
 def page(rows: Rows, size: str) -> list[str]:
-    """The table and the figure."""
+    """Returns the table and the figure."""
     return [
         f"# What a decision costs against its work ({size})",
         "Median milliseconds of a decision of `r3-pano`, and of its scoring alone; megabytes of "

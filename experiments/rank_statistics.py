@@ -19,7 +19,7 @@ def spearman(
     seed: int = 0,
     resamples: int = RESAMPLES,
 ) -> Estimate:
-    """Spearman's rank correlation of two columns [n], with an interval over views.
+    """Returns Spearman's rank correlation of two columns [n], with an interval over views.
 
     Args:
         x: one value per view.
@@ -44,7 +44,7 @@ def kendall(
     seed: int = 0,
     resamples: int = RESAMPLES,
 ) -> Estimate:
-    """Kendall's tau-b (ties counted) of two columns [n]; arguments as in `spearman`."""
+    """Returns Kendall's tau-b (ties counted) of two columns [n]; arguments as in `spearman`."""
     return with_interval(_kendall, (x, y), strata=strata, seed=seed, resamples=resamples)
 
 
@@ -57,7 +57,7 @@ def partial_spearman(
     seed: int = 0,
     resamples: int = RESAMPLES,
 ) -> Estimate:
-    """Spearman's correlation of x and y that remains once the columns `given` are known.
+    """Returns Spearman's correlation of x and y that remains once the columns `given` are known.
 
     All columns become ranks; x and y are regressed on the others (least squares, with a
     constant), and the residuals' Pearson correlation is the answer. For one column z this is
@@ -80,7 +80,7 @@ def with_interval(
     seed: int = 0,
     resamples: int = RESAMPLES,
 ) -> Estimate:
-    """Any statistic of paired columns, with its percentile interval over views.
+    """Returns the any statistic of paired columns, with its percentile interval over views.
 
     Rows with a NaN are left out. Resamples for which the statistic is not defined are left out of
     the interval; it is NaN where the statistic itself is, or fewer than half of them are left.
@@ -114,7 +114,7 @@ def with_interval(
 def _complete(
     columns: Sequence[np.ndarray], strata: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The rows without NaN, [columns, m], and their strata, [m]."""
+    """Returns the rows without NaN, [columns, m], and their strata, [m]."""
     arrays = [np.asarray(column, dtype=np.float64) for column in columns]
     labels = np.zeros(arrays[0].shape, int) if strata is None else np.asarray(strata)
     shapes = [array.shape for array in (*arrays, labels)]

@@ -130,7 +130,7 @@ share frames. So an interval says what other views of the scene and other runs m
 
 
 def _agreement(scenes: Sequence[SceneModels]) -> str:
-    """Whether what was computed here is what the benchmark has recorded."""
+    """Returns whether what was computed here is what the benchmark has recorded."""
     columns = [models.columns for models in scenes]
     score = max(np.nanmax(np.abs(c[SCORE] - c["renderability"])) for c in columns)
     psnr = max(np.nanmax(np.abs(c["psnr"] - c["psnr_again"])) for c in columns)
@@ -142,7 +142,7 @@ def _agreement(scenes: Sequence[SceneModels]) -> str:
 
 
 def view_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
-    """One row per model and view."""
+    """Yields one row per model and view."""
     names = [name for name in _VIEW_COLUMNS if name in models.columns]
     known = zip(models.methods, models.seeds, models.snapshots, strict=True)
     for m, (method, seed, snapshot) in enumerate(known):
@@ -154,7 +154,7 @@ def view_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
 
 
 def error_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
-    """R, and coverage beside it, against every error."""
+    """Yields R, and coverage beside it, against every error."""
     for error in models.errors():
         for predictor, other in ((SCORE, COVERAGE), (COVERAGE, SCORE)):
             find = lambda statistic, given="", error=error, predictor=predictor: told(
@@ -171,7 +171,7 @@ def error_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
 
 
 def budget_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
-    """How it goes with the budget."""
+    """Yields how it goes with the budget."""
     for snapshot in snapshots_of_models(models):
         mine = np.array([name == snapshot for name in models.snapshots])
         mean = lambda name, mine=mine: float(np.nanmean(models.columns[name][mine]))
@@ -192,7 +192,7 @@ def budget_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
 
 
 def term_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
-    """Every term, product and rival: what it says, and how much of that is coverage."""
+    """Yields every term, product and rival: what it says, and how much of that is coverage."""
     for name in (COVERAGE, COVER, *PRODUCTS):
         plain = column(name, "one") if name in PRODUCTS else ""
         find = lambda statistic, predictor, error="psnr", given="": told(

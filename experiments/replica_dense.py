@@ -50,7 +50,7 @@ def write_tables(folder: Path, name: str, records: Records, origin: Origin) -> N
 
 
 def tables_of(records: Records) -> dict[str, Table]:
-    """Quality, tails, and differences where the reference was run."""
+    """Returns the quality, tails, and differences where the reference was run."""
     tables = {"quality": quality_table(records), "tails": tail_table(records)}
     if REFERENCE in methods_of(records):
         tables["differences"] = difference_table(records, REFERENCE)

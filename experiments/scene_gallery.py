@@ -35,7 +35,7 @@ VIEWS: dict[str, tuple[tuple[float, ...], ...]] = {
 
 
 def _opened(world: World, height: float = 1.9) -> World:
-    """The world without what lies above a height, to look into from above."""
+    """Returns the world without what lies above a height, to look into from above."""
     low = world.vertices[world.faces][:, :, 2].max(axis=1) < height
     on_shell = np.zeros(len(world.faces), dtype=bool)
     for bound in world.bounds:
@@ -82,7 +82,7 @@ def _from_above(world: World) -> Image.Image:
 
 
 def contact_sheet() -> Image.Image:
-    """Two views and a cut per scene, three scenes to a row."""
+    """Returns two views and a cut per scene, three scenes to a row."""
     rows = -(-len(VIEWS) // _COLUMNS)
     gap = 6
     width, height = 3 * _TILE + gap, _TILE + gap

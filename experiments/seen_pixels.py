@@ -39,7 +39,7 @@ def _limit(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
 
 
 def recorded(frames: Sequence[Frame]) -> Recorded:
-    """What decides, from frames of one camera."""
+    """Returns what decides, from frames of one camera."""
     return Recorded(
         limit=jnp.stack([jnp.where(f.depth > 0.0, _limit(f.depth), 0.0) for f in frames]),
         T_camera_world=jnp.stack([invert_pose(f.T_world_camera) for f in frames]),
@@ -51,7 +51,7 @@ def recorded(frames: Sequence[Frame]) -> Recorded:
 def seen_pixels(
     view: PosedImage, frames: Recorded, max_range: Float[Array, ""], tolerance: Float[Array, ""]
 ) -> Bool[Array, "H W"]:
-    """True where a test view shows what at least one frame has looked at.
+    """Returns True where a test view shows what at least one frame has looked at.
 
     Args:
         view: with its true depth; pixels without (holes of the scan) are never seen.

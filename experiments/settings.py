@@ -81,7 +81,7 @@ class Setting:
         return self.name.rpartition(".")[2]
 
     def parse(self, text: str) -> Value:
-        """A value of this setting from text.
+        """Returns a value of this setting from text.
 
         Raises:
             ValueError: the text is no value of its kind.
@@ -108,7 +108,7 @@ _KINDS = {bool: "true or false", int: "whole numbers", float: "numbers", str: "w
 
 
 def known_settings(conditions: Conditions) -> dict[str, Setting]:
-    """All settings by name; defaults are those of the conditions where these have a say."""
+    """Returns all settings by name; defaults are those of the conditions where these have a say."""
     found = [
         _setting(name, Conditions, "conditions", field, getattr(conditions, field))
         for name, field in _OF_CONDITIONS.items()
@@ -165,7 +165,7 @@ def _own_sentences(config: type) -> dict[str, str]:
 
 
 def find_setting(word: str, known: Mapping[str, Setting]) -> Setting:
-    """A setting by its name, or by the last part of it where that is enough.
+    """Returns a setting by its name, or by the last part of it where that is enough.
 
     Raises:
         ValueError: no setting, or several, go by that name; says which are near.
@@ -187,7 +187,7 @@ def find_setting(word: str, known: Mapping[str, Setting]) -> Setting:
 
 
 def with_settings(cell: Cell, values: Mapping[str, Value]) -> Cell:
-    """The same cell under other settings.
+    """Returns the same cell under other settings.
 
     A policy's setting at its default is left out, so that it is the same cell whether it was
     given or not.

@@ -220,6 +220,6 @@ def take_over(files: Sequence[Path], root: Path, cells: Sequence[Cell]) -> None:
 
 
 def origin(module: str, records: Records) -> Origin:
-    """Where a result comes from: the records tell machine and commit."""
+    """Returns where a result comes from: the records tell machine and commit."""
     machines = [record["machine"] for record in records]
     return joint_origin(module, machines, [record["commit"] for record in records])

@@ -157,7 +157,7 @@ def request_for(options: Options) -> Request:
 
 
 def points_of(options: Options) -> tuple[tuple[Axis, ...], tuple[Point, ...]]:
-    """What is swept, and the points to try, that of the defaults among them.
+    """Returns what is swept, and the points to try, that of the defaults among them.
 
     Raises:
         ValueError: a setting or a value that does not exist.
@@ -170,7 +170,7 @@ def points_of(options: Options) -> tuple[tuple[Axis, ...], tuple[Point, ...]]:
 
 
 def cells_of(plain: tuple[Cell, ...], points: tuple[Point, ...]) -> list[list[Cell]]:
-    """The cells of every point: those of the plan under other settings.
+    """Returns the cells of every point: those of the plan under other settings.
 
     Raises:
         ValueError: a point that cannot work.
@@ -184,12 +184,12 @@ def in_rounds(cells: list[list[Cell]]) -> list[Cell]:
 
 
 def last_records(root: Path, cells: list[Cell]) -> list[dict]:
-    """The cells' records at the end of the budget."""
+    """Returns the cells' records at the end of the budget."""
     return [r for r in read_records(root, cells) if r["snapshot"] == cells[0].conditions.budget]
 
 
 def folder_name(options: Options, axes: tuple[Axis, ...]) -> str:
-    """Another folder for another sweep."""
+    """Returns the another folder for another sweep."""
     names = "-".join(axis.setting.short for axis in axes)
     kind = "" if options.random is None else "-random"
     return f"{options.size}-{options.policy}-{names}{kind}"

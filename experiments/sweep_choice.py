@@ -64,7 +64,7 @@ class Choice:
 
 
 def choose(trials: Sequence[Trial], default: Point) -> Choice:
-    """The arg max of the criterion; of equals, the first.
+    """Returns the arg max of the criterion; of equals, the first.
 
     Args:
         trials: the same scenes, seeds and views in all of them.
@@ -97,7 +97,7 @@ class LeftOut:
 
 
 def leave_one_out(trials: Sequence[Trial], default: int) -> tuple[LeftOut, ...]:
-    """For every scene, the choice of the other scenes and what it achieves here.
+    """Returns the for every scene, the choice of the other scenes and what it achieves here.
 
     Nothing here was chosen by the views that evaluate it: this is how much tuning really gains.
     Empty with a single scene.

@@ -26,7 +26,7 @@ class Listed:
     values: tuple[Value, ...]
 
     def draw(self, rng: np.random.Generator) -> Value:
-        """One of them."""
+        """Returns one of them."""
         return self.values[int(rng.integers(len(self.values)))]
 
 
@@ -40,7 +40,7 @@ class Range:
     is_log: bool
 
     def draw(self, rng: np.random.Generator) -> Value:
-        """Uniform, or uniform in the logarithm."""
+        """Returns the uniform, or uniform in the logarithm."""
         is_whole = self.setting.kind is int
         # Each whole number has an interval of its own, the first and the last ones too.
         margin = 0.5 if is_whole else 0.0
@@ -57,7 +57,7 @@ Axis = Listed | Range
 
 
 def parse_axes(words: Sequence[str], known: Mapping[str, Setting]) -> tuple[Axis, ...]:
-    """What is swept, from `NAME=VALUES` words.
+    """Returns what is swept, from `NAME=VALUES` words.
 
     Raises:
         ValueError: a word, a name or a value that is not understood, a setting given twice.
@@ -98,7 +98,7 @@ def _parse_range(setting: Setting, text: str) -> Range:
 
 
 def grid_points(axes: Sequence[Axis]) -> tuple[Point, ...]:
-    """Every combination of the listed values; the last setting varies fastest.
+    """Returns every combination of the listed values; the last setting varies fastest.
 
     Raises:
         ValueError: a range, which has no end of values.
@@ -115,7 +115,7 @@ def grid_points(axes: Sequence[Axis]) -> tuple[Point, ...]:
 
 
 def random_points(axes: Sequence[Axis], count: int, seed: int) -> tuple[Point, ...]:
-    """Different points at random; the first ones are the same whatever the count.
+    """Returns the different points at random; the first ones are the same whatever the count.
 
     Raises:
         ValueError: fewer than one, or more than there are.
@@ -132,13 +132,13 @@ def random_points(axes: Sequence[Axis], count: int, seed: int) -> tuple[Point, .
 
 
 def _size(axis: Axis) -> float:
-    """How many values there are."""
+    """Returns how many values there are."""
     if isinstance(axis, Listed):
         return len(axis.values)
     return int(axis.high - axis.low) + 1 if axis.setting.kind is int else math.inf
 
 
 def with_default(points: Sequence[Point], axes: Sequence[Axis]) -> tuple[Point, ...]:
-    """The points, and the default among them: what every other one is compared with."""
+    """Returns the points, and the default among them: what every other one is compared with."""
     default = {axis.setting.name: axis.setting.default for axis in axes}
     return tuple(points) if default in points else (default, *points)

@@ -80,7 +80,7 @@ class _Opened(NamedTuple):
     handle: int | None
 
     def at(self, name: str) -> str:
-        """What names a file in it, for calls that are given the handle, too."""
+        """Returns what names a file in it, for calls that are given the handle, too."""
         return name if self.handle is not None else str(self.path / name)
 
 
@@ -119,17 +119,17 @@ def _handle(stack: contextlib.ExitStack, name: str, above: int | None) -> int | 
 
 
 def is_link(path: Path) -> bool:
-    """Whether a path is a link itself, or a junction of Windows."""
+    """Returns whether a path is a link itself, or a junction of Windows."""
     return path.is_symlink() or getattr(os.path, "isjunction", lambda _: False)(path)
 
 
 def _marked(folder: Path) -> list[Path]:
-    """The folders of ours that a folder lies in, itself first."""
+    """Returns the folders of ours that a folder lies in, itself first."""
     return [at for at in (folder, *folder.parents) if kind_of(at) is not None]
 
 
 def kind_of(folder: Path) -> str | None:
-    """Kind of a folder of ours, by its marker; None without one."""
+    """Returns the kind of a folder of ours, by its marker; None without one."""
     note = folder / MARKER / _NOTE
     try:
         descriptor = os.open(note, os.O_RDONLY | _NO_LINK | getattr(os, "O_NONBLOCK", 0))
@@ -166,7 +166,7 @@ def check_own(folder: Path, kind: Kind, remedy: str = "give another folder") -> 
 
 
 def is_own(folder: Path, kind: Kind) -> bool:
-    """Whether a folder is ours: by its marker, or without one by its content."""
+    """Returns whether a folder is ours: by its marker, or without one by its content."""
     found = kind_of(folder)
     if found is not None:
         return found == kind
@@ -176,7 +176,7 @@ def is_own(folder: Path, kind: Kind) -> bool:
 
 
 def holds(path: Path, *marks: bytes) -> bool:
-    """Whether a path is a regular file, and no link, in which all of these bytes stand."""
+    """Returns whether a path is a regular file, and no link, in which all of these bytes stand."""
     try:
         found = os.lstat(path)
         if not stat.S_ISREG(found.st_mode) or found.st_size > _LARGEST:

@@ -44,7 +44,7 @@ _ON_HOST = (1, 3)
 
 
 def _as_image(image: ArrayLike) -> Array:
-    """Half and double precision become float32; integers stay, to be refused by name."""
+    """Returns half and double precision become float32; integers stay, to be refused by name."""
     array = jnp.asarray(image)
     # Cast to float, 8-bit colors would be 255 times too bright and millimeters too far.
     return array.astype(jnp.float32) if jnp.issubdtype(array.dtype, jnp.floating) else array
@@ -133,7 +133,7 @@ class Frame(eqx.Module):
         ignore: Any = None,
         far: bool = False,
     ) -> "Frame":
-        """A frame from the arrays of another program.
+        """Returns a frame from the arrays of another program.
 
         Arrays are NumPy's, JAX's, or anything with `__dlpack__`: a PyTorch tensor on the CPU, or
         on a device that JAX uses too. They are copied; their memory may be written again.
@@ -240,7 +240,7 @@ a_frame = one(Frame, "Frame.from_arrays makes one of arrays", leaf="depth", ndim
 
 
 def as_array(name: str, value: Any) -> np.ndarray | Array:
-    """An array of any of the known kinds, as NumPy's if it lies in ordinary memory.
+    """Returns an array of any of the known kinds, as NumPy's if it lies in ordinary memory.
 
     Args:
         name: what the caller calls it, for errors.
@@ -305,7 +305,7 @@ def color_image(rgb: Any) -> Float[Array, "H W 3"]:
 
 
 def _hint(shape: tuple[int, ...]) -> str:
-    """What to do about the shapes that other libraries prefer."""
+    """Returns what to do about the shapes that other libraries prefer."""
     if len(shape) == 3 and shape[2] == 4:
         return ": leave out alpha, rgb[..., :3]"
     if len(shape) == 3 and shape[0] == 3:
@@ -345,7 +345,7 @@ def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float
 
 
 def pinhole_camera(camera: Any, height: int, width: int, pixel_center: float | int) -> Camera:
-    """A camera from a matrix of intrinsics; a `Camera` as it is.
+    """Returns a camera from a matrix of intrinsics; a `Camera` as it is.
 
     Args:
         camera: a `Camera`, or [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
@@ -381,7 +381,7 @@ def pinhole_camera(camera: Any, height: int, width: int, pixel_center: float | i
 
 
 def without(depth: Float[Array, "H W"], ignore: Any) -> Float[Array, "H W"]:
-    """Depth without the pixels of a mask, which become 0: no measurement.
+    """Returns the depth without the pixels of a mask, which become 0: no measurement.
 
     Args:
         depth: z-depth [m].
@@ -401,7 +401,7 @@ def without(depth: Float[Array, "H W"], ignore: Any) -> Float[Array, "H W"]:
 
 
 def to_camera_to_world(pose: Any, convention: str) -> Any:
-    """The camera-to-world pose in OpenCV axes of one in another convention.
+    """Returns the camera-to-world pose in OpenCV axes of one in another convention.
 
     Args:
         pose: a matrix [4, 4], NumPy's or JAX's; of another shape it stays as it is, to be refused.
@@ -425,7 +425,7 @@ def to_camera_to_world(pose: Any, convention: str) -> Any:
 
 
 def own_matrix(name: str, value: Any) -> np.ndarray | Array:
-    """A small matrix whose memory is not the caller's.
+    """Returns a small matrix whose memory is not the caller's.
 
     Raises:
         TypeError: not an array.
@@ -435,7 +435,7 @@ def own_matrix(name: str, value: Any) -> np.ndarray | Array:
 
 
 def _float32(array: np.ndarray | Array) -> np.ndarray | Array:
-    """The same numbers in memory of their own."""
+    """Returns the same numbers in memory of their own."""
     if isinstance(array, np.ndarray):
         return np.array(array, dtype=np.float32)
     return array.astype(jnp.float32)

@@ -10,7 +10,7 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def exposure_warning(host: str, what: str = "sees the page") -> str | None:
-    """Warns of what listens for other machines; None where it does not.
+    """Returns warns of what listens for other machines; None where it does not.
 
     Args:
         host: the address to listen at.
@@ -48,5 +48,5 @@ def check_free(host: str, port: int) -> None:
 
 
 def in_use(host: str, port: int) -> str:
-    """Says that somebody else listens there."""
+    """Returns says that somebody else listens there."""
     return f"port {port} of {host} is in use: give another one with --port, or 0 for any"

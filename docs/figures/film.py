@@ -83,7 +83,7 @@ def pictures_of(run: Run, model: r3jax.GaussianScene, num_orbit: int) -> Iterato
 
 
 def _path(run: Run, step: int) -> list[Squares]:
-    """The path so far, and the newest view as a red frustum."""
+    """Returns the path so far, and the newest view as a red frustum."""
     rows = run.rows[: step + 1]
     segments, colors = path_segments(rows, len(run.rows))
     frusta = [frustum_segments(run.camera, row.pose, 0.14) for row in rows]
@@ -96,7 +96,7 @@ def _path(run: Run, step: int) -> list[Squares]:
 
 
 def _below(model: r3jax.GaussianScene, height: float) -> r3jax.GaussianScene:
-    """The model without its ceiling: Gaussians above a height become transparent."""
+    """Returns the model without its ceiling: Gaussians above a height become transparent."""
     is_above = model.means[:, 2] > height
     faint = jnp.where(is_above.reshape(model.opacity_logits.shape), -30.0, model.opacity_logits)
     return eqx.tree_at(lambda scene: scene.opacity_logits, model, faint)
@@ -109,7 +109,7 @@ def _splats(scene: r3jax.GaussianScene, camera: r3jax.Camera, pose: np.ndarray) 
 
 
 def _page(scene: np.ndarray, run: Run, step: int, subtitle: str | None = None) -> np.ndarray:
-    """The picture with its sheet, at its final size."""
+    """Returns the picture with its sheet, at its final size."""
     image, _ = run.images(step)
     sheet = Sheet.of_run(run, step, image, "renderability")
     if subtitle:

@@ -94,7 +94,7 @@ def read_walks() -> dict[str, list[str]]:
 
 
 def exists(name: str) -> bool:
-    """True if a dotted name is that of a module, or of something in one."""
+    """Returns True if a dotted name is that of a module, or of something in one."""
     parts = name.split(".")
     for i in range(len(parts), 0, -1):
         try:

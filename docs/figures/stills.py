@@ -75,7 +75,7 @@ def draw(
     background: tuple[int, int, int] = (255, 255, 255),
     strength: float = 1.4,
 ) -> np.ndarray:
-    """A picture, [H, W, 3] uint8.
+    """Returns a picture, [H, W, 3] uint8.
 
     Args:
         camera: intrinsics and size.
@@ -192,7 +192,7 @@ def overview(
     elevation: float,
     fov: float = 32.0,
 ) -> tuple[Camera, np.ndarray]:
-    """A camera outside that has all points in view.
+    """Returns a camera outside that has all points in view.
 
     Args:
         points: [n, 3] [m].
@@ -267,12 +267,12 @@ class Sheet:
 
     @staticmethod
     def scene_width(width: int) -> int:
-        """What is left for the picture beside the column [px]."""
+        """Returns what is left for the picture beside the column [px]."""
         return width - _COLUMN
 
     @staticmethod
     def of_run(run: Run, step: int, image: np.ndarray, quantity: str) -> "Sheet":
-        """The sheet of a view of a run.
+        """Returns the sheet of a view of a run.
 
         Args:
             run: the run.
@@ -302,7 +302,7 @@ class Sheet:
 
 
 def compose(picture: np.ndarray, sheet: Sheet) -> np.ndarray:
-    """The picture with its sheet at the right, [H, W + 320, 3] uint8."""
+    """Returns the picture with its sheet at the right, [H, W + 320, 3] uint8."""
     height, width = picture.shape[:2]
     canvas = Image.new("RGB", (width + _COLUMN, height), _PAPER)
     canvas.paste(Image.fromarray(np.ascontiguousarray(picture)), (0, 0))
@@ -325,7 +325,7 @@ def compose(picture: np.ndarray, sheet: Sheet) -> np.ndarray:
 
 @functools.cache
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The letters of all pictures."""
+    """Returns the letters of all pictures."""
     return ImageFont.load_default(size)
 
 

@@ -28,7 +28,7 @@ def main(folder: tyro.conf.Positional[Path]) -> None:
 
 
 def curves() -> Figure:
-    """Each term against what it depends on."""
+    """Returns each term against what it depends on."""
     figure, (bias, noise, resolution) = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
     angle = np.linspace(0.0, 90.0, 200)
     cosine = np.cos(np.deg2rad(angle))

@@ -32,18 +32,18 @@ class Origin:
 
 
 def command_line(module: str) -> str:
-    """The command that runs now, as anyone would type it in the repository's root."""
+    """Returns the command that runs now, as anyone would type it in the repository's root."""
     return shlex.join(["python", "-m", module, *sys.argv[1:]])
 
 
 def origin_of(module: str, records: Sequence[dict[str, Any]]) -> Origin:
-    """The origin of a result that was made of missions, some of them perhaps elsewhere."""
+    """Returns the origin of a result that was made of missions, some of them perhaps elsewhere."""
     machines = [record["machine"] for record in records]
     return joint_origin(module, machines, [record["flight"]["commit"] for record in records])
 
 
 def joint_origin(module: str, machines: Iterable[str], commits: Iterable[str | None]) -> Origin:
-    """The origin of a result whose parts came from these machines and commits."""
+    """Returns the origin of a result whose parts came from these machines and commits."""
     sources = {commit or "unknown" for commit in commits}
     return Origin(
         command_line(module), " and ".join(sorted(set(machines))), " and ".join(sorted(sources))
@@ -75,7 +75,7 @@ def write_markdown(path: Path, paragraphs: Sequence[str], origin: Origin) -> Non
 
 
 def markdown_table(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows with the same keys, as a table: text to the left, numbers to the right."""
+    """Returns rows with the same keys, as a table: text to the left, numbers to the right."""
     names = list(rows[0])
     is_text = [isinstance(rows[0][name], str) for name in names]
     lines = [names, ["---" if text else "---:" for text in is_text]]

@@ -137,7 +137,7 @@ def sweep_figure(
 
 
 def _places(values: Sequence[object]) -> tuple[np.ndarray, bool]:
-    """Where each value is on the axis, and whether that is its size."""
+    """Returns where each value is on the axis, and whether that is its size."""
     numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
     if len(numbers) == len(values):
         return np.array(numbers, dtype=np.float64), True
@@ -149,7 +149,7 @@ Samples = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
 def latency_figure(latency: Samples, title: str = "") -> Figure:
-    """Milliseconds of planning against key frames: a panel per method, all on one scale.
+    """Returns milliseconds of planning against key frames: a panel per method, all on one scale.
 
     Line: median; band: to the 95th percentile; dotted: 99th percentile.
 
@@ -186,7 +186,7 @@ def latency_figure(latency: Samples, title: str = "") -> Figure:
 
 
 def memory_figure(memory: Samples, title: str = "", limit: float | None = None) -> Figure:
-    """Bytes that planning needs against key frames: a line per method.
+    """Returns bytes that planning needs against key frames: a line per method.
 
     Args:
         memory: bytes [k] per method.

@@ -53,7 +53,7 @@ def tail_table(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Table:
-    """What a mean hides: one line per method with the bad tail of its views.
+    """Returns what a mean hides: one line per method with the bad tail of its views.
 
     Columns: mean over scenes with its 95 % interval (`statistics.mean_over_scenes`), the worst
     scene, then median, 5th percentile, worst view and the share of views under 20 dB of all test
@@ -120,7 +120,7 @@ def tail_table(
 def ause_of_renderability(
     cells: Sequence[Cell], method: str, scenes: Sequence[str], metric: Metric
 ) -> float | None:
-    """Relative AUSE of R within a model: mean over seeds, then over scenes.
+    """Returns the relative AUSE of R within a model: mean over seeds, then over scenes.
 
     None where a scene has no model with both columns, or where all errors of its models are equal.
     """
@@ -236,7 +236,7 @@ Curve = tuple[np.ndarray, np.ndarray]
 def area_table(
     cells: Sequence[Cell], title: str = "", *, x: str = "views", metric: str = "psnr"
 ) -> Table:
-    """Mean height of quality against a budget, per scene, and the mean of the scenes.
+    """Returns the mean height of quality against a budget, per scene, and the mean of the scenes.
 
     Each seed has a curve through its snapshots; its area is taken over the widest range of x that
     all curves of the scene span, whatever the method, and divided by that range (so dB stay dB);
@@ -292,7 +292,7 @@ def area_table(
 
 
 def _curves(cells: Sequence[Cell], method: str, x: str, metric: str) -> list[Curve]:
-    """The curve of every seed; none at all if one of them has fewer than two points."""
+    """Returns the curve of every seed; none at all if one of them has fewer than two points."""
     chosen = [cell for cell in cells if method_name(cell) == method]
     curves: list[Curve] = []
     for budget, quality in zip(

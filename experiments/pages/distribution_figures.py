@@ -25,7 +25,7 @@ _RIDGE_HEIGHT = 1.5
 
 
 def density(values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Gaussian kernel density of the values [n] at the grid [g]; integrates to 1.
+    """Returns Gaussian kernel density of the values [n] at the grid [g]; integrates to 1.
 
     The kernel's width is Silverman's rule (0.9 min(deviation, IQR / 1.34) n^-1/5), and at least
     the grid's spacing, so that equal values make a narrow peak and no division by 0.
@@ -107,7 +107,7 @@ def scatter_figure(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Figure:
-    """Score against metric, one point per view, with both distributions at the sides.
+    """Returns the score against metric, one point per view, with both distributions at the sides.
 
     The line above holds Spearman's and Kendall's coefficients of all views with 95 % intervals
     (resampled within groups).

@@ -31,7 +31,7 @@ _BINS = 8
 
 
 def told(found: Estimate, decimals: int = 2) -> str:
-    """An estimate with its interval, as tables and titles have it."""
+    """Returns an estimate with its interval, as tables and titles have it."""
     if np.isnan(found.value):
         return "–"
     if np.isnan(found.low):
@@ -40,13 +40,13 @@ def told(found: Estimate, decimals: int = 2) -> str:
 
 
 def budget_name(snapshot: str) -> str:
-    """`views:30` as people read it."""
+    """Returns `views:30` as people read it."""
     kind, _, amount = snapshot.partition(":")
     return f"{amount} {kind}"
 
 
 def budget_colors(models: SceneModels) -> dict[str, str]:
-    """A color for each budget, the same in every figure of a scene."""
+    """Returns a color for each budget, the same in every figure of a scene."""
     return dict(zip(snapshots_of_models(models), OKABE_ITO, strict=False))
 
 

@@ -38,7 +38,7 @@ class PolicyStyle:
     """How much of the marker is filled: a curve of one point has no line to tell it by."""
 
     def line(self) -> dict[str, Any]:
-        """Arguments of `Axes.plot`."""
+        """Returns arguments of `Axes.plot`."""
         return {
             "color": self.color, "marker": self.marker, "linestyle": self.dashes,
             "linewidth": self.width, "markersize": 4.5, "zorder": self.order,
@@ -71,7 +71,7 @@ _VARIANTS: tuple[tuple[Any, Literal["none", "left", "bottom"]], ...] = (
 
 
 def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
-    """The look of each method, as `equal_terms.method_name` writes it.
+    """Returns the look of each method, as `equal_terms.method_name` writes it.
 
     The first settings of a policy look the same in every figure; others have other dashes, and
     markers that are hollow or half filled.
@@ -116,7 +116,7 @@ _LEGEND_LINE, _LETTER, _HANDLE = 0.19, 0.068, 0.55
 
 
 def _columns_that_fit(labels: Sequence[str], width: float) -> int:
-    """The fewest columns with the fewest lines that are no wider than that [inch]."""
+    """Returns the fewest columns with the fewest lines that are no wider than that [inch]."""
     for lines in range(1, len(labels)):
         columns = -(-len(labels) // lines)
         # As matplotlib fills them: one below the other, the first columns one longer.

@@ -78,7 +78,7 @@ def positions_figure(
 def _box(
     positions: Mapping[str, np.ndarray], box: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner; no side is shorter than a fifth of the longest."""
+    """Returns the lower and upper corner; no side is shorter than a fifth of the longest."""
     everywhere = np.concatenate(list(positions.values()))
     low, high = (everywhere.min(axis=0), everywhere.max(axis=0)) if box is None else box
     size = np.maximum(high - low, max(0.2 * float(np.max(high - low)), 0.1))

@@ -38,7 +38,7 @@ class Sweep:
         return {setting.name: setting.default for setting in self.settings}
 
     def label(self, point: Point) -> str:
-        """A point in words."""
+        """Returns a point in words."""
         named = (f"{s.short} = {_text(point[s.name])}" for s in self.settings)
         return ", ".join(named)
 
@@ -66,7 +66,7 @@ def write_page(folder: Path, sweep: Sweep, reported: Sequence[str], origin: Orig
 
 
 def setting_figure(sweep: Sweep, setting: Setting, choice: Choice) -> Figure:
-    """PSNR over one setting, a line per scene; the others, if any, lie in the band."""
+    """Returns PSNR over one setting, a line per scene; the others, if any, lie in the band."""
     values = list(dict.fromkeys(_short(trial.point[setting.name]) for trial in sweep.trials))
     by_scene: dict[str, list[list[float]]] = {}
     for value in values:
@@ -85,7 +85,7 @@ def _padded(rows: list[list[float]]) -> np.ndarray:
 
 
 def point_rows(sweep: Sweep, choice: Choice) -> list[dict[str, Any]]:
-    """A line per point, as people read it."""
+    """Returns a line per point, as people read it."""
     rows = []
     for i, trial in enumerate(sweep.trials):
         marks = [word for word, j in (("best", choice.best), ("default", choice.default)) if i == j]
@@ -121,7 +121,7 @@ def csv_rows(sweep: Sweep, choice: Choice) -> list[dict[str, Any]]:
 
 
 def verdict(sweep: Sweep, choice: Choice) -> str:
-    """The choice in words, and how far it can be trusted."""
+    """Returns the choice in words, and how far it can be trusted."""
     best, default = (sweep.trials[i].point for i in (choice.best, choice.default))
     words = [f"Best is **{sweep.label(best)}**: {_interval(choice.means[choice.best])} dB."]
     if choice.best == choice.default:
@@ -200,7 +200,7 @@ def _left_out(sweep: Sweep, choice: Choice) -> list[str]:
 
 
 def _tail(scores: Sequence[np.ndarray]) -> float:
-    """Mean over scenes of the 5th percentile of the views."""
+    """Returns the mean over scenes of the 5th percentile of the views."""
     return float(np.mean([np.nanpercentile(values, 5) for values in scores]))
 
 

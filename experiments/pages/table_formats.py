@@ -14,7 +14,7 @@ _LATEX = {
 
 
 def to_markdown(table: Table) -> str:
-    """A pipe table: best in bold, second best in italics, missing as a dash."""
+    """Returns a pipe table: best in bold, second best in italics, missing as a dash."""
     heads = [*table.heads, *table.columns]
     lines = [
         f"**{table.title}**",
@@ -41,12 +41,12 @@ def _markdown_entry(entry: Entry) -> str:
 
 
 def _unpiped(text: str) -> str:
-    """For a field of a pipe table."""
+    """Returns the for a field of a pipe table."""
     return text.replace("|", r"\|")
 
 
 def to_latex(table: Table) -> str:
-    r"""A `table` for the package booktabs: best `\textbf`, second best `\underline`."""
+    r"""Returns a `table` for the package booktabs: best `\textbf`, second best `\underline`."""
     columns = "l" * len(table.heads) + "r" * len(table.columns)
     lines = [
         r"\begin{table}",
@@ -91,7 +91,7 @@ def _escaped(text: str) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """One line per row with every digit; an empty field where there is no value.
+    """Returns one line per row with every digit; an empty field where there is no value.
 
     After the labels and the number of seeds, every column is followed by what belongs to it:
     `mean`, `mean low`, `mean high`.

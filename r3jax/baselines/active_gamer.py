@@ -80,7 +80,7 @@ class LatticeStage:
     """Directions of the Fibonacci lattice at every place."""
 
     def columns(self, grid_shape: Sequence[int], cell_size: float) -> np.ndarray:
-        """The cells (x, y) that hold a point of the lattice, [n, 2]; no cell twice.
+        """Returns the cells (x, y) that hold a point of the lattice, [n, 2]; no cell twice.
 
         The lattice lies half a spacing inside the box's lower corner.
         """
@@ -192,7 +192,7 @@ def empty_pools(grid_shape: Sequence[int], cell_size: float) -> Pools:
 
 
 def admit(pool: Pool, has_place: np.ndarray) -> Pool:
-    """All directions of the places [P] that can be stood at join the pool."""
+    """Returns all directions of the places [P] that can be stood at join the pool."""
     return replace(pool, entered=np.asarray(pool.entered) | has_place[:, None])
 
 
@@ -252,7 +252,7 @@ def _best_remembered(
 
 
 def empty_share(view: PixelView) -> Float[Array, ""]:
-    """The gain: share of the pixels in which the map shows nothing."""
+    """Returns the gain: share of the pixels in which the map shows nothing."""
     return jnp.mean(~view.hit, dtype=jnp.float32)
 
 
@@ -271,7 +271,7 @@ class ActiveGamer(GreedyPolicy):
     source = "ActiveGAMER, Chen et al., CVPR 2025"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Pools:
-        """Empty pools."""
+        """Returns the empty pools."""
         del camera
         return empty_pools(grid.log_odds.shape, float(grid.cell_size))
 
@@ -286,7 +286,7 @@ class ActiveGamer(GreedyPolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """Gain and distance of the pool's candidates; lots for others."""
+        """Returns the gain and distance of the pool's candidates; lots for others."""
         if situation.notes is None:
             return candidates, draw_lots(len(candidates.valid), key=key)
         gain = self._gain(situation.camera, situation.map_state, situation.grid, candidates)
@@ -298,7 +298,7 @@ class ActiveGamer(GreedyPolicy):
     def score_again(
         self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
     ) -> Scored:
-        """Their order stays: where they stand in the pool is not known any more."""
+        """Returns the their order stays: where they stand in the pool is not known any more."""
         del situation, key
         return candidates, {"lot": before}
 
@@ -335,7 +335,7 @@ class ActiveGamer(GreedyPolicy):
     def _gain(
         self, camera: Camera, map_state: MapState, grid: OccupancyGrid, candidates: Candidates
     ) -> np.ndarray:
-        """Share of empty pixels of each view [C]; 0 for padding."""
+        """Returns the share of empty pixels of each view [C]; 0 for padding."""
         poses, scoring = candidates.poses_on_device(), self.scoring_for(grid)
         gain = score_pixels(empty_share, map_state, grid, camera, poses, scoring)
         return np.where(candidates.valid, np.asarray(gain, dtype=np.float64), 0.0)

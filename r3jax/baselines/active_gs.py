@@ -100,7 +100,7 @@ def low_confidence(
 def regions_of(
     free: np.ndarray, unexplored: np.ndarray, count: np.ndarray, normal_sum: np.ndarray
 ) -> Regions:
-    """The frontier and the cells of low confidence, those with a free face neighbor.
+    """Returns the frontier and the cells of low confidence, those with a free face neighbor.
 
     A frontier cell is unexplored and is looked at from the mean direction to its free face
     neighbors, any other from the mean normal of its voxels of low confidence.
@@ -170,7 +170,7 @@ def aimed_views(
 def _draw(
     travel: Travel, cells: np.ndarray, normals: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Random places round cells, [R, _DRAWS, 3] [m], and which of them could do."""
+    """Returns the random places round cells, [R, _DRAWS, 3] [m], and which of them could do."""
     closest, farthest = VIEW_DISTANCE
     aims = travel.centers(cells)[:, None, :]
     directions = _draw_directions(normals, rng)
@@ -288,7 +288,7 @@ class ActiveGS(GreedyPolicy):
         return no_sightings()
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
-        """Directions, distances and normals of the frame's voxels."""
+        """Returns directions, distances and normals of the frame's voxels."""
         reach = self.config.scoring.max_range
         # The table may have grown with this frame, which moves its rows.
         before = aligned(state.memory, map_state)
@@ -307,7 +307,7 @@ class ActiveGS(GreedyPolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """U of every view, its two parts, and lots in case that every U is zero."""
+        """Returns U of every view, its two parts, and lots in case that every U is zero."""
         scoring, confidence = self.config.scoring, situation.memory.confidence
         reach = _REACH * float(scoring.max_range)
         cells, rendering = score_by_pixels(

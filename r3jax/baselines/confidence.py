@@ -61,7 +61,7 @@ class Sightings(eqx.Module):
 
 
 def no_sightings(capacity: int = 2) -> Sightings:
-    """Nothing seen yet."""
+    """Returns the nothing seen yet."""
     return Sightings(
         key=jnp.full((2, capacity), EMPTY_WORD, dtype=jnp.uint32),
         views=jnp.zeros(capacity),
@@ -148,7 +148,7 @@ def _sight(
     frame: Frame,
     max_range: Float[Array, ""],
 ) -> Sightings:
-    """One frame's sighting of the voxels that some points stand for."""
+    """Returns one frame's sighting of the voxels that some points stand for."""
     num = groups.is_leader.shape[0]
     # Padding lies past the end: clipped to be read here, and then found in no row.
     index = jnp.minimum(leader, num - 1)
@@ -186,7 +186,7 @@ def _unit(x: Float[Array, "3 M"]) -> Float[Array, "3 M"]:
 
 
 def _weight(distance: Float[Array, " N"], max_range: Float[Array, ""]) -> Float[Array, " N"]:
-    """What a sighting counts by its distance: all at the camera, nothing at the range."""
+    """Returns what a sighting counts by its distance: all at the camera, nothing at the range."""
     # Rays within range by depth may be longer than it off the axis: no negative weights.
     return jnp.maximum(0.0, 1.0 - distance / max_range)
 

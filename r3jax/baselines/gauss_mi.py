@@ -61,7 +61,7 @@ SAME_PLACE, SAME_DIRECTION = 0.3, np.deg2rad(10.0)
 
 
 def side_weights(scene: GaussianScene, position: Float[Array, " 3"]) -> Float[Array, "n 4"]:
-    """w_k of a view from `position`: how much of it goes along +x, +y, -x, -y."""
+    """Returns w_k of a view from `position`: how much of it goes along +x, +y, -x, -y."""
     offset = scene.means - position[None, :]
     unit = offset / jnp.maximum(safe_norm(offset, axis=1), 1e-6)[:, None]
     x, y = unit[:, 0], unit[:, 1]
@@ -70,7 +70,7 @@ def side_weights(scene: GaussianScene, position: Float[Array, " 3"]) -> Float[Ar
 
 
 def reliability(marks: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
-    """r_k from log-odds."""
+    """Returns r_k from log-odds."""
     return jnp.clip(jax.nn.sigmoid(marks), *RELIABILITY)
 
 
@@ -113,7 +113,7 @@ def _scores(
     marks: Float[Array, "n 4"],
     poses: Float[Array, "C 4 4"],
 ) -> tuple[Array, Array]:
-    """The sum over pixels of weight x sum over k of w_k (-ln r_k), of every pose."""
+    """Returns the sum over pixels of weight x sum over k of w_k (-ln r_k), of every pose."""
     doubt, offsets = -jnp.log(reliability(marks)), jnp.zeros((scene.capacity, 2))
 
     def score(pose: Array) -> tuple[Array, Array]:
@@ -126,7 +126,7 @@ def _scores(
 
 
 def novelty(pose: np.ndarray, before: np.ndarray) -> float:
-    """1 - 0.95^k, k poses back to the first that is like this one, from the second-last on.
+    """Returns 1 - 0.95^k, k poses back to the first that is like this one, from the second-last on.
 
     Args:
         pose: of the view on offer, [4, 4].
@@ -178,7 +178,7 @@ class GaussMI(OnlinePolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """The utility of every view, as for images of the published size."""
+        """Returns the utility of every view, as for images of the published size."""
         online, camera = memory_of(situation), self.score_camera(situation.camera)
         poses = candidates.poses_on_device()
         sums = with_room(_scores, online.scene, camera, online.marks, poses)

@@ -69,7 +69,7 @@ def unseen_share(
     num_bins: int,
     kappa: Float[Array, ""],
 ) -> Float[Array, "..."]:
-    """1 - V: the product over the visited bins of 1 - exp(kappa (<q_k, d> - 1)), in [0, 1].
+    """Returns 1 - V: the product over the visited bins of 1 - exp(kappa (<q_k, d> - 1)), in [0, 1].
 
     1 where no bin was visited, 0 at the direction of one that was.
 
@@ -142,7 +142,7 @@ def entropy_of_views(
     num_bins: int,
     num_steps: int,
 ) -> Float[Array, " C"]:
-    """Mean over the rays of each view of H(u), [nats].
+    """Returns the mean over the rays of each view of H(u), [nats].
 
     Args:
         ends: of the rays of all views.
@@ -173,7 +173,7 @@ def unknown_share(
     cells: Float[Array, "h w"],
     beliefs: Beliefs,
 ) -> Float[Array, "h w"]:
-    """u: the probability that a ray's color comes from something that no photo shows."""
+    """Returns u: the probability that a ray's color comes from something that no photo shows."""
     passes = (1.0 - beliefs.cell_opacity) ** cells
     # As a sum of what is small: 1 - passes (1 - unseen) would lose the digits of a known voxel.
     return (1.0 - passes) + passes * jnp.where(hit, unseen, 0.0)
@@ -249,7 +249,7 @@ class GavisConfig(PlannerConfig):
             raise InputError(f"cell_opacity must lie in [0, 1], got {self.cell_opacity}")
 
     def beliefs(self) -> Beliefs:
-        """The three of them, traced, so that a sweep compiles once."""
+        """Returns the three of them, traced, so that a sweep compiles once."""
         numbers = (self.kappa, self.cell_opacity, self.color_entropy)
         return Beliefs(*(jnp.asarray(number, dtype=jnp.float32) for number in numbers))
 
@@ -267,7 +267,7 @@ class Gavis(GreedyPolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """The mean entropy of the rays of every view."""
+        """Returns the mean entropy of the rays of every view."""
         del key
         state, grid, scoring = situation.map_state, situation.scoring_grid, self.config.scoring
         poses = candidates.poses_on_device()

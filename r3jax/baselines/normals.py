@@ -70,7 +70,7 @@ def _slope(
 
 
 def _shifted(image: Float[Array, "H W"], by: int, axis: int) -> Float[Array, "H W"]:
-    """The pixel `by` places further along an axis; 0 beyond the border."""
+    """Returns the pixel `by` places further along an axis; 0 beyond the border."""
     size = image.shape[axis]
     if abs(by) >= size:
         return jnp.zeros_like(image)

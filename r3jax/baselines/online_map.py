@@ -195,7 +195,7 @@ def is_wrong(
     seen: tuple[np.ndarray, np.ndarray, np.ndarray],
     settings: MapSettings,
 ) -> np.ndarray:
-    """Pixels of the wrong color, too little opacity, or a surface in front of the map's."""
+    """Returns pixels of the wrong color, too little opacity, or a surface in front of the map's."""
     color, distance, alpha = seen
     error = np.mean((color - rgb) ** 2, axis=-1)
     return (
@@ -501,13 +501,13 @@ def _gradient_of_view(
 
 @partial(jax.jit, donate_argnums=0)
 def _added(total: GaussianScene, part: GaussianScene, rows: Int[Array, " r"]) -> GaussianScene:
-    """The total with a part added to its rows; those beyond its capacity go nowhere."""
+    """Returns the total with a part added to its rows; those beyond its capacity go nowhere."""
     add = lambda t, p: t.at[rows].add(p, mode="drop", unique_indices=True)
     return jax.tree.map(add, total, part)
 
 
 def _unevenness(scene: GaussianScene) -> Float[Array, ""]:
-    """Mean difference between a Gaussian's sizes and their mean [m]."""
+    """Returns the mean difference between a Gaussian's sizes and their mean [m]."""
     sizes = jnp.exp(scene.log_scales)
     uneven = jnp.mean(jnp.abs(sizes - sizes.mean(axis=1, keepdims=True)), axis=1)
     return _mean_over(uneven, scene.is_alive.astype(jnp.float32))
@@ -577,7 +577,7 @@ def _stepped(
     num: Array,
     settings: MapSettings,
 ) -> tuple[GaussianScene, Moments]:
-    """One step of Adam down the mean gradient of a batch of `num` key frames."""
+    """Returns one step of Adam down the mean gradient of a batch of `num` key frames."""
     gradient = jax.tree.map(lambda g: g / num, total)
     if settings.isotropy > 0.0:
         uneven = jax.grad(_unevenness)(scene)

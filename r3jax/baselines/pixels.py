@@ -90,7 +90,7 @@ def score_pixels(
     rows: Any = (),
     reach: float | None = None,
 ) -> Any:
-    """`value` of every pose; fields of shape [C, ...]. Not to be called under jit.
+    """Returns `value` of every pose; fields of shape [C, ...]. Not to be called under jit.
 
     Args:
         value: what to make of a view.

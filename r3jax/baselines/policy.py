@@ -59,7 +59,7 @@ class OnlinePolicy(GreedyPolicy):
         return online
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
-        """The state before the first frame: an empty map."""
+        """Returns the state before the first frame: an empty map."""
         state = super().init(camera, grid, key=key)
         online = empty_online_map(camera, self.map_settings, key, self.num_marks)
         return replace(state, memory=online)
@@ -85,7 +85,7 @@ class OnlinePolicy(GreedyPolicy):
 
 
 def memory_of(situation: Any) -> OnlineMap:
-    """The map in a situation."""
+    """Returns the map in a situation."""
     online = situation.memory
     assert isinstance(online, OnlineMap)
     return online

@@ -84,7 +84,7 @@ class R3con(GreedyPolicy):
     Config = R3conConfig
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Centers of different safe cells within the radius."""
+        """Returns centers of different safe cells within the radius."""
         travel, num = situation.travel, self.config.num_candidates
         cells = np.argwhere(travel.goals)
         is_other = np.any(cells != np.array(travel.start_cell), axis=1)
@@ -124,7 +124,7 @@ class R3con(GreedyPolicy):
         }
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """The shares of utility and path; what cannot be reached does not weigh paths."""
+        """Returns the shares of utility and path; what cannot be reached does not weigh paths."""
         path = utilities["path"]  # inf for padding, too
         counts = np.isfinite(path)
         weight = utilities["mean_lack"][counts].max() if counts.any() else 0.0
@@ -165,7 +165,7 @@ def _look_round(
 
 
 def _cone_angle(camera: Camera) -> Float[Array, ""]:
-    """Half the smaller field of view [rad]."""
+    """Returns half the smaller field of view [rad]."""
     return jnp.minimum(
         jnp.arctan(0.5 * camera.width / camera.fx), jnp.arctan(0.5 * camera.height / camera.fy)
     )

@@ -66,7 +66,7 @@ class Seen:
     """Fold of each image used, in the order of `Survey.chosen`."""
 
     def without(self, fold: int) -> MapState:
-        """The map of all images but those of a fold."""
+        """Returns the map of all images but those of a fold."""
         return united([part for i, part in enumerate(self.folds) if i != fold])
 
 
@@ -153,7 +153,7 @@ def integrate_rays(grid: OccupancyGrid, eye: np.ndarray, points: np.ndarray) -> 
     origin = np.asarray(grid.origin, np.float64)
 
     def inside(positions: np.ndarray) -> np.ndarray:
-        """Flat indices of the cells that hold positions, those outside left out."""
+        """Returns the flat indices of the cells that hold positions, those outside left out."""
         index = np.floor((positions - origin) / cell).astype(np.int64)
         index = index[np.all((index >= 0) & (index < shape), axis=1)]
         return (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
@@ -176,7 +176,7 @@ _RAY_STEP = 1.4
 
 
 def _measured_points(frame: Frame) -> np.ndarray:
-    """The points of a frame's pixels that have a depth, [m, 3] [audit units]."""
+    """Returns the points of a frame's pixels that have a depth, [m, 3] [audit units]."""
     depth, camera = np.asarray(frame.depth), frame.camera
     row, column = np.nonzero(depth > 0.0)
     z = depth[row, column].astype(np.float64)
@@ -195,7 +195,7 @@ _integrate_pixels = jax.jit(integrate_pixels)
 
 
 def _grown(state: MapState, frame: Frame, drop_edges: bool) -> MapState:
-    """The frame's pixels join; the table grows."""
+    """Returns the frame's pixels join; the table grows."""
     arguments = frame, jnp.float32(RANGE), jnp.asarray(drop_edges)
     try:
         return update_growing(lambda now: _integrate_pixels(now, *arguments), state, _MOST_ROWS)
@@ -206,7 +206,7 @@ def _grown(state: MapState, frame: Frame, drop_edges: bool) -> MapState:
 
 
 def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
-    """How far an image looks [audit units]."""
+    """Returns how far an image looks [audit units]."""
     if source.is_dense:
         return jnp.float32(RANGE)
     farthest = float(jnp.max(frame.depth))
@@ -214,7 +214,7 @@ def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
 
 
 def _blank(state: MapState) -> MapState:
-    """The same rows, of which nothing has been seen."""
+    """Returns the same rows, of which nothing has been seen."""
     empty = jax.tree.map(jnp.zeros_like, state)
     kept = lambda m: (m.key, m.voxel_size)
     return eqx.tree_at(kept, empty, kept(state))
@@ -235,7 +235,7 @@ def _join_fold(
 
 
 def united(parts: Sequence[MapState]) -> MapState:
-    """The union of maps with the same rows: what `merge` gives, row by row."""
+    """Returns the union of maps with the same rows: what `merge` gives, row by row."""
     total = parts[0]
     for part in parts[1:]:
         total = _unite(total, part)

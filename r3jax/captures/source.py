@@ -57,7 +57,7 @@ class SamplingTable(NamedTuple):
 
 
 def thinned(camera: Camera, stride: int) -> Camera:
-    """The pinhole of every `stride`-th pixel, from the middle of the first block on."""
+    """Returns the pinhole of every `stride`-th pixel, from the middle of the first block on."""
     sides = (camera.width, camera.height)
     width, height = (len(taken(side, stride)) for side in sides)
     cx, cy = (
@@ -68,12 +68,12 @@ def thinned(camera: Camera, stride: int) -> Camera:
 
 
 def taken(side: int, stride: int) -> np.ndarray:
-    """Which of `side` pixels in a row are taken; at least one."""
+    """Returns which of `side` pixels in a row are taken; at least one."""
     return np.arange(min(stride // 2, side - 1), side, stride)
 
 
 def ray_lengths(shape: tuple[int, ...], lens: np.ndarray) -> np.ndarray:
-    """Lengths of the pixels' rays (x, y, 1), [h, w]: depth along the ray over z.
+    """Returns lengths of the pixels' rays (x, y, 1), [h, w]: depth along the ray over z.
 
     Args:
         shape: h, w.
@@ -86,7 +86,7 @@ def ray_lengths(shape: tuple[int, ...], lens: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=8)
 def sampling_table(lens: Lens, stride: int) -> SamplingTable:
-    """Where the pixels of `thinned(lens.camera, stride)` lie in the lens's own image.
+    """Returns where the pixels of `thinned(lens.camera, stride)` lie in the lens's own image.
 
     Raises:
         ForeignFileError: a lens whose distortion is not known here.
@@ -102,7 +102,7 @@ def sampling_table(lens: Lens, stride: int) -> SamplingTable:
 
 
 def distorted(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the lens shows the ray (x, y, 1): its own normalized coordinates.
+    """Returns where the lens shows the ray (x, y, 1): its own normalized coordinates.
 
     The models are COLMAP's: a polynomial in the squared radius and a tangential part (Brown), or
     in the angle to the axis (fisheye).
@@ -270,7 +270,7 @@ class Source:
     """What the capture holds beside its images, a sentence."""
 
     def __len__(self) -> int:
-        """Number of images."""
+        """Returns the number of images."""
         return len(self.poses)
 
     @property
@@ -287,11 +287,11 @@ class Source:
         return self.kind == "depth"
 
     def camera(self, index: int) -> Camera:
-        """The pinhole of a thinned image."""
+        """Returns the pinhole of a thinned image."""
         return thinned(self.lenses[index].camera, self.stride)
 
     def with_depth(self, scale: float = 1.0, *, is_along_ray: bool = False) -> "Source":
-        """The same with depth images converted; sparse points have no such mistakes.
+        """Returns the same with depth images converted; sparse points have no such mistakes.
 
         Args:
             scale: all depths are multiplied by this.
@@ -316,7 +316,7 @@ class Source:
         return dataclasses.replace(self, read=read)
 
     def frame(self, index: int, alignment: Alignment) -> Frame:
-        """One image in the audit's coordinates.
+        """Returns one image in the audit's coordinates.
 
         Raises:
             FormatError, RunError: a file is missing or broken.
@@ -324,7 +324,7 @@ class Source:
         return self.framed(self.read(index), index, alignment)
 
     def framed(self, picture: Picture, index: int, alignment: Alignment) -> Frame:
-        """An image that has been read, in the audit's coordinates."""
+        """Returns an image that has been read, in the audit's coordinates."""
         rgb, depth = picture
         return Frame(
             rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
@@ -338,7 +338,7 @@ class Source:
 
 
 def source_of(capture: Run | PosedImages, name: str) -> Source:
-    """Any capture, to be audited.
+    """Returns the any capture, to be audited.
 
     Args:
         capture: what was opened; a recording with its poses as they are (`up="z"`).
@@ -423,7 +423,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
 
 
 def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:
-    """One for all images: resolutions are compared between them."""
+    """Returns one for all images: resolutions are compared between them."""
     return max(-(-max(lens.width, lens.height) // MAX_SIDE) for lens in lenses)
 
 
@@ -446,7 +446,7 @@ def _thinned_colors(images: PosedImages, index: int, stride: int) -> tuple[np.nd
 
 
 def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
-    """Points without tracks: no image is known to see them (as in a PLY)."""
+    """Returns points without tracks: no image is known to see them (as in a PLY)."""
     if images.points is not None and len(images.points):
         xyz, rgb = images.points.xyz, images.points.rgb
     elif images.points_path is not None:

@@ -62,7 +62,7 @@ def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:
 
 
 def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray:
-    """Centers of the free cells where a camera could be held, [c, 3] [audit units].
+    """Returns centers of the free cells where a camera could be held, [c, 3] [audit units].
 
     Args:
         grid: free and occupied space.

@@ -209,7 +209,7 @@ def _distinct(directions: np.ndarray, weight: np.ndarray) -> float:
 
 
 def _of_cameras(up: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """C at directions [u, 3], for the cameras' axes [n, 3, 3]."""
+    """Returns the c at directions [u, 3], for the cameras' axes [n, 3, 3]."""
     right, down, forward = np.moveaxis(np.einsum("ki,nij->knj", up, rotations), 2, 0)
 
     def level(sine: np.ndarray) -> np.ndarray:
@@ -229,7 +229,7 @@ def _of_cameras(up: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 
 def _of_surfaces(up: np.ndarray, normals: Normals) -> np.ndarray:
-    """S at directions [u, 3]: densities on the sphere, their logarithms weighted."""
+    """Returns the s at directions [u, 3]: densities on the sphere, their logarithms weighted."""
     cosine = up @ normals.direction.T
     variance = _EVEN**2 + normals.error**2
     cap = 1.0 / (2.0 * np.pi * variance)
@@ -244,7 +244,7 @@ def _of_surfaces(up: np.ndarray, normals: Normals) -> np.ndarray:
 
 
 def _grid_round(direction: np.ndarray) -> np.ndarray:
-    """A square grid of directions round one, [u, 3]."""
+    """Returns a square grid of directions round one, [u, 3]."""
     across = np.linalg.svd(direction[None])[2][1:]
     steps = np.linspace(-1.0, 1.0, _STEPS) * np.tan(np.radians(_AROUND))
     x, y = (side.reshape(-1, 1) for side in np.meshgrid(steps, steps))

@@ -25,7 +25,7 @@ def check_viser() -> None:
 
 
 def resume_command(command: str, path: Path) -> str:
-    """What goes on with a run, to be copied into a shell."""
+    """Returns what goes on with a run, to be copied into a shell."""
     return f"r3jax {command} --resume {shlex.quote(str(path))}"
 
 
@@ -43,7 +43,7 @@ def resumable(command: str, path: Path) -> Generator[None]:
 
 
 def one_line(error: BaseException) -> str:
-    """An error's text without line breaks."""
+    """Returns an error's text without line breaks."""
     return " ".join(str(error).split())
 
 

@@ -23,18 +23,18 @@ POLICIES = (
 
 
 def method_name(cell: Cell) -> str:
-    """The policy with the settings it was given: `active-gs`, `ours (lambda1=0.3)`."""
+    """Returns the policy with the settings it was given: `active-gs`, `ours (lambda1=0.3)`."""
     settings = ", ".join(f"{name}={value}" for name, value in sorted(cell["settings"].items()))
     return f"{cell['policy']} ({settings})" if settings else cell["policy"]
 
 
 def policy_of(method: str) -> str:
-    """The policy of a method, as `method_name` writes it."""
+    """Returns the policy of a method, as `method_name` writes it."""
     return method.partition(" (")[0]
 
 
 def shared_settings(cells: Sequence[Cell]) -> dict[str, Any]:
-    """Settings that were given to the policies of all records alike, by name."""
+    """Returns settings that were given to the policies of all records alike, by name."""
     first = cells[0]["settings"]
     missing = object()
     return {
@@ -45,7 +45,7 @@ def shared_settings(cells: Sequence[Cell]) -> dict[str, Any]:
 
 
 def with_short_names(cells: Sequence[Cell]) -> list[Cell]:
-    """The same records, with names as short as this set of them allows.
+    """Returns the same records, with names as short as this set of them allows.
 
     Settings that all share leave the methods' names, and a scene from a file is called by the
     file's name without folder and suffix, unless two scenes would then be called the same.
@@ -65,7 +65,7 @@ def with_short_names(cells: Sequence[Cell]) -> list[Cell]:
 
 
 def scene_title(scene: str) -> str:
-    """The name of a scene, without folder and suffix where it is that of a file."""
+    """Returns the name of a scene, without folder and suffix where it is that of a file."""
     kind, colon, path = scene.partition(":")
     return PurePath(path).stem if colon and kind == "mesh" else scene
 
@@ -114,7 +114,7 @@ def terms_of(cell: Cell) -> dict[str, object]:
 
 
 def terms_in_scene(cell: Cell) -> dict[str, object]:
-    """The same of what only those of one scene must share."""
+    """Returns the same of what only those of one scene must share."""
     return {
         "the scene's hash": cell["scene_hash"],
         "the hash of the test views": cell["test_views"]["hash"],
@@ -155,12 +155,12 @@ def _describe(cell: Cell) -> str:
 
 
 def scenes_of(cells: Sequence[Cell]) -> list[str]:
-    """The scenes in alphabetical order."""
+    """Returns the scenes in alphabetical order."""
     return sorted({cell["scene"] for cell in cells})
 
 
 def methods_of(cells: Sequence[Cell]) -> list[str]:
-    """The methods in the order of tables, whatever the order of the records.
+    """Returns the methods in the order of tables, whatever the order of the records.
 
     Policies go as in `POLICIES` (those it does not know first), what is said of them in brackets,
     such as their settings, alphabetically.
@@ -172,7 +172,7 @@ def methods_of(cells: Sequence[Cell]) -> list[str]:
 
 
 def snapshots_of(cells: Sequence[Cell]) -> list[str]:
-    """The snapshots (`views:30`, `seconds:120.5`, ...) by kind and size."""
+    """Returns the snapshots (`views:30`, `seconds:120.5`, ...) by kind and size."""
 
     def key(snapshot: str) -> tuple[str, float]:
         kind, _, size = snapshot.partition(":")

@@ -52,7 +52,7 @@ class TestSet:
     """How many of them the model has seen; None if not known."""
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame in order, as recorded."""
+        """Returns every frame in order, as recorded."""
         return frames_of(self.capture, self.numbers)
 
 
@@ -144,7 +144,7 @@ def mapped_views(model: TrainedModel, test: TestSet, capture: Capture) -> list[i
 
 
 def frames_of(capture: Capture, numbers: list[int]) -> Iterator[Frame]:
-    """Some frames of a capture, read one by one."""
+    """Returns some frames of a capture, read one by one."""
     return (capture.source.frame(number) for number in numbers)
 
 
@@ -237,7 +237,7 @@ def judge(
 
 
 def _map(capture: Capture, numbers: list[int]) -> MapState:
-    """The map of some views, on the terms of the run if it is one."""
+    """Returns the map of some views, on the terms of the run if it is one."""
     config = capture.run.header.config if capture.run is not None else {}
     return map_of(
         frames_of(capture, numbers),
@@ -301,7 +301,7 @@ def write_judgment(
 
 
 def _record(judgment: Judgment, spec: str) -> dict[str, Any]:
-    """Everything that the numbers depend on, and the numbers."""
+    """Returns everything that the numbers depend on, and the numbers."""
     settings = judgment.settings
     summaries: dict[str, Any] = {}
     for summary in judgment.summaries:
@@ -327,7 +327,7 @@ def _record(judgment: Judgment, spec: str) -> dict[str, Any]:
 
 
 def _sheet(judgment: Judgment, worst: int):
-    """The contact sheet of the worst views."""
+    """Returns the contact sheet of the worst views."""
     rows, renders = judgment.evaluation.rows, judgment.evaluation.renders
     place = {row.view: i for i, row in enumerate(rows)}
     lines: list[SheetView] = []

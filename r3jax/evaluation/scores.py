@@ -104,7 +104,7 @@ class Summary:
 
 
 def summarize(rows: Sequence[ViewRow], *, seed: int = 0) -> tuple[Summary, ...]:
-    """Mean, bootstrap interval, median and tail of every metric that has values.
+    """Returns the mean, bootstrap interval, median and tail of every metric that has values.
 
     The interval is the percentile bootstrap of the mean (Efron 1979): 4000 test sets of the same
     size are drawn from the views, with replacement. It says how much the choice of the test views
@@ -149,7 +149,7 @@ def _summary(metric: Metric, views: np.ndarray, values: np.ndarray, seed: int) -
 
 
 def bootstrap_interval(values: np.ndarray, *, seed: int = 0) -> tuple[float, float]:
-    """95 % interval of the mean by resampling the values, [n], n >= 1."""
+    """Returns 95 % interval of the mean by resampling the values, [n], n >= 1."""
     if len(values) == 1:
         return float(values[0]), float(values[0])
     found = stats.bootstrap(
@@ -165,7 +165,7 @@ def bootstrap_interval(values: np.ndarray, *, seed: int = 0) -> tuple[float, flo
 
 
 def worst_rows(rows: Sequence[ViewRow], count: int) -> list[ViewRow]:
-    """The rows with the lowest PSNR, worst first."""
+    """Returns the rows with the lowest PSNR, worst first."""
     return sorted(rows, key=lambda row: row.psnr)[:count]
 
 

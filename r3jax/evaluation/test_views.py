@@ -70,15 +70,15 @@ class Truth(Protocol):
         ...
 
     def free_positions(self, spacing: Sequence[float | int], margin: float | int) -> np.ndarray:
-        """Reachable lattice points [P, 3] [m]."""
+        """Returns the reachable lattice points [P, 3] [m]."""
         ...
 
     def seen_share(self, poses: np.ndarray) -> np.ndarray:
-        """Share of a view that shows a surface, [V] in [0, 1]."""
+        """Returns the share of a view that shows a surface, [V] in [0, 1]."""
         ...
 
     def frames(self, poses: np.ndarray, camera: Camera) -> Iterator[Frame]:
-        """Frames without noise at poses [V, 4, 4]."""
+        """Returns frames without noise at poses [V, 4, 4]."""
         ...
 
 
@@ -181,7 +181,7 @@ def load_view_set(
     margin: float | int = MARGIN,
     max_views: int | None = None,
 ) -> ViewSet:
-    """The stored test views of a scene; computed and stored if they are not there yet.
+    """Returns the stored test views of a scene; computed and stored if they are not there yet.
 
     Several processes may call this at once: all get the same views.
 
@@ -213,7 +213,7 @@ def load_view_set(
 def render_view_set(
     truth: Truth, view_set: ViewSet, resolution: int, fov: float | int = 60.0
 ) -> Iterator[Frame]:
-    """The truth at every test view: exact depth without limit of range.
+    """Returns the truth at every test view: exact depth without limit of range.
 
     Args:
         truth: the scene.
@@ -269,7 +269,7 @@ def _evenly(positions: np.ndarray, spacing: Sequence[float | int], count: int) -
 
 
 def _settings(view_set: ViewSet) -> list[Any]:
-    """Everything but the views, as JSON holds it."""
+    """Returns everything but the views, as JSON holds it."""
     return [view_set.scene_hash, [*view_set.spacing], view_set.margin, view_set.max_views]
 
 
@@ -304,7 +304,7 @@ def _write(path: Path, view_set: ViewSet) -> None:
 
 
 def _from_record(record: dict[str, Any]) -> ViewSet:
-    """The set that a stored record describes."""
+    """Returns the set that a stored record describes."""
     check_fields("set", record, _KINDS)
     x, y, z = (float(side) for side in record["spacing"])
     views = record["views"]

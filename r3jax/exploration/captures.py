@@ -152,7 +152,7 @@ def begin_leg(
 def _in_pieces(
     num: int, decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: CaptureSettings
 ) -> Leg:
-    """The leg of a path in `num` pieces, two or more."""
+    """Returns the leg of a path in `num` pieces, two or more."""
     places = points_along(decision.waypoints, num)
     places[-1] = decision.T_world_camera[:3, 3]
     flight = rules.flight(decision)
@@ -166,7 +166,7 @@ def _in_pieces(
 
 
 def allowed_turns(stops: np.ndarray, seconds: np.ndarray, rules: CaptureSettings) -> np.ndarray:
-    """Largest turn on each piece of a path, [n] [rad]; inf: any.
+    """Returns the largest turn on each piece of a path, [n] [rad]; inf: any.
 
     Args:
         stops: where the pieces begin and end, [n + 1, 3] [m].
@@ -186,7 +186,7 @@ def allowed_turns(stops: np.ndarray, seconds: np.ndarray, rules: CaptureSettings
 
 
 def elevations_of(motion: Motion) -> tuple[float, float]:
-    """Lowest and highest elevation of a line of sight [rad]."""
+    """Returns the lowest and highest elevation of a line of sight [rad]."""
     low, high = np.radians(motion.elevations)
     return float(low), float(high)
 
@@ -225,7 +225,7 @@ def aim(
 def observe_view(
     planner: Planner, frame: Frame, rules: CaptureSettings, *, captured: bool
 ) -> Planner:
-    """`observe` of a frame of the loop.
+    """Returns `observe` of a frame of the loop.
 
     No decision follows a frame that was captured while moving: the cells that it failed to show
     are counted here.

@@ -22,7 +22,7 @@ class Clock(Protocol):
         ...
 
     def charge(self, stage: str, measured: float) -> float:
-        """Seconds on the mission clock for one call of a stage that took `measured` [s]."""
+        """Returns seconds on the mission clock for one call of a stage that took `measured` [s]."""
         ...
 
 
@@ -33,7 +33,7 @@ class WallClock:
     measures: bool = True
 
     def charge(self, stage: str, measured: float) -> float:
-        """The measured time itself."""
+        """Returns the measured time itself."""
         return measured
 
 
@@ -48,12 +48,12 @@ class ModelClock:
     measures: bool = False
 
     def charge(self, stage: str, measured: float) -> float:
-        """The fixed cost of the stage, whatever was measured."""
+        """Returns the fixed cost of the stage, whatever was measured."""
         return self.costs[stage]
 
 
 def model_clock(config: ExplorationConfig) -> ModelClock:
-    """The clock of fixed costs; a decision's and a frame's are settings."""
+    """Returns the clock of fixed costs; a decision's and a frame's are settings."""
     return ModelClock(
         {
             "planning": config.planning_seconds,
@@ -65,7 +65,7 @@ def model_clock(config: ExplorationConfig) -> ModelClock:
 
 
 def make_clock(config: ExplorationConfig) -> Clock:
-    """The clock that the settings name: `wall` or `model`."""
+    """Returns the clock that the settings name: `wall` or `model`."""
     return WallClock() if config.clock == "wall" else model_clock(config)
 
 

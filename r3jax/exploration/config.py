@@ -47,12 +47,12 @@ class Budget:
     amount: float
 
     def allows(self, *, views: int, frames: int, seconds: float, metres: float) -> bool:
-        """True if a mission of that size lies within the budget."""
+        """Returns True if a mission of that size lies within the budget."""
         spent = {"views": views, "frames": frames, "seconds": seconds, "metres": metres}
         return spent[self.unit] <= self.amount
 
     def spent_share(self, *, views: int, frames: int, seconds: float, metres: float) -> float:
-        """Share of the budget that such a mission has used, in [0, 1]."""
+        """Returns the share of the budget that such a mission has used, in [0, 1]."""
         spent = {"views": views, "frames": frames, "seconds": seconds, "metres": metres}
         # Mapping the last image may exceed the budget: only its arrival has to lie within.
         return min(1.0, spent[self.unit] / self.amount)

@@ -34,13 +34,13 @@ def _renderability_of_views(
 def view_renderability(
     map_state: MapState, camera: Camera, T_world_camera: Float[Array, "4 4"]
 ) -> float:
-    """Renderability of one view of the map, as a number on the host."""
+    """Returns the renderability of one view of the map, as a number on the host."""
     return float(_renderability_of_views(map_state, camera, T_world_camera[None])[0])
 
 
 @functools.lru_cache(maxsize=4)
 def _probe_sequence(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple[np.ndarray, ...]:
-    """Positions [n, 3] and directions [n, 3], evenly spread, the same for every run."""
+    """Returns positions [n, 3] and directions [n, 3], evenly spread, the same for every run."""
     from scipy.stats import qmc  # half a second, which a page that only looks on need not wait for
 
     # Not scrambled: equal runs must write equal rows, and runs of one scene share their probes.
@@ -90,7 +90,7 @@ def _poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 def mean_renderability(map_state: MapState, grid: OccupancyGrid, camera: Camera, num: int) -> float:
-    """Mean renderability of the probe views; 0 while there is none."""
+    """Returns the mean renderability of the probe views; 0 while there is none."""
     poses = probe_poses(grid, num)
     if len(poses) == 0:
         return 0.0
@@ -109,7 +109,7 @@ def measure_coverage(
     arrival_renderability: float,
     num_probes: int,
 ) -> Coverage:
-    """Everything that a row says about the state after its view."""
+    """Returns everything that a row says about the state after its view."""
     unexplored = np.asarray(grid.unexplored)
     known = int(unexplored.size - unexplored.sum())
     return Coverage(

@@ -57,7 +57,7 @@ class RecordedViews(Protocol):
         ...
 
     def frame(self, step: int) -> Frame:
-        """The frame of one view, as it entered the map."""
+        """Returns the frame of one view, as it entered the map."""
         ...
 
     def newest_state(self, start: LoopState) -> LoopState:

@@ -42,7 +42,7 @@ from r3jax.planning.robot.motion import motion_of
 def start_state(
     mission: Mission, init_key: jax.Array, other_starts: Iterable[np.ndarray] = ()
 ) -> LoopState:
-    """The state before the first view.
+    """Returns the state before the first view.
 
     Args:
         mission: settings of the run.
@@ -68,7 +68,7 @@ def start_state(
 def step(
     state: LoopState, mission: Mission, *, exchange: float = 0.0
 ) -> tuple[LoopState, TakenView | Stop]:
-    """One frame: decide where to go (the first view is taken at the start), fly, look, map.
+    """Returns one frame: decide where to go (the first view is taken at the start), fly, look, map.
 
     Where a path is under way nothing is decided: the next frame on it is taken.
 
@@ -118,7 +118,7 @@ class _Chosen(NamedTuple):
 
 
 def _choose(state: LoopState, mission: Mission) -> _Chosen:
-    """Decides where to go; what was decided while moving is reconsidered."""
+    """Returns decides where to go; what was decided while moving is reconsidered."""
     mission.on_stage("plan")
     clock, planned = mission.clock, state.planned
     # By the number of the view, so that a resumed run draws what it would have drawn.
@@ -219,7 +219,7 @@ def _next_frame(
 
 
 def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
-    """The policy's reason, in words."""
+    """Returns the policy's reason, in words."""
     return Stop(
         StopReason(info.outcome.value),
         f"after {state.counts} the policy {state.planner.policy.name!r} drew "
@@ -387,7 +387,7 @@ def _arrive(
     *,
     captured: bool,
 ) -> LoopState:
-    """One frame more: the pose is the frame's, and the totals count the path to it.
+    """Returns one frame more: the pose is the frame's, and the totals count the path to it.
 
     The recorded pose (float32) is the pose from here on: a run read back goes on the same way.
     """

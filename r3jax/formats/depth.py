@@ -113,7 +113,7 @@ def _load_openexr() -> Any:
 
 
 def _pixels_of_exr(data: bytes) -> np.ndarray:
-    """The only channel of an EXR image, or the one that is named like depth."""
+    """Returns the only channel of an EXR image, or the one that is named like depth."""
     openexr = _load_openexr()
     try:
         file = openexr.InputFile(io.BytesIO(data))
@@ -136,7 +136,7 @@ def _pixels_of_exr(data: bytes) -> np.ndarray:
 
 
 def _kind(channel: Any) -> str:
-    """NumPy's type of a channel."""
+    """Returns NumPy's type of a channel."""
     return {"HALF": "<f2", "FLOAT": "<f4", "UINT": "<u4"}[str(channel.type)]
 
 

@@ -123,7 +123,7 @@ def _write_transforms(out: Path, run: Run, points: str | None) -> None:
 def posed_model(
     lens: Lens, names: Sequence[str], poses: np.ndarray, points: ColmapPoints
 ) -> ColmapModel:
-    """A model of images from one camera, without keypoints; everything is numbered from 1.
+    """Returns a model of images from one camera, without keypoints; everything is numbered from 1.
 
     Args:
         lens: the camera of all images.

@@ -45,7 +45,7 @@ def nearest_guess(path: Path) -> str | None:
 
 
 def _names(path: Path) -> list[str]:
-    """Names in a folder and in the folders below it, with a slash between."""
+    """Returns names in a folder and in the folders below it, with a slash between."""
     found: list[str] = []
     for entry in sorted(os.listdir(path))[:_MOST]:
         found.append(entry)
@@ -55,7 +55,7 @@ def _names(path: Path) -> list[str]:
 
 
 def _of_archive(path: Path) -> str | None:
-    """A zip archive or database that is damaged, or of something else."""
+    """Returns a zip archive or database that is damaged, or of something else."""
     if path.suffix.lower() == ".db":
         return _of_database(path)
     if path.suffix.lower() not in SUFFIXES:

@@ -134,7 +134,7 @@ class Lens:
         return min(width, height) > 0 and off <= self.width + self.height
 
     def resized(self, width: int, height: int) -> "Lens":
-        """The lens of the same images with another number of pixels [px]."""
+        """Returns the lens of the same images with another number of pixels [px]."""
         across, down = width / self.width, height / self.height
         scales = (across, across, down) if MODELS[self.model][1][0] == "f" else (
             across, down, across, down,
@@ -149,7 +149,7 @@ class Lens:
 
 
 def matrix_lens(K: np.ndarray, size: tuple[int, int], offset: float = 0.5) -> Lens:
-    """The PINHOLE of a matrix of intrinsics, [3, 3] or larger.
+    """Returns the PINHOLE of a matrix of intrinsics, [3, 3] or larger.
 
     Args:
         K: the matrix.
@@ -161,6 +161,6 @@ def matrix_lens(K: np.ndarray, size: tuple[int, int], offset: float = 0.5) -> Le
 
 
 def pinhole_lens(camera: Camera) -> Lens:
-    """The PINHOLE of a camera."""
+    """Returns the PINHOLE of a camera."""
     values = (camera.fx, camera.fy, camera.cx, camera.cy)
     return Lens("PINHOLE", camera.width, camera.height, tuple(float(value) for value in values))

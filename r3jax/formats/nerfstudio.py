@@ -146,7 +146,7 @@ def read_transforms(path: Path | str) -> PosedImages:
 
 
 def _smaller_copies(folder: Path, images: list[Path]) -> list[Path]:
-    """Where all images are gone, their copies in images_2, images_4 or images_8, if any."""
+    """Returns where all images are gone, their copies in images_2, images_4 or images_8, if any."""
     if folder in {image.parent for image in images} or any(map(os.path.exists, images)):
         return images
     for copy in COPIES:
@@ -201,7 +201,7 @@ def _depth_unit(content: _Fields) -> DepthUnit:
 
 
 def _applied(content: _Fields) -> np.ndarray | None:
-    """`applied_transform` and `applied_scale` as one 4x4 matrix."""
+    """Returns `applied_transform` and `applied_scale` as one 4x4 matrix."""
     rows = content.get("applied_transform")
     if rows is None and content.get("applied_scale") is None:
         return None
@@ -211,7 +211,7 @@ def _applied(content: _Fields) -> np.ndarray | None:
 
 
 def _applied_scale(content: _Fields) -> float:
-    """What all positions were multiplied by; 1 where the file does not say."""
+    """Returns what all positions were multiplied by; 1 where the file does not say."""
     scale = content.get("applied_scale")
     check_type("applied_scale", scale, float | None)
     if scale is None:
@@ -222,7 +222,7 @@ def _applied_scale(content: _Fields) -> float:
 
 
 def _matrix(name: str, rows: Any, size: int = 4) -> np.ndarray:
-    """A square matrix; its last row may be left out."""
+    """Returns a square matrix; its last row may be left out."""
     check_type(name, rows, list[list[float]])
     if [len(row) for row in rows] not in ([size] * (size - 1), [size] * size):
         raise ForeignFileError(f"`{name}` must be a {size - 1}x{size} or a {size}x{size} matrix")
@@ -232,7 +232,7 @@ def _matrix(name: str, rows: Any, size: int = 4) -> np.ndarray:
 
 
 def _pose(path: Path, which: str, frame: _Fields) -> np.ndarray:
-    """`T_world_camera` in OpenCV axes."""
+    """Returns `T_world_camera` in OpenCV axes."""
     name = f"{which}.transform_matrix"
     with naming(path):
         check_fields(which, frame, {"transform_matrix": list[Any]})
@@ -241,7 +241,7 @@ def _pose(path: Path, which: str, frame: _Fields) -> np.ndarray:
 
 
 def _lens(path: Path, which: str, fields: _Fields, images: Sequence[Path]) -> Lens:
-    """The camera of one frame; of the images the frame's own goes first."""
+    """Returns the camera of one frame; of the images the frame's own goes first."""
     with naming(path):
         try:
             width, height = _size(fields, images)
@@ -262,7 +262,7 @@ def _size(fields: _Fields, images: Sequence[Path]) -> tuple[int, int]:
 
 
 def _whole(fields: _Fields, name: str) -> int:
-    """A size; instant-ngp writes it with a decimal point."""
+    """Returns a size; instant-ngp writes it with a decimal point."""
     value = _value(fields, name)
     if value != int(value):
         raise ForeignFileError(f"`{name}` must be a whole number, got {value:g}")
@@ -317,7 +317,7 @@ def _focal_lengths(fields: _Fields, width: int, height: int) -> tuple[float, flo
 
 
 def transforms_of(run: Run, points: str | None = None) -> dict[str, Any]:
-    """The content of transforms.json.
+    """Returns the content of transforms.json.
 
     Args:
         run: a run with at least one view.
@@ -405,7 +405,7 @@ class Normalization(NamedTuple):
     """Applied after it."""
 
     def undone(self, poses: np.ndarray, T_capture_original: np.ndarray | None) -> np.ndarray:
-        """Poses in a capture's own coordinates, [n, 4, 4].
+        """Returns poses in a capture's own coordinates, [n, 4, 4].
 
         Args:
             poses: camera to the training's coordinates, [n, 4, 4].

@@ -159,7 +159,7 @@ def _text_table(data: bytes, vertices: _Vertices) -> np.ndarray:
 
 
 def _colors(table: np.ndarray) -> np.ndarray:
-    """[n, 3] uint8; fractions are of 1."""
+    """Returns [n, 3] uint8; fractions are of 1."""
     names = ("red", "green", "blue")
     if not all(name in (table.dtype.names or ()) for name in names):
         return np.full((len(table), 3), _GRAY, np.uint8)

@@ -56,11 +56,11 @@ class SparsePoints:
     """Index of the image of every observation, [t] int64."""
 
     def __len__(self) -> int:
-        """Number of points."""
+        """Returns the number of points."""
         return len(self.xyz)
 
     def seen_by(self, image: int) -> np.ndarray:
-        """Indices of the points that an image sees, ascending."""
+        """Returns indices of the points that an image sees, ascending."""
         return np.unique(self.seen_point[self.seen_image == image])
 
 
@@ -121,11 +121,11 @@ class PosedImages:
     """What else is there but not among the images, a sentence; None: nothing is left out."""
 
     def __len__(self) -> int:
-        """Number of images."""
+        """Returns the number of images."""
         return len(self.image_paths)
 
     def with_depth(self, folder: Path, unit: DepthUnit) -> "PosedImages":
-        """The same images with the depth images of a folder: 16-bit PNGs of the same names.
+        """Returns the same images with the depth images of a folder: 16-bit PNGs of the same names.
 
         For formats that have no place for depth. Images without a PNG there have no depth.
         """
@@ -191,7 +191,7 @@ class PosedImages:
             raise FormatError(depth_path, str(error)) from None
 
     def rgb(self, index: int) -> np.ndarray:
-        """The pixels of one image as they are, distortion included, [H, W, 3] uint8.
+        """Returns the pixels of one image as they are, distortion included, [H, W, 3] uint8.
 
         Raises:
             FormatError: the file is missing, broken or of another size.
@@ -199,7 +199,7 @@ class PosedImages:
         return self.masked_rgb(index)[0]
 
     def masked_rgb(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """The pixels of one image, and which of them its alpha channel does not cut out.
+        """Returns the pixels of one image, and which of them its alpha channel does not cut out.
 
         Returns:
             [H, W, 3] uint8 as `rgb`, and [H, W] bool; None: all of them count.
@@ -214,7 +214,7 @@ class PosedImages:
             return masked_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
 
     def depth(self, index: int) -> np.ndarray | None:
-        """The depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
+        """Returns the depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
 
         0 is no measurement, inf nothing within range.
 
@@ -233,7 +233,7 @@ class PosedImages:
         return resample_depth(stored, self.lenses[index], own)
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame in order, read one by one."""
+        """Returns every frame in order, read one by one."""
         return (self.frame(index) for index in range(len(self)))
 
 
@@ -275,7 +275,7 @@ def find_images(places: Iterable[Path], names: Mapping[str, Lens]) -> Path | Non
 
 
 def _fits(folder: Path, there: list[str], names: Mapping[str, Lens]) -> bool:
-    """True if the first image that can be opened has the shape of its lens."""
+    """Returns True if the first image that can be opened has the shape of its lens."""
     with suppress(ForeignFileError, OSError):
         size = first_size((folder / name for name in there), IMAGE_FORMATS)
         return names[there[0]].has_shape(*size)
@@ -315,7 +315,7 @@ def pair_images(
 
 
 def left_out(count: int, total: int, frames: str = "frames") -> str | None:
-    """A sentence on frames that are left out; None where there are none.
+    """Returns a sentence on frames that are left out; None where there are none.
 
     Args:
         count: of those that are left out.

@@ -59,7 +59,7 @@ def mend_pose(path: Path, which: str, pose: np.ndarray) -> np.ndarray:
 
 
 def read_lines(path: Path, data: bytes | None = None) -> Iterator[tuple[int, list[str]]]:
-    """The words of every line that has any, and its number from 1; comments start with #.
+    """Yields the words of every line that has any, and its number from 1; comments start with #.
 
     A heading that lost its # ("timestamp filename") is no line either.
 
@@ -79,7 +79,7 @@ def read_lines(path: Path, data: bytes | None = None) -> Iterator[tuple[int, lis
 
 
 def to_floats(path: Path, number: int, words: list[str], columns: int) -> list[float]:
-    """The numbers of one line.
+    """Returns the numbers of one line.
 
     Raises:
         FormatError: another number of words, or one that is no number.
@@ -93,7 +93,7 @@ def to_floats(path: Path, number: int, words: list[str], columns: int) -> list[f
 
 
 def read_numbers(path: Path, columns: int, data: bytes | None = None) -> np.ndarray:
-    """A table of numbers, [n, columns] float64, n >= 1; `data` as in `read_lines`.
+    """Returns a table of numbers, [n, columns] float64, n >= 1; `data` as in `read_lines`.
 
     Raises:
         FormatError: the file is missing, holds no numbers, or a line has another number of them.
@@ -106,7 +106,7 @@ def read_numbers(path: Path, columns: int, data: bytes | None = None) -> np.ndar
 
 
 def read_matrix(path: Path, rows: int, columns: int, data: bytes | None = None) -> np.ndarray:
-    """A matrix of this shape, float64; `data` as in `read_lines`.
+    """Returns a matrix of this shape, float64; `data` as in `read_lines`.
 
     Raises:
         FormatError: the file is missing, or holds something else.
@@ -130,7 +130,7 @@ def read_poses(path: Path) -> np.ndarray:
 
 
 def up_of_poses(poses: np.ndarray) -> np.ndarray | None:
-    """The vertical of a data set whose world has z up, [3].
+    """Returns the vertical of a data set whose world has z up, [3].
 
     None where the first pose is the identity: then another program wrote it in this layout, whose
     world is the first camera.
@@ -139,7 +139,7 @@ def up_of_poses(poses: np.ndarray) -> np.ndarray | None:
 
 
 def nearest(times: np.ndarray, others: np.ndarray, max_gap: float) -> np.ndarray:
-    """For each time the index of the nearest other time; -1 where it is too far away.
+    """Returns the for each time the index of the nearest other time; -1 where it is too far away.
 
     Args:
         times: [n] [s], in any order.
@@ -168,7 +168,7 @@ def rotation_of(quaternion: np.ndarray) -> np.ndarray:
 
 
 def quaternion_of(R: np.ndarray) -> np.ndarray:
-    """The quaternion w x y z [4] of a rotation matrix [3, 3], with w >= 0."""
+    """Returns the quaternion w x y z [4] of a rotation matrix [3, 3], with w >= 0."""
     return Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
 
 

@@ -29,7 +29,7 @@ _Z_UP_FROM_Y_UP = np.array(
 
 
 def is_recording(path: Path) -> bool:
-    """True if the folder looks like a recording."""
+    """Returns True if the folder looks like a recording."""
     return (path / "poses.txt").exists() and (path / "images").is_dir()
 
 

@@ -34,7 +34,7 @@ def spare_places(size: int, num: int) -> Int[Array, " n"]:
 
 
 def running_count(flags: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Number of set flags up to and including each place. n < 2^24."""
+    """Returns the number of set flags up to and including each place. n < 2^24."""
     # float32 has every integer up to 2^24; beyond, counts would be rounded.
     if flags.shape[0] >= 1 << 24:
         raise InputError(f"running_count is exact below 2^24 flags, got {flags.shape[0]}")
@@ -56,7 +56,7 @@ def _inclusive_sum(x: Array) -> Array:
 
 
 def positions_of_set(flags: Bool[Array, " n"], size: int) -> Int[Array, " M"]:
-    """Indices of the first `size` set flags, in order; n pads.
+    """Returns indices of the first `size` set flags, in order; n pads.
 
     Like `jnp.nonzero(flags, size=size, fill_value=n)`, but quick.
     """

@@ -48,7 +48,7 @@ def voxel_index(
 
 
 def voxel_center(index: Int[Array, "..."], voxel_size: Float[Array, ""]) -> Float[Array, "..."]:
-    """Center of the voxel along each coordinate [m]."""
+    """Returns the center of the voxel along each coordinate [m]."""
     return (index.astype(jnp.float32) + 0.5) * voxel_size
 
 
@@ -69,7 +69,7 @@ def pack(
 def unpack(
     low: UInt32[Array, "*n"], high: UInt32[Array, "*n"]
 ) -> tuple[Int[Array, "*n"], Int[Array, "*n"], Int[Array, "*n"]]:
-    """Inverse of `pack`. Empty rows give indices that mean nothing."""
+    """Returns the inverse of `pack`. Empty rows give indices that mean nothing."""
     mask21 = jnp.uint32((1 << 21) - 1)
     ux = low & mask21
     uy = (low >> 21) | ((high & jnp.uint32((1 << 10) - 1)) << 11)

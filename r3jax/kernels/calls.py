@@ -56,7 +56,7 @@ class Cells(NamedTuple):
     """False for cells that are known, and for padding."""
 
     def take(self, index: Int[Array, " k"], valid: Bool[Array, " k"]) -> "Cells":
-        """The cells at `index`; not unexplored where `valid` is False."""
+        """Returns the cells at `index`; not unexplored where `valid` is False."""
         part = (self.x[index], self.y[index], self.z[index])
         return Cells(*part, valid & self.unexplored[index])
 
@@ -198,7 +198,7 @@ def sums(
     rows: MapRows, cells: Cells, views: Views, layout: Layout, forms: Forms,
     num_bins: int, voxel_bins: int, *, keep: bool = False,
 ) -> tuple[Array, ...]:  # fmt: skip
-    """Sums what views show, by direction: `scoring.formulas.sums_in_view`.
+    """Returns sums what views show, by direction: `scoring.formulas.sums_in_view`.
 
     Args:
         rows: of the map.
@@ -233,7 +233,7 @@ def changes(
     position: Float[Array, "P 3"], focal: Float[Array, " P"], forms: Forms,
     num_bins: int, voxel_bins: int,
 ) -> tuple[Float[Array, "P B"], Float[Array, "P B"]]:  # fmt: skip
-    """Sums what imagined views have changed: `scoring.formulas.change_of_sums`.
+    """Returns sums what imagined views have changed: `scoring.formulas.change_of_sums`.
 
     Args:
         before: rows of the map before the views.
@@ -309,7 +309,7 @@ def _as_bytes(cells: Cells) -> Cells:
 
 
 def _choices(forms: Forms) -> tuple[bool, bool]:
-    """Whether kappa is always 1, and whether delta is that of pairs."""
+    """Returns whether kappa is always 1, and whether delta is that of pairs."""
     return forms.kappa == "one", forms.delta == "pairwise"
 
 
@@ -320,18 +320,18 @@ def _workers() -> np.ndarray:
 
 
 def _options(*values: int) -> np.ndarray:
-    """Whole numbers of a call, and how many threads share it."""
+    """Returns the whole numbers of a call, and how many threads share it."""
     return np.append(np.array(values, dtype=np.int32), _workers())
 
 
 @functools.cache
 def _lattice(num_bins: int) -> np.ndarray:
-    """Directions of bins [B, 3]."""
+    """Returns directions of bins [B, 3]."""
     return fibonacci_lattice(num_bins).astype(np.float32)
 
 
 @functools.cache
 def _bins(num_bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Candidates of every octahedral cell [S^2, K], and directions of bins [B, 3]."""
+    """Returns candidates of every octahedral cell [S^2, K], and directions of bins [B, 3]."""
     table = np.ascontiguousarray(nearest_bin_table(num_bins).T, dtype=np.int32)
     return table, _lattice(num_bins)

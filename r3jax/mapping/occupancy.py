@@ -111,7 +111,7 @@ class OccupancyGrid(eqx.Module):
 
 
 def cells_of(grid: OccupancyGrid) -> Cells:
-    """All cells of a grid, z fastest."""
+    """Returns all cells of a grid, z fastest."""
     shape = grid.log_odds.shape
     x, y, z = (
         grid.origin[i] + (jnp.arange(n, dtype=jnp.float32) + 0.5) * grid.cell_size
@@ -130,7 +130,7 @@ a_grid = one(OccupancyGrid, "r3jax.empty_grid makes one", leaf="log_odds", ndim=
 
 
 def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyGrid:
-    """A grid in which nothing has been explored.
+    """Returns a grid in which nothing has been explored.
 
     Args:
         bounds: lower and upper corner of the box to cover, [2, 3] [m].
@@ -169,7 +169,7 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
 
 
 def world_to_cell(grid: OccupancyGrid, points_world: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
-    """The cell that holds each point; outside the grid the index lies outside its shape."""
+    """Returns the cell that holds each point; outside the grid the index lies outside its shape."""
     # Reshaped, not broadcast: the tests let JAX raise on implicit rank promotion.
     origin = grid.origin.reshape((1,) * (points_world.ndim - 1) + (3,))
     index = jnp.floor((points_world - origin) / grid.cell_size)
@@ -178,20 +178,20 @@ def world_to_cell(grid: OccupancyGrid, points_world: Float[Array, "*n 3"]) -> In
 
 
 def cell_centers(grid: OccupancyGrid, cells: Int[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Center of each cell in the world [m]."""
+    """Returns the center of each cell in the world [m]."""
     origin = grid.origin.reshape((1,) * (cells.ndim - 1) + (3,))
     return origin + (cells.astype(jnp.float32) + 0.5) * grid.cell_size
 
 
 def centers_on_host(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
-    """`cell_centers` of any number of cells [n, 3] in NumPy, float64: nothing compiles."""
+    """Returns `cell_centers` of any number of cells [n, 3] in NumPy, float64: nothing compiles."""
     return np.asarray(grid.origin, np.float64) + (cells + 0.5) * float(grid.cell_size)
 
 
 def log_odds_at(
     grid: OccupancyGrid, points_world: Float[Array, "*n 3"], outside: float = 0.0
 ) -> Float[Array, "*n"]:
-    """Log-odds of the cell that holds each point; `outside` for points beyond the grid."""
+    """Returns log-odds of the cell that holds each point; `outside` for points beyond the grid."""
     index = world_to_cell(grid, points_world)
     inside = _inside(grid, index)
     # Cell 0 stands in: a negative index would read from the far side of the grid.
@@ -201,7 +201,7 @@ def log_odds_at(
 
 @jax.jit
 def frontier(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
-    """Free cells with an unexplored face neighbor: where known space ends."""
+    """Returns the free cells with an unexplored face neighbor: where known space ends."""
     return grid.free & _has_face_neighbor(grid.unexplored)
 
 
@@ -272,7 +272,7 @@ def integrate_depth(
 def _hit_cells(
     grid: OccupancyGrid, frame: Frame, max_range: Float[Array, ""]
 ) -> Bool[Array, "X Y Z"]:
-    """Cells that hold at least one measured point within range."""
+    """Returns cells that hold at least one measured point within range."""
     x, y = _ray_slopes(frame.camera)
     is_measured = (frame.depth > 0.0) & jnp.isfinite(frame.depth)
     # Replaced before the arithmetic: inf times a slope of 0 is NaN.
@@ -303,7 +303,7 @@ def _ray_slopes(camera: Camera) -> tuple[Float[Array, "H W"], Float[Array, "H W"
 def _passed_cells(
     grid: OccupancyGrid, frame: Frame, max_range: Float[Array, ""]
 ) -> Bool[Array, "X Y Z"]:
-    """Cells of which at least four octants' centers were seen through."""
+    """Returns cells of which at least four octants' centers were seen through."""
     camera = frame.camera
     # The whole grid is turned into the camera's frame, since cells are asked, not rays.
     T_camera_world = invert_pose(frame.T_world_camera)
@@ -345,7 +345,7 @@ def _passed_cells(
 def _nearest_by_block(
     camera: Camera, depth: Float[Array, "H W"]
 ) -> tuple[Float[Array, "h w"], int]:
-    """Least z-depth measured in each block of pixels, and the block's side [px].
+    """Returns the least z-depth measured in each block of pixels, and the block's side [px].
 
     A block without any measurement gets 0: nothing passes it.
     """
@@ -369,7 +369,7 @@ def _inside(grid: OccupancyGrid, index: Int[Array, "*n 3"]) -> Bool[Array, "*n"]
 
 
 def _distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X Y Z"]:
-    """Distance from a point to every cell's center [m]."""
+    """Returns the distance from a point to every cell's center [m]."""
     return jnp.sqrt(squared_distance(grid, point))
 
 
@@ -388,7 +388,7 @@ def squared_distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Ar
 
 
 def _has_face_neighbor(mask: Bool[Array, "X Y Z"]) -> Bool[Array, "X Y Z"]:
-    """Cells with a face neighbor in the mask; beyond the grid there is none."""
+    """Returns cells with a face neighbor in the mask; beyond the grid there is none."""
     # Padded, not rolled: opposite faces of the grid are no neighbors.
     padded = jnp.pad(mask, 1)
     return (

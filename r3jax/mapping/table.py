@@ -43,7 +43,7 @@ def _slot(hashed: UInt32[Array, " n"], probe: Int[Array, ""], capacity: int) -> 
 def find(
     table: UInt32[Array, "2 N"], keys: UInt32[Array, "2 n"], valid: Bool[Array, " n"]
 ) -> Int[Array, " n"]:
-    """Row of each key; N where it is absent or not valid."""
+    """Returns the row of each key; N where it is absent or not valid."""
     capacity = table.shape[1]
     hashed = hash_key(keys[0], keys[1])
 
@@ -69,7 +69,7 @@ def find(
 def find_or_insert(
     table: UInt32[Array, "2 N"], keys: UInt32[Array, "2 n"], valid: Bool[Array, " n"]
 ) -> tuple[UInt32[Array, "2 N"], Int[Array, " n"]]:
-    """Row of each key, new rows for keys that had none.
+    """Returns the row of each key, new rows for keys that had none.
 
     Args:
         table: packed keys of the rows.

@@ -70,7 +70,7 @@ def integrate_groups(
     camera_position: Float[Array, " 3"] | Float[Array, "P 3"],
     focal: Float[Array, ""],
 ) -> MapState:
-    """One observation per touched voxel joins the map, `JOINED` voxels at a time.
+    """Returns one observation per touched voxel joins the map, `JOINED` voxels at a time.
 
     Args:
         state: the map before.
@@ -132,7 +132,7 @@ def _by_formulas(
 def _by_kernels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
-    """The same in machine code."""
+    """Returns the same in machine code."""
     factor = nan_unless_valid(frame.camera, frame.T_world_camera)
     # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
     image = for_kernels(frame, factor * max_range, drop_edges)
@@ -169,7 +169,7 @@ def for_kernels(
 def _integrate(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
-    """One frame joins the map, by kernels on CPUs and by the formulas elsewhere."""
+    """Returns one frame joins the map, by kernels on CPUs and by the formulas elsewhere."""
     add = by_platform(cpu=_by_kernels, default=_by_formulas)
     return add(state, frame, max_range, drop_edges)
 

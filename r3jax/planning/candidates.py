@@ -68,7 +68,7 @@ class Candidates(eqx.Module):
         return poses_along(self.position, self.direction)
 
     def poses_on_device(self) -> Float[Array, "C 4 4"]:
-        """Poses for scoring, float32."""
+        """Returns poses for scoring, float32."""
         return _poses_along(
             jnp.asarray(self.position, dtype=jnp.float32),
             jnp.asarray(self.direction, dtype=jnp.float32),
@@ -175,7 +175,7 @@ def draw_positions(
 
 
 def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -> np.ndarray:
-    """`num` positions uniform over the safe, reachable cells within `radius` of the robot.
+    """Returns `num` positions uniform over the safe, reachable cells within `radius` of the robot.
 
     The cells are those with their center within the radius, and the robot's own (if it is known
     to be free). Several positions may share a cell. If the robot's own cell does not keep the
@@ -264,7 +264,7 @@ def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
 
 
 def spread(places: np.ndarray, num: int) -> np.ndarray:
-    """Indices of up to `num` places, each the farthest from those before (Gonzalez 1985).
+    """Returns indices of up to `num` places, each the farthest from those before (Gonzalez 1985).
 
     The first is the one nearest to the middle of all: it does not depend on their order, but for
     ties.
@@ -288,13 +288,13 @@ def spread(places: np.ndarray, num: int) -> np.ndarray:
 
 
 def in_plain_view(travel: Travel, a: np.ndarray, b: np.ndarray) -> bool:
-    """True if the straight line between two positions [m] runs through known free space."""
+    """Returns True if the straight line between two positions [m] runs through known free space."""
     scale = travel.cell_size
     return segment_is_inside(travel.free, (a - travel.origin) / scale, (b - travel.origin) / scale)
 
 
 def random_directions(num: int, *, key: Array) -> np.ndarray:
-    """`num` directions uniform on the sphere, [num, 3] float64.
+    """Returns `num` directions uniform on the sphere, [num, 3] float64.
 
     Not bounded in elevation: floors and ceilings are part of the scene, and test views look
     straight up and down too.

@@ -123,7 +123,7 @@ class GreedyPolicy(ABC):
         del camera, grid
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """The candidates: those of R3, unless the policy has its own."""
+        """Returns the candidates: those of R3, unless the policy has its own."""
         travel, grid = situation.travel, situation.scoring_grid
         return Drawn(random_views(travel, grid, self.config, key=key), situation.memory)
 
@@ -134,12 +134,12 @@ class GreedyPolicy(ABC):
     def score_again(
         self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
     ) -> Scored:
-        """`score` of candidates of an earlier decision, whose totals [C] were `before`."""
+        """Returns `score` of candidates of an earlier decision, whose totals [C] were `before`."""
         del before
         return self.score(situation, candidates, key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """`total` of each candidate, from `utility` and `path` [C]: U_view."""
+        """Returns `total` of each candidate, from `utility` and `path` [C]: U_view."""
         return net_utility(utilities["utility"], utilities["path"], self.config.lambda2)
 
     def conclude(
@@ -149,18 +149,18 @@ class GreedyPolicy(ABC):
         utilities: dict[str, np.ndarray],
         best: int,
     ) -> Any:
-        """The memory after candidate `best` was chosen."""
+        """Returns the memory after candidate `best` was chosen."""
         del candidates, utilities, best
         return situation.memory
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
-        """The state before the first frame; nothing in it is random."""
+        """Returns the state before the first frame; nothing in it is random."""
         del key
         memory = self.first_memory(camera, grid)
         return initial_state(camera, grid, memory, self.config.motion)
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
-        """The map holds all that most policies need of a frame."""
+        """Returns the map holds all that most policies need of a frame."""
         del map_state, frame
         return state
 
@@ -173,7 +173,7 @@ class GreedyPolicy(ABC):
         *,
         key: Array,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """The candidate with the greatest total, of those that the robot may take."""
+        """Returns the candidate with the greatest total, of those that the robot may take."""
         rule = Rule(self.draw, self.score, self.weigh, self.conclude)
         return decide(rule, (state, map_state, grid, T_world_camera), self.config, key=key)
 
@@ -208,7 +208,7 @@ class GreedyPolicy(ABC):
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> PlannerState:
-        """The cells on the path, and what the latest view failed to show."""
+        """Returns the cells on the path, and what the latest view failed to show."""
         state, situation = look_round(state, map_state, grid, T_world_camera, self.config)
         return with_path(state, situation.travel, waypoints)
 
@@ -220,7 +220,7 @@ Known = tuple[PlannerState, MapState, OccupancyGrid, np.ndarray]
 def decide(
     rule: Rule, known: Known, config: PlannerConfig, *, key: Array
 ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-    """One decision, from drawing to choice.
+    """Returns one decision, from drawing to choice.
 
     Args:
         rule: of the policy.
@@ -285,7 +285,7 @@ def look_round(
     T_world_camera: np.ndarray,
     config: PlannerConfig,
 ) -> tuple[PlannerState, Situation]:
-    """Finds where the robot can go, what it may do next, and which cells can be explored.
+    """Returns finds where the robot can go, what it may do next, and which cells can be explored.
 
     Args:
         state: the policy's memory.
@@ -384,7 +384,7 @@ def net_utility(
 def initial_state(
     camera: Camera, grid: OccupancyGrid, memory: Any = None, motion: Motion | None = None
 ) -> PlannerState:
-    """The memory of a robot that has not moved yet."""
+    """Returns the memory of a robot that has not moved yet."""
     nowhere = np.zeros(grid.log_odds.shape, dtype=bool)
     looks = np.zeros(grid.log_odds.shape, dtype=np.int32)
     is_relative = motion is not None and motion.is_relative
@@ -414,7 +414,7 @@ def _decision_for(
     travel: Travel,
     limits: Limits,
 ) -> Decision:
-    """Candidate `best`, the path to it, and what else was on offer."""
+    """Returns the candidate `best`, the path to it, and what else was on offer."""
     waypoints = travel.path(candidates.position[best])
     # Measured again: shortcuts may have made the path shorter than the length that was weighed.
     length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
@@ -432,7 +432,7 @@ def _decision_for(
 
 
 def _nothing_in_reach(travel: Travel, config: PlannerConfig, stopwatch: "Stopwatch") -> PlanInfo:
-    """The answer where no candidate was found: safe places exist, or not even those."""
+    """Returns the answer where no candidate was found: safe places exist, or not even those."""
     centers = travel.centers(np.argwhere(travel.safe))
     # Safe places within the radius that no path leads to are told from none at all.
     near = np.linalg.norm(centers - travel.start, axis=1) <= config.radius

@@ -129,7 +129,7 @@ def take_in(planner: Planner, frame: Frame) -> Planner:
 def decide(
     planner: Planner, T_world_camera: ArrayLike, key: Array
 ) -> tuple[Decision | None, Planner, PlanInfo]:
-    """Decides where to look next.
+    """Returns decides where to look next.
 
     Args:
         planner: what is known.

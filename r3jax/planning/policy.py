@@ -108,7 +108,7 @@ class Policy(Protocol):
     name: str
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Any:
-        """The state before the first frame."""
+        """Returns the state before the first frame."""
         ...
 
     def observe(self, state: Any, map_state: MapState, frame: Frame) -> Any:
@@ -124,7 +124,7 @@ class Policy(Protocol):
         *,
         key: Array,
     ) -> tuple[Decision | None, Any, PlanInfo]:
-        """The next view, or None with the reason in the info."""
+        """Returns the next view, or None with the reason in the info."""
         ...
 
     def follow(

@@ -182,7 +182,7 @@ def _best(candidates: Candidates, total: np.ndarray, num: int) -> np.ndarray:
 
 
 def free_box(travel: Travel, position: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """A box round a place all over which the robot may stop.
+    """Returns a box round a place all over which the robot may stop.
 
     The box of cells round the place's own grows, one layer at a time, over safe cells to which a
     way leads, and ends where candidates do: a quarter of a cell from the middles of its outermost.

@@ -52,7 +52,7 @@ def describe(name: str) -> str:
 
 
 def source_of(name: str) -> str:
-    """Says where a policy's rule comes from, in a phrase.
+    """Returns says where a policy's rule comes from, in a phrase.
 
     Raises:
         ValueError: no policy has that name.

@@ -55,7 +55,7 @@ class Turning:
         return bool(turn(self.start, self.end) <= self.allowed.sum() + _SAME)
 
     def feasible(self, piece: int, now: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Which directions the camera may have after a piece.
+        """Returns which directions the camera may have after a piece.
 
         Args:
             piece: number of the piece.
@@ -94,19 +94,19 @@ class Turning:
 
 
 def turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Length of the turn between directions [..., 2], [...] [rad]."""
+    """Returns the length of the turn between directions [..., 2], [...] [rad]."""
     difference = _difference(first, second)
     return np.asarray(np.hypot(difference[..., 0], difference[..., 1]))
 
 
 def _difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """From one direction to another, [..., 2], round the shorter side."""
+    """Returns the from one direction to another, [..., 2], round the shorter side."""
     difference = np.asarray(second, dtype=np.float64) - first
     return np.stack([wrapped(difference[..., 0]), difference[..., 1]], axis=-1)
 
 
 def _towards(now: np.ndarray, goal: np.ndarray, most: float) -> np.ndarray:
-    """The direction after a turn of at most `most` [rad] straight to a goal."""
+    """Returns the direction after a turn of at most `most` [rad] straight to a goal."""
     whole = float(turn(now, goal))
     return now + min(1.0, most / max(whole, 1e-12)) * _difference(now, goal)
 
@@ -134,7 +134,7 @@ def along(offset: np.ndarray, now: np.ndarray) -> np.ndarray:
 def axes_within(
     elevations: tuple[float, float], num_bins: int = 526
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The axes of a panorama that a camera may have, moved into what it may tilt to.
+    """Returns the axes of a panorama that a camera may have, moved into what it may tilt to.
 
     Those whose bins, caps of 1 / B of the sphere, reach into the allowed elevations; at least those
     that are nearest.

@@ -39,7 +39,7 @@ _HEADROOM = 0.35
 def floor_picture(
     map_state: MapState, grid: OccupancyGrid, height: float
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """The place from above, cut open over the cameras' heads.
+    """Returns the place from above, cut open over the cameras' heads.
 
     Light gray is unexplored at the cameras' height, white is free, dark gray is occupied; on
     top lie the highest voxels below the cut, in their mean color.
@@ -106,7 +106,7 @@ def panorama_picture(
     T_world_camera: np.ndarray,
     max_range: float,
 ) -> PanoramaPicture:
-    """Renderability in all directions from a camera's position.
+    """Returns the renderability in all directions from a camera's position.
 
     Args:
         map_state: the voxels.
@@ -156,7 +156,7 @@ def _is_free_to(grid: OccupancyGrid, position: np.ndarray, max_range: float) -> 
 
 
 def _nearest_rows(map_state: MapState, position: np.ndarray, max_range: float) -> np.ndarray:
-    """The map row that is seen in every direction, [h, w]; N where there is none.
+    """Returns the map row that is seen in every direction, [h, w]; N where there is none.
 
     A painter's picture: every voxel covers the angle of its edge, the far ones are painted
     first. The first column looks along azimuth +180 degrees, the first row straight up.
@@ -233,13 +233,13 @@ def show_renderability(
 
 
 def empty_directions() -> list[Patch]:
-    """Entries of a legend for directions without a voxel."""
+    """Returns entries of a legend for directions without a voxel."""
     kinds = (("beyond the sensor's range", BEYOND), ("never seen", _NEVER_SEEN))
     return [Patch(facecolor=color, edgecolor=style.MUTED, label=name) for name, color in kinds]
 
 
 def small_png(rgb: np.ndarray, pose: np.ndarray, up: np.ndarray, side: int) -> bytes:
-    """A small PNG of an image, turned by quarters until the vertical points up.
+    """Returns a small PNG of an image, turned by quarters until the vertical points up.
 
     Args:
         rgb: colors, [H, W, 3] uint8.
@@ -255,7 +255,7 @@ def small_png(rgb: np.ndarray, pose: np.ndarray, up: np.ndarray, side: int) -> b
 
 
 def png(rgb: np.ndarray) -> bytes:
-    """A PNG of an image [H, W, 3] uint8."""
+    """Returns a PNG of an image [H, W, 3] uint8."""
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, format="png", compress_level=1)
     return buffer.getvalue()

@@ -45,7 +45,7 @@ SCORE_MAP = "RdYlGn"
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of that size [inch] without pyplot's global state."""
+    """Returns an empty figure of that size [inch] without pyplot's global state."""
     return Figure(figsize=(width, height), dpi=110, layout="constrained", facecolor="white")
 
 
@@ -64,7 +64,7 @@ def dress(axes: Axes, title: str = "", x: str = "", y: str = "") -> Axes:
 
 
 def blank(axes: Axes, title: str = "") -> Axes:
-    """Axes for an image: no ticks, no grid."""
+    """Returns axes for an image: no ticks, no grid."""
     dress(axes, title)
     axes.grid(visible=False)
     axes.set_xticks([])
@@ -77,7 +77,7 @@ def blank(axes: Axes, title: str = "") -> Axes:
 def picture_grid(
     lines: int, columns: int, aspect: float, space: float
 ) -> tuple[Figure, np.ndarray]:
-    """A figure 10 inches wide for images of one shape.
+    """Returns a figure 10 inches wide for images of one shape.
 
     Args:
         lines: of images.

@@ -155,7 +155,7 @@ def _refuse_half_a_fork(run: Run) -> None:
 
 
 def _as_flown(rows: Sequence[StepRow]) -> list[StepRow]:
-    """The rows; a path that was left before its end is cut to what was flown.
+    """Returns the rows; a path that was left before its end is cut to what was flown.
 
     Who takes over is told the path, and must not take for visited what lies ahead.
     """
@@ -246,7 +246,7 @@ def _header(runs: list[Run]) -> RunHeader:
 
 
 def _behind(row: StepRow, before: StepRow | None) -> StepRow:
-    """A row of a later run, numbered on behind the last row of the runs before."""
+    """Returns a row of a later run, numbered on behind the last row of the runs before."""
     if before is None:
         return row
     return replace(

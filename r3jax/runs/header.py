@@ -102,7 +102,7 @@ class RunHeader:
 
 
 def camera_fields(camera: Camera) -> dict[str, int | float]:
-    """A camera as plain numbers."""
+    """Returns a camera as plain numbers."""
     traced = {name: float(getattr(camera, name)) for name in _LENS}
     return {"width": camera.width, "height": camera.height, **traced}
 
@@ -133,7 +133,7 @@ def policy_fields(policy: Policy) -> dict[str, Any]:
 
 
 def settings_of(policy: object) -> dict[str, Any]:
-    """What JSON can hold of a policy's settings.
+    """Returns what JSON can hold of a policy's settings.
 
     A free-flying camera's motion is left out, and so are refinement where there is none and the
     mounting of a camera that turns by itself: that is what their absence has always meant.
@@ -150,7 +150,7 @@ def settings_of(policy: object) -> dict[str, Any]:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of what shapes the result on this machine."""
+    """Returns versions of what shapes the result on this machine."""
     import jax  # only here is a device needed
 
     versions: dict[str, str] = {
@@ -166,7 +166,7 @@ def package_versions() -> dict[str, str]:
 
 
 def header_to_json(header: RunHeader) -> str:
-    """The text of run.json."""
+    """Returns the text of run.json."""
     # Format and version come first, for those who open the file by hand.
     plain = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(header)}
     # NaN would become a word that `parse_json` refuses: the run could never be read.

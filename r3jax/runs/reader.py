@@ -61,15 +61,15 @@ class Run:
         return f"{self.end.outcome}: {self.end.message}"
 
     def image_path(self, step: int) -> Path:
-        """Where the color image of a view lies."""
+        """Returns where the color image of a view lies."""
         return self.path / "frames" / f"{step:06d}.png"
 
     def depth_path(self, step: int) -> Path:
-        """Where the depth image of a view lies."""
+        """Returns where the depth image of a view lies."""
         return self.path / "frames" / f"{step:06d}.depth.png"
 
     def frame(self, step: int) -> Frame:
-        """The frame of one view, as it entered the map.
+        """Returns the frame of one view, as it entered the map.
 
         Raises:
             RunError: an image is missing, broken, or not the one that was recorded.
@@ -77,7 +77,7 @@ class Run:
         return from_integers(*self.images(step), self.rows[step].pose, self.camera)
 
     def images(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """The images of one view as they are stored: [H, W, 3] uint8 and [H, W] uint16.
+        """Returns the images of one view as they are stored: [H, W, 3] uint8 and [H, W] uint16.
 
         Raises:
             RunError: an image is missing, broken, or not the one that was recorded.
@@ -91,19 +91,19 @@ class Run:
         return rgb, depth
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame in order, read one by one."""
+        """Returns every frame in order, read one by one."""
         return (self.frame(row.step) for row in self.rows)
 
     def checkpoint(self) -> tuple[int, MapState, OccupancyGrid]:
-        """The newest stored map and grid, and the view after which they were stored."""
+        """Returns the newest stored map and grid, and the view after which they were stored."""
         return read_checkpoint(self.path / "checkpoints")
 
     def checkpoint_steps(self) -> list[int]:
-        """The views after which a state is stored, oldest first."""
+        """Returns the views after which a state is stored, oldest first."""
         return checkpoint_steps(self.path / "checkpoints")
 
     def load_checkpoint(self, step: int) -> dict[str, dict[str, np.ndarray]]:
-        """The arrays of a stored state, by table.
+        """Returns the arrays of a stored state, by table.
 
         Raises:
             RunError: there is none for that view, or it cannot be read.
@@ -162,7 +162,7 @@ def read_png(path: Path, width: int, height: int, *, is_depth: bool) -> np.ndarr
 
 
 def complete_lines(path: Path) -> list[str]:
-    """Lines that end in a newline: a power cut may have torn the last one.
+    """Returns lines that end in a newline: a power cut may have torn the last one.
 
     Raises:
         RunError: missing, not permitted, or larger than any trace.

@@ -48,7 +48,7 @@ class Reason:
 
 
 def reason_of(explanation: Explanation, grid: OccupancyGrid) -> Reason:
-    """What an explanation says of what the view sees.
+    """Returns what an explanation says of what the view sees.
 
     Args:
         explanation: of one view.

@@ -32,7 +32,7 @@ class Difference:
 def rebuild(
     runs: Sequence[Run], views: int | None = None, on_frame: Callable[[], None] = lambda: None
 ) -> tuple[MapState, OccupancyGrid]:
-    """The map and the grid that have seen what the runs have seen, one run after the other.
+    """Returns the map and the grid that have seen what the runs have seen, one run after the other.
 
     Args:
         runs: of one scene: the same box, cells, voxels and range.
@@ -57,7 +57,7 @@ def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
 
 
 def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
-    """The map and the grid after each view of a run, in order, lazily.
+    """Returns the map and the grid after each view of a run, in order, lazily.
 
     Raises:
         RunError: no view, settings that cannot work, or a frame that is missing or broken.
@@ -84,7 +84,7 @@ def _last(
 def _states(
     runs: Sequence[Run], frames: Iterable[tuple[Run, int]]
 ) -> Iterator[tuple[MapState, OccupancyGrid]]:
-    """The map and the grid of several runs after each frame."""
+    """Yields the map and the grid of several runs after each frame."""
     config, state = config_of(runs[0]), _first(runs)
     for run, step in frames:
         state = add_frame(*state, run.frame(step), config)
@@ -92,13 +92,13 @@ def _states(
 
 
 def _first(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    """The map and the grid before the first view of runs in one scene."""
+    """Returns the map and the grid before the first view of runs in one scene."""
     config = config_of(runs[0])
     return empty_map(config.capacity, config.voxel_size, config.num_bins), grid_before(runs)
 
 
 def team_of(run: Run) -> list[Run]:
-    """The runs of all members of the team that a run flew in, in order.
+    """Returns the runs of all members of the team that a run flew in, in order.
 
     Raises:
         RunError: it flew in none; one is missing, or was cut off before the last meeting.
@@ -119,7 +119,7 @@ def team_of(run: Run) -> list[Run]:
 
 
 def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
-    """The grid before the first view of runs in one scene.
+    """Returns the grid before the first view of runs in one scene.
 
     Raises:
         RunError: a run without a view, or settings that cannot work.
@@ -153,7 +153,7 @@ def is_decided_apart(run: Run) -> bool:
 def differences(
     run: Run, on_frame: Callable[[], None] = lambda: None
 ) -> tuple[int, list[Difference]]:
-    """Where the newest stored map and grid are not those that the frames rebuild.
+    """Returns where the newest stored map and grid are not those that the frames rebuild.
 
     Those of a run that flew in a team are rebuilt from the frames of all its members.
 
@@ -198,12 +198,12 @@ def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | N
 
 
 def parts_of(run: Run) -> list[int]:
-    """Views of each run that a merged one is made of; all views of any other."""
+    """Returns views of each run that a merged one is made of; all views of any other."""
     return (run.header.parent or {}).get("merged_views", [len(run.rows)])
 
 
 def starts_of(run: Run) -> list[np.ndarray]:
-    """Where a run began; a merged one began several times."""
+    """Returns where a run began; a merged one began several times."""
     if not run.rows:
         raise RunError(run.path, "the run has no view")
     # The last part begins no other: its sum would be one past the last row.

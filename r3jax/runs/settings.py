@@ -29,7 +29,7 @@ class RunSettings:
     policy: Policy
 
     def with_limits(self, budget: str | None, until: str | None) -> "RunSettings":
-        """The same with another budget or goal where one is given.
+        """Returns the same with another budget or goal where one is given.
 
         Raises:
             ValueError: a budget or a goal that cannot work.
@@ -44,7 +44,7 @@ class RunSettings:
 
 
 def config_of(run: Run) -> ExplorationConfig:
-    """The settings of the loop that a run was made with.
+    """Returns the settings of the loop that a run was made with.
 
     Raises:
         RunError: a setting that this version does not know, or cannot work with.
@@ -75,7 +75,7 @@ def _config_class(run: Run) -> type[PlannerConfig]:
 
 
 def planner_config_of(run: Run) -> PlannerConfig:
-    """The settings of the policy that a run was made with.
+    """Returns the settings of the policy that a run was made with.
 
     Raises:
         RunError: a setting that this version does not know, or cannot work with.
@@ -225,6 +225,6 @@ def changed_versions(run: Run) -> list[str]:
 
 
 def _pose_at(start: Any) -> np.ndarray:
-    """`T_world_camera` [4, 4] at a position [m], looking along x."""
+    """Returns `T_world_camera` [4, 4] at a position [m], looking along x."""
     pose = pose_along(jnp.asarray(start, jnp.float32), jnp.asarray([1.0, 0.0, 0.0]))
     return np.asarray(pose, dtype=np.float64)

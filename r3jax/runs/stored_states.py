@@ -118,12 +118,12 @@ class CheckpointWriter:
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
-    """The views after which a state is stored, oldest first."""
+    """Returns the views after which a state is stored, oldest first."""
     return [int(path.name) for path in numbered(folder)]
 
 
 def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]:
-    """The tables that were stored after view `step`.
+    """Returns the tables that were stored after view `step`.
 
     Raises:
         RunError: it is not there, damaged, or it cannot be read.
@@ -143,7 +143,7 @@ def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]
 
 
 def _storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Orbax refuses arrays without elements: their names say what they are."""
+    """Returns Orbax refuses arrays without elements: their names say what they are."""
 
     def named(name: str, x: np.ndarray) -> str:
         return name if x.size else f"{name} empty {x.dtype.str} {list(x.shape)}"
@@ -152,7 +152,7 @@ def _storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _stored(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Inverse of `_storable`."""
+    """Returns the inverse of `_storable`."""
     arrays: dict[str, np.ndarray] = {}
     for full_name, array in table.items():
         name, is_empty, rest = full_name.partition(" empty ")
@@ -164,7 +164,7 @@ def _stored(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
-    """The newest stored map and grid, and the view after which they were stored.
+    """Returns the newest stored map and grid, and the view after which they were stored.
 
     Raises:
         RunError: there is none, or it cannot be read.
@@ -185,20 +185,20 @@ def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
 
 
 def map_tables(map_state: MapState, grid: OccupancyGrid) -> dict[str, dict[str, np.ndarray]]:
-    """The tables `map` and `grid` of a checkpoint."""
+    """Returns the tables `map` and `grid` of a checkpoint."""
     num_bins = {"num_bins": np.asarray(map_state.num_bins)}
     return {"map": named_arrays(map_state) | num_bins, "grid": named_arrays(grid)}
 
 
 def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
-    """The state as a checkpoint holds it."""
+    """Returns the state as a checkpoint holds it."""
     tables = map_tables(state.map_state, state.grid)
     tables["policy"] = named_arrays(state.policy_state)
     return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in _LOOP}}
 
 
 def newest_state(folder: Path, rows: Sequence[StepRow], start: LoopState) -> LoopState:
-    """The newest stored state that can be used; the start if there is none.
+    """Returns the newest stored state that can be used; the start if there is none.
 
     Args:
         folder: of the checkpoints.
@@ -227,7 +227,7 @@ def newest_state(folder: Path, rows: Sequence[StepRow], start: LoopState) -> Loo
 
 
 def state_of(tables: Tables, like: LoopState) -> LoopState:
-    """Inverse of `state_tables`.
+    """Returns the inverse of `state_tables`.
 
     Args:
         tables: of a checkpoint.
@@ -257,13 +257,13 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
 
 
 def named_arrays(tree: Any) -> dict[str, np.ndarray]:
-    """Every leaf of a tree by its path in it, such as `memory.of_stage.0.left`."""
+    """Returns every leaf of a tree by its path in it, such as `memory.of_stage.0.left`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {_name(path): np.asarray(leaf) for path, leaf in leaves}
 
 
 def fill(template: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """A tree built like `template` whose leaves are `arrays`: inverse of `named_arrays`.
+    """Returns a tree built like `template` whose leaves are `arrays`: inverse of `named_arrays`.
 
     Shapes may differ from the template's, as tables grow; types may not.
 

@@ -318,7 +318,7 @@ class RunWriter:
             self._lock.close()
 
     def __enter__(self) -> "RunWriter":
-        """The writer itself."""
+        """Returns the writer itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -338,7 +338,7 @@ def _named(path: Path, what: str) -> Generator[None]:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """A PNG of [H, W, 3] uint8 or [H, W] uint16."""
+    """Returns a PNG of [H, W, 3] uint8 or [H, W] uint16."""
     from PIL import Image  # a run is read without images more often than with them
 
     buffer = io.BytesIO()

@@ -61,7 +61,7 @@ def explain_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig | None = None,
 ) -> Explanation:
-    """The utility of one view, divided among its causes, for every voxel and in total.
+    """Returns the utility of one view, divided among its causes, for every voxel and in total.
 
     It sees what `view_utility` of the same view sees. A voxel that was observed once only is
     never called inconsistent: nothing was measured against it.
@@ -96,7 +96,7 @@ def _divide_visible(
     focal: Float[Array, ""],
     forms: Forms,
 ) -> _Sums:
-    """Deficits of the visible voxels by cause; summed in the order in which U_R is."""
+    """Returns deficits of the visible voxels by cause; summed in the order in which U_R is."""
     num = voxels.capacity
 
     def add(index: Int[Array, " K"], valid: Bool[Array, " K"], sums: _Sums) -> _Sums:

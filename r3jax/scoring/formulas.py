@@ -56,7 +56,7 @@ def sums_of_seen(
     forms: Forms,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """`sums_in_view` of voxels and cells that are known to be seen."""
+    """Returns `sums_in_view` of voxels and cells that are known to be seen."""
     deficit = 1.0 - score_voxels(voxels, position, focal, forms).value
     deficit, unexplored = jnp.where(seen[0], deficit, 0.0), seen[1].astype(jnp.float32)
     points = jnp.stack([cells.x, cells.y, cells.z])
@@ -75,7 +75,7 @@ def change_of_sums(
     forms: Forms,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """Sums up what imagined views have changed of `sums_in_view` where the same is seen.
+    """Returns sums up what imagined views have changed of `sums_in_view` where the same is seen.
 
     Args:
         before: voxels and cells before the views.
@@ -147,7 +147,7 @@ def mean_of_rows(
 def terms_of_rows(
     voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
-    """`score_voxels` of every row; where the position is not finite, every term is NaN."""
+    """Returns `score_voxels` of every row; where the position is not finite, every term is NaN."""
     factor = jnp.where(jnp.all(jnp.isfinite(position)), 1.0, jnp.nan)
     terms = score_voxels(voxels, position, focal, forms)
     return jax.tree.map(lambda term: factor * term, terms)

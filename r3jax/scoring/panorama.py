@@ -72,7 +72,7 @@ def panorama_of(
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> Panorama:
-    """`panorama` of voxels and cells that are already at hand.
+    """Returns `panorama` of voxels and cells that are already at hand.
 
     Args:
         voxels: of the map.
@@ -97,7 +97,7 @@ def panorama_of_bins(
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> Panorama:
-    """The panorama whose bins have these scores."""
+    """Returns the panorama whose bins have these scores."""
     num_bins = config.panorama_bins
     directions = bins_in_view(camera, num_bins) @ bins
     # Of equal scores the first wins: the choice can be repeated.

@@ -36,7 +36,7 @@ def simulate_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> tuple[MapState, Bool[Array, " N"]]:
-    """The map after a view that is only imagined.
+    """Returns the map after a view that is only imagined.
 
     Args:
         state: the map before.
@@ -59,7 +59,7 @@ def imagine_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> tuple[MapState, OccupancyGrid]:
-    """Map and grid for a decision that takes a view as taken.
+    """Returns the map and grid for a decision that takes a view as taken.
 
     The unexplored cells that the view would show no longer count.
 
@@ -83,7 +83,7 @@ def simulate_view_near(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> tuple[MapState, Cells]:
-    """Voxels and cells at hand after a view that is only imagined.
+    """Returns voxels and cells at hand after a view that is only imagined.
 
     The unexplored cells that the view shows are no longer unexplored.
 
@@ -106,7 +106,7 @@ def observed(
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
 ) -> MapState:
-    """The voxels with one more, imagined, observation of those that are visible.
+    """Returns the voxels with one more, imagined, observation of those that are visible.
 
     Args:
         voxels: before.

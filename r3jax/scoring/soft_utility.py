@@ -78,7 +78,7 @@ class SoftUtility(eqx.Module):
     """Of the image's sides [rad], and of the range as a share of it."""
 
     def __call__(self, T_world_camera: Float[Array, "4 4"]) -> Float[Array, ""]:
-        """The soft utility of a view."""
+        """Returns the soft utility of a view."""
         R, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
         # Products and sums, not a matrix product: on some devices those round to ten bits.
         offset = self.points - position[:, None]
@@ -145,7 +145,7 @@ def soft_utility_near(
     config: ScoringConfig,
     softness: Float[Array, ""] | float = SOFTNESS,
 ) -> SoftUtility:
-    """`soft_utility` of voxels and cells that are already at hand."""
+    """Returns `soft_utility` of voxels and cells that are already at hand."""
     farther = eqx.tree_at(lambda c: c.max_range, config, _RANGE_MARGIN * config.max_range)
     view = pinhole_view(_widened(camera), T_world_camera, farther)
     seen, unexplored = seen_in_view(voxels, cells, view, farther)
@@ -167,7 +167,7 @@ def soft_utility_near(
 
 
 def _widened(camera: Camera) -> Camera:
-    """A camera of as many pixels that sees `_MARGIN` more on every side."""
+    """Returns a camera of as many pixels that sees `_MARGIN` more on every side."""
 
     def lens(focal: Array, center: Array, size: int) -> tuple[Array, float]:
         # Even about the axis: as much on each side as on the wider one.

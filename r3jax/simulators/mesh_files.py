@@ -87,7 +87,7 @@ def check_claims(path: Path, tree: dict[str, Any]) -> None:
 
 
 def _stored(path: Path, tree: dict[str, Any]) -> int:
-    """Bytes of a file and of those beside it that its buffers name, each once."""
+    """Returns bytes of a file and of those beside it that its buffers name, each once."""
     names = {
         _part(buffer, "uri", str, "") for buffer in _part(tree, "buffers", list[dict[str, Any]], [])
     }
@@ -104,7 +104,7 @@ def _stored(path: Path, tree: dict[str, Any]) -> int:
 def _accessor_size(
     number: int, accessor: dict[str, Any], views: list[dict[str, Any]], lengths: list[int]
 ) -> tuple[int, int]:
-    """Numbers in an accessor, and their bytes."""
+    """Returns numbers in an accessor, and their bytes."""
     if "bufferView" not in accessor or "sparse" in accessor:
         raise ForeignFileError(
             f"accessor {number} has no buffer view of its own: compressed and sparse meshes are "
@@ -144,7 +144,7 @@ def _at(items: list[Any], index: int, what: str) -> Any:
 
 
 def _whole(tree: dict[str, Any], name: str, default: int | None = None) -> int:
-    """An entry that is a whole number >= 0."""
+    """Returns an entry that is a whole number >= 0."""
     value = tree.get(name, default)
     check_type(name, value, int)
     if value < 0:
@@ -164,14 +164,14 @@ def _check_extensions(tree: dict[str, Any]) -> None:
 
 
 def num_lines(tree: dict[str, Any]) -> int:
-    """Primitives that are lines: of a tree that `check_claims` let through."""
+    """Returns primitives that are lines: of a tree that `check_claims` let through."""
     meshes = _part(tree, "meshes", list[dict[str, Any]], [])
     modes = [primitive.get("mode") for mesh in meshes for primitive in mesh.get("primitives", [])]
     return sum(mode in _LINES for mode in modes)
 
 
 def texture_transforms(tree: dict[str, Any]) -> dict[str, np.ndarray]:
-    """How each material of a glTF file moves the texture coordinates of its base color.
+    """Returns how each material of a glTF file moves the texture coordinates of its base color.
 
     The extension is defined by the Khronos group: uv' = translation * rotation * scale * uv, in
     glTF's own coordinates, where v grows downwards.
@@ -198,14 +198,14 @@ def texture_transforms(tree: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _part(tree: dict[str, Any], name: str, kind: Any, default: Any) -> Any:
-    """An optional entry of the tree, with its type checked."""
+    """Returns an optional entry of the tree, with its type checked."""
     value = tree.get(name, default)
     check_type(name, value, kind)
     return value
 
 
 def _affine(settings: dict[str, Any]) -> np.ndarray:
-    """The map of one material, [3, 3]."""
+    """Returns the map of one material, [3, 3]."""
     offset = _part(settings, "offset", list[float], [0.0, 0.0])
     scale = _part(settings, "scale", list[float], [1.0, 1.0])
     angle = _part(settings, "rotation", float, 0.0)

@@ -19,7 +19,7 @@ C3 = (
 def harmonics(
     x: Float[Array, " n"], y: Float[Array, " n"], z: Float[Array, " n"], degree: int
 ) -> list[Float[Array, " n"]]:
-    """The basis functions at unit directions (x, y, z), (degree + 1)^2 of them."""
+    """Returns the basis functions at unit directions (x, y, z), (degree + 1)^2 of them."""
     basis = [jnp.full_like(x, C0)]
     if degree >= 1:
         basis += [-C1 * y, C1 * z, -C1 * x]
@@ -48,7 +48,7 @@ def harmonics(
 def view_colors(
     sh: Float[Array, "n k 3"], means: Float[Array, "n 3"], camera_center: Float[Array, " 3"]
 ) -> Float[Array, "3 n"]:
-    """Colors of Gaussians as a camera sees them: max(SH(direction) + 0.5, 0).
+    """Returns colors of Gaussians as a camera sees them: max(SH(direction) + 0.5, 0).
 
     Args:
         sh: coefficients, k = (degree + 1)^2.
@@ -69,7 +69,7 @@ def view_colors(
 def _sum_harmonics(
     sh: Float[Array, "n k 3"], x: Float[Array, " n"], y: Float[Array, " n"], z: Float[Array, " n"]
 ) -> Float[Array, "3 n"]:
-    """The sum of coefficient x basis at unit directions, for each channel."""
+    """Returns the sum of coefficient x basis at unit directions, for each channel."""
     basis = harmonics(x, y, z, _degree(sh))
     return jnp.stack([sum(b * sh[:, i, c] for i, b in enumerate(basis)) for c in range(3)])
 

@@ -127,7 +127,7 @@ def _is_compiled(source: Source) -> bool:
 def _rows(
     camera_size: tuple[int, int], scene: GaussianScene, camera: Camera, pose: Array, behind: Array
 ) -> GaussianScene:
-    """Sums of squared gradients, one row of pixels after the other."""
+    """Returns sums of squared gradients, one row of pixels after the other."""
     width, height = camera_size
     columns = jnp.arange(width, dtype=jnp.float32) + 0.5
 

@@ -120,7 +120,7 @@ def newest_name(models: Path) -> str | None:
 
 
 def _read_record(path: Path) -> dict[str, Any]:
-    """train.json, with what is used of it checked.
+    """Returns train.json, with what is used of it checked.
 
     Raises:
         ForeignFileError: it is damaged.

@@ -68,7 +68,7 @@ class Views(eqx.Module):
         return self.rgb.shape[2]
 
     def view(self, index: int | Int[Array, ""]) -> PosedImage:
-        """One view; the index may be traced."""
+        """Returns one view; the index may be traced."""
         return PosedImage(
             rgb=self.rgb[index].astype(jnp.float32) / 255.0,
             depth=self.depth[index],
@@ -77,7 +77,7 @@ class Views(eqx.Module):
         )
 
     def take(self, indices: np.ndarray) -> "Views":
-        """Some of the views, in the order of the indices."""
+        """Returns some of the views, in the order of the indices."""
         return jax.tree.map(lambda x: x[jnp.asarray(indices)], self)
 
 
@@ -135,7 +135,7 @@ def load_views(frames: Iterable[Frame], resolution: int | None = None) -> Views:
 
 
 def fitted_size(width: int, height: int, resolution: int | None) -> tuple[int, int]:
-    """Width and height [px] when the longer side has at most `resolution` pixels."""
+    """Returns the width and height [px] when the longer side has at most `resolution` pixels."""
     longer = max(width, height)
     if resolution is None or resolution >= longer:
         return width, height
@@ -207,7 +207,7 @@ def _overlaps(long: int, short: int) -> np.ndarray:
 
 
 def median_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Lower median of the measurements whose pixel centers lie in each new pixel.
+    """Returns the lower median of the measurements whose pixel centers lie in each new pixel.
 
     Args:
         depth: [H, W] [m]; 0 is no measurement, inf is a measurement (beyond range).

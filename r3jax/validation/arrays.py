@@ -20,7 +20,7 @@ _SQUEEZE = 200
 
 
 def read_npz(path: str | Path, types: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ file.
+    """Returns the arrays of an NPZ file.
 
     Args:
         path: the file.
@@ -57,7 +57,7 @@ def read_npz(path: str | Path, types: Mapping[str, str]) -> dict[str, np.ndarray
 
 
 def read_npy(data: bytes) -> np.ndarray:
-    """The array of an NPY file.
+    """Returns the array of an NPY file.
 
     Raises:
         ForeignFileError: not an NPY, cut off, or no plain numbers or texts.
@@ -71,7 +71,7 @@ def read_npy(data: bytes) -> np.ndarray:
 
 
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One member."""
+    """Returns one member."""
     with archive.open(info) as file:
         return _array(file, info.filename, info.file_size)
 

@@ -19,7 +19,7 @@ _MAX_POINTER = 1024
 
 
 def check_regular(path: str | Path) -> int:
-    """Size of a regular file [bytes]; links are followed.
+    """Returns the size of a regular file [bytes]; links are followed.
 
     Opening a pipe would block, and a device such as /dev/zero has no end.
 
@@ -47,7 +47,7 @@ def check_regular(path: str | Path) -> int:
 
 
 def read_bytes(path: str | Path, limit: int) -> bytes:
-    """The whole content of a regular file.
+    """Returns the whole content of a regular file.
 
     Args:
         path: the file.
@@ -96,7 +96,7 @@ _LONGEST = 1000
 
 
 def check_relative(name: str) -> PurePosixPath:
-    """A relative path that stays below the folder it is relative to.
+    """Returns a relative path that stays below the folder it is relative to.
 
     Links inside the folder may still lead elsewhere: they are the user's own.
 
@@ -138,12 +138,12 @@ def below(folder: Path, name: str) -> Path:
 
 
 def _is_absolute(name: str) -> bool:
-    """True for the absolute paths of any system."""
+    """Returns True for the absolute paths of any system."""
     return name.startswith(("/", "\\")) or re.match(r"[A-Za-z]:[\\/]", name) is not None
 
 
 def _respelled(folder: Path, name: str) -> str:
-    """A name of Windows, or an absolute one, as a file of the folder is called here."""
+    """Returns a name of Windows, or an absolute one, as a file of the folder is called here."""
     parts = PureWindowsPath(name).parts
     if ".." in parts or os.path.exists(folder / name.lstrip("/")):
         return name
@@ -154,7 +154,7 @@ def _respelled(folder: Path, name: str) -> str:
 
 
 def _namesake(path: Path) -> Path:
-    """The file, or where it is missing the one whose ending has the other case."""
+    """Returns the file, or where it is missing the one whose ending has the other case."""
     if not path.suffix or os.path.exists(path):  # no matter how long the name is
         return path
     others = (path.with_suffix(path.suffix.lower()), path.with_suffix(path.suffix.upper()))

@@ -35,7 +35,7 @@ _WHITE = (1 << 16) - 1
 
 
 def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
-    """Width and height of an image [px].
+    """Returns the width and height of an image [px].
 
     Raises:
         ForeignFileError: not an image of these formats, broken, or too large.
@@ -46,7 +46,7 @@ def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
 
 
 def first_size(paths: Iterable[Path], formats: Sequence[str]) -> tuple[int, int]:
-    """Width and height of the first image that can be opened, of some of one size [px].
+    """Returns the width and height of the first image that can be opened, of some of one size [px].
 
     Raises:
         ForeignFileError, OSError: as `image_size`, of the first of them; none can be opened.
@@ -67,7 +67,7 @@ def image_pixels(
     modes: Sequence[str] = (),
     wanted: str = "",
 ) -> np.ndarray:
-    """The pixels of an image.
+    """Returns the pixels of an image.
 
     Args:
         path: the file, or what it holds.

@@ -66,7 +66,7 @@ def depth_buffer(voxels: Voxels, view: View, config: VisibilityConfig) -> DepthB
 
 
 def _nearest(voxels: Voxels, view: View) -> tuple[Float[Array, "h w"], Int[Array, "h w"]]:
-    """Distance and number of the nearest voxel in every pixel."""
+    """Returns the distance and number of the nearest voxel in every pixel."""
     shapes = pyramid(view.shape)
     offsets = [0]
     for height, width in shapes:
@@ -108,14 +108,14 @@ def visible(
 
 
 def sees_voxels(voxels: Voxels, view: View, buffer: DepthBuffer) -> Bool[Array, " n"]:
-    """True for the voxels in the image, within range, and not hidden as a whole."""
+    """Returns True for the voxels in the image, within range, and not hidden as a whole."""
     place = view.place(jax.lax.stop_gradient(voxels.center))
     margin = corner_margin(view, place, voxels.size, buffer.limit)
     return voxels.present & is_in_view(view, place) & (margin >= 0.0)
 
 
 def sees_points(points: Float[Array, "3 m"], view: View, buffer: DepthBuffer) -> Bool[Array, " m"]:
-    """True for the points in the image, within range, and before every voxel."""
+    """Returns True for the points in the image, within range, and before every voxel."""
     place = view.place(jax.lax.stop_gradient(points))
     # Before the surface itself: the slack behind it is for voxels that belong to it.
     return is_in_view(view, place) & (depth_margin(view, place, buffer.distance) >= 0.0)
@@ -149,7 +149,7 @@ def corner_margin(
 
 
 def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
-    """True for points that fall into the image, at any distance."""
+    """Returns True for points that fall into the image, at any distance."""
     height, width = view.shape
     # Half-open: a point on the far border belongs to a pixel that is not there.
     is_in = (place.column >= 0.0) & (place.column < width) & place.ahead
@@ -157,7 +157,7 @@ def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
 
 
 def is_in_view(view: View, place: Placement) -> Bool[Array, " n"]:
-    """True for points in the image and within range."""
+    """Returns True for points in the image and within range."""
     return is_in_image(view, place) & (place.distance <= view.max_range)
 
 
@@ -168,7 +168,7 @@ def _at_pixel(
     *,
     wraps: bool,
 ) -> Float[Array, " n"]:
-    """Values at continuous coordinates; outside, where the map wraps, or at the border."""
+    """Returns values at continuous coordinates; outside, where the map wraps, or at the border."""
     height, width = image.shape
 
     def whole(value: Array, size: int) -> Array:
@@ -201,7 +201,7 @@ def footprint(
     *,
     wraps: bool,
 ) -> list[Int[Array, " n"]]:
-    """Indices into the pyramid of the pixels that each voxel covers; behind its end: none.
+    """Returns indices into the pyramid of the pixels that each voxel covers; behind its end: none.
 
     The level is the first on which the footprint spans at most two pixel centers an axis. A
     footprint is the octagon round the projected cube.

@@ -91,7 +91,7 @@ class PinholeView(eqx.Module):
         return along(0), along(1), along(2)
 
     def may_see(self, points: Coordinates, margin: Float[Array, ""]) -> Bool[Array, " n"]:
-        """False only for points that lie outside the frustum by more than `margin` [m]."""
+        """Returns False only for points that lie outside the frustum by more than `margin` [m]."""
         x, y, z = self.in_camera(points)
         camera = self.camera
         reach = self.max_range + margin
@@ -163,7 +163,7 @@ class PanoramaView(eqx.Module):
         return math.sqrt(4.0 * math.pi) / self.size
 
     def may_see(self, points: Coordinates, margin: Float[Array, ""]) -> Bool[Array, " n"]:
-        """False only for points out of range by more than `margin` [m]."""
+        """Returns False only for points out of range by more than `margin` [m]."""
         x, y, z = (points[i] - self.position[i] for i in range(3))
         reach = self.max_range + margin
         return x * x + y * y + z * z <= reach * reach
@@ -227,7 +227,7 @@ def for_kernels(view: View, tolerance: Float[Array, ""], focal: Float[Array, ""]
 def pinhole_view(
     camera: Camera, T_world_camera: Float[Array, "4 4"], config: VisibilityConfig
 ) -> PinholeView:
-    """The view of a camera; its longest side is reduced to `config.zbuffer_size` pixels.
+    """Returns the view of a camera; its longest side is reduced to `config.zbuffer_size` pixels.
 
     Visibility is piecewise constant, so no derivative passes through the pose.
     """
@@ -240,7 +240,7 @@ def pinhole_view(
 
 
 def panorama_view(position: Float[Array, " 3"], config: VisibilityConfig) -> PanoramaView:
-    """All directions from a position; no derivative passes through it."""
+    """Returns all directions from a position; no derivative passes through it."""
     still = jax.lax.stop_gradient(position)
     return PanoramaView(still, config.max_range, config.panorama_size)
 

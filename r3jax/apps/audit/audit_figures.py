@@ -80,7 +80,7 @@ def gain_figure(audit: Audit) -> Figure:
 
 
 def panorama_strip(audit: Audit, count: int = 3) -> Figure:
-    """All directions from some standpoints: colors above, renderability below."""
+    """Returns all directions from some standpoints: colors above, renderability below."""
     standpoints = audit.standpoints[:count]
     figure = style.new_figure(10.0, 2.55 * len(standpoints))
     grid = figure.subplots(len(standpoints), 2, squeeze=False)
@@ -127,7 +127,7 @@ def view_figures(audit: Audit) -> list[Figure]:
 
 
 def worst_frames(audit: Audit, count: int = 4) -> list[EvaluatedFrame]:
-    """The frames with the lowest renderability, the worst first."""
+    """Returns the frames with the lowest renderability, the worst first."""
     order = np.argsort(audit.renderability, kind="stable")
     return [audit.frames[i] for i in order[:count].tolist()]
 
@@ -239,7 +239,7 @@ class _Shown:
 
 
 def best_picture(audit: Audit, region: Region) -> _Shown | None:
-    """The image with the region near its middle, at a good distance, and not hidden.
+    """Returns the image with the region near its middle, at a good distance, and not hidden.
 
     Only depth images tell what is hidden. None: no image has the region's middle in it.
     """
@@ -262,7 +262,7 @@ def best_picture(audit: Audit, region: Region) -> _Shown | None:
 
 
 def _shows(audit: Audit, finding: _Shown, z: float) -> bool:
-    """False where something else is measured there."""
+    """Returns False where something else is measured there."""
     if not audit.source.is_dense:
         return True
     depth = audit.source.read(finding.index)[1][int(finding.row), int(finding.column)]
@@ -270,7 +270,7 @@ def _shows(audit: Audit, finding: _Shown, z: float) -> bool:
 
 
 def region_figure(audit: Audit) -> Figure | None:
-    """The worst regions in images of the capture; None where no image shows any."""
+    """Returns the worst regions in images of the capture; None where no image shows any."""
     shown = [
         (number, region, finding)
         for number, region in enumerate(audit.regions)

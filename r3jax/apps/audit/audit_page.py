@@ -137,7 +137,7 @@ def picture_faults(audit: Audit) -> dict[str, Any]:
 
 
 def _nothing_found(audit: Audit) -> str:
-    """What was looked for and not found; of the rest nothing is said."""
+    """Returns what was looked for and not found; of the rest nothing is said."""
     record = audit.faults.record
     known = lambda name: any(value is not None for value in record.get(name, []))
     good = [
@@ -168,14 +168,14 @@ def _finding(audit: Audit, finding: Finding) -> dict[str, Any]:
 
 
 def _thumbnail(audit: Audit, index: int) -> bytes:
-    """A small PNG of an image of the capture, its upper edge up."""
+    """Returns a small PNG of an image of the capture, its upper edge up."""
     rgb, _ = audit.source.read(index)
     up = audit.survey.alignment.rotation.T @ [0.0, 0.0, 1.0]
     return small_png(rgb, audit.source.poses[index], up, _SIDE)
 
 
 def _causes(audit: Audit) -> list[dict[str, Any]]:
-    """A row for each cause."""
+    """Returns a row for each cause."""
     found, is_complete = audit.diagnosis, audit.source.is_complete
     whole = float(found.is_seen.sum()) * audit.survey.voxel_size**2
     rows: list[dict[str, Any]] = []
@@ -204,7 +204,7 @@ def _causes(audit: Audit) -> list[dict[str, Any]]:
 
 
 def _regions(audit: Audit) -> list[dict[str, Any]]:
-    """A row for each bad region, and for each place where the capture ends."""
+    """Returns a row for each bad region, and for each place where the capture ends."""
     rows: list[dict[str, Any]] = []
     for number, region in enumerate(audit.all_regions):
         center = audit.survey.alignment.points_back(region.center[None])[0]
@@ -224,7 +224,7 @@ def _regions(audit: Audit) -> list[dict[str, Any]]:
 
 
 def _shows(view: Suggestion, region: Region) -> bool:
-    """True if a view shows most of a region."""
+    """Returns True if a view shows most of a region."""
     shown = view.cells if region.cause == "unseen" else view.shown
     return len(region.rows) > 0 and float(np.isin(region.rows, shown).mean()) >= 0.5
 

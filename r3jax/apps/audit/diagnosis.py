@@ -73,7 +73,7 @@ FEWEST_PICTURES = 2
 
 
 def known_rows(state: MapState, is_complete: bool) -> np.ndarray:
-    """Which rows of the map of all images are known surfaces, [N].
+    """Returns which rows of the map of all images are known surfaces, [N].
 
     Args:
         state: the map.
@@ -216,14 +216,14 @@ class Diagnosis:
         return float((self.value[evaluated] >= FINE).mean()) if evaluated.any() else 0.0
 
     def share(self, cause: str) -> float:
-        """Share of the surfaces that can be seen, of those with this cause."""
+        """Returns the share of the surfaces that can be seen, of those with this cause."""
         evaluated = self.is_seen
         wanted = self.cause[evaluated] == CAUSES.index(cause)
         return float(wanted.mean()) if evaluated.any() else 0.0
 
 
 def demand_of(state: MapState, standpoints: np.ndarray, config: ScoringConfig) -> Demand:
-    """Which voxels each standpoint sees.
+    """Returns which voxels each standpoint sees.
 
     Args:
         state: the map.
@@ -247,7 +247,7 @@ def _visible(
 def score_from_standpoints(
     state: MapState, demand: Demand, focal: Float[Array, ""], config: ScoringConfig
 ) -> StandpointScores:
-    """Every standpoint's answers.
+    """Returns every standpoint's answers.
 
     Args:
         state: the map; its surfaces are those of the demand.
@@ -270,7 +270,7 @@ def _answers(
     config: ScoringConfig,
     ids: Float[Array, " q"],
 ) -> tuple[Float[Array, "q N"], Float[Array, "q 3 N"], Float[Array, "q 3 N"]]:
-    """Values, terms and costs of some of the standpoints."""
+    """Returns values, terms and costs of some of the standpoints."""
     num = voxels.count.shape[0]
 
     def answer(number: Float[Array, ""]) -> tuple[Array, Array, Array]:

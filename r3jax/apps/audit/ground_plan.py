@@ -33,13 +33,13 @@ HIDDEN = "#9ca3af"
 
 
 def score_colors(value: np.ndarray) -> np.ndarray:
-    """RGB [n, 3] uint8 of renderabilities [n] in [0, 1]: red, yellow, green."""
+    """Returns RGB [n, 3] uint8 of renderabilities [n] in [0, 1]: red, yellow, green."""
     rgba = colormaps[style.SCORE_MAP](np.clip(value, 0.0, 1.0))
     return np.rint(255.0 * np.asarray(rgba)[..., :3]).astype(np.uint8)
 
 
 def cause_colors(diagnosis: Diagnosis) -> np.ndarray:
-    """RGB [N, 3] uint8 of every voxel's cause."""
+    """Returns RGB [N, 3] uint8 of every voxel's cause."""
     table = np.array([_rgb(COLOR_OF_CAUSE[name]) for name in CAUSES], np.uint8)
     return np.where(
         diagnosis.is_seen[:, None], table[diagnosis.cause], np.array(_rgb(HIDDEN), np.uint8)
@@ -75,12 +75,12 @@ _PALE = 0.55
 
 
 def region_label(number: int) -> str:
-    """A, B, ... of the regions."""
+    """Returns a, B, ... of the regions."""
     return chr(ord("A") + number) if number < 26 else str(number + 1)
 
 
 def plan_figure(audit: Audit) -> Figure:
-    """Two maps: regions, frames and suggested views; and renderability of all surfaces."""
+    """Returns two maps: regions, frames and suggested views; and renderability of all surfaces."""
     heights = np.array([frame.pose[2, 3] for frame in audit.frames])
     height = float(np.median(heights))
     picture, extent = floor_picture(audit.seen.state, audit.seen.grid, height)
@@ -119,13 +119,13 @@ def plan_figure(audit: Audit) -> Figure:
 
 
 def ground_label(audit: Audit, axis: int) -> str:
-    """Name of a horizontal axis of the map, in the capture's words where it has any."""
+    """Returns the name of a horizontal axis of the map, in the capture's words where it has any."""
     name = axis_name(audit.survey.alignment, axis)
     return f"{name or ('along the ground', 'across')[axis]} [{audit.survey.unit}]"
 
 
 def axis_name(alignment: Alignment, axis: int) -> str | None:
-    """The capture's axis that an axis of the audit is, such as `-z`; None: none of them."""
+    """Returns the capture's axis that an axis of the audit is, such as `-z`; None: none of them."""
     direction = alignment.rotation[axis]
     best = int(np.argmax(np.abs(direction)))
     if abs(direction[best]) < 0.9999 or np.any(alignment.origin != 0.0):

@@ -65,7 +65,7 @@ def write_outputs(audit: Audit, folder: Path, capture: Path) -> dict[str, Path]:
 
 
 def audited_capture(folder: Path) -> Path | None:
-    """The capture whose audit a folder holds; None: not known."""
+    """Returns the capture whose audit a folder holds; None: not known."""
     try:
         record = parse_json(read_bytes(folder / "audit.json", _MAX_BYTES))
         return Path(record["capture_path"])
@@ -113,7 +113,7 @@ def _write_clouds(audit: Audit, values: Path, causes: Path) -> None:
 
 
 def record_of(audit: Audit) -> dict[str, Any]:
-    """The content of audit.json."""
+    """Returns the content of audit.json."""
     survey, plan = audit.survey, audit.plan
     square = survey.length(1.0) ** 2
     return {
@@ -182,7 +182,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
 
 
 def _surfaces(audit: Audit, face: float) -> dict[str, Any]:
-    """Shares by cause, as on the page, and areas of what is known.
+    """Returns shares by cause, as on the page, and areas of what is known.
 
     Args:
         audit: what was found.
@@ -202,7 +202,7 @@ def _surfaces(audit: Audit, face: float) -> dict[str, Any]:
 
 
 def _score(score: ViewScore) -> dict[str, Any]:
-    """The numbers of a frame; null where nothing that it shows is known."""
+    """Returns the numbers of a frame; null where nothing that it shows is known."""
     known = None if np.isnan(score.renderability) else score.renderability
     return {**dataclasses.asdict(score), "renderability": known}
 

@@ -57,17 +57,17 @@ _ORDINARY = ("angle", "rare", "distance", "noise")
 
 
 def length(audit: Audit, in_audit: float) -> str:
-    """A length of the audit, in the capture's units."""
+    """Returns a length of the audit, in the capture's units."""
     return f"{audit.survey.length(in_audit):.3g} {audit.survey.unit}"
 
 
 def area(audit: Audit, in_audit: float) -> str:
-    """An area of the audit to two digits, in the capture's units: voxels count no finer."""
+    """Returns an area of the audit to two digits, in the capture's units: voxels count no finer."""
     return f"{two_digits(in_audit * audit.survey.length(1.0) ** 2)} {audit.survey.unit}²"
 
 
 def two_digits(value: float) -> str:
-    """A positive number with two digits that count: 0.012, 2.0, 76, 1200."""
+    """Returns a positive number with two digits that count: 0.012, 2.0, 76, 1200."""
     rounded = float(f"{value:.2g}")
     return f"{rounded:.0f}" if rounded >= 10.0 else f"{rounded:#.2g}"
 
@@ -78,7 +78,7 @@ def point(position: np.ndarray) -> str:
 
 
 def origin(audit: Audit) -> str | None:
-    """The point that was subtracted from a capture far from its origin; None: none."""
+    """Returns the point that was subtracted from a capture far from its origin; None: none."""
     subtracted = audit.survey.alignment.origin
     if not np.any(subtracted):
         return None
@@ -89,7 +89,7 @@ def origin(audit: Audit) -> str | None:
 
 
 def verdict(audit: Audit) -> list[str]:
-    """What the audit comes to, a sentence each."""
+    """Returns what the audit comes to, a sentence each."""
     sentences = [_surfaces(audit)]
     first = int(audit.survey.is_one_place)  # nothing goes before that
     if (audit.survey.up.within or 0.0) > _DOUBTFUL:
@@ -136,7 +136,7 @@ def _surfaces(audit: Audit) -> str:
 
 
 def _promises(audit: Audit) -> list[str]:
-    """How the frames would render, and what further views would add."""
+    """Returns how the frames would render, and what further views would add."""
     found, plan = audit.diagnosis, audit.plan
     sentences: list[str] = []
     mean = audit.mean_renderability
@@ -169,7 +169,7 @@ def _promises(audit: Audit) -> list[str]:
 
 
 def vertical(audit: Audit) -> str:
-    """Which way is up, and how sure that is."""
+    """Returns which way is up, and how sure that is."""
     up = audit.survey.up
     if up.within is None:
         return f"Up is {_up_name(up.direction)} of the capture."
@@ -183,7 +183,7 @@ def vertical(audit: Audit) -> str:
 
 
 def unread(audit: Audit) -> list[str]:
-    """Which pictures could not be read, and why: one sentence, or none."""
+    """Returns which pictures could not be read, and why: one sentence, or none."""
     left_out = audit.faults.left_out
     if not left_out:
         return []
@@ -196,7 +196,7 @@ def unread(audit: Audit) -> list[str]:
 
 
 def without_depth(audit: Audit) -> list[str]:
-    """How many pictures say nothing of depth: one sentence, or none."""
+    """Returns how many pictures say nothing of depth: one sentence, or none."""
     count = len(audit.faults.without_depth)
     if not count:
         return []
@@ -208,7 +208,7 @@ def without_depth(audit: Audit) -> list[str]:
 
 
 def cause_share(audit: Audit, cause: str) -> float:
-    """Share of what is evaluated that has this cause, or `fine`.
+    """Returns the share of what is evaluated that has this cause, or `fine`.
 
     With a depth camera: of the surface visible from where people could stand. Without: of what the
     frames show, as points exist only where pictures saw them.
@@ -217,7 +217,7 @@ def cause_share(audit: Audit, cause: str) -> float:
 
 
 def saturation() -> str:
-    """What R cannot say of a capture that is covered well."""
+    """Returns what R cannot say of a capture that is covered well."""
     return (
         f"With a mean of {SATURATED:g} or more, R says that these pictures show what others show "
         "well enough, and not which of them renders better: of a kitchen of 250 pictures with a "
@@ -232,7 +232,7 @@ def listed(parts: list[str]) -> str:
 
 
 def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
-    """Why a view is suggested."""
+    """Returns why a view is suggested."""
     face = audit.survey.voxel_size**2
     parts: list[str] = []
     total = sum(view.causes.values())
@@ -262,7 +262,7 @@ def directions(audit: Audit, view: Suggestion, like: int) -> str:
 
 
 def method(audit: Audit) -> list[str]:
-    """How the numbers came about, a sentence or two each."""
+    """Returns how the numbers came about, a sentence or two each."""
     survey, source = audit.survey, audit.source
     depth = {
         "depth": "depth images",
@@ -341,7 +341,7 @@ def _up_name(up: np.ndarray) -> str:
 
 
 def steps_between(here: np.ndarray, there: np.ndarray, length: Callable[[float], str]) -> list[str]:
-    """What to do to get from one view to another: go, hold higher, turn, look up.
+    """Returns what to do to get from one view to another: go, hold higher, turn, look up.
 
     Forward and left are those of the view where one is, in the plane; a view that looks straight up
     or down is faced as its upper edge.

@@ -73,7 +73,7 @@ def view_gains(
     poses: np.ndarray,
     config: ScoringConfig,
 ) -> np.ndarray:
-    """The gain of every view, [C] [voxels].
+    """Returns the gain of every view, [C] [voxels].
 
     Args:
         state: the map.
@@ -226,7 +226,7 @@ class Task:
     """Settings of all scores."""
 
     def evaluate(self, state: MapState) -> tuple[StandpointScores, Diagnosis]:
-        """What the standpoints say of a map, and what it comes to."""
+        """Returns what the standpoints say of a map, and what it comes to."""
         answers = score_from_standpoints(state, self.demand, self.camera.focal, self.config)
         return answers, diagnose(state, self.demand, answers)
 
@@ -272,7 +272,7 @@ class LazyGreedy:
         *,
         key: Array,
     ) -> tuple[Decision | None, Memory, PlanInfo]:
-        """The candidate with the largest gain; None where none gains a voxel."""
+        """Returns the candidate with the largest gain; None where none gains a voxel."""
         del key  # nothing is drawn
         gains, num = state.gains.copy(), len(self.poses)
         answers, diagnosis = self.task.evaluate(map_state)
@@ -349,7 +349,7 @@ _NO_POSES = np.zeros((0, 4, 4))
 def candidate_poses(
     state: MapState, grid: OccupancyGrid, task: Task, places: np.ndarray
 ) -> np.ndarray:
-    """The best directions of every place, [C, 4, 4] float64: exactly rigid, roll-free."""
+    """Returns the best directions of every place, [C, 4, 4] float64: exactly rigid, roll-free."""
     panoramas = score_positions(state, grid, task.camera, places, task.config)
     scores = np.asarray(panoramas.direction_scores)
     lattice = fibonacci_lattice(scores.shape[1])
@@ -363,7 +363,7 @@ def candidate_poses(
 
 
 def _apart(scores: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-    """Indices of the best directions of a place, apart from each other."""
+    """Returns indices of the best directions of a place, apart from each other."""
     left = scores.astype(np.float64)
     chosen: list[int] = []
     for _ in range(DIRECTIONS):
@@ -381,7 +381,7 @@ def _best(
     answers: StandpointScores,
     poses: np.ndarray,
 ) -> int | None:
-    """The candidate that gains most now; brings `gains` up to date as far as needed.
+    """Returns the candidate that gains most now; brings `gains` up to date as far as needed.
 
     None: no candidate gains anything worth it.
     """
@@ -414,7 +414,7 @@ class _Taken(NamedTuple):
 
 
 def _imagine(planner: Planner, task: Task, decision: Decision) -> tuple[Planner, _Taken]:
-    """The planner as if a view had been taken, and what that view shows."""
+    """Returns the planner as if a view had been taken, and what that view shows."""
     T = jnp.asarray(decision.T_world_camera, dtype=jnp.float32)
     cells = visible_unexplored(planner.map_state, planner.grid, task.camera, T, task.config)
     after, shown = simulate_view(planner.map_state, task.camera, T, task.config)

@@ -110,7 +110,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
         return Camera.from_fov(self.resolution, self.resolution, self.fov)
 
     def exploration_config(self) -> ExplorationConfig:
-        """Settings of the loop."""
+        """Returns settings of the loop."""
         return ExplorationConfig(
             voxel_size=self.voxel_size,
             cell_size=self.cell_size,
@@ -122,7 +122,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
         )
 
     def train_config(self, seed: int) -> TrainConfig:
-        """Settings of the training: vanilla 3DGS, the same for every policy."""
+        """Returns settings of the training: vanilla 3DGS, the same for every policy."""
         return TrainConfig(
             iterations=self.iterations,
             num_gaussians=self.gaussians,
@@ -133,7 +133,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
         )
 
     def policy(self, name: str, settings: dict[str, Any]) -> Policy:
-        """A policy that scores what this sensor sees.
+        """Returns a policy that scores what this sensor sees.
 
         Args:
             name: one of `planning.registry.policy_names()`.
@@ -181,7 +181,7 @@ def _further(given: dict[str, Any], config: type, own: tuple[str, ...]) -> dict[
 
 
 def snapshot_slug(snapshot: str) -> str:
-    """A snapshot as a part of file names: `views:30` is `views-30`."""
+    """Returns a snapshot as a part of file names: `views:30` is `views-30`."""
     return str(parse_budget(snapshot)).replace(":", "-")
 
 
@@ -254,7 +254,7 @@ class Cell:
 
 
 def identity(cell: Cell) -> dict[str, Any]:
-    """Everything that the results of a cell depend on, as plain values.
+    """Returns everything that the results of a cell depend on, as plain values.
 
     Settings of the policy and of the training count with their defaults, so that a changed
     default is another cell. Snapshots do not count: each has its own record.
@@ -332,24 +332,24 @@ class CellPaths:
         return self.folder / "error.txt"
 
     def record(self, snapshot: str) -> Path:
-        """The result of one snapshot: it is done if this file is there."""
+        """Returns the result of one snapshot: it is done if this file is there."""
         return self.folder / f"snapshot-{snapshot_slug(snapshot)}.json"
 
     def checkpoints(self, snapshot: str) -> Path:
-        """Folder of a training that is under way."""
+        """Returns the folder of a training that is under way."""
         return self.folder / "training" / snapshot_slug(snapshot)
 
     def model(self, snapshot: str) -> Path:
-        """The trained Gaussians."""
+        """Returns the trained Gaussians."""
         return self.run / "models" / snapshot_slug(snapshot) / "scene.ply"
 
 
 def paths_of(root: Path, cell: Cell) -> CellPaths:
-    """Where the files of a cell lie in a benchmark's folder."""
+    """Returns where the files of a cell lie in a benchmark's folder."""
     return CellPaths(Path(root) / "cells" / cell.name)
 
 
 def snapshots_left(root: Path, cell: Cell) -> tuple[str, ...]:
-    """The snapshots that have no record yet."""
+    """Returns the snapshots that have no record yet."""
     paths = paths_of(root, cell)
     return tuple(s for s in cell.conditions.snapshots if not paths.record(s).exists())

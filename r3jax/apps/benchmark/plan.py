@@ -58,7 +58,7 @@ class Request:
 def make_plan(
     request: Request, root: Path, on_stage: Callable[[str], None] = lambda stage: None
 ) -> tuple[Cell, ...]:
-    """Every cell, scene by scene, with each scene's test views rendered and stored.
+    """Returns every cell, scene by scene, with each scene's test views rendered and stored.
 
     Args:
         request: what to do.
@@ -102,14 +102,14 @@ def make_plan(
 
 
 def cells_left(root: Path, cells: Sequence[Cell]) -> tuple[Cell, ...]:
-    """The cells that have snapshots without a record."""
+    """Returns the cells that have snapshots without a record."""
     return tuple(cell for cell in cells if snapshots_left(root, cell))
 
 
 def prepare_scene(
     request: Request, scene: str, root: Path, on_stage: Callable[[str], None]
 ) -> ViewSet:
-    """A scene's test set; its images lie in the folder afterwards.
+    """Returns a scene's test set; its images lie in the folder afterwards.
 
     Args:
         request: how scenes are opened, and on what terms.

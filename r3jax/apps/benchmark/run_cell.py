@@ -133,7 +133,7 @@ def _lock(folder: Path) -> Generator[None]:
 
 
 def _finished_run(path: Path) -> Run | None:
-    """The exploration, if there is one that came to its end."""
+    """Returns the exploration, if there is one that came to its end."""
     try:
         run = read_run(path)
     except RunError:
@@ -202,7 +202,7 @@ def _open(cell: Cell) -> Simulator:
 
 
 def _header(cell: Cell, simulator: Simulator, policy: dict[str, Any]) -> RunHeader:
-    """The header of the exploration of a cell by a policy."""
+    """Returns the header of the exploration of a cell by a policy."""
     conditions = cell.conditions
     return RunHeader(
         scene={
@@ -245,7 +245,7 @@ def _retake(
 
 
 def _begin_or_resume(path: Path, header: RunHeader) -> tuple[RunWriter, Run | None]:
-    """A new run, or what was recorded of the one that lies there."""
+    """Returns a new run, or what was recorded of the one that lies there."""
     if (path / "run.json").exists():
         try:
             return RunWriter.resume(path)
@@ -258,7 +258,7 @@ def _begin_or_resume(path: Path, header: RunHeader) -> tuple[RunWriter, Run | No
 
 
 def steps_within(run: Run, snapshot: str) -> tuple[StepRow, ...]:
-    """The views that were taken within a snapshot's budget.
+    """Returns the views that were taken within a snapshot's budget.
 
     As in the loop, a view must arrive within the budget; the time that mapping it takes comes
     after.
@@ -317,7 +317,7 @@ def _do_snapshot(
 
 
 def _submission_fields(submission: Submission, run: Run) -> dict[str, Any]:
-    """What a record tells of the submission that it judges."""
+    """Returns what a record tells of the submission that it judges."""
     pairs = zip(submission.frames, run.rows, strict=True)
     return {
         "sha256": content_hash(submission),

@@ -167,7 +167,7 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
 
 
 def _check_start(submission: Submission, simulator: Simulator) -> Iterator[Problem]:
-    """The first frame is taken at the scene's start, at no cost."""
+    """Yields the first frame is taken at the scene's start, at no cost."""
     first, start = submission.frames[0], begin_at(submission.robot, simulator.start_pose)
     apart = float(np.linalg.norm(first.position - start[:3, 3]))
     turned = math.degrees(angle_between(first.pose.astype(np.float64), start))
@@ -180,7 +180,7 @@ def _check_start(submission: Submission, simulator: Simulator) -> Iterator[Probl
 
 
 def check_captures(submission: Submission, lengths: Sequence[float]) -> Iterator[Problem]:
-    """Before a view there are no more frames captured while moving than the loop takes.
+    """Yields the before a view there are no more frames captured while moving than the loop takes.
 
     The loop cuts a path into the fewest equal pieces that are not too long, and captures a frame
     between two of them: for n frames the whole path is longer than n of the longest pieces, and
@@ -212,7 +212,7 @@ def check_times(
     flown: float,
     length: float,
 ) -> Iterator[str]:
-    """The clock leaves time for deciding, flying and mapping."""
+    """Yields the clock leaves time for deciding, flying and mapping."""
     config, motion = submission.config, submission.robot
     costs = model_clock(config).costs if config.clock == "model" else {}
     if frame.mapping < _less(costs.get("mapping", 0.0)):
@@ -241,14 +241,14 @@ def check_times(
 
 
 def _less(value: float) -> float:
-    """A length [m] or a time [s] with what rounding may take from it."""
+    """Returns a length [m] or a time [s] with what rounding may take from it."""
     return value * (1.0 - 1e-4) - 1e-4
 
 
 def conditions_of(
     submission: Submission, base: Conditions, snapshots: tuple[str, ...] = ()
 ) -> Conditions:
-    """The terms of a submission's exploration, with the training and judging of `base`.
+    """Returns the terms of a submission's exploration, with the training and judging of `base`.
 
     Args:
         submission: gives budget, sensor, maps and clock.
@@ -280,7 +280,7 @@ def conditions_of(
 
 
 def _square(submission: Submission) -> tuple[int, float]:
-    """Width [px] and field of view [degrees] of the square images of a benchmark."""
+    """Returns the width [px] and field of view [degrees] of the square images of a benchmark."""
     camera = submission.camera
     width, half = int(camera["width"]), 0.5 * camera["width"]
     # As people write it: the focal length is stored in float32.
@@ -302,7 +302,7 @@ def plan_submission(
     max_test_views: int | None = 120,
     on_stage: Callable[[str], None] = lambda stage: None,
 ) -> Cell:
-    """The cell of a submission, with its scene's test views rendered and stored.
+    """Returns the cell of a submission, with its scene's test views rendered and stored.
 
     Args:
         submission: as it was read.
@@ -345,7 +345,7 @@ def plan_submission(
 
 
 def _settings_of(submission: Submission) -> dict[str, Any]:
-    """What tables must tell of how the views were chosen: what carried the camera."""
+    """Returns what tables must tell of how the views were chosen: what carried the camera."""
     if submission.robot == MOTIONS["free"]:
         return {}
     names = [name for name, motion in MOTIONS.items() if motion == submission.robot]
@@ -353,7 +353,7 @@ def _settings_of(submission: Submission) -> dict[str, Any]:
 
 
 def stored_submission(root: Path, digest: str) -> Path:
-    """Where a benchmark keeps a submission, by the hash of its content."""
+    """Returns where a benchmark keeps a submission, by the hash of its content."""
     return Path(root) / FOLDER / f"{digest[:16]}.jsonl"
 
 
@@ -441,7 +441,7 @@ def retake(
 
 
 def _choices(frames: Sequence[SubmittedFrame], paths: Sequence[np.ndarray]) -> list[Choice | None]:
-    """The path to each view, all that is known of its choice.
+    """Returns the path to each view, all that is known of its choice.
 
     As in a trace, it belongs to the first frame that was taken on the path.
     """

@@ -87,7 +87,7 @@ class Table:
 
 
 def metric_named(name: str) -> Metric:
-    """The metric of `scores.METRICS`.
+    """Returns the metric of `scores.METRICS`.
 
     Raises:
         ValueError: there is none of that name.
@@ -100,7 +100,7 @@ def metric_named(name: str) -> Metric:
 
 
 def full_title(metric: Metric) -> str:
-    """The metric's title where it does not stand below that of PSNR."""
+    """Returns the metric's title where it does not stand below that of PSNR."""
     return "PSNR [dB], holes left out" if metric.name == "psnr_measured" else metric.title
 
 
@@ -120,25 +120,25 @@ def ranked(values: Sequence[float | None], metric: Metric) -> list[Entry]:
 
 
 def with_bounds(entry: Entry, found: Estimate, metric: Metric, sign: str = "") -> Entry:
-    """The entry with its 95 % interval; `sign` as in format strings."""
+    """Returns the entry with its 95 % interval; `sign` as in format strings."""
     low, high = (f"{end:{sign}.{metric.decimals}f}" for end in (found.low, found.high))
     extra = {"low": found.low, "high": found.high}
     return Entry(entry.value, f"{entry.text} [{low}, {high}]", entry.rank, extra)
 
 
 def with_name(entry: Entry, name: str) -> Entry:
-    """The entry with what it belongs to."""
+    """Returns the entry with what it belongs to."""
     return Entry(entry.value, f"{entry.text} ({name})", entry.rank, {"name": name})
 
 
 def seed_text(seeds: Sequence[Sequence[int]]) -> str:
-    """Fewest and most seeds of some cells: `3`, `2-3`."""
+    """Returns the fewest and most seeds of some cells: `3`, `2-3`."""
     counts = sorted({len(found) for found in seeds})
     return f"{counts[0]}" if len(counts) == 1 else f"{counts[0]}-{counts[-1]}"
 
 
 def seed_texts(cells: Sequence[Cell]) -> dict[str, str]:
-    """The same for each method over all scenes of the table."""
+    """Returns the same for each method over all scenes of the table."""
     found = seeds_by_method(cells)
     return {method: seed_text(list(scenes.values())) for method, scenes in found.items()}
 
@@ -174,7 +174,7 @@ def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
 
 
 def _short_commit(commit: str | None) -> str:
-    """Ten digits, and whether the source was changed after it."""
+    """Returns the ten digits, and whether the source was changed after it."""
     digits, hyphen, changed = (commit or "unknown").partition("-")
     return f"{digits[:10]}{hyphen}{changed}"
 
@@ -184,7 +184,7 @@ PAPER_METRICS = ("ssim", "psnr", "lpips")
 
 
 def quality_table(cells: Sequence[Cell], title: str = "", *, with_intervals: bool = False) -> Table:
-    """The paper's table: methods x (SSIM, PSNR, LPIPS) by scenes and their mean.
+    """Returns the paper's table: methods x (SSIM, PSNR, LPIPS) by scenes and their mean.
 
     A field is the mean over seeds of the mean over the scene's test views. The last column is the
     mean of the scenes, and missing for a method without one of them: means over other scenes are
@@ -227,7 +227,7 @@ def quality_table(cells: Sequence[Cell], title: str = "", *, with_intervals: boo
 
 
 def _part(scores: Scores, scene: str | None, scenes: Sequence[str]) -> Scores:
-    """The scores of one scene, or (None) of all if there are some for all; empty if not."""
+    """Returns the scores of one scene, or (None) of all if there are some for all; empty if not."""
     if scene is not None:
         return {scene: scores[scene]} if scene in scores else {}
     return scores if set(scores) == set(scenes) else {}
@@ -255,7 +255,7 @@ def headed_groups(records: Sequence[Cell]) -> list[tuple[str, list[Cell]]]:
 
 
 def groups_on_equal_terms(records: Sequence[Cell]) -> list[list[Cell]]:
-    """Records of one snapshot in groups that may share a table, each as large as it can be.
+    """Returns records of one snapshot in groups that may share a table, each as large as it can be.
 
     One that is there twice (the same method, scene and seed) begins a group of its own.
     """

@@ -49,7 +49,7 @@ _FACES = ndimage.generate_binary_structure(3, 1)
 
 
 def possible_cells(grid: OccupancyGrid, margin: float = MARGIN) -> np.ndarray:
-    """Cells that a camera may stand in, for all that is known, [X, Y, Z] bool.
+    """Returns cells that a camera may stand in, for all that is known, [X, Y, Z] bool.
 
     None of them comes nearer than `margin` [m] to an occupied cell or to the end of the grid, and
     each connects over others of them to one that is known to be free.
@@ -62,7 +62,7 @@ def possible_cells(grid: OccupancyGrid, margin: float = MARGIN) -> np.ndarray:
 
 
 def free_space_views(grid: OccupancyGrid, num: int) -> np.ndarray:
-    """The first `num` views of a fixed sequence over the grid that stand in possible cells.
+    """Returns the first `num` views of a fixed sequence over the grid that stand in possible cells.
 
     Args:
         grid: what is known.
@@ -149,7 +149,7 @@ def forecast_map(
 def view_features(
     state: MapState, camera: Camera, poses: Float[Array, "V 4 4"], config: ScoringConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coverage and renderability of views, [V] float64 each."""
+    """Returns the coverage and renderability of views, [V] float64 each."""
     coverage, renderability = _features(state, camera, poses, config)
     return np.asarray(coverage, dtype=np.float64), np.asarray(renderability, dtype=np.float64)
 
@@ -226,7 +226,7 @@ class Outlook:
         return [int(counts[frames - 1]) for frames in self.frames]
 
     def _views_by_frame(self) -> np.ndarray:
-        """Views up to each frame of the run, that frame included."""
+        """Returns views up to each frame of the run, that frame included."""
         return np.cumsum([not row.captured for row in self.run.rows])
 
     def watch(

@@ -103,14 +103,14 @@ def fit(coverage: np.ndarray, renderability: np.ndarray, psnr: np.ndarray) -> Ps
 
 
 def statistic(values: np.ndarray, name: str) -> float:
-    """The mean or a percentile of values, by its name: `mean`, `p10`."""
+    """Returns the mean or a percentile of values, by its name: `mean`, `p10`."""
     return (
         float(np.mean(values)) if name == MEAN else float(np.percentile(values, percent_of(name)))
     )
 
 
 def percent_of(name: str) -> float:
-    """The number in the name of a percentile.
+    """Returns the number in the name of a percentile.
 
     Raises:
         ValueError: no percentile has that name.
@@ -137,7 +137,7 @@ class Calibration:
     """Which runs, in a sentence."""
 
     def half_width(self, name: str, level: float) -> float:
-        """Half of the interval of a statistic [dB]: that share of the errors is no larger.
+        """Returns half of the interval of a statistic [dB]: that share of the errors is no larger.
 
         Between two percentiles whose errors are known it is interpolated; outside, the last one's.
         """
@@ -154,7 +154,7 @@ def leave_one_out(
     scenes: Sequence[str],
     models: Sequence[str],
 ) -> list[dict[str, tuple[float, float]]]:
-    """Forecast and truth of every model, by a calibration that has not seen its scene.
+    """Returns the forecast and truth of every model, by a calibration that has not seen its scene.
 
     Args:
         coverage: of each view, [V].
@@ -184,7 +184,7 @@ def leave_one_out(
 
 
 def errors_of(pairs: Sequence[Mapping[str, tuple[float, float]]]) -> dict[str, tuple[float, ...]]:
-    """Sizes of the errors by statistic, increasing, as `Calibration` keeps them."""
+    """Returns sizes of the errors by statistic, increasing, as `Calibration` keeps them."""
     return {
         name: tuple(sorted(round(abs(pair[name][0] - pair[name][1]), 4) for pair in pairs))
         for name in STATISTICS
@@ -214,7 +214,7 @@ _KINDS = {
 
 @functools.cache
 def default_calibration() -> Calibration:
-    """The calibration that comes with the package."""
+    """Returns the calibration that comes with the package."""
     return read_calibration(Path(str(files("r3jax.apps.forecast") / "calibration.json")))
 
 
@@ -230,7 +230,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """A calibration that `write_calibration` wrote.
+    """Returns a calibration that `write_calibration` wrote.
 
     Raises:
         ValueError: the file is no calibration, or one of another version.
@@ -270,7 +270,7 @@ class PsnrForecast(Protocol):
     """What a goal asks of a forecast, which takes JAX to make."""
 
     def value(self, name: str) -> float:
-        """A statistic of the PSNR [dB]."""
+        """Returns a statistic of the PSNR [dB]."""
         ...
 
 
@@ -285,7 +285,7 @@ class Goal:
     """`mean`, or a percentile: `p10`."""
 
     def reached(self, forecast: PsnrForecast) -> bool:
-        """True if the forecast is at least as good."""
+        """Returns True if the forecast is at least as good."""
         return forecast.value(self.statistic) >= self.psnr
 
     def __str__(self) -> str:

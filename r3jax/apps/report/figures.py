@@ -25,7 +25,7 @@ _DOT, _CAPTURED_DOT = 26, 8
 
 
 def progress_figure(run: Run) -> Figure:
-    """Coverage and mean renderability against views, or frames, and against seconds."""
+    """Returns the coverage and mean renderability against views, or frames, and against seconds."""
     figure = style.new_figure(10.0, 5.6)
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
     numbers = np.arange(1, len(run.rows) + 1)
@@ -62,7 +62,7 @@ def progress_figure(run: Run) -> Figure:
 
 
 def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
-    """The place from above, with the path colored by acquisition order."""
+    """Returns the place from above, with the path colored by acquisition order."""
     positions = np.array([row.pose[:3, 3] for row in run.rows])
     picture, extent = floor_picture(map_state, grid, float(np.median(positions[:, 2])))
     width, height = extent[1] - extent[0], extent[3] - extent[2]
@@ -107,7 +107,7 @@ def _draw_path(axes: Axes, rows: Sequence[StepRow]) -> None:
 
 
 def _draw_views(axes: Axes, rows: Sequence[StepRow]) -> PathCollection:
-    """Draws where frames were taken, smaller while moving, and where the camera looked."""
+    """Returns draws where frames were taken, smaller while moving, and where the camera looked."""
     x, y, _ = np.array([row.pose[:3, 3] for row in rows]).T
     u, v, _ = np.array([row.pose[:3, 2] for row in rows]).T
     order, (low, high) = np.arange(len(rows)), _span(rows)
@@ -143,7 +143,7 @@ def _span(rows: Sequence[StepRow]) -> tuple[int, int]:
 
 
 def cost_figure(run: Run) -> Figure:
-    """Step times by stage, and the memory of the map."""
+    """Returns the step times by stage, and the memory of the map."""
     figure = style.new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=[1.4, 1.0])
     table = stage_times(run)
@@ -174,7 +174,7 @@ def cost_figure(run: Run) -> Figure:
 
 
 def strip_figure(run: Run, count: int = 12) -> Figure:
-    """Some of the recorded images, evenly spread over the run."""
+    """Returns some of the recorded images, evenly spread over the run."""
     from PIL import Image
 
     steps = np.unique(np.linspace(0, len(run.rows) - 1, count).round().astype(int))
@@ -237,7 +237,7 @@ _MANY = 60
 def utility_by_cause(
     run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
 ) -> np.ndarray:
-    """What each view of a run promised when it was chosen, by cause.
+    """Returns what each view of a run promised when it was chosen, by cause.
 
     Args:
         run: the run.

@@ -70,7 +70,7 @@ class EvaluatedModel:
 
 
 def read_evaluated_model(run: Run) -> EvaluatedModel | None:
-    """The newest evaluation of the run; None if there is none.
+    """Returns the newest evaluation of the run; None if there is none.
 
     Raises:
         RunError: the files are damaged.
@@ -110,7 +110,7 @@ def _check(evaluation: Any) -> None:
 
 
 def _read_columns(path: Path) -> dict[str, np.ndarray]:
-    """history.csv by column; empty if it has no rows.
+    """Returns history.csv by column; empty if it has no rows.
 
     Raises:
         ValueError, csv.Error: not a table, or not with these columns.
@@ -144,7 +144,7 @@ def _check_hash(path: Path, data: bytes, sha256: str | None) -> None:
 
 
 def training_figure(history: dict[str, np.ndarray]) -> Figure:
-    """PSNR of the training views and number of Gaussians, against steps."""
+    """Returns PSNR of the training views and number of Gaussians, against steps."""
     figure = style.new_figure(10.0, 2.9)
     left, right = figure.subplots(1, 2)
     step, psnr = history["step"], history["psnr"]
@@ -179,7 +179,7 @@ def quality_rows(evaluation: dict[str, Any]) -> list[list[str]]:
 
 
 def quality_note(evaluation: dict[str, Any]) -> str:
-    """How the numbers came about, in a sentence or two."""
+    """Returns how the numbers came about, in a sentence or two."""
     trained_on = evaluation.get("trained_on")
     count = len(evaluation["numbers"])
     if trained_on == 0:

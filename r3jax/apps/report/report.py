@@ -135,7 +135,7 @@ def write_report(
 
 
 def _saved(path: Path, figure: Figure) -> bytes:
-    """The figure as PNG, which is also written beside the page."""
+    """Returns the figure as PNG, which is also written beside the page."""
     png = style.to_png(figure)
     write_atomic(path, png)
     return png
@@ -165,7 +165,7 @@ def _forecast(outlook: Outlook, map_state: MapState, grid: OccupancyGrid) -> Fig
 
 
 def _model(folder: Path, model: EvaluatedModel) -> dict[str, Any]:
-    """What the page says of the trained model; what came out of it all stands first."""
+    """Returns what the page says of the trained model; what came out of it all stands first."""
     return {
         "note": quality_note(model.evaluation),
         "rows": quality_rows(model.evaluation),
@@ -175,7 +175,7 @@ def _model(folder: Path, model: EvaluatedModel) -> dict[str, Any]:
 
 
 def _cards(run: Run, model: EvaluatedModel | None) -> dict[str, str]:
-    """A few large numbers: what came out of the run first."""
+    """Returns a few large numbers: what came out of the run first."""
     last, captured = run.rows[-1], sum(row.captured for row in run.rows)
     views = str(len(run.rows) - captured)
     cards: dict[str, str] = {}
@@ -195,7 +195,7 @@ def _cards(run: Run, model: EvaluatedModel | None) -> dict[str, str]:
 
 
 def _settings(run: Run) -> dict[str, str]:
-    """Outcome, numbers and every setting, so that the page explains itself."""
+    """Returns the outcome, numbers and every setting, so that the page explains itself."""
     header = run.header
     return {
         **summary(run),
@@ -209,7 +209,7 @@ def _settings(run: Run) -> dict[str, str]:
 
 
 def _in_words(settings: dict[str, Any]) -> str:
-    """Settings as text: `name value`, groups in brackets behind their name."""
+    """Returns settings as text: `name value`, groups in brackets behind their name."""
     texts: list[str] = []
     for name, value in settings.items():
         words = name.replace("_", " ")

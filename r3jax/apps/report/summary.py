@@ -57,7 +57,7 @@ class StageTime:
 
 
 def stage_times(run: Run) -> list[StageTime]:
-    """Step times by stage, as measured; stages that never ran are left out."""
+    """Returns the step times by stage, as measured; stages that never ran are left out."""
     table: list[StageTime] = []
     known = [*STAGES, *sorted({k for t in run.timings for k in t} - {"step", *STAGES})]
     for key in known:
@@ -86,7 +86,7 @@ def outcome(run: Run) -> str:
 
 
 def summary(run: Run) -> dict[str, str]:
-    """What happened, as short texts under short names."""
+    """Returns what happened, as short texts under short names."""
     header = run.header
     texts = {
         "scene": str(header.scene.get("name", "?")),

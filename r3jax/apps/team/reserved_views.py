@@ -72,7 +72,7 @@ class ReservedViews:
         *,
         key: Array,
     ) -> tuple[Decision | None, Any, PlanInfo]:
-        """The view that the policy would take if the promised ones had been taken."""
+        """Returns the view that the policy would take if the promised ones had been taken."""
         # One after the other: what the first promises to show, the second cannot promise again.
         for view in self.promised:
             pose = jnp.asarray(view.T_world_camera, dtype=jnp.float32)
@@ -99,7 +99,7 @@ class ReservedViews:
 def without_yielded(
     grid: OccupancyGrid, here: Float[Array, " 3"], others: Float[Array, "K 3"]
 ) -> OccupancyGrid:
-    """The grid for a decision that leaves to others what lies nearer to them.
+    """Returns the grid for a decision that leaves to others what lies nearer to them.
 
     Cells that are nearer to one of the others than to here do not count, unless that would leave
     nothing to explore.

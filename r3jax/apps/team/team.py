@@ -131,7 +131,7 @@ class Common:
 
 
 def last_meeting(seconds: float, meet_every: float) -> float:
-    """The clock at the last meeting [s]; 0 for `meet_every`: the radio is always on."""
+    """Returns the clock at the last meeting [s]; 0 for `meet_every`: the radio is always on."""
     return math.floor(seconds / meet_every) * meet_every if meet_every > 0.0 else seconds
 
 
@@ -143,7 +143,7 @@ def in_order(observations: tuple[Observation, ...]) -> list[Observation]:
 def share(
     common: Common, until: float, config: ExplorationConfig, *, repeat_compiled: bool
 ) -> tuple[Common, list[SharedFrame]]:
-    """A meeting: all frames up to a time join the common map.
+    """Returns a meeting: all frames up to a time join the common map.
 
     Args:
         common: before.
@@ -278,7 +278,7 @@ def _start(
     on_stage: Callable[[str], None] | None,
     recorded: Run | None,
 ) -> tuple[Mission, LoopState]:
-    """One member's mission, and its state before the first view."""
+    """Returns one member's mission, and its state before the first view."""
     key = jax.random.key(seed)
     # The first member is the camera that `explore` would fly alone.
     init_key, key = jax.random.split(jax.random.fold_in(key, number) if number else key)
@@ -343,7 +343,7 @@ def _meet(flying: list[_Flying], common: Common, until: float, views: list[TeamV
 
 
 def _take_over(me: _Flying, common: Common) -> _Flying:
-    """The common map becomes one's own, with the frames on top that were not shared yet."""
+    """Returns the common map becomes one's own, with the frames on top that were not shared yet."""
     received = me.received
     if all(shared.view.member == me.number for shared in received):
         return replace(me, received=())  # one's own map is just that already
@@ -374,13 +374,13 @@ def _take_over(me: _Flying, common: Common) -> _Flying:
 
 
 def _with_common(state: LoopState, common: Common) -> LoopState:
-    """The state with the map and the grid of all."""
+    """Returns the state with the map and the grid of all."""
     planner = replace(state.planner, map_state=common.map_state, grid=common.grid)
     return replace(state, planner=planner)
 
 
 def _promised_to(me: _Flying, common: Common) -> tuple[PromisedView, ...]:
-    """The views that the others were heading for at the last meeting."""
+    """Returns the views that the others were heading for at the last meeting."""
     first: dict[int, Observation] = {}
     for observation in in_order(common.waiting):
         if observation.member != me.number:
@@ -415,7 +415,7 @@ def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Obs
 
 
 def _decided_by(state: LoopState, policy: Policy) -> LoopState:
-    """The state of a planner whose next decision is a policy's."""
+    """Returns the state of a planner whose next decision is a policy's."""
     return replace(state, planner=replace(state.planner, policy=policy))
 
 
@@ -427,7 +427,7 @@ def _stop_all(flying: list[_Flying], reason: StopReason, why: str) -> None:
 
 
 def _finish(me: _Flying, state: LoopState) -> Result:
-    """Records how a member ended."""
+    """Returns records how a member ended."""
     assert me.stop is not None
     stop = me.stop if me.recorder is None else me.recorder.record_end(state, me.stop)
     return Result(state, me.rows, stop.reason, stop.message)

@@ -118,7 +118,7 @@ class LatestWorker(Generic[Question, Answer]):
                 self._idle = None
 
     def _settled(self) -> tuple[int, Question] | None:
-        """The newest question once none has followed it for a while; the lock is held."""
+        """Returns the newest question once none has followed it for a while; the lock is held."""
         newest = -1
         while newest != self._asked and not self._closed:
             newest = self._asked
@@ -276,7 +276,7 @@ class App:
         self.controls.show_note(str(error) or type(error).__name__)
 
     def _heights(self, bounds: np.ndarray) -> tuple[float, float, float]:
-        """Least, greatest and first height of the cut [m]."""
+        """Returns the least, greatest and first height of the cut [m]."""
         low, high = (float(z) for z in np.asarray(bounds)[:, 2])
         corners = np.array([[0.0, 0.0, high]])
         rows = self.story.rows
@@ -288,7 +288,7 @@ class App:
             self._add_view()
 
     def _prepare(self) -> bool:
-        """Something for later, while nothing is asked: first the views along the path."""
+        """Returns something for later, while nothing is asked: first the views along the path."""
         if not self.story.is_live and self._num_added < len(self.story.rows):
             self._add_view()
             return True
@@ -326,6 +326,6 @@ class App:
 
 
 def _follows_camera(question: Query) -> bool:
-    """Whether the map's colors depend on where the dragged camera is."""
+    """Returns whether the map's colors depend on where the dragged camera is."""
     settings = question.settings
     return settings.layer.has_score and settings.place != PLACES[0]

@@ -63,7 +63,7 @@ class SurfaceTerms(eqx.Module):
 
 
 def probe_positions(grid: OccupancyGrid, num: int = NUM_PROBES) -> np.ndarray:
-    """Positions in known free space [m], evenly spread, [P, 3] float32, P <= num.
+    """Returns positions in known free space [m], evenly spread, [P, 3] float32, P <= num.
 
     They are those of the probe views that a run's mean renderability is measured with.
     """
@@ -78,7 +78,7 @@ def surface_terms(
     *,
     pad_to: int = 1,
 ) -> SurfaceTerms:
-    """The terms of every voxel, averaged over the positions that see it.
+    """Returns the terms of every voxel, averaged over the positions that see it.
 
     Args:
         state: the map.
@@ -170,7 +170,7 @@ class Blocks:
         return len(self.rows)
 
     def mean(self, values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-        """The weighted mean over the voxels of each block.
+        """Returns the weighted mean over the voxels of each block.
 
         Args:
             values: of every row of the map, [N].
@@ -187,7 +187,7 @@ class Blocks:
 
 
 def blocks_of(map_state: MapState, budget: int = BUDGET) -> Blocks:
-    """The voxels of a map in at most `budget` blocks, as fine as that allows.
+    """Returns the voxels of a map in at most `budget` blocks, as fine as that allows.
 
     Raises:
         ValueError: a budget without a block.
@@ -212,13 +212,13 @@ def blocks_of(map_state: MapState, budget: int = BUDGET) -> Blocks:
 
 
 def _packed(index: np.ndarray) -> np.ndarray:
-    """One number per index [3, m] from 0 on."""
+    """Returns one number per index [3, m] from 0 on."""
     x, y, z = index
     return (x << 42) | (y << 21) | z
 
 
 def block_values(blocks: Blocks, terms: SurfaceTerms, quantity: str) -> np.ndarray:
-    """R or a term per block, [n] in [0, 1]; NaN where no position sees any of its voxels.
+    """Returns R or a term per block, [n] in [0, 1]; NaN where no position sees any of its voxels.
 
     Raises:
         KeyError: there is no such term.
@@ -230,7 +230,7 @@ def block_values(blocks: Blocks, terms: SurfaceTerms, quantity: str) -> np.ndarr
 
 
 def block_causes(blocks: Blocks, capacity: int, reason: Reason) -> np.ndarray:
-    """The cause that took most of what the voxels of each block lacked for a view, [n] int.
+    """Returns the cause that took most of what the voxels of each block lacked for a view, [n] int.
 
     Args:
         blocks: of the map that the view was chosen on.
@@ -252,7 +252,7 @@ _SHADE = 0.5
 
 
 def cause_colors(causes: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Color per block, [n, 3] uint8, of what `block_causes` found [n].
+    """Returns the color per block, [n, 3] uint8, of what `block_causes` found [n].
 
     Args:
         causes: per block; where none took anything, it is gray.
@@ -267,7 +267,7 @@ def cause_colors(causes: np.ndarray, own: np.ndarray) -> np.ndarray:
 def block_colors(
     blocks: Blocks, map_state: MapState, terms: SurfaceTerms | None, quantity: str
 ) -> np.ndarray:
-    """Color per block, [n, 3] uint8.
+    """Returns the color per block, [n, 3] uint8.
 
     Args:
         blocks: of the map.
@@ -300,7 +300,7 @@ class Known:
 def known_at(
     moment: Moment, camera: Camera, config: ScoringConfig, budget: int, *, with_terms: bool = True
 ) -> Known:
-    """The blocks of a moment's map, and what cameras in known free space think of them.
+    """Returns the blocks of a moment's map, and what cameras in known free space think of them.
 
     Args:
         moment: the moment.
@@ -318,19 +318,19 @@ def known_at(
 
 
 def scoring_of(header: RunHeader) -> ScoringConfig:
-    """The settings of the scores, with the range of the run's sensor."""
+    """Returns the settings of the scores, with the range of the run's sensor."""
     max_range = float(header.config.get("max_range", 5.0))
     return ScoringConfig(max_range=jnp.asarray(max_range, dtype=jnp.float32))
 
 
 def title_of(header: RunHeader) -> str:
-    """Who explored what, in a few words; a file's name without its folders."""
+    """Returns the who explored what, in a few words; a file's name without its folders."""
     scene = str(header.scene.get("name", "")).rpartition("/")[2]
     return f"{header.policy.get('name', '')} in {scene}"
 
 
 def cut_height(rows: Sequence[StepRow], points: np.ndarray) -> float:
-    """Height above which nothing is drawn, so that one looks in from above [m].
+    """Returns the height above which nothing is drawn, so that one looks in from above [m].
 
     Args:
         rows: of the trace, at least one: the cameras stay in view.

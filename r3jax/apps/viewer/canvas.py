@@ -280,7 +280,7 @@ class Canvas:
 
 
 def framing(points: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where to look from and to [m], so that points [n, 3] [m] fill a window.
+    """Returns where to look from and to [m], so that points [n, 3] [m] fill a window.
 
     Args:
         points: what is to be in view.

@@ -35,7 +35,7 @@ CAUSE_COLORS = tuple(to_bytes(np.asarray(to_rgb(color))) for color in style.CAUS
 
 @functools.cache
 def _table(name: str) -> np.ndarray:
-    """256 colors, [256, 3] uint8."""
+    """Returns 256 colors, [256, 3] uint8."""
     colors = matplotlib.colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
     table = np.rint(colors * 255.0).astype(np.uint8)
     table.flags.writeable = False
@@ -43,7 +43,7 @@ def _table(name: str) -> np.ndarray:
 
 
 def paint(values: np.ndarray, name: str = SCORES) -> np.ndarray:
-    """Colors of numbers in [0, 1]; NaN becomes `UNSEEN`.
+    """Returns colors of numbers in [0, 1]; NaN becomes `UNSEEN`.
 
     Args:
         values: [...]; what lies outside [0, 1] gets the color of the nearer end.
@@ -64,7 +64,7 @@ def linear_light(encoded: np.ndarray) -> np.ndarray:
 
 
 def css_color(color: np.ndarray | tuple[int, int, int]) -> str:
-    """A color of three bytes as browsers write it, such as `#0f766e`."""
+    """Returns a color of three bytes as browsers write it, such as `#0f766e`."""
     return "#" + "".join(f"{int(part):02x}" for part in color)
 
 

@@ -150,19 +150,19 @@ def _part(macro: str, **values: Any) -> str:
 
 
 def head_html(text: str) -> str:
-    """The line below the title."""
+    """Returns the line below the title."""
     return _part("head", text=text)
 
 
 def note_html(text: str) -> str:
-    """A line about what went wrong, or is missing."""
+    """Returns a line about what went wrong, or is missing."""
     return _part("note", text=text)
 
 
 def view_html(
     row: StepRow, num_views: int, image: np.ndarray, reason: Reason | str, unit: str = "view"
 ) -> str:
-    """The photo of a view, what the trace says of it, and why it was chosen.
+    """Returns the photo of a view, what the trace says of it, and why it was chosen.
 
     Args:
         row: of the trace.
@@ -187,7 +187,7 @@ def view_html(
 
 
 def facts_of_view(row: StepRow) -> dict[str, str]:
-    """What the trace says of a view."""
+    """Returns what the trace says of a view."""
     return {
         "mission clock": f"{row.seconds:.1f} s",
         "this view cost": f"{sum(row.charged.values()):.1f} s",
@@ -199,7 +199,7 @@ def facts_of_view(row: StepRow) -> dict[str, str]:
 
 
 def best_candidates(choice: Choice) -> list[dict[str, Any]]:
-    """The best candidates of a decision in words."""
+    """Returns the best candidates of a decision in words."""
     chosen = chosen_rank(choice)
     lines: list[dict[str, Any]] = []
     for rank in range(min(len(choice.top.get("total", [])), _SHOWN)):
@@ -222,7 +222,7 @@ def best_candidates(choice: Choice) -> list[dict[str, Any]]:
 
 
 def chosen_rank(choice: Choice) -> int | None:
-    """Which of the best candidates was taken, from 0; None if it is not among them."""
+    """Returns which of the best candidates was taken, from 0; None if it is not among them."""
     for rank, total in enumerate(choice.top.get("total", [])):
         if total is not None and math.isclose(total, choice.score, rel_tol=1e-5, abs_tol=1e-12):
             return rank
@@ -243,7 +243,7 @@ def _ordinal(number: int) -> str:
 
 
 def promise_of(reason: Reason | str) -> dict[str, Any] | str:
-    """What a view promised when it was chosen, by cause; or why that is not known."""
+    """Returns what a view promised when it was chosen, by cause; or why that is not known."""
     if isinstance(reason, str):
         return reason
     total = reason.utility
@@ -265,12 +265,12 @@ def _count(number: int, name: str) -> str:
 
 
 def pending_html() -> str:
-    """Before the first numbers."""
+    """Returns the before the first numbers."""
     return _part("pending")
 
 
 def stale_html(content: str, text: str = "") -> str:
-    """What belongs to another pose or view, faint, below what is going on.
+    """Returns what belongs to another pose or view, faint, below what is going on.
 
     Args:
         content: from this module.
@@ -281,7 +281,7 @@ def stale_html(content: str, text: str = "") -> str:
 
 
 def preview_html(glance: QuickPreview, look: CameraPreview | None, view: int) -> str:
-    """R of the dragged camera, its terms, and the utility of looking there.
+    """Returns R of the dragged camera, its terms, and the utility of looking there.
 
     Args:
         glance: what takes milliseconds.
@@ -305,7 +305,7 @@ def preview_html(glance: QuickPreview, look: CameraPreview | None, view: int) ->
 
 
 def pictures_html(pictures: Sequence[tuple[str, np.ndarray]], panorama: np.ndarray) -> str:
-    """The dragged camera's pictures and its panorama, each with its name.
+    """Returns the dragged camera's pictures and its panorama, each with its name.
 
     Args:
         pictures: names and pictures, [H, W, 3] uint8 each.
@@ -321,24 +321,24 @@ def pictures_html(pictures: Sequence[tuple[str, np.ndarray]], panorama: np.ndarr
 
 
 def _picture(image: np.ndarray) -> dict[str, Any]:
-    """A picture [H, W, 3] uint8 for the template."""
+    """Returns a picture [H, W, 3] uint8 for the template."""
     return {"url": image_url(image), "is_coarse": _is_coarse(image)}
 
 
 def image_url(image: np.ndarray) -> str:
-    """A picture [H, W, 3] uint8 as an address that holds it."""
+    """Returns a picture [H, W, 3] uint8 as an address that holds it."""
     file, kind = io.BytesIO(), "png" if _is_coarse(image) else "jpeg"
     Image.fromarray(np.ascontiguousarray(image)).save(file, kind, quality=88)
     return data_url(file.getvalue(), kind)
 
 
 def _is_coarse(picture: np.ndarray) -> bool:
-    """Few pixels stay squares: they are measurements, no photo."""
+    """Returns the few pixels stay squares: they are measurements, no photo."""
     return picture.shape[1] < _COARSE
 
 
 def _utilities(look: CameraPreview) -> tuple[float, float]:
-    """The utility where the camera looks, and the best one from its position."""
+    """Returns the utility where the camera looks, and the best one from its position."""
     lattice = fibonacci_lattice(len(look.direction_scores))
     here = int(np.argmax(lattice @ look.T_world_camera[:3, 2]))
     return float(look.direction_scores[here]), float(look.direction_scores.max())
@@ -367,7 +367,7 @@ class Caption:
 
 
 def legend_html(caption: Caption, with_candidates: bool = False) -> str:
-    """The legend of what is drawn, of which moment, and what its colors mean.
+    """Returns the legend of what is drawn, of which moment, and what its colors mean.
 
     Args:
         caption: what is drawn.
@@ -396,7 +396,7 @@ def legend_html(caption: Caption, with_candidates: bool = False) -> str:
 
 
 def _bar(name: str, low: str, high: str, hint: str) -> dict[str, Any]:
-    """A color map from left to right, and what its ends mean."""
+    """Returns a color map from left to right, and what its ends mean."""
     stops = [css_color(color) for color in paint(np.linspace(0.0, 1.0, _STOPS), name)]
     return {"hint": hint, "stops": stops, "low": low, "high": high}
 

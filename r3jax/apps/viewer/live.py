@@ -36,7 +36,7 @@ def open_live(
     subtitle: str,
     earlier: Run | None = None,
 ) -> "LiveFeed":
-    """A page for an exploration that is about to begin.
+    """Returns a page for an exploration that is about to begin.
 
     Args:
         server: with an empty page; it stays the caller's.
@@ -91,7 +91,7 @@ class LiveFeed:
             self.app.grow()
 
     def __enter__(self) -> "LiveFeed":
-        """The feed itself."""
+        """Returns the feed itself."""
         return self
 
     def __exit__(

@@ -24,7 +24,7 @@ SPLAT_BUDGET = 300_000
 
 
 def path_segments(rows: Sequence[StepRow], num_views: int) -> tuple[np.ndarray, np.ndarray]:
-    """The path that the camera flew, segment by segment.
+    """Returns the path that the camera flew, segment by segment.
 
     Args:
         rows: of the trace from the first one on, as many as are to be drawn.
@@ -131,18 +131,18 @@ def splat_arrays(
 
 
 def _matrices(wxyz: np.ndarray) -> np.ndarray:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] of any length but 0."""
+    """Returns the rotation matrices [..., 3, 3] of quaternions [..., 4] of any length but 0."""
     return Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
 
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
-    """The unit quaternion wxyz of a rotation matrix [3, 3], w >= 0."""
+    """Returns the unit quaternion wxyz of a rotation matrix [3, 3], w >= 0."""
     w, x, y, z = Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True).tolist()
     return w, x, y, z
 
 
 def pose_of(wxyz: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """`T_world_camera` [4, 4] float64 of a quaternion wxyz and a position [m]."""
+    """Returns `T_world_camera` [4, 4] float64 of a quaternion wxyz and a position [m]."""
     pose = np.eye(4)
     pose[:3, :3] = _matrices(wxyz)
     pose[:3, 3] = position

@@ -132,7 +132,7 @@ class PlaceLayer:
         moment: Moment,
         reason: Reason | str,
     ) -> bool:
-        """Whether `draw` would draw what is drawn already."""
+        """Returns whether `draw` would draw what is drawn already."""
         return self._drawn == _key(settings, T_world_camera, moment.step, reason)
 
     def draw(
@@ -142,7 +142,7 @@ class PlaceLayer:
         moment: Moment,
         reason: Reason | str,
     ) -> Show:
-        """What is wished for.
+        """Returns what is wished for.
 
         Args:
             settings: of the user.
@@ -179,7 +179,7 @@ class PlaceLayer:
         return show
 
     def _voxels(self, settings: DisplaySettings, position: np.ndarray, moment: Moment) -> _Drawing:
-        """The map, colored as wished and cut open."""
+        """Returns the map, colored as wished and cut open."""
         has_score = settings.layer.has_score
         from_free_space = settings.place == PLACES[0]
         known = self._known_at(moment, with_terms=has_score and from_free_space)
@@ -236,7 +236,7 @@ class PlaceLayer:
         return known
 
     def _recorded(self, cut: float) -> _Drawing:
-        """The measured points, cut open."""
+        """Returns the measured points, cut open."""
         if self._points is None:
             assert self._sources.points is not None
             self._points = self._sources.points()
@@ -248,7 +248,7 @@ class PlaceLayer:
         return _Drawing(show, _WHOLE, f"{len(points):,} points, as many from each view")
 
     def _splats(self, cut: float) -> _Drawing:
-        """The trained splats, cut open."""
+        """Returns the trained splats, cut open."""
         model = self._sources.model
         assert model is not None
         if self._gaussians is None:
@@ -263,7 +263,7 @@ class PlaceLayer:
         return _Drawing(show, _WHOLE, f"{share} Gaussians in their mean colors")
 
     def _mesh(self, cut: float) -> _Drawing:
-        """The scene's own triangles, but for those above the cut."""
+        """Returns the scene's own triangles, but for those above the cut."""
         assert self._sources.mesh is not None
         glb = self._sources.mesh(cut)
         show = functools.partial(self._canvas.show_mesh, "/mesh", glb)
@@ -276,7 +276,7 @@ _WHOLE = "of the whole run"
 def _key(
     settings: DisplaySettings, T_world_camera: np.ndarray, step: int, reason: Reason | str
 ) -> tuple[object, ...]:
-    """What a drawing depends on: equal keys, equal drawings."""
+    """Returns what a drawing depends on: equal keys, equal drawings."""
     layer = settings.layer
     key: tuple[object, ...] = (layer, settings.cut)
     if not layer.is_of_one_view:
@@ -292,7 +292,7 @@ def _key(
 
 
 def voxel_note(blocks: Blocks) -> str:
-    """How many voxels are drawn, and how."""
+    """Returns how many voxels are drawn, and how."""
     if blocks.num_voxels == len(blocks.centers):
         return f"{blocks.num_voxels:,} voxels of {100 * blocks.edge:.3g}\u00a0cm"
     return (
@@ -350,7 +350,7 @@ class Query:
 
 
 def picture_camera(camera: Camera) -> Camera:
-    """A run's camera at the size of the pictures beside the dragged one."""
+    """Returns a run's camera at the size of the pictures beside the dragged one."""
     return camera.resized(*fitted_size(camera.width, camera.height, PICTURE_SIZE))
 
 
@@ -401,7 +401,7 @@ class QueryHandler:
             self._deciding.join()
 
     def prepare(self) -> bool:
-        """Something for later, while nothing is asked."""
+        """Returns something for later, while nothing is asked."""
         try:
             return self._story.advance()
         except RunError as error:
@@ -441,7 +441,7 @@ class QueryHandler:
     def _draw(
         self, settings: DisplaySettings, pose: np.ndarray, moment: Moment, reason: Reason | str
     ) -> Iterator[Show]:
-        """The place and what it shows in words, unless it is there already."""
+        """Yields the place and what it shows in words, unless it is there already."""
         if self._place.is_drawn(settings, pose, moment, reason):
             return
         text = f"View {settings.step + 1}: drawing {settings.layer.name}"
@@ -518,7 +518,7 @@ class QueryHandler:
         self.look = look
 
     def _show_pictures(self, look: CameraPreview, settings: DisplaySettings) -> Show:
-        """What the camera would see, beside the true image if that is wanted."""
+        """Returns what the camera would see, beside the true image if that is wanted."""
         photographer, quantity = self._extras.photographer, settings.layer.quantity
         if settings.shows_truth and photographer is not None:
             look = replace(look, truth=photographer(look.T_world_camera))
@@ -532,7 +532,7 @@ class QueryHandler:
             self._controls.show_legend(legend_html(self._place.caption, has_candidates))
 
     def _show_candidates(self, step: int, is_wanted: bool) -> Show:
-        """The candidates of a view, colored by score, and the legend; all is shown then."""
+        """Returns the candidates of a view, colored by score, and the legend; all is shown then."""
         segments, colors = np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
         if is_wanted:
             offer = self._story.offer(step) or self._offers.get(step)
@@ -586,7 +586,7 @@ class QueryHandler:
 
 
 def floor_height(heights: np.ndarray, voxel_size: float) -> float:
-    """The height of the floor [m]: the lower side of the lowest layer that is well filled.
+    """Returns the height of the floor [m]: the lower side of the lowest layer that is well filled.
 
     Args:
         heights: centers of voxels, [n] [m].
@@ -598,6 +598,6 @@ def floor_height(heights: np.ndarray, voxel_size: float) -> float:
 
 
 def _color_of(glance: QuickPreview) -> Color:
-    """The color of R, darker than the map's, so that lines stand out before it."""
+    """Returns the color of R, darker than the map's, so that lines stand out before it."""
     red, green, blue = paint(np.asarray([glance.renderability]))[0].tolist()
     return round(0.7 * red), round(0.7 * green), round(0.7 * blue)

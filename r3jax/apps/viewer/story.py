@@ -53,7 +53,7 @@ class Offer:
 
 
 def offer_of(decision: Decision) -> Offer:
-    """The candidates of a decision."""
+    """Returns the candidates of a decision."""
     gap = np.abs(decision.candidates - decision.T_world_camera).max(axis=(1, 2))
     return Offer(decision.candidates, decision.utilities, int(np.argmin(gap)))
 
@@ -101,7 +101,7 @@ class _RecordedWorld:
 def decide_again(
     run: Run, policy: Policy, config: ExplorationConfig
 ) -> Iterator[tuple[int, Offer | None]]:
-    """What was on offer at every view of a run, in order; takes as long as planning took.
+    """Yields what was on offer at every view of a run, in order; takes as long as planning took.
 
     Args:
         run: the run, with at least one view; not a merged one.
@@ -167,7 +167,7 @@ class Moment:
 
 
 def why_no_choice(row: StepRow) -> str:
-    """Why no decision stands with a view."""
+    """Returns why no decision stands with a view."""
     if row.captured:
         return "captured while moving"
     if row.begins_run:
@@ -202,7 +202,7 @@ class Timeline:
         self._stored = self._shown = stored
 
     def at(self, step: int) -> Moment:
-        """The state after view `step`.
+        """Returns the state after view `step`.
 
         Raises:
             IndexError: the run has no such view.
@@ -242,12 +242,12 @@ class Timeline:
             yield moment
 
     def _before(self, step: int) -> Moment:
-        """The latest known state that is not later than `step`."""
+        """Returns the latest known state that is not later than `step`."""
         known = [self._start, self._reached, *self._kept.values(), self._shown, self._stored]
         return max((m for m in known if m is not None and m.step <= step), key=lambda m: m.step)
 
     def _after(self, moment: Moment) -> Moment:
-        """The state one view later."""
+        """Returns the state one view later."""
         config, frame = self._config, self.run.frame(moment.step + 1)
         after = Moment(moment.step + 1, *add_frame(moment.map_state, moment.grid, frame, config))
         if after.step % self.stride == 0:
@@ -306,11 +306,11 @@ class Story(Protocol):
         ...
 
     def image(self, step: int) -> np.ndarray:
-        """The picture of a view, [H, W, 3] uint8."""
+        """Returns the picture of a view, [H, W, 3] uint8."""
         ...
 
     def moment(self, step: int) -> Moment:
-        """What was known after a view; for the worker's thread only."""
+        """Returns what was known after a view; for the worker's thread only."""
         ...
 
     def replay(self, step: int) -> Iterator[tuple[int, int]]:
@@ -322,11 +322,11 @@ class Story(Protocol):
         ...
 
     def offer(self, step: int) -> Offer | None:
-        """The candidates that a view was chosen from; None if they are not known."""
+        """Returns the candidates that a view was chosen from; None if they are not known."""
         ...
 
     def reason(self, step: int) -> Reason | str:
-        """What a view promised when it was chosen, or why that is not known."""
+        """Returns what a view promised when it was chosen, or why that is not known."""
         ...
 
 
@@ -357,7 +357,7 @@ class RecordedStory:
         return self._run.rows
 
     def image(self, step: int) -> np.ndarray:
-        """The picture of a view, [H, W, 3] uint8.
+        """Returns the picture of a view, [H, W, 3] uint8.
 
         Raises:
             RunError: it is missing or broken.
@@ -365,7 +365,7 @@ class RecordedStory:
         return _recorded_image(self._run, step)
 
     def moment(self, step: int) -> Moment:
-        """What was known after a view."""
+        """Returns what was known after a view."""
         return self._timeline.at(step)
 
     def replay(self, step: int) -> Iterator[tuple[int, int]]:
@@ -399,7 +399,7 @@ class RecordedStory:
         return explain_run(self._run, ((m.map_state, m.grid) for m in moments))
 
     def offer(self, step: int) -> Offer | None:
-        """The trace does not keep the candidates."""
+        """Returns the trace does not keep the candidates."""
         del step
         return None
 
@@ -460,7 +460,7 @@ class LiveStory:
         self._rows.append(view.row)
 
     def image(self, step: int) -> np.ndarray:
-        """The picture of a view, made smaller if it is new, [h, w, 3] uint8.
+        """Returns the picture of a view, made smaller if it is new, [h, w, 3] uint8.
 
         Raises:
             RunError: one that was recorded before is missing or broken.
@@ -470,7 +470,7 @@ class LiveStory:
         return _recorded_image(self._earlier, step)
 
     def moment(self, step: int) -> Moment:
-        """What is known now: earlier maps are not kept.
+        """Returns what is known now: earlier maps are not kept.
 
         Raises:
             LookupError: before the first view.
@@ -481,20 +481,20 @@ class LiveStory:
         return self._moment
 
     def replay(self, step: int) -> Iterator[tuple[int, int]]:
-        """There is nothing to replay: the newest state is at hand."""
+        """Returns the there is nothing to replay: the newest state is at hand."""
         del step
         return iter(())
 
     def advance(self) -> bool:
-        """There is nothing to prepare."""
+        """Returns the there is nothing to prepare."""
         return False
 
     def offer(self, step: int) -> Offer | None:
-        """The candidates that a view was chosen from."""
+        """Returns the candidates that a view was chosen from."""
         return self._offers.get(step)
 
     def reason(self, step: int) -> Reason | str:
-        """The map that a view was chosen on is not kept."""
+        """Returns the map that a view was chosen on is not kept."""
         del step
         return "known once the run is over and opened by `r3jax view`"
 

@@ -132,18 +132,18 @@ def _detail_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndar
 
 
 def _noise(image: BlockImage) -> np.ndarray:
-    """Detail of the plainest blocks in each direction, [4]: noise of the sensor."""
+    """Returns the detail of the plainest blocks in each direction, [4]: noise of the sensor."""
     return np.percentile(image.detail, _PLAIN, axis=0)
 
 
 def _directions(image: BlockImage, blocks: np.ndarray) -> np.ndarray:
-    """Unit directions in which a frame sees some of its blocks, [m, 3]."""
+    """Returns the unit directions in which a frame sees some of its blocks, [m, 3]."""
     offset = image.points[blocks] - image.pose[:3, 3]
     return offset / np.linalg.norm(offset, axis=1, keepdims=True)
 
 
 def image_motion(images: Sequence[BlockImage]) -> np.ndarray:
-    """How far the image moved from one frame to the next, [n] [share of the image's width].
+    """Returns how far the image moved from one frame to the next, [n] [share of the image's width].
 
     A turn by an angle moves it by the focal length times as much; a step by that over the depth.
     The larger of before and after; 0 of a single frame.
@@ -175,7 +175,7 @@ class Light:
     """Logarithms of red and of blue over green, [n, 2]; NaN: not compared."""
 
     def change(self, values: np.ndarray) -> np.ndarray:
-        """Values [n] beside the median of the neighbors', [n]; NaN: not compared."""
+        """Returns values [n] beside the median of the neighbors', [n]; NaN: not compared."""
         change = np.full(len(values), np.nan)
         for i, near in enumerate(neighbors_of(len(values), self.pairs)):
             if len(near):
@@ -211,7 +211,7 @@ _DIFFERS = 4.0
 
 
 def repeats(images: Sequence[BlockImage]) -> list[list[int]]:
-    """Groups of frames that repeat each other, each in order, the largest first.
+    """Returns groups of frames that repeat each other, each in order, the largest first.
 
     Every frame of a group repeats its first one: a slow pan is no chain of repetitions.
     """
@@ -233,7 +233,7 @@ def repeats(images: Sequence[BlockImage]) -> list[list[int]]:
 
 
 def _is_like(a: BlockImage, b: BlockImage, reach: float) -> bool:
-    """True if two frames from one place show the same pixels."""
+    """Returns True if two frames from one place show the same pixels."""
     if a.shape != b.shape:
         return False
     difference = np.abs(a.color - b.color)

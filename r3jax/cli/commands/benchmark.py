@@ -132,7 +132,7 @@ def _read(options: BenchmarkOptions, path: Path) -> Submission:
 
 
 def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
-    """Says of each file what is wrong with it, or how many frames are in order."""
+    """Returns says of each file what is wrong with it, or how many frames are in order."""
     code = 0
     for path in options.submissions.submission:
         try:
@@ -155,7 +155,7 @@ def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
 
 
 def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[Cell, ...]:
-    """The cells of the policies, or of the submissions."""
+    """Returns the cells of the policies, or of the submissions."""
     if not options.submissions.submission:
         return make_plan(_request(options), options.out, on_stage)
     conditions, snapshots = _judging(options), words(options.snapshots or "")
@@ -185,7 +185,7 @@ def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[C
 
 
 def _judging(options: BenchmarkOptions) -> Conditions:
-    """How models are trained and judged; the rest is a submission's own."""
+    """Returns how models are trained and judged; the rest is a submission's own."""
     size = options.training.train_resolution
     return Conditions(
         resolution=max(Conditions.resolution, size), **settings_for(Conditions, options.training)
@@ -193,7 +193,7 @@ def _judging(options: BenchmarkOptions) -> Conditions:
 
 
 def _images_again(records: Sequence[dict[str, Any]]) -> list[str]:
-    """Whether the frames of submissions are, bit for bit, those that were seen there."""
+    """Returns whether the frames of submissions are, bit for bit, those that were seen there."""
     lines: dict[str, None] = {}
     for record in records:
         if (told := record.get("submission")) is not None and told["known_images"]:
@@ -206,7 +206,7 @@ def _images_again(records: Sequence[dict[str, Any]]) -> list[str]:
 def beside(
     records: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Records with those of the same scenes and snapshots that were made on equal terms.
+    """Returns records with those of the same scenes and snapshots that were made on equal terms.
 
     Args:
         records: of submissions.

@@ -220,7 +220,7 @@ class ExploreOptions:
         return self.policy is not None or self.planning != PlanningOptions()
 
     def path(self, policy: str) -> Path:
-        """The folder of a new run of the scene with a policy."""
+        """Returns the folder of a new run of the scene with a policy."""
         kind, colon, rest = (self.scene or "").partition(":")
         stem = Path(rest).stem if colon else kind
         if kind == "habitat" and colon:
@@ -332,7 +332,7 @@ class TeamOptions:
         return self.folder.out / (self.folder.name or name)
 
     def singles(self) -> list[ExploreOptions]:
-        """The options of each camera as if it flew alone.
+        """Returns the options of each camera as if it flew alone.
 
         Raises:
             ValueError: neither one value for all cameras nor one for each, or one that a camera

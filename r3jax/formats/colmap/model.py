@@ -68,7 +68,7 @@ class ColmapPoints:
     """Indices of the keypoints in those images, [t] int64."""
 
     def __len__(self) -> int:
-        """Number of points."""
+        """Returns the number of points."""
         return len(self.ids)
 
 
@@ -84,7 +84,7 @@ class ColmapModel:
 
 
 def points_without_tracks(xyz: np.ndarray, rgb: np.ndarray) -> ColmapPoints:
-    """Points that no image is known to see, numbered from 1.
+    """Returns points that no image is known to see, numbered from 1.
 
     Args:
         xyz: [m, 3].
@@ -103,7 +103,7 @@ def points_without_tracks(xyz: np.ndarray, rgb: np.ndarray) -> ColmapPoints:
 
 
 def pose_of(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """`T_world_camera` [4, 4] float64 of COLMAP's world-to-camera pose.
+    """Returns `T_world_camera` [4, 4] float64 of COLMAP's world-to-camera pose.
 
     Raises:
         ForeignFileError: see `rotation_of`; a translation that is not finite, or too far away.

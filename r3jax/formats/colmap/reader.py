@@ -30,7 +30,7 @@ and of fractions (FULL_OPENCV) may be larger."""
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of the model in a capture's folder, None if there is none."""
+    """Returns the folder of the model in a capture's folder, None if there is none."""
     for name in _MODEL_FOLDERS:
         folder = path / name
         if any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
@@ -98,7 +98,7 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
 
 
 def _parts(path: Path, folder: Path) -> list[Path]:
-    """COLMAP numbers its models, one for every part of a capture that it could not join.
+    """Returns COLMAP numbers its models, one for every part of a capture that it could not join.
 
     A part without its images is left out where another one is whole: some keep only a piece of it.
     """
@@ -109,7 +109,7 @@ def _parts(path: Path, folder: Path) -> list[Path]:
 
 
 def _numbered(folder: Path) -> list[Path]:
-    """The model and those of other numbers beside it."""
+    """Returns the model and those of other numbers beside it."""
     found = [part for part in folder.parent.iterdir() if part.name.isdecimal()]
     return sorted((p for p in found if find_model(p) == p), key=lambda p: int(p.name))
 
@@ -121,7 +121,7 @@ def _has_images(folder: Path) -> bool:
 def _left_out(
     folder: Path, models: Mapping[Path, ColmapModel], image_paths: tuple[Path, ...]
 ) -> str | None:
-    """A sentence on the other models and the images that this one has no pose for."""
+    """Returns a sentence on the other models and the images that this one has no pose for."""
     posed = set(image_paths)
     suffixes = {path.suffix for path in posed}
     beside = {file for place in {path.parent for path in posed} for file in _files(place)}

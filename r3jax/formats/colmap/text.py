@@ -70,13 +70,13 @@ _Line = tuple[int, str]
 
 
 def _lines(path: Path) -> Iterator[_Line]:
-    """Every line, without blanks at its ends."""
+    """Yields every line, without blanks at its ends."""
     for number, raw in enumerate(io.BytesIO(plain_text(read_bytes(path, _MAX_BYTES))), start=1):
         yield number, os.fsdecode(raw).strip()
 
 
 def _rows(path: Path) -> Iterator[_Line]:
-    """The lines that are neither empty nor comments."""
+    """Returns the lines that are neither empty nor comments."""
     return (line for line in _lines(path) if _is_row(line))
 
 
@@ -85,7 +85,7 @@ def _is_row(line: _Line) -> bool:
 
 
 def _parsed(line: _Line, parse: Callable[[str], T]) -> T:
-    """What a line says; errors get its number."""
+    """Returns what a line says; errors get its number."""
     try:
         return parse(line[1])
     except (ValueError, OverflowError) as error:
@@ -186,7 +186,7 @@ def _points(rows: Sequence[_Point]) -> ColmapPoints:
 
 
 def _joined(*values: object) -> str:
-    """Numbers with all their digits: what is read is what was written."""
+    """Returns numbers with all their digits: what is read is what was written."""
     return " ".join(str(value) for value in values)
 
 

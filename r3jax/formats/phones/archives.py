@@ -53,11 +53,11 @@ class Archive:
     """The opened archive; None: a folder."""
 
     def where(self, name: str) -> Path:
-        """Path of a file, for messages; that of a member of an archive is no file."""
+        """Returns the path of a file, for messages; that of a member of an archive is no file."""
         return self.path / f"{self.top}{name}"
 
     def has(self, name: str) -> bool:
-        """True if there is a file of this name."""
+        """Returns True if there is a file of this name."""
         if self.zipped is None:
             return self.where(name).is_file()
         return self.top + name in self.zipped.NameToInfo
@@ -108,7 +108,7 @@ class Archive:
             return image_pixels(data, IMAGE_FORMATS, size)
 
     def size(self, name: str) -> tuple[int, int]:
-        """Width and height of an image [px].
+        """Returns the width and height of an image [px].
 
         Raises:
             FormatError: missing, or damaged.
@@ -139,7 +139,7 @@ class Archive:
 
 
 def _unpack(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """One member, that must be as long as it says."""
+    """Returns one member, that must be as long as it says."""
     info = archive.NameToInfo.get(name)
     if info is None:
         raise ForeignFileError("the file is missing in the archive")
@@ -216,7 +216,7 @@ def open_zip(path: Path) -> zipfile.ZipFile:
 
 
 def is_there(path: Path, *marks: str) -> bool:
-    """True if a folder or a whole archive holds these names, at its top or one below."""
+    """Returns True if a folder or a whole archive holds these names, at its top or one below."""
     try:
         return find_archive(path, *marks) is not None
     except FormatError:

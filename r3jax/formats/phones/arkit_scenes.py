@@ -42,7 +42,7 @@ _MILLISECONDS = (0.0, -0.001, 0.001)
 
 
 def is_arkit_scenes(path: Path) -> bool:
-    """True if the folder or archive looks like a video of ARKitScenes."""
+    """Returns True if the folder or archive looks like a video of ARKitScenes."""
     return is_there(path, _TRAJECTORY)
 
 
@@ -93,7 +93,7 @@ def _shot(archive: Archive, name: str, camera: str, pose: np.ndarray) -> Shot:
 
 
 def _trajectory(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
-    """Times [n] and poses `T_world_camera` [n, 4, 4]."""
+    """Returns times [n] and poses `T_world_camera` [n, 4, 4]."""
     table = read_numbers(archive.where(_TRAJECTORY), 7, archive.read(_TRAJECTORY))
     if not np.all(np.isfinite(table)) or np.abs(table).max() > 1e12:
         raise ForeignFileError("there are numbers that are not finite or far too large")
@@ -104,7 +104,7 @@ def _trajectory(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _time(name: str) -> float:
-    """Seconds in a name such as 40753679_6791.528; NaN is never near a pose."""
+    """Returns seconds in a name such as 40753679_6791.528; NaN is never near a pose."""
     try:
         return float(name.rpartition("_")[2])
     except ValueError:
@@ -112,7 +112,7 @@ def _time(name: str) -> float:
 
 
 def _camera_name(name: str, cameras: set[str]) -> str | None:
-    """The camera of an image, whose time may be a millisecond off."""
+    """Returns the camera of an image, whose time may be a millisecond off."""
     video, _, _ = name.rpartition("_")
     candidates = [f"{video}_{_time(name) + off:.3f}" for off in _MILLISECONDS]
     return next((one for one in (name, *candidates) if one in cameras), None)

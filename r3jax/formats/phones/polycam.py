@@ -46,7 +46,7 @@ _NO_DEPTH = (
 
 
 def is_polycam(path: Path) -> bool:
-    """True if the folder or archive looks like raw data of Polycam."""
+    """Returns True if the folder or archive looks like raw data of Polycam."""
     return is_there(path, "keyframes")
 
 
@@ -82,7 +82,7 @@ def read_polycam(path: Path | str) -> PosedImages:
 
 
 def _shot(archive: Archive, kind: str, name: str) -> Shot:
-    """One frame; `kind` begins the names of the folders."""
+    """Returns one frame; `kind` begins the names of the folders."""
     source = f"keyframes/{kind}cameras/{name}.json"
     camera = archive.json(source)
     with naming(archive.where(source)):

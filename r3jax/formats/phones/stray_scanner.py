@@ -79,7 +79,7 @@ class Video:
         self._next, self._frames = len(self._times), iter(())
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Returns the number of frames."""
         return len(self._times)
 
     def frame(self, number: int) -> np.ndarray:
@@ -106,7 +106,7 @@ class Video:
         raise FormatError(self._path, f"the video ends before frame {number}")
 
     def _from(self, number: int) -> Iterator[Any]:
-        """Frames from the key frame before a frame on."""
+        """Yields frames from the key frame before a frame on."""
         self._container.seek(self._times[number], stream=self._stream)
         yield from self._container.decode(self._stream)
 
@@ -126,7 +126,7 @@ def _load_av(path: Path) -> ModuleType:
 
 
 def is_stray_scanner(path: Path) -> bool:
-    """True if the folder or archive looks like a recording of Stray Scanner."""
+    """Returns True if the folder or archive looks like a recording of Stray Scanner."""
     return is_there(path, "odometry.csv", _VIDEO)
 
 
@@ -173,7 +173,7 @@ def read_stray_scanner(path: Path | str) -> PosedImages:
 
 
 def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -> Shot:
-    """One frame of a row [8] of the table and its intrinsics [4]."""
+    """Returns one frame of a row [8] of the table and its intrinsics [4]."""
     number = int(row[0])
     if number != row[0] or number < 0:
         raise ForeignFileError(f"{row[0]:g} is no number of a frame")
@@ -188,7 +188,7 @@ def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -
 
 
 def _video(archive: Archive) -> Video:
-    """The video, from the disk where it lies there."""
+    """Returns the video, from the disk where it lies there."""
     name = archive.where(_VIDEO)
     if archive.zipped is not None:
         return Video(name, archive.read(_VIDEO, _MAX_VIDEO))
@@ -222,7 +222,7 @@ def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _number(word: str, which: str) -> float:
-    """A field; NaN where it is empty."""
+    """Returns a field; NaN where it is empty."""
     try:
         value = float(word) if word else 0.0
     except ValueError:
@@ -233,7 +233,7 @@ def _number(word: str, which: str) -> float:
 
 
 def _camera_matrix(archive: Archive) -> np.ndarray:
-    """fx, fy, cx, cy of all frames, [4]."""
+    """Returns fx, fy, cx, cy of all frames, [4]."""
     name = "camera_matrix.csv"
     K = read_matrix(archive.where(name), 3, 3, archive.read(name).replace(b",", b" "))
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])

@@ -55,15 +55,15 @@ class ImageTimes:
     """By the bag, [n] int64 [ns]."""
 
     def __len__(self) -> int:
-        """Number of images."""
+        """Returns the number of images."""
         return len(self.stamps)
 
     def take(self, chosen: np.ndarray) -> "ImageTimes":
-        """Some of them, [k]."""
+        """Returns some of them, [k]."""
         return ImageTimes(self.topic, self.stamps[chosen], self.times[chosen])
 
     def read(self, bag: AnyBag, index: int) -> Any:
-        """The message of one image."""
+        """Returns the message of one image."""
         time = int(self.times[index])
         for stamped in bag.messages([self.topic], time, time + 1):
             if stamp_of(stamped.message, stamped.time) == self.stamps[index]:
@@ -71,7 +71,7 @@ class ImageTimes:
         raise FormatError(bag.path, f"an image on {self.topic} is not there any more")
 
     def name(self, bag: AnyBag, index: int) -> Path:
-        """What an image is called in messages: the topic and its stamp [s]."""
+        """Returns what an image is called in messages: the topic and its stamp [s]."""
         seconds, rest = divmod(int(self.stamps[index]), 1_000_000_000)
         return bag.path / self.topic.lstrip("/") / f"{seconds}.{rest:09d}"
 
@@ -136,7 +136,7 @@ class BagReading:
                 add_transforms(self._tree, one, but=None if pose is None else pose.child)
 
     def images(self, choose: Choice | None = None) -> PosedImages:
-        """The posed images of what was added so far; raises FormatError as `read_bag`.
+        """Returns the posed images of what was added so far; raises FormatError as `read_bag`.
 
         Args:
             choose: tells which of the images to take, in the order of time; None: all that have
@@ -226,7 +226,7 @@ def _rgb(bag: AnyBag, images: ImageTimes, index: int, lens: Lens) -> np.ndarray:
 def _depth(
     bag: AnyBag, depths: ImageTimes, index: int, lens: Lens, camera: "_DepthCamera"
 ) -> np.ndarray:
-    """z-depth [h, w] float32, registered where it is not."""
+    """Returns z-depth [h, w] float32, registered where it is not."""
     with naming(depths.name(bag, index)):
         depth = depth_of(depths.read(bag, index))
     if camera.elsewhere is None:
@@ -242,7 +242,7 @@ def _images_of(bag: AnyBag, name: str, found: list[tuple[int, int]]) -> ImageTim
 
 
 def _lens(bag: AnyBag, image: ImageTopic, named: str | None) -> Lens | None:
-    """The lens of a topic's images; None where no camera_info belongs to it."""
+    """Returns the lens of a topic's images; None where no camera_info belongs to it."""
     name = find_info(bag, image, named)
     if name is None:
         return None
@@ -269,7 +269,7 @@ def _depth_camera(
     lens: Lens,
     named: str | None,
 ) -> _DepthCamera:
-    """Where the depth camera is: by tf, if the frames differ.
+    """Returns where the depth camera is: by tf, if the frames differ.
 
     Raises:
         FormatError: elsewhere, and not to be registered here.

@@ -78,7 +78,7 @@ class GrowingFile:
         return os.fstat(self._file.fileno()).st_size
 
     def part(self, begin: int, end: int) -> bytes | None:
-        """The bytes from `begin` to `end`; None where they have not all been written."""
+        """Returns the bytes from `begin` to `end`; None where they have not all been written."""
         if end > self.size:
             return None
         found = os.pread(self._file.fileno(), end - begin, begin)
@@ -133,7 +133,7 @@ class McapFollower:
         return data
 
     def _record(self, operation: int, begin: int, end: int) -> list[Note]:
-        """Messages of one record of the file; takes note of schemas and channels."""
+        """Returns messages of one record of the file; takes note of schemas and channels."""
         self._is_whole = operation in (_DATA_END, _FOOTER)  # the summary repeats what was there
         if operation == _MESSAGE:
             head = self._file.part(begin, min(end, begin + _MESSAGE_HEAD.size)) or b""
@@ -153,7 +153,7 @@ class McapFollower:
         return []
 
     def _chunk(self, begin: int) -> bytes:
-        """The records of a chunk, unpacked; the last one is kept."""
+        """Returns the records of a chunk, unpacked; the last one is kept."""
         if self._unpacked[0] != begin:
             head = self._file.part(begin - _HEAD.size, begin) or bytes(_HEAD.size)
             data = self._file.part(begin, begin + _HEAD.unpack(head)[1]) or b""
@@ -194,7 +194,7 @@ class McapFollower:
 
 
 def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Operation, beginning and end of each record of a chunk."""
+    """Yields the operation, beginning and end of each record of a chunk."""
     at = 0
     while at < len(data):
         if at + _HEAD.size > len(data):
@@ -208,7 +208,7 @@ def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
-    """A text with its length before it, and where it ends."""
+    """Returns a text with its length before it, and where it ends."""
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
     if end > len(data):
@@ -276,27 +276,27 @@ class GrowingBag:
                         self.types[note.channel.topic] = note.channel.kind
 
     def topics(self, *types: str) -> list[str]:
-        """Names of the topics of these types, sorted."""
+        """Returns names of the topics of these types, sorted."""
         return sorted(name for name, one in self.types.items() if one in types)
 
     def messages(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
     ) -> Iterator[Stamped]:
-        """Messages of some topics, as in `Bag.messages`, in the order of the file."""
+        """Yields messages of some topics, as in `Bag.messages`, in the order of the file."""
         found = sorted(i for topic in topics for i in self._by_topic.get(topic, ()))
         for file, note in (self._notes[i] for i in found):
             if (start is None or start <= note.time) and (stop is None or note.time < stop):
                 yield self._message(file, note)
 
     def fresh(self, topics: Collection[str]) -> Iterator[Stamped]:
-        """Messages of some topics that came in since this was last asked."""
+        """Yields messages of some topics that came in since this was last asked."""
         first, self._fresh = self._fresh, len(self._notes)
         for file, note in self._notes[first:]:
             if note.channel.topic in topics:
                 yield self._message(file, note)
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic."""
+        """Returns the first message of a topic."""
         if topic not in self._by_topic:
             raise FormatError(self.path, f"there is no message on {topic}")
         return self._message(*self._notes[self._by_topic[topic][0]]).message
@@ -357,7 +357,7 @@ def _refuse(path: Path, found: list[Path]) -> None:
 
 
 def _numbered(path: Path) -> tuple[int, str]:
-    """The order of drive_9.mcap and drive_10.mcap."""
+    """Returns the order of drive_9.mcap and drive_10.mcap."""
     number = re.search(r"_(\d{1,9})\.mcap$", path.name)
     return int(number[1]) if number else 0, path.name
 
@@ -377,7 +377,7 @@ class FollowedBag:
         self._reading: BagReading | None = None
 
     def images(self, files: list[Path]) -> PosedImages:
-        """What is there by now.
+        """Returns what is there by now.
 
         Args:
             files: of `growing_files`.
@@ -395,7 +395,7 @@ class FollowedBag:
 
 
 def key_frames(stamps: np.ndarray, poses: np.ndarray, until: int) -> np.ndarray:
-    """Frames half a second apart between which the camera has moved.
+    """Returns frames half a second apart between which the camera has moved.
 
     Args:
         stamps: [n] int64 [ns], ascending.

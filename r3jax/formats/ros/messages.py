@@ -76,12 +76,12 @@ def stamp_of(message: Any, otherwise: int = 0) -> int:
 
 
 def frame_of(message: Any) -> str:
-    """The frame of a message's header; ROS 1 may begin it with a slash."""
+    """Returns the frame of a message's header; ROS 1 may begin it with a slash."""
     return str(message.header.frame_id).lstrip("/")
 
 
 def encoding_of(message: Any) -> str:
-    """How the pixels of an image are stored, such as rgb8 or 16UC1."""
+    """Returns how the pixels of an image are stored, such as rgb8 or 16UC1."""
     if hasattr(message, "encoding"):
         return str(message.encoding)
     stored = str(message.format)
@@ -89,13 +89,13 @@ def encoding_of(message: Any) -> str:
 
 
 def is_depth(message: Any) -> bool:
-    """True if an image holds depth."""
+    """Returns True if an image holds depth."""
     is_packed = "compressedDepth" in getattr(message, "format", "")
     return is_packed or encoding_of(message) in _DEPTHS
 
 
 def is_color(message: Any) -> bool:
-    """True if an image holds colors."""
+    """Returns True if an image holds colors."""
     if is_depth(message):
         return False
     stored = encoding_of(message)
@@ -106,12 +106,12 @@ def is_color(message: Any) -> bool:
 
 
 def is_gray(message: Any) -> bool:
-    """True if an image holds 8 bits of gray."""
+    """Returns True if an image holds 8 bits of gray."""
     return not is_depth(message) and encoding_of(message).startswith(_GRAY)
 
 
 def rgb_of(message: Any) -> np.ndarray:
-    """Colors of an image, [H, W, 3] uint8.
+    """Returns colors of an image, [H, W, 3] uint8.
 
     Args:
         message: sensor_msgs/Image of 8-bit RGB, Bayer, YUV 4:2:2 or gray, or CompressedImage of
@@ -205,12 +205,12 @@ def depth_of(message: Any) -> np.ndarray:
 
 
 def clean_depth(depth: np.ndarray) -> np.ndarray:
-    """The same as float32; NaN, negative numbers and -inf become 0: no measurement."""
+    """Returns the same as float32; NaN, negative numbers and -inf become 0: no measurement."""
     return np.where(depth > 0.0, depth, 0.0).astype(np.float32)  # NaN makes it false
 
 
 def _rows(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
-    """The rows of a plain image without what pads them, [height, width * channels]."""
+    """Returns the rows of a plain image without what pads them, [height, width * channels]."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     used = width * channels * kind.itemsize
     if not 0 < width * height <= MAX_PIXELS:
@@ -226,7 +226,7 @@ def _rows(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
 
 
 def _unpacked(data: bytes, stored: str, is_meters: bool) -> np.ndarray:
-    """Depth from a PNG of 16 bits or RVL, with image_transport's header or without."""
+    """Returns the depth from a PNG of 16 bits or RVL, with image_transport's header or without."""
     inverse = None
     if "compressedDepth" in stored:
         if len(data) < _COMPRESSED_DEPTH_HEAD.size:
@@ -249,7 +249,7 @@ def _unpacked(data: bytes, stored: str, is_meters: bool) -> np.ndarray:
 
 
 def lens_of(info: Any, *, is_rectified: bool = False) -> Lens:
-    """The lens of sensor_msgs/CameraInfo, where pixel centers lie at whole numbers.
+    """Returns the lens of sensor_msgs/CameraInfo, where pixel centers lie at whole numbers.
 
     Args:
         info: the message.
@@ -273,7 +273,7 @@ def lens_of(info: Any, *, is_rectified: bool = False) -> Lens:
 
 
 def rectified_lens(matrix: np.ndarray, size: tuple[int, int]) -> Lens:
-    """The pinhole of a matrix [9] or [12] whose pixel centers lie at whole numbers.
+    """Returns the pinhole of a matrix [9] or [12] whose pixel centers lie at whole numbers.
 
     Args:
         matrix: K or P, row by row.
@@ -289,7 +289,7 @@ def rectified_lens(matrix: np.ndarray, size: tuple[int, int]) -> Lens:
 
 
 def _distortion(name: str, coefficients: np.ndarray) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's name of a lens, and its coefficients."""
+    """Returns COLMAP's name of a lens, and its coefficients."""
     if name not in _MODELS:
         raise ForeignFileError(
             f"the distortion {name[:40]!r} is not known, only {', '.join(filter(None, _MODELS))}: "
@@ -336,7 +336,7 @@ def unpack_rvl(data: bytes) -> np.ndarray:
 
 
 def _numbers(stream: bytes) -> np.ndarray:
-    """All numbers of a stream, [k] int64."""
+    """Returns all numbers of a stream, [k] int64."""
     words = np.frombuffer(stream[: len(stream) // 4 * 4], "<u4")
     nibbles = (words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32)) & 15
     nibbles = nibbles.ravel().astype(np.int64)
@@ -351,7 +351,7 @@ def _numbers(stream: bytes) -> np.ndarray:
 
 
 def _runs(numbers: np.ndarray, total: int) -> tuple[np.ndarray, np.ndarray]:
-    """Differences of the pixels that are measured, and which pixels those are [total]."""
+    """Returns differences of the pixels that are measured, and which pixels those are [total]."""
     is_measured = np.zeros(total, bool)
     deltas: list[np.ndarray] = []
     at, pixel = 0, 0

@@ -71,7 +71,7 @@ _NODES = (
 
 
 def is_rtabmap_database(path: Path) -> bool:
-    """True if the file is a database with the tables of RTAB-Map."""
+    """Returns True if the file is a database with the tables of RTAB-Map."""
     if path.suffix.lower() != ".db" or not path.is_file():
         return False
     try:
@@ -161,7 +161,7 @@ def _reading(path: Path) -> Generator[None]:
 
 
 def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
-    """All rows of a query; raises FormatError as `_reading`."""
+    """Returns all rows of a query; raises FormatError as `_reading`."""
     with _reading(path):
         return query_database(path, sql, values)
 
@@ -182,7 +182,7 @@ def _optimized(path: Path) -> dict[int, np.ndarray] | None:
 
 
 def _unzipped(blob: Any) -> bytes:
-    """The bytes of a matrix that RTAB-Map compressed; its size and type follow them."""
+    """Returns the bytes of a matrix that RTAB-Map compressed; its size and type follow them."""
     if not isinstance(blob, bytes):
         raise ForeignFileError("the optimized poses are no bytes")
     try:
@@ -202,7 +202,7 @@ def _poses(data: bytes) -> np.ndarray:
 def _node(
     path: Path, row: tuple[Any, ...], optimized: dict[int, np.ndarray] | None
 ) -> _Node | None:
-    """A node; None where it has no camera or no pose."""
+    """Returns a node; None where it has no camera or no pose."""
     number, pose, calibration = row
     is_known = isinstance(number, int) and isinstance(calibration, bytes)
     if not is_known or not isinstance(pose, bytes) or len(pose) != 48:
@@ -216,7 +216,7 @@ def _node(
 
 
 def _camera(path: Path, number: int, data: bytes) -> tuple[Lens, np.ndarray]:
-    """A node's lens, and the camera on the robot."""
+    """Returns a node's lens, and the camera on the robot."""
     header = np.frombuffer(data[: 4 * _HEADER], "<i4").tolist()
     if len(header) < _HEADER or header[3] != 0:
         raise ForeignFileError(
@@ -255,7 +255,7 @@ def _rgb(path: Path, node: _Node) -> np.ndarray:
 
 
 def _depth(path: Path, node: _Node, *, has_confidence: bool) -> np.ndarray:
-    """z-depth [h, w] float32, where the sensor was sure."""
+    """Returns z-depth [h, w] float32, where the sensor was sure."""
     with naming(path / "depth" / str(node.id)):
         depth = _all_depth(_blob(path, "depth", node))
         rows = _query(path, _CONFIDENCE, (node.id,)) if has_confidence else []
@@ -284,7 +284,7 @@ def _confidence(data: bytes) -> np.ndarray:
 
 
 def _all_depth(data: bytes) -> np.ndarray:
-    """z-depth [h, w] float32 as it is stored."""
+    """Returns z-depth [h, w] float32 as it is stored."""
     if data.startswith(_RVL):
         return clean_depth(0.001 * unpack_rvl(data[len(_RVL) :]).astype(np.float64))
     wanted = "depth must be a PNG of 16 bits or of four channels"
@@ -302,12 +302,12 @@ _POSES = "_camera_poses.txt"
 
 
 def is_rtabmap_export(path: Path) -> bool:
-    """True if the folder looks like an export of RTAB-Map."""
+    """Returns True if the folder looks like an export of RTAB-Map."""
     return _name(path) is not None
 
 
 def _name(path: Path) -> str | None:
-    """What the names of all files begin with."""
+    """Returns what the names of all files begin with."""
     found = [one.name.removesuffix(_POSES) for one in path.glob(f"*{_POSES}")]
     found = [name for name in found if (path / f"{name}_rgb").is_dir()]
     return found[0] if len(found) == 1 else None
@@ -340,7 +340,7 @@ def read_rtabmap_export(path: Path | str) -> PosedImages:
 
 
 def _shot(archive: Archive, source: Path, name: str, row: np.ndarray) -> Shot | None:
-    """One frame of a row [9]; None where it has no image or camera."""
+    """Returns one frame of a row [9]; None where it has no image or camera."""
     number = int(row[8]) if np.isfinite(row[8]) and abs(row[8]) < 1e15 else -1
     image, calibration = f"{name}_rgb/{number}.jpg", f"{name}_calib/{number}.yaml"
     if not archive.has(image) or not archive.has(calibration):
@@ -358,7 +358,7 @@ def _shot(archive: Archive, source: Path, name: str, row: np.ndarray) -> Shot | 
 
 
 def _lens(text: str, size: tuple[int, int]) -> Lens:
-    """The camera in a YAML of OpenCV, for an image of this width and height."""
+    """Returns the camera in a YAML of OpenCV, for an image of this width and height."""
     matrix = _matrix(text, "projection_matrix", 12)
     matrix = _matrix(text, "camera_matrix", 9) if matrix is None else matrix
     if matrix is None:
@@ -367,7 +367,7 @@ def _lens(text: str, size: tuple[int, int]) -> Lens:
 
 
 def _matrix(text: str, name: str, count: int) -> np.ndarray | None:
-    """The numbers of a matrix; None where it is not there."""
+    """Returns the numbers of a matrix; None where it is not there."""
     found = re.search(rf"{name}:[^\[\]]{{0,200}}data:\s*\[([^\[\]]{{0,2000}})\]", text)
     if found is None:
         return None

@@ -94,7 +94,7 @@ def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
 
 
 def _likeness(color: ImageTopic, depth: ImageTopic) -> tuple[bool, ...]:
-    """How likely two topics are the color and depth of one camera."""
+    """Returns how likely two topics are the color and depth of one camera."""
     has = lambda one, *words: any(word in one.name for word in words)
     is_packed = lambda one: one.name.endswith(_TRANSPORTS)
     return (
@@ -110,14 +110,14 @@ def _likeness(color: ImageTopic, depth: ImageTopic) -> tuple[bool, ...]:
 
 
 def _parent(topic: str) -> str:
-    """The namespace of an image's topic, that its camera_info shares."""
+    """Returns the namespace of an image's topic, that its camera_info shares."""
     for suffix in _TRANSPORTS:
         topic = topic.removesuffix(suffix)
     return topic.rpartition("/")[0].lstrip("/")
 
 
 def find_info(bag: AnyBag, image: ImageTopic, named: str | None) -> str | None:
-    """Topic of an image's camera: its sibling, else the only one of the same frame."""
+    """Returns the topic of an image's camera: its sibling, else the only one of the same frame."""
     if named is not None:
         return named
     infos = bag.topics(CAMERA_INFO)
@@ -130,20 +130,20 @@ def find_info(bag: AnyBag, image: ImageTopic, named: str | None) -> str | None:
 
 
 def find_pose(bag: AnyBag) -> str | None:
-    """The topic that most likely says where the robot is."""
+    """Returns the topic that most likely says where the robot is."""
     found = [name for kind in POSES for name in bag.topics(kind)]
     return found[0] if found else None
 
 
 def _listed(bag: AnyBag) -> str:
-    """Some topics and their types."""
+    """Returns some topics and their types."""
     shown = [f"{name} ({kind.rpartition('/')[2]})" for name, kind in sorted(bag.types.items())]
     more = f" and {len(shown) - 12} more" if shown[12:] else ""
     return (", ".join(shown[:12])[:1000] or "nothing") + more + not_parsed(bag)
 
 
 def not_parsed(bag: AnyBag) -> str:
-    """A part of a sentence on the topics that are left out."""
+    """Returns a part of a sentence on the topics that are left out."""
     if not bag.left_out:
         return ""
     more = f" and {len(bag.left_out) - 4} more" if bag.left_out[4:] else ""
@@ -232,13 +232,13 @@ def find_chain(
 
 
 def _known(tree: TransformTree) -> str:
-    """A part of a sentence on the transforms that there are."""
+    """Returns a part of a sentence on the transforms that there are."""
     known = [f"{child} in {edge.parent}" for child, edge in sorted(tree.edges.items())]
     return f", tf only has {', '.join(known[:4])[:200]}" if known else ""
 
 
 def _pose_of(message: Any) -> tuple[Any, Any]:
-    """Position and orientation of a message that holds one pose."""
+    """Returns the position and orientation of a message that holds one pose."""
     if hasattr(message, "transform"):
         return message.transform.translation, message.transform.rotation
     pose = message.pose

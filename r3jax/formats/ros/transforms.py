@@ -119,11 +119,11 @@ class TransformTree:
         return found
 
     def is_timed(self, chain: list[str]) -> bool:
-        """True if an edge of a chain has samples in time."""
+        """Returns True if an edge of a chain has samples in time."""
         return any(self.edges[frame].times for frame in chain[:-1])
 
     def is_moving(self, chain: list[str]) -> bool:
-        """True if these samples differ; ROS 1 repeats what never moves all the time."""
+        """Returns True if these samples differ; ROS 1 repeats what never moves all the time."""
         edges = [self.edges[frame] for frame in chain[:-1]]
         samples = [part for edge in edges for part in (edge.positions, edge.rotations)]
         return any(np.ptp(np.stack(part), axis=0).max() > _STILL for part in samples)

@@ -28,7 +28,7 @@ _FIELDS = {"w": int, "h": int, "fx": float, "fy": float, "cx": float, "cy": floa
 
 
 def is_replica_slam(path: Path) -> bool:
-    """True if the folder looks like a scene of Replica-SLAM."""
+    """Returns True if the folder looks like a scene of Replica-SLAM."""
     return (path / "traj.txt").exists() and (path / "results").is_dir()
 
 
@@ -59,7 +59,7 @@ def read_replica_slam(path: Path | str) -> PosedImages:
 
 
 def _numbered(folder: Path, start: str) -> dict[str, Path]:
-    """The images whose names start like this, by what follows."""
+    """Returns the images whose names start like this, by what follows."""
     if not folder.is_dir():
         raise FormatError(folder, "the folder is missing")
     kinds = (".png", ".jpg", ".jpeg")
@@ -70,7 +70,7 @@ def _numbered(folder: Path, start: str) -> dict[str, Path]:
 
 
 def _camera(path: Path) -> tuple[Lens, DepthUnit]:
-    """The camera of all images, and the unit of their depth."""
+    """Returns the camera of all images, and the unit of their depth."""
     places = (path / "cam_params.json", path.resolve().parent / "cam_params.json")
     source = next((place for place in places if place.exists()), places[0])
     with naming(source):

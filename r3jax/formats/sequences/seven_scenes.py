@@ -28,12 +28,12 @@ _SUFFIXES = (".jpeg", ".jpg", ".png")
 
 
 def is_seven_scenes(path: Path) -> bool:
-    """True if the folder looks like a sequence of the data set."""
+    """Returns True if the folder looks like a sequence of the data set."""
     return path.is_dir() and bool(_colors(path))
 
 
 def _colors(path: Path) -> dict[str, Path]:
-    """Color images by the names of their frames."""
+    """Returns the color images by the names of their frames."""
     found = [p for p in path.glob("frame-*.color.*") if p.suffix.lower() in _SUFFIXES]
     found.sort(key=lambda image: _SUFFIXES.index(image.suffix.lower()))
     return {image.name.removesuffix(f".color{image.suffix}"): image for image in found}
@@ -66,7 +66,7 @@ def read_seven_scenes(path: Path | str) -> PosedImages:
 
 
 def _lens(path: Path) -> Lens:
-    """The data set's own camera, unless a file of intrinsics names another one."""
+    """Returns the data set's own camera, unless a file of intrinsics names another one."""
     folders = (path, path.resolve().parent)
     found = (folder / "camera-intrinsics.txt" for folder in folders)
     source = next((file for file in found if file.exists()), None)

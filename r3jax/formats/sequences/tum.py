@@ -45,7 +45,7 @@ _DEFAULT = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
 
 
 def is_tum(path: Path) -> bool:
-    """True if the folder looks like a sequence of the benchmark."""
+    """Returns True if the folder looks like a sequence of the benchmark."""
     return all((path / name).exists() for name in ("rgb.txt", "depth.txt", "groundtruth.txt"))
 
 
@@ -88,7 +88,7 @@ def read_tum(path: Path | str) -> PosedImages:
 
 
 def _pictures(folder: Path, name: str) -> tuple[np.ndarray, list[Path]]:
-    """Times [n] and paths of a list of images."""
+    """Returns times [n] and paths of a list of images."""
     source = folder / name
     times: list[float] = []
     paths: list[Path] = []
@@ -108,7 +108,7 @@ def _pictures(folder: Path, name: str) -> tuple[np.ndarray, list[Path]]:
 
 
 def _pose(source: Path, row: np.ndarray) -> np.ndarray:
-    """`T_world_camera` of a line: time, translation, quaternion x y z w."""
+    """Returns `T_world_camera` of a line: time, translation, quaternion x y z w."""
     return quaternion_pose(source, f"the pose at {row[0]:.4f} s", row[1:4], row[4:])
 
 

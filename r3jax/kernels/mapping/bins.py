@@ -39,7 +39,7 @@ class Camera(NamedTuple):
 
 @inlined
 def camera_of(frame, voxel_size):
-    """The camera of a frame."""
+    """Returns the camera of a frame."""
     T = frame.T_world_camera
     return Camera(voxel_size, frame.focal, T[0, 3], T[1, 3], T[2, 3])
 
@@ -83,7 +83,7 @@ def nearest_bin(x, y, z, cell, table, lattice):
 
 @inlined
 def center_of_words(low, high, voxel_size):
-    """Center [m] of the voxel whose key has these words (`geometry.voxels.unpack`)."""
+    """Returns the center [m] of the voxel whose key has these words (`geometry.voxels.unpack`)."""
     return (
         (signed_of(low) + _HALF) * voxel_size,
         (signed_of(middle_of(low, high)) + _HALF) * voxel_size,
@@ -93,7 +93,7 @@ def center_of_words(low, high, voxel_size):
 
 @inlined
 def center_of(key, row, voxel_size):
-    """Center of the voxel in a row of the map [m]."""
+    """Returns the center of the voxel in a row of the map [m]."""
     return center_of_words(key[0, row], key[1, row], voxel_size)
 
 
@@ -144,6 +144,6 @@ def mark_rows(key, visited, resolution, rows, num, camera, table, lattice):
 
 @inlined
 def is_sound(camera):
-    """False for a camera or a voxel size that cannot be: nothing is seen then."""
+    """Returns False for a camera or a voxel size that cannot be: nothing is seen then."""
     total = camera.voxel_size + camera.focal + camera.x + camera.y + camera.z
     return (camera.voxel_size > _ZERO) & (abs(total) < _INFINITE)

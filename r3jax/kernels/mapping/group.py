@@ -61,7 +61,7 @@ def _sort3(a, b, c):
 
 @inlined_fused
 def _or(value, other):
-    """A depth, and another where it is no measurement."""
+    """Returns a depth, and another where it is no measurement."""
     return value if value > _ZERO else other
 
 

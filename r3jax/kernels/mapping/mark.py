@@ -32,7 +32,7 @@ _ZERO, _ONE, _NEAREST = np.float32(0.0), np.float32(1.0), np.float32(1e-3)
 
 @inlined_fused
 def _along(T, axis, center):
-    """One coordinate of a point in the camera's frame."""
+    """Returns one coordinate of a point in the camera's frame."""
     along = T[axis, 0] * center[0] + T[axis, 1] * center[1]
     return along + T[axis, 2] * center[2] + T[axis, 3]
 
@@ -79,7 +79,7 @@ def _project(key, first, num, frame, voxel_size, pixels, depths):
 
 @inlined_fused
 def _is_shown(pixel, measured, z, depth, slack, is_visible):
-    """Whether a frame shows a row that lies in one of its pixels."""
+    """Returns whether a frame shows a row that lies in one of its pixels."""
     if measured == _ZERO:
         return is_visible  # a hole
     if not measured > _ZERO:
@@ -94,7 +94,7 @@ def _is_shown(pixel, measured, z, depth, slack, is_visible):
 
 @inlined
 def _is_camera(frame, camera):
-    """False for intrinsics or a pose that cannot be."""
+    """Returns False for intrinsics or a pose that cannot be."""
     total = frame.fx + frame.fy + frame.cx + frame.cy
     for axis in range(3):
         for k in range(4):

@@ -88,7 +88,7 @@ _low_bits_to_exponent = _of_float(_emit_shift_exponent)
 
 @intrinsic
 def whole(typingctx, value):
-    """A whole number as an int32; Numba's own conversion goes by way of int64."""
+    """Returns a whole number as an int32; Numba's own conversion goes by way of int64."""
 
     def codegen(context, builder, sig, args):
         return builder.fptosi(args[0], _INT)
@@ -117,7 +117,7 @@ def end_of(typingctx, word):
 
 @intrinsic
 def signed_of(typingctx, word):
-    """The lowest 21 bits of a word as a number from -2^20 on, in a float."""
+    """Returns the lowest 21 bits of a word as a number from -2^20 on, in a float."""
 
     def codegen(context, builder, sig, args):
         bits = builder.and_(args[0], _int((1 << 21) - 1))
@@ -127,13 +127,13 @@ def signed_of(typingctx, word):
 
 
 def _biased(builder, index):
-    """A whole number from -2^20 on, in a float, as 21 bits; inverse of `signed_of`."""
+    """Returns a whole number from -2^20 on, in a float, as 21 bits; inverse of `signed_of`."""
     return builder.add(builder.fptosi(index, _INT), _int(1 << 20))
 
 
 @intrinsic
 def low_word(typingctx, x, y):
-    """The low word of a packed key (`geometry.voxels.pack`), of whole numbers in floats."""
+    """Returns the low word of a packed key (`geometry.voxels.pack`), of whole numbers in floats."""
 
     def codegen(context, builder, sig, args):
         x, y = _biased(builder, args[0]), _biased(builder, args[1])
@@ -144,7 +144,7 @@ def low_word(typingctx, x, y):
 
 @intrinsic
 def high_word(typingctx, y, z):
-    """The high word of a packed key, of whole numbers in floats."""
+    """Returns the high word of a packed key, of whole numbers in floats."""
 
     def codegen(context, builder, sig, args):
         y, z = _biased(builder, args[0]), _biased(builder, args[1])
@@ -165,7 +165,7 @@ def fused(typingctx, a, b, c):
 
 @intrinsic
 def count_bits(typingctx, word):
-    """How many bits of a word of 32 are set."""
+    """Returns how many bits of a word of 32 are set."""
 
     def codegen(context, builder, sig, args):
         return builder.zext(builder.ctpop(args[0]), ir.IntType(64))
@@ -175,13 +175,13 @@ def count_bits(typingctx, word):
 
 @intrinsic
 def bits_of(typingctx, value):
-    """The bits of a float, as a word of 32."""
+    """Returns the bits of a float, as a word of 32."""
     return types.uint32(types.float32), lambda context, builder, sig, args: _bits(builder, args[0])
 
 
 @intrinsic
 def float_of(typingctx, word):
-    """The float of which a word of 32 holds the bits."""
+    """Returns the float of which a word of 32 holds the bits."""
 
     def codegen(context, builder, sig, args):
         return builder.bitcast(args[0], _FLOAT)
@@ -191,7 +191,7 @@ def float_of(typingctx, word):
 
 @intrinsic
 def _add_bits(typingctx, value, other):
-    """The float whose bits are the sum of two floats' bits."""
+    """Returns the float whose bits are the sum of two floats' bits."""
 
     def codegen(context, builder, sig, args):
         return builder.bitcast(
@@ -215,7 +215,7 @@ def key_of(typingctx, distance, row):
 
 @intrinsic
 def distance_of(typingctx, key):
-    """The distance in a key."""
+    """Returns the distance in a key."""
     long = ir.IntType(64)
 
     def codegen(context, builder, sig, args):
@@ -234,7 +234,7 @@ _E4, _E5 = np.float32(9.675541892647743e-3), np.float32(1.3276472454890609e-3)
 
 @inlined_fused
 def exp2(power):
-    """2^power to 2e-7, and 2^-126 for all powers below.
+    """Returns 2^power to 2e-7, and 2^-126 for all powers below.
 
     2^n p(f) with n the nearest integer and p of degree 5 (as in `kernels.splatting.lanes`).
     """
@@ -252,7 +252,7 @@ _L5, _L7 = np.float32(0.5770780163555854), np.float32(0.41219858311113244)
 
 @inlined_fused
 def log2(x):
-    """log2 x to 1e-6, for normal x > 0.
+    """Returns log2 x to 1e-6, for normal x > 0.
 
     The series of the inverse hyperbolic tangent: log m = 2 artanh((m - 1) / (m + 1)), with the
     mantissa m in [sqrt(1/2), sqrt(2)).

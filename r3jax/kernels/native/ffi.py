@@ -101,7 +101,7 @@ def answers_metadata(frame):
 
 @inlined
 def _buffer(frame, kind, index):
-    """Address of the index-th argument or result of a call."""
+    """Returns address of the index-th argument or result of a call."""
     return _int64_at(_int64_at(frame + kind) + 8 * index)
 
 
@@ -118,14 +118,14 @@ def float0(frame, kind, index):
 
 @inlined
 def floats1(frame, kind, index):
-    """Views the index-th argument or result as float32 with one axis."""
+    """Returns views the index-th argument or result as float32 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_floats(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
 
 @inlined
 def floats_flat(frame, kind, index):
-    """Views the index-th argument or result, of any shape, as float32 with one axis."""
+    """Returns views the index-th argument or result, of any shape, as float32 with one axis."""
     buffer = _buffer(frame, kind, index)
     size = 1
     for axis in range(_int64_at(buffer + _RANK)):
@@ -135,7 +135,7 @@ def floats_flat(frame, kind, index):
 
 @inlined
 def floats2(frame, kind, index):
-    """Views the index-th argument or result as float32 with two axes."""
+    """Returns views the index-th argument or result as float32 with two axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1)
     return carray(_floats(_int64_at(buffer + _DATA)), shape)
@@ -143,7 +143,7 @@ def floats2(frame, kind, index):
 
 @inlined
 def floats3(frame, kind, index):
-    """Views the index-th argument or result as float32 with three axes."""
+    """Returns views the index-th argument or result as float32 with three axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1), _length(buffer, 2)
     return carray(_floats(_int64_at(buffer + _DATA)), shape)
@@ -151,14 +151,14 @@ def floats3(frame, kind, index):
 
 @inlined
 def ints1(frame, kind, index):
-    """Views the index-th argument or result as int32 with one axis."""
+    """Returns views the index-th argument or result as int32 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_ints(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
 
 @inlined
 def bytes2(frame, kind, index):
-    """Views the index-th argument or result as uint8 with two axes."""
+    """Returns views the index-th argument or result as uint8 with two axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1)
     return carray(_bytes(_int64_at(buffer + _DATA)), shape)
@@ -166,7 +166,7 @@ def bytes2(frame, kind, index):
 
 @inlined
 def ints2(frame, kind, index):
-    """Views the index-th argument or result as int32 with two axes."""
+    """Returns views the index-th argument or result as int32 with two axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1)
     return carray(_ints(_int64_at(buffer + _DATA)), shape)
@@ -174,7 +174,7 @@ def ints2(frame, kind, index):
 
 @inlined
 def words2(frame, kind, index):
-    """Views the index-th argument or result as uint32 with two axes."""
+    """Returns views the index-th argument or result as uint32 with two axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1)
     return carray(_words(_int64_at(buffer + _DATA)), shape)
@@ -182,7 +182,7 @@ def words2(frame, kind, index):
 
 @inlined
 def bytes1(frame, kind, index):
-    """Views the index-th argument or result as uint8 with one axis."""
+    """Returns views the index-th argument or result as uint8 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_bytes(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
@@ -219,7 +219,7 @@ def _start_threads() -> str:
 
 
 def num_workers() -> int:
-    """Threads that share the work: one for each core that the process may use."""
+    """Returns threads that share the work: one for each core that the process may use."""
     return min(get_num_threads(), num_cores())
 
 

@@ -59,7 +59,7 @@ class _Library(JITCodeLibrary):
         self._final_module.link_in(module, preserve=True)
 
     def _get_module_for_linking(self) -> Any:
-        """The function and all that it calls, for what Numba compiles in its own way."""
+        """Returns the function and all that it calls, for what Numba compiles in its own way."""
         module = super()._get_module_for_linking().clone()
         # Callers first: LLVM leaves out functions that have no caller yet.
         for library in reversed(self._apart):
@@ -67,7 +67,7 @@ class _Library(JITCodeLibrary):
         return module
 
     def get_pointer_to_function(self, name: str) -> int:
-        """The address of a function; 0 if it is not defined here, as is usual."""
+        """Returns the address of a function; 0 if it is not defined here, as is usual."""
         self._ensure_finalized()
         if not self._is_native and not self._defines(name):
             return 0

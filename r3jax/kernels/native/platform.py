@@ -16,7 +16,7 @@ from r3jax.kernels.native.structs import misread
 
 
 def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that is `cpu` where a program runs on a CPU, and `default` elsewhere.
+    """Returns a function that is `cpu` where a program runs on a CPU, and `default` elsewhere.
 
     Args:
         cpu: calls kernels. Not used if this jaxlib's FFI version is unsupported.
@@ -42,7 +42,7 @@ def call_of_many(
     item: Any,
     num_rows: int,
 ) -> Any:
-    """`formula(shared, item)`, such that `vmap` over items is one call of a kernel on CPUs.
+    """Returns `formula(shared, item)`, such that `vmap` over items is one call of a kernel on CPUs.
 
     Elsewhere it is the formula in batches, whose memory does not grow with the number of items.
     Where what is shared differs as well, one call follows the other.
@@ -66,7 +66,7 @@ def call_of_many(
 
 
 def _over_items(score: Callable[[Any, Any], Any], shared: Any, items: Any) -> Any:
-    """`score(shared, items)`, so that `vmap` over items is one call of all of them."""
+    """Returns `score(shared, items)`, so that `vmap` over items is one call of all of them."""
     # Jitted, so that its constants stay inside: a branch under `vmap` would batch them, too.
     batched = custom_vmap(jax.jit(score))
 
@@ -100,12 +100,12 @@ def _over_items(score: Callable[[Any, Any], Any], shared: Any, items: Any) -> An
 
 
 def is_cpu_only() -> bool:
-    """Whether JAX has found no other device."""
+    """Returns whether JAX has found no other device."""
     return set(backend.backends()) == {"cpu"}
 
 
 def can_call_kernels() -> bool:
-    """Whether kernels run here; warns once if they do not, or only one after the other."""
+    """Returns whether kernels run here; warns once if they do not, or only one after the other."""
     problem = missing_for_kernels()
     if problem and jax.default_backend() == "cpu":
         _warn(

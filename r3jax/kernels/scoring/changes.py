@@ -44,7 +44,7 @@ def _shown_rows(before, after):
 
 @inlined
 def _find_set(items, bits, chosen):
-    """Writes where the items stand whose bit is set; returns how many they are."""
+    """Returns writes where the items stand whose bit is set; returns how many they are."""
     num = 0
     for i in range(items.shape[0]):
         item = np.int64(items[i])

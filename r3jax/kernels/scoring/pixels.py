@@ -83,7 +83,7 @@ def _draw(view, layout, voxel_size, runs, centers, numbers, placed, targets, key
 
 @inlined_fused
 def _value_of(row, view, rows, forms, lattice, bits):
-    """R of the voxel in a row of the map, as a view sees it."""
+    """Returns R of the voxel in a row of the map, as a view sees it."""
     x, y, z = center_of(rows.key, row, rows.voxel_size)
     dx, dy, dz = view.position[0] - x, view.position[1] - y, view.position[2] - z
     distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), _LEAST)

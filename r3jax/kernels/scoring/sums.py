@@ -127,7 +127,7 @@ class Buffer(NamedTuple):
 
 @kernel
 def new_scratch():
-    """Room for a chunk."""
+    """Returns the room for a chunk."""
     return Scratch(
         np.empty(PLACED, np.float32), np.empty(TARGETS, np.int32), np.empty(CHUNK, np.int32),
         np.empty(CHUNK + 1, np.int32), np.empty(ANGLES, np.float32), np.zeros(CHUNK, np.int32),
@@ -322,7 +322,7 @@ def unexplored_of(cells):
 
 @kernel
 def _sorted_cells(cells):
-    """Bricks of the unexplored cells."""
+    """Returns bricks of the unexplored cells."""
     found = unexplored_of(cells)
     order, bricks = sorted_points(found.centers)
     empty = Empty(np.empty_like(found.centers), np.empty_like(found.numbers))

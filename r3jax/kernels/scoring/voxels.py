@@ -46,7 +46,7 @@ _CLASSES = 8
 
 @inlined
 def bins_of(words, word, row):
-    """Two words of 32 bins as one of 64; the second may not be there."""
+    """Returns two words of 32 bins as one of 64; the second may not be there."""
     bits = np.uint64(words[word, row])
     if word + 1 < words.shape[0]:
         bits |= np.uint64(words[word + 1, row]) << np.uint64(32)
@@ -55,7 +55,7 @@ def bins_of(words, word, row):
 
 @inlined
 def _num_directions(record, words):
-    """How many bins a voxel was seen from."""
+    """Returns how many bins a voxel was seen from."""
     num = np.int64(0)
     for word in range(words):
         num += count_bits(record[_WORDS + word])
@@ -100,7 +100,7 @@ def empty_voxels(num, num_words):
 
 @kernel
 def sorted_voxels(rows, views, is_sound, forms, workers):
-    """Bricks of the voxels that some view may see, and what is known of them."""
+    """Returns bricks of the voxels that some view may see, and what is known of them."""
     slots, bricks = sorted_slots(rows, views, is_sound, workers)
     voxels = empty_voxels(bricks.starts[bricks.starts.shape[0] - 1], rows.visited.shape[0])
     _gather(slots, bricks, rows, forms, workers, voxels)

@@ -27,7 +27,7 @@ SQUARES, TALLIES = "r3jax_splatting_squares", "r3jax_splatting_tallies"
 
 @inlined
 def _cloud(frame, kind):
-    """Means, quats, log_scales, logits, harmonics, offsets: the first six arrays."""
+    """Returns means, quats, log_scales, logits, harmonics, offsets: the first six arrays."""
     return (
         floats2(frame, kind, 0), floats2(frame, kind, 1), floats2(frame, kind, 2),
         floats1(frame, kind, 3), floats2(frame, kind, 4), floats2(frame, kind, 5),

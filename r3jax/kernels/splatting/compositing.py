@@ -68,7 +68,7 @@ def alpha_in_row(record, dx, across, slant, dy):
 
 @inlined
 def in_tile(record, left, top, lanes):
-    """What a Gaussian's alpha in a tile takes: dx, A dx^2, B dx, and its center's row."""
+    """Returns what a Gaussian's alpha in a tile takes: dx, A dx^2, B dx, and its center's row."""
     dx = (record[at.CENTER_X] - (np.float32(left) + _HALF)) - lanes
     y = record[at.CENTER_Y] - (np.float32(top) + _HALF)
     return dx, record[at.A] * dx * dx, record[at.B] * dx, y
@@ -100,7 +100,7 @@ def _blend_row(k, alpha, color, depth, state):
 
 @inlined
 def tile_is_finished(state):
-    """Whether no pixel lets any light through."""
+    """Returns whether no pixel lets any light through."""
     most = load(state, 0)
     for k in range(TILE, PIXELS, TILE):
         most = larger(most, load(state, k))

@@ -19,7 +19,7 @@ _Residuals = tuple[Float[Array, "H W 3"], Float[Array, ""] | float]
 def image_loss(
     rgb: Float[Array, "H W 3"], target: Float[Array, "H W 3"], weight: Float[Array, ""] | float
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """`loss.loss_and_error`; the loss has a gradient by `rgb`, and nothing else has any."""
+    """Returns `loss.loss_and_error`; the loss has a gradient by `rgb`, and nothing else has any."""
     return _loss_forward(rgb, target, weight)[0]
 
 
@@ -58,7 +58,7 @@ def adam_step(
     num_open: Int[Array, ""],
     is_wanted: Bool[Array, ""],
 ) -> tuple[tuple[GaussianScene, GaussianScene, GaussianScene], Bool[Array, ""]]:
-    """`optimizer.adam_update` in the buffers of what it changes.
+    """Returns `optimizer.adam_update` in the buffers of what it changes.
 
     Args:
         trees: the scene, the moments of first and second order, and the gradient.

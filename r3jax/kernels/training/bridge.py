@@ -39,7 +39,7 @@ def _loss(frame):
 
 @inlined
 def _arrays(frame, kind, first):
-    """The five arrays of a scene, each flat."""
+    """Returns the five arrays of a scene, each flat."""
     return (
         floats_flat(frame, kind, first), floats_flat(frame, kind, first + 1),
         floats_flat(frame, kind, first + 2), floats_flat(frame, kind, first + 3),

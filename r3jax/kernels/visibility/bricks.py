@@ -70,7 +70,7 @@ def box_of(views, is_sound, voxel_size):
 
 @inlined
 def _brick_of(key, row, box, shift, dims):
-    """Number of a row's brick; -1 outside the box."""
+    """Returns the number of a row's brick; -1 outside the box."""
     x, y, z = voxel_of(key, row)
     is_in = (x >= box[0, 0]) & (x <= box[1, 0]) & (y >= box[0, 1]) & (y <= box[1, 1])
     is_in = is_in & (z >= box[0, 2]) & (z <= box[1, 2])
@@ -209,7 +209,7 @@ def divide_points(points):
 
 @kernel
 def are_finite(numbers):
-    """Whether all of some numbers [a, b] are finite."""
+    """Returns whether all of some numbers [a, b] are finite."""
     found = True
     for i in range(numbers.shape[0]):
         for j in range(numbers.shape[1]):
@@ -258,7 +258,7 @@ def sorted_points(points):
 
 @inlined
 def bounds_of(view, layout):
-    """The range of a view [m] and the planes that bound it, as `may_see` takes them.
+    """Returns the range of a view [m] and the planes that bound it, as `may_see` takes them.
 
     Each plane by its slope, `along = slope z`, and by how far along a margin reaches.
     """
@@ -279,7 +279,7 @@ def _slant(slope):
 
 @inlined
 def may_see(bounds, x, y, z, radius, margin):
-    """False only if no voxel whose center lies in a sphere can appear in a view.
+    """Returns False only if no voxel whose center lies in a sphere can appear in a view.
 
     Args:
         bounds: of the view.

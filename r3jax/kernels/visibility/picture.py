@@ -16,7 +16,7 @@ RING = 2
 
 @inlined
 def side_of(shape):
-    """The least power of two that holds an image."""
+    """Returns the least power of two that holds an image."""
     side = 1
     while side < max(shape[0], shape[1]):
         side *= 2
@@ -25,7 +25,7 @@ def side_of(shape):
 
 @inlined
 def num_levels(side):
-    """Levels of a pyramid, down to a single pixel."""
+    """Returns levels of a pyramid, down to a single pixel."""
     levels = 1
     while side > 1:
         side, levels = side >> 1, levels + 1
@@ -40,20 +40,20 @@ def stride_of(side):
 
 @inlined
 def begin_of(level, side):
-    """Place of the first pixel of a level; with floats as well."""
+    """Returns the place of the first pixel of a level; with floats as well."""
     rows = 2 * (side - (side >> level)) + 2 * RING * level
     return (rows + RING) * stride_of(side) + RING
 
 
 @inlined
 def picture_size(side):
-    """Places of the finest level."""
+    """Returns places of the finest level."""
     return stride_of(side) * stride_of(side)
 
 
 @inlined
 def pyramid_size(side):
-    """Places of all levels."""
+    """Returns places of all levels."""
     return (2 * side + 2 * RING * num_levels(side)) * stride_of(side)
 
 
@@ -83,7 +83,7 @@ def stands_for(row, column, shape, wraps):
 
 @inlined
 def _ring_pixel(i, shape):
-    """Row and column of the i-th pixel one step outside of an image."""
+    """Returns the row and column of the i-th pixel one step outside of an image."""
     height, width = shape
     if i < 2 * (width + 2):
         return (height if i & 1 else -1), (i >> 1) - 1

@@ -52,7 +52,7 @@ class View(NamedTuple):
 
 @inlined
 def view_at(views, i):
-    """The i-th of some views."""
+    """Returns the i-th of some views."""
     return View(
         (views.position[i, 0], views.position[i, 1], views.position[i, 2]), views.rotation[i],
         views.fx[i], views.fy[i], views.cx[i], views.cy[i], views.max_range[i],
@@ -62,7 +62,7 @@ def view_at(views, i):
 
 @kernel
 def sound_views(views, voxel_size):
-    """False for views with anything that is not finite, which see nothing."""
+    """Returns False for views with anything that is not finite, which see nothing."""
     is_sound = np.empty(views.focal.shape[0], np.bool_)
     is_size = voxel_size > _ZERO and voxel_size < _INFINITE
     for i in range(is_sound.shape[0]):

@@ -48,7 +48,7 @@ class Frontier(GreedyPolicy):
     source = "Yamauchi, CIRA 1997: the nearest frontier"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> np.ndarray:
-        """Frontier cells that were looked at on purpose, [X, Y, Z] bool: none."""
+        """Returns the frontier cells that were looked at on purpose, [X, Y, Z] bool: none."""
         del camera
         return np.zeros(grid.log_odds.shape, dtype=bool)
 
@@ -72,14 +72,14 @@ class Frontier(GreedyPolicy):
         return Drawn(candidates_along(stops, aims - stops).padded(num), attempted, notes=True)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Nothing: the path alone decides; lots where no frontier is in reach."""
+        """Returns the nothing: the path alone decides; lots where no frontier is in reach."""
         lots = {} if situation.notes else draw_lots(len(candidates.valid), key=key)
         return candidates, lots
 
     def score_again(
         self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
     ) -> Scored:
-        """Their order stays: which cells they were drawn for is not known any more."""
+        """Returns the their order stays: which cells they were drawn for is not known any more."""
         del situation, key
         return candidates, {"lot": before}
 
@@ -94,7 +94,7 @@ class Frontier(GreedyPolicy):
         utilities: dict[str, np.ndarray],
         best: int,
     ) -> Any:
-        """The cells that the chosen view of the frontier shows count as looked at."""
+        """Returns the cells that the chosen view of the frontier shows count as looked at."""
         del utilities
         if not situation.notes:
             return situation.memory
@@ -107,7 +107,7 @@ class Frontier(GreedyPolicy):
 
 
 def _is_looked_at(centers: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
-    """Which cells a view shows, walls left aside: [X, Y, Z] bool."""
+    """Returns which cells a view shows, walls left aside: [X, Y, Z] bool."""
     offset = centers - T_world_camera[:3, 3]
     distance = np.linalg.norm(offset, axis=-1)
     along = offset @ T_world_camera[:3, 2]

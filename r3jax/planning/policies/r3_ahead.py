@@ -168,7 +168,7 @@ class R3Ahead(GreedyPolicy):
         return turned, {"utility": utility, "ahead": rate}
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """The rate of the best path: the path is in it."""
+        """Returns the rate of the best path: the path is in it."""
         return utilities["ahead"]
 
 
@@ -236,7 +236,7 @@ class BeamProblem:
 
 
 def search(problem: BeamProblem) -> list[Path]:
-    """The paths of the greatest rate, best first; none if no place can be reached."""
+    """Returns the paths of the greatest rate, best first; none if no place can be reached."""
     config = problem.config
     views = problem.views
     ways = problem.limits.path_costs(problem.lengths, views.direction)
@@ -266,7 +266,7 @@ def search(problem: BeamProblem) -> list[Path]:
 
 
 def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
-    """Lengths of paths between positions [C, 3] that the robot can come to, [C, C] [m].
+    """Returns lengths of paths between positions [C, 3] that the robot can come to, [C, C] [m].
 
     Over straight lines between near ones, each safe throughout, or back past the robot: no
     shorter than the shortest way. Unreachable positions are infinitely far from all others.
@@ -291,7 +291,7 @@ def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
 
 
 def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
-    """The path with one more view, once for each place that is tried."""
+    """Returns the path with one more view, once for each place that is tried."""
     config, last, views = problem.config, path.places[-1], problem.views
     (pose,) = poses_along(views.position[[last]], path.directions[-1][None])
     # Turns count from the last view of the path, not from where the robot is now.
@@ -332,7 +332,7 @@ def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
 
 
 def _best(paths: list[Path], num: int) -> list[Path]:
-    """The `num` paths of the greatest rate; of those through the same places, the first."""
+    """Returns the `num` paths of the greatest rate; of those through the same places, the first."""
     kept: dict[frozenset[tuple[int, bytes]], Path] = {}
     # The same views in another order know the same: only the fastest order is kept.
     for path in sorted(paths, key=lambda path: -path.rate):
@@ -363,7 +363,7 @@ def _apart(
 
 
 def _are_apart(views: Candidates, other: _Sight) -> np.ndarray:
-    """Which of the views are another choice than one view, [C]."""
+    """Returns which of the views are another choice than one view, [C]."""
     position, direction = other
     is_far = np.linalg.norm(views.position - position, axis=1) >= _APART
     # Directions have any length: a product on the other side saves dividing by it.

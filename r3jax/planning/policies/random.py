@@ -18,15 +18,15 @@ class Random(GreedyPolicy):
     source = "the floor of every comparison"
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Nearby positions, random directions."""
+        """Returns the nearby positions, random directions."""
         num, radius = self.config.num_candidates, self.config.radius
         return Drawn(free_views(situation.travel, num, radius, key=key), situation.memory)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """The lot that each candidate draws."""
+        """Returns the lot that each candidate draws."""
         del situation
         return candidates, draw_lots(len(candidates.valid), key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """The lot alone: paths cost nothing."""
+        """Returns the lot alone: paths cost nothing."""
         return utilities["lot"]

@@ -42,7 +42,7 @@ class Limits:
         return Candidates(positions, directions, candidates.valid)
 
     def at_height(self, positions: np.ndarray) -> np.ndarray:
-        """Positions [..., 3] [m] at the nearest allowed height."""
+        """Returns positions [..., 3] [m] at the nearest allowed height."""
         allowed = np.array(positions)
         # Straight up or down is the shortest way back into a range of heights.
         allowed[..., 2] = np.clip(allowed[..., 2], *self.heights)
@@ -109,7 +109,7 @@ class Limits:
     def _turned(
         self, positions: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest angles that are allowed at positions [..., 3].
+        """Returns the nearest angles that are allowed at positions [..., 3].
 
         A turn by both angles is no longer than the root of the sum of their squares: the axes of
         azimuth and elevation are at right angles to each other.
@@ -133,7 +133,7 @@ class Limits:
         return azimuth_now + share * by[0], elevation_now + share * by[1]
 
     def clipped(self, azimuth: np.ndarray, elevation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angles [rad] whose elevation is allowed."""
+        """Returns angles [rad] whose elevation is allowed."""
         return azimuth, np.clip(elevation, *np.radians(self.motion.elevations))
 
 
@@ -142,7 +142,7 @@ UNBOUND = Limits()
 
 
 def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
-    """The pose where a mission begins, [4, 4]: its elevation becomes one that is allowed.
+    """Returns the pose where a mission begins, [4, 4]: its elevation becomes one that is allowed.
 
     Raises:
         ValueError: the robot cannot be at that height.
@@ -160,7 +160,7 @@ def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
 
 
 def angles_of(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation [rad] of poses [C, 4, 4] without roll, [C] each.
+    """Returns the azimuth and elevation [rad] of poses [C, 4, 4] without roll, [C] each.
 
     The azimuth is read off the level axis of the image: it means something straight up, too.
     """
@@ -179,13 +179,13 @@ def angles_along(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def directions_along(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Unit vectors along azimuths and elevations [...] [rad], [..., 3]."""
+    """Returns the unit vectors along azimuths and elevations [...] [rad], [..., 3]."""
     level = np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 def rotations(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Axes of the cameras that look there without roll, [C, 3, 3]."""
+    """Returns axes of the cameras that look there without roll, [C, 3, 3]."""
     forward = directions_along(azimuth, elevation)
     # From the azimuth: a cross product with the vertical vanishes straight up and down.
     right = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
@@ -193,7 +193,7 @@ def rotations(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 
 
 def _angle_of_turn(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Angle of the rotation that changes azimuth and elevation by so much [rad].
+    """Returns the angle of the rotation that changes azimuth and elevation by so much [rad].
 
     The real part of the product of the two rotations' quaternions: their axes are at right angles
     to each other, so that nothing else enters it.
@@ -203,12 +203,12 @@ def _angle_of_turn(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Angles [rad] as turns by at most half a circle."""
+    """Returns angles [rad] as turns by at most half a circle."""
     return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi))
 
 
 def _distance(
     first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """Between pairs of azimuth and elevation [rad]."""
+    """Returns the between pairs of azimuth and elevation [rad]."""
     return np.hypot(wrapped(second[0] - first[0]), second[1] - first[1])

@@ -123,7 +123,7 @@ class Motion:
         return length / self.speed + self.turning(angle)
 
     def turning(self, angle: float) -> float:
-        """Time for a turn by `angle` [rad] alone [s]."""
+        """Returns the time for a turn by `angle` [rad] alone [s]."""
         return 0.0 if self.turn_rate is None else math.degrees(angle) / self.turn_rate
 
 
@@ -144,7 +144,7 @@ height where it starts; a drone whose gimbal cannot look up far; a person who wa
 
 
 def make_motion(name: str = "free", **changes: Any) -> Motion:
-    """A motion by name, with other values for some of its fields.
+    """Returns a motion by name, with other values for some of its fields.
 
     Raises:
         ValueError: no motion has that name, it has no such field, or a value cannot work.
@@ -175,7 +175,7 @@ def check_height(height: float, heights: tuple[float, float]) -> None:
 
 
 def motion_of_record(record: Any) -> Motion:
-    """A motion from what JSON holds of it; None, where nothing was written: a free camera.
+    """Returns a motion from what JSON holds of it; None, where nothing was written: a free camera.
 
     Raises:
         ValueError: an unknown field, a value of another kind, or one that cannot work.
@@ -188,5 +188,5 @@ def motion_of_record(record: Any) -> Motion:
 
 
 def motion_of(policy: object) -> Motion:
-    """The motion that a policy plans for: a free-flying camera if it does not say."""
+    """Returns the motion that a policy plans for: a free-flying camera if it does not say."""
     return getattr(getattr(policy, "config", None), "motion", MOTIONS["free"])

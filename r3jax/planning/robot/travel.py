@@ -82,11 +82,11 @@ class Travel:
         return goals
 
     def contains(self, cell: tuple[int, int, int]) -> bool:
-        """True if the grid has that cell."""
+        """Returns True if the grid has that cell."""
         return all(0 <= i < n for i, n in zip(cell, self.usable.shape, strict=True))
 
     def cell_of(self, position: np.ndarray) -> tuple[int, int, int]:
-        """The cell that holds a position [m]; it may lie outside the grid."""
+        """Returns the cell that holds a position [m]; it may lie outside the grid."""
         # float64 throughout: float32 would put points on a border into either cell.
         x, y, z = np.floor((np.asarray(position, np.float64) - self.origin) / self.cell_size)
         return int(x), int(y), int(z)
@@ -110,7 +110,7 @@ class Travel:
         return float(np.linalg.norm(first - self.start) + self.cost[x, y, z])
 
     def lengths(self, positions: np.ndarray) -> np.ndarray:
-        """Path lengths [m] to positions [n, 3]; inf where there is no way.
+        """Returns the path lengths [m] to positions [n, 3]; inf where there is no way.
 
         The straight line where it is safe, else the path over the cells' centers: no shorter
         than what `path` returns.
@@ -204,7 +204,7 @@ def plan_travel(
     heights: tuple[float, float] = UNLIMITED,
     body: float = 0.0,
 ) -> Travel:
-    """Shortest paths from a position to everywhere that is safe. Once per decision.
+    """Returns the shortest paths from a position to everywhere that is safe. Once per decision.
 
     Args:
         grid: what is known.
@@ -263,7 +263,7 @@ def plan_travel(
 
 
 def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
-    """Cells round whose center a ball of radius `margin` [m] touches free cells only.
+    """Returns cells round whose center a ball of radius `margin` [m] touches free cells only.
 
     Args:
         free: cells known to be free, [X, Y, Z] bool; beyond the array nothing is.
@@ -287,7 +287,7 @@ def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
 
 
 def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
-    """True if a segment runs through cells of the mask only, corners it touches included.
+    """Returns True if a segment runs through cells of the mask only, corners it touches included.
 
     Args:
         mask: [X, Y, Z] bool; beyond the array nothing is in the mask.
@@ -303,7 +303,7 @@ def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
 def layers_between(
     heights: tuple[float, float], origin: float, cell_size: float, num: int
 ) -> tuple[int, int]:
-    """The first and the last layer of cells that hold heights [m] out of a range.
+    """Returns the first and the last layer of cells that hold heights [m] out of a range.
 
     Args:
         heights: lowest and highest, either may be infinite.
@@ -324,7 +324,7 @@ def cells_over_matter(
     origin: float,
     cell_size: float,
 ) -> np.ndarray:
-    """Cells in which a camera on a body would have something known inside the body.
+    """Returns cells in which a camera on a body would have something known inside the body.
 
     The body is a cylinder below the camera, as wide as the safety margin; of a cell the lowest
     allowed height counts. What is unknown is open: a camera that looks ahead never sees the floor

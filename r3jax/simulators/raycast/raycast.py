@@ -146,7 +146,7 @@ class RaycastSimulator:
         return bool(hits.distance[0] > 1.0)
 
     def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
-        """The RGB-D frame at a pose [4, 4].
+        """Returns the RGB-D frame at a pose [4, 4].
 
         Depth is 0 on surfaces that the sensor fails on (`Material.is_hole`), and inf where no
         surface lies within `max_range`.
@@ -243,7 +243,7 @@ class RaycastSimulator:
         directions: np.ndarray,
         steps: np.ndarray,
     ) -> np.ndarray:
-        """What the mirrors hit by `rays` (indices) show, one bounce deep, [n, 3]."""
+        """Returns what the mirrors hit by `rays` (indices) show, one bounce deep, [n, 3]."""
         from r3jax.simulators.raycast.shading import shade
 
         normal = self._face_normals[hits.face[rays]]
@@ -289,7 +289,7 @@ class RaycastSimulator:
 
 
 def _depth_limit(max_range: float | int | None) -> np.float32:
-    """The depth beyond which nothing is measured [m]."""
+    """Returns the depth beyond which nothing is measured [m]."""
     if max_range is not None and not max_range > 0.0:
         raise InputError(f"max_range must be positive or None, got {max_range}")
     return np.float32(np.inf if max_range is None else max_range)

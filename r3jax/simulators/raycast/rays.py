@@ -68,7 +68,7 @@ class TriangleScene:
         cull_back_faces: bool = False,
         neighbors: bool = False,
     ) -> Hits:
-        """First hits of rays.
+        """Returns the first hits of rays.
 
         Args:
             origins: [n, 3], or [1, 3] if all start there [m].

@@ -69,7 +69,7 @@ def _turn_all(directions, rotation, workers, there):
 
 
 def inside(directions: np.ndarray, pixels: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """Directions of the rays inside pixels, [m S, 3]: those of a pixel follow each other.
+    """Returns directions of the rays inside pixels, [m S, 3]: those of a pixel follow each other.
 
     Args:
         directions: of the rays through the centers of all pixels [n, 3].
@@ -120,7 +120,7 @@ def _average_all(image, pixels, colors, workers):
 
 @inlined
 def _differ(image, face, row, column, next_row, next_column):
-    """True if two pixels show different faces in different colors."""
+    """Returns True if two pixels show different faces in different colors."""
     if face[row, column] == face[next_row, next_column]:
         return False
     contrast = np.float32(0.0)
@@ -178,19 +178,19 @@ def dot(a, b):
 
 @inlined_fused
 def dot_in_turn(a, b):
-    """The same from the first coordinate on: where images have always had it so."""
+    """Returns the same from the first coordinate on: where images have always had it so."""
     return fused(a[2], b[2], fused(a[1], b[1], a[0] * b[0]))
 
 
 @inlined_fused
 def three(column, begin, i):
-    """A vector in three columns that follow each other."""
+    """Returns a vector in three columns that follow each other."""
     return column[begin + i], column[begin + BLOCK + i], column[begin + 2 * BLOCK + i]
 
 
 @inlined_fused
 def _moved(step, mirror, normal, per_along, direction, path, gradients):
-    """How far, in texels, a hit moves when the pixel moves by one column or row.
+    """Returns how far, in texels, a hit moves when the pixel moves by one column or row.
 
     With the plane's normal n and direction d, a change e of the direction moves the hit by
     t (e - d (n e) / (n d)) (Igehy, "Tracing ray differentials", 1999). A mirror reflects e.
@@ -234,7 +234,7 @@ def _measure(floats, steps, num):
 
 @inlined_fused
 def _wrapped(first, size):
-    """The texel, 0 to size - 1, that a texture which repeats shows at a whole number."""
+    """Returns the texel, 0 to size - 1, that a texture which repeats shows at a whole number."""
     number, length = np.float32(first), np.float32(size)
     # Remainders of vectors are taken in floats; one step mends what rounding has spoiled.
     at = np.int32(first - np.int32(whole(floor(number / length)) * size))
@@ -245,7 +245,7 @@ def _wrapped(first, size):
 
 @inlined_fused
 def _pair(x, size):
-    """The two texels next to x of a texture that repeats, and the second one's weight."""
+    """Returns the two texels next to x of a texture that repeats, and the second one's weight."""
     low = floor(x)
     first = _wrapped(whole(low), size)
     second = np.int32(first + 1)
@@ -551,7 +551,7 @@ def shade(
     path_before: np.ndarray | None = None,
     mirror: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Colors of hits in [0, 1], black where nothing was hit, [n, 3] float32.
+    """Returns colors of hits in [0, 1], black where nothing was hit, [n, 3] float32.
 
     Args:
         tables: the world's tables.

@@ -28,12 +28,12 @@ __all__ = ["describe", "open_scene", "open_world", "outside_scenes", "scene_hash
 
 
 def scene_names() -> list[str]:
-    """Names of the embedded scenes; `outside_scenes` says what else can be opened."""
+    """Returns names of the embedded scenes; `outside_scenes` says what else can be opened."""
     return list(procedural.names())
 
 
 def describe(name: str) -> str:
-    """One line about a scene.
+    """Returns one line about a scene.
 
     Raises:
         ValueError: the scene is unknown; the message lists the known ones.
@@ -44,7 +44,7 @@ def describe(name: str) -> str:
 
 @naming_extras()
 def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> World:
-    """The triangles and materials behind a scene's name.
+    """Returns the triangles and materials behind a scene's name.
 
     Args:
         spec: the name of an embedded scene, or one of `outside_scenes`. Of a Habitat scene this is

@@ -35,12 +35,12 @@ _HOW_TO_GET = (
 
 
 def names() -> list[str]:
-    """The nine scenes, as the paper calls them."""
+    """Returns the nine scenes, as the paper calls them."""
     return list(_FOLDERS)
 
 
 def mesh_file(name: str) -> Path:
-    """The mesh of a scene: z-up, meters.
+    """Returns the mesh of a scene: z-up, meters.
 
     Raises:
         ValueError: the scene is unknown, or its file is not there; says how to get it.
@@ -52,7 +52,7 @@ def mesh_file(name: str) -> Path:
 
 
 def stage_file(name: str) -> Path:
-    """The stage config of a scene, for Habitat-Sim.
+    """Returns the stage config of a scene, for Habitat-Sim.
 
     Raises:
         ValueError: the scene is unknown, or its file is not there; says how to get it.
@@ -69,7 +69,7 @@ def stage_file(name: str) -> Path:
 
 
 def _folder(name: str) -> Path:
-    """The folder of a scene; it may be missing."""
+    """Returns the folder of a scene; it may be missing."""
     if name not in _FOLDERS:
         raise InputError(f"unknown Replica scene {name!r}; known are {', '.join(_FOLDERS)}")
     root = os.environ.get(ROOT)

@@ -84,7 +84,7 @@ def rasterize(
 def pixel_view(
     camera: Camera, T_world_camera: Float[Array, "4 4"], focal: float
 ) -> Float[Array, "4 4"]:
-    """The view matrix that gives our pixels in a camera with square pixels, centered.
+    """Returns the view matrix that gives our pixels in a camera with square pixels, centered.
 
     Args:
         camera: intrinsics.

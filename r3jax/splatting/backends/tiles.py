@@ -102,7 +102,7 @@ def list_tiles(
 def tile_boxes(
     center: Float[Array, "2 n"], reach: Float[Array, "2 n"], columns: int, rows: int
 ) -> TileBoxes:
-    """The tiles that the boxes center +- reach [px] touch, on a grid of columns x rows."""
+    """Returns the tiles that the boxes center +- reach [px] touch, on a grid of columns x rows."""
     is_drawn = reach[0] >= 0.0
 
     def span(axis: int, size: int) -> tuple[Array, Array]:
@@ -121,7 +121,7 @@ def tile_boxes(
 
 
 def near_to_far(depth: Float[Array, " n"], is_drawn: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """The order by depth of what is drawn, then the rest. Stable.
+    """Returns the order by depth of what is drawn, then the rest. Stable.
 
     A radix sort: each pass sorts by some bits of the depth, the lowest first, the place in the
     order so far being the low bits of its keys.

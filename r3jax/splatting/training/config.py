@@ -31,12 +31,12 @@ class Schedule(NamedTuple):
     """Iterations between two resets of the opacities (vanilla)."""
 
     def refines_after(self, step: int) -> bool:
-        """True if the Gaussians are refined after iteration `step` (the first is 1)."""
+        """Returns True if the Gaussians are refined after iteration `step` (the first is 1)."""
         inside = self.refine_from < step < self.refine_until
         return inside and step % self.refine_every == 0
 
     def resets_after(self, step: int) -> bool:
-        """True if the opacities are reset after iteration `step`."""
+        """Returns True if the opacities are reset after iteration `step`."""
         return 0 < step < self.refine_until and step % self.reset_every == 0
 
 
@@ -179,7 +179,7 @@ class TrainConfig(eqx.Module):
         return 2 * self.num_gaussians if self.capacity is None else self.capacity
 
     def schedule(self) -> Schedule:
-        """The schedule of this run. That of the paper for 30000 iterations or more."""
+        """Returns the schedule of this run. That of the paper for 30000 iterations or more."""
         tenth = max(1, self.iterations // 10)
         last, share = (15_000, (1, 2)) if self.strategy == "vanilla" else (25_000, (5, 6))
         until = min(last, self.iterations * share[0] // share[1])
@@ -192,5 +192,5 @@ class TrainConfig(eqx.Module):
         )
 
     def as_record(self) -> dict[str, Any]:
-        """All settings as plain numbers and strings."""
+        """Returns all settings as plain numbers and strings."""
         return dataclasses.asdict(self)

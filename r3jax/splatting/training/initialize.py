@@ -126,7 +126,7 @@ def surface_points(views: Views) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unproject(camera: Camera, pose: np.ndarray, depth: np.ndarray, chosen: np.ndarray):
-    """World coordinates [m, 3] of the chosen pixels' centers."""
+    """Returns the world coordinates [m, 3] of the chosen pixels' centers."""
     row, column = np.nonzero(chosen)
     z = depth[row, column].astype(np.float64)
     x = (column + 0.5 - float(camera.cx)) / float(camera.fx) * z
@@ -201,7 +201,7 @@ def _num_occupied(points: np.ndarray, voxel_size: float) -> int:
 def thin(
     points: np.ndarray, colors: np.ndarray, voxel_size: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean point and the mean color of each occupied voxel, [n, 3] float64 both.
+    """Returns the mean point and the mean color of each occupied voxel, [n, 3] float64 both.
 
     Args:
         points: [m, 3] [m], at least one.
@@ -220,7 +220,7 @@ def thin(
 
 
 def neighbor_scales(points: np.ndarray) -> np.ndarray:
-    """Root mean square distance to the 3 nearest other points [m], within limits, [n].
+    """Returns the root mean square distance to the 3 nearest other points [m], within limits, [n].
 
     Points that coincide, and stray ones, are held within a fifth and five times the median. A
     single point gets 5 cm.
@@ -235,7 +235,7 @@ def neighbor_scales(points: np.ndarray) -> np.ndarray:
 
 
 def _random_points(views: Views, count: int, key: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Points drawn evenly inside a box around the cameras and what they look at.
+    """Returns points drawn evenly inside a box around the cameras and what they look at.
 
     What they look at is taken to lie as far ahead as the cameras are apart, at least 1 m.
     """
@@ -252,7 +252,7 @@ def _random_points(views: Views, count: int, key: Array) -> tuple[np.ndarray, np
 def _as_scene(
     points: np.ndarray, colors: np.ndarray, capacity: int, sh_degree: int
 ) -> GaussianScene:
-    """Round Gaussians of one opacity; unused rows behind."""
+    """Returns the round Gaussians of one opacity; unused rows behind."""
     n = len(points)
     log_scales = np.zeros((capacity, 3), dtype=np.float32)
     log_scales[:n] = np.log(neighbor_scales(points))[:, None]

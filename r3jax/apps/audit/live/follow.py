@@ -130,7 +130,7 @@ class Guide:
             self._questions.put((self._planner, frame))
 
     def _up(self, source: Source) -> np.ndarray:
-        """The vertical; a guess is made again whenever there are twice as many frames."""
+        """Returns the vertical; a guess is made again whenever there are twice as many frames."""
         if self._up_name is not None:
             return up_of(self._up_name)
         if source.up is not None:
@@ -161,7 +161,7 @@ class Guide:
         )
 
     def _warnings(self, source: Source, arrival: Arrival) -> list[str]:
-        """What is wrong with the latest frame beside those before it."""
+        """Returns what is wrong with the latest frame beside those before it."""
         camera, pose = source.camera(arrival.index), source.poses[arrival.index]
         self._recent.append((arrival.name, block_image(*arrival.picture, camera, pose)))
         names, images = zip(*self._recent, strict=True)
@@ -174,7 +174,7 @@ class Guide:
         ]
 
     def _has_arrived(self, frame: Frame) -> bool:
-        """True if the camera is where it was sent, and looks there."""
+        """Returns True if the camera is where it was sent, and looks there."""
         assert self._target is not None
         pose = np.asarray(frame.T_world_camera, np.float64)
         is_near = np.linalg.norm(pose[:3, 3] - self._target[:3, 3]) < _NEAR
@@ -206,7 +206,7 @@ class Guide:
         self._page.decided(frame, decision)
 
     def __enter__(self) -> "Guide":
-        """The guide itself."""
+        """Returns the guide itself."""
         self._thread.start()
         return self
 

@@ -73,7 +73,7 @@ def _stage_recording(path: Path, scratch: Path) -> Path:
 
 
 def _in_order(stems: list[str], poses: int) -> list[str]:
-    """Names that certainly belong to the first poses.
+    """Returns names that certainly belong to the first poses.
 
     With as many names as poses all do. Otherwise, if names are numbers, only those before the
     first gap: a frame that is late would take another one's pose.
@@ -87,7 +87,7 @@ def _in_order(stems: list[str], poses: int) -> list[str]:
 
 
 def complete_lines(path: Path) -> list[str]:
-    """Lines of a text of poses that are whole: 16 numbers and an end.
+    """Returns lines of a text of poses that are whole: 16 numbers and an end.
 
     Raises:
         OSError: not permitted.
@@ -101,7 +101,7 @@ def complete_lines(path: Path) -> list[str]:
 
 
 def _stage_numbered(path: Path, scratch: Path) -> Path:
-    """Frames of 7-Scenes' layout: those with an image, a depth image and a pose."""
+    """Returns frames of 7-Scenes' layout: those with an image, a depth image and a pose."""
     files = {entry.name: entry for entry in path.iterdir() if entry.name.startswith("frame-")}
     bases = {name.partition(".")[0] for name in files}
     kept: list[Path] = []
@@ -216,7 +216,7 @@ class GrowingCapture:
         return source, self._arrivals(source), self._has_moved(source)
 
     def _opened(self, files: list[Path]) -> Source:
-        """The frames that are whole by now; raises ValueError, OSError where none is."""
+        """Returns the frames that are whole by now; raises ValueError, OSError where none is."""
         path = self._path.resolve()
         if self._bag is not None and files:
             return source_of(self._bag.images(files), path.stem)
@@ -225,7 +225,7 @@ class GrowingCapture:
         return source_of(images, (path.parent if path.is_file() else path).name)
 
     def _arrivals(self, source: Source) -> list[Arrival]:
-        """The first of the new frames that can be read."""
+        """Returns the first of the new frames that can be read."""
         found: list[Arrival] = []
         self._is_pending, self.waiting_for = False, ""
         for index, key in enumerate(_keys(source)):
@@ -244,7 +244,7 @@ class GrowingCapture:
         return found
 
     def _has_moved(self, source: Source) -> bool:
-        """True if poses of frames that are in were corrected; takes note of them."""
+        """Returns True if poses of frames that are in were corrected; takes note of them."""
         moved = False
         for index, key in enumerate(_keys(source)):
             if key not in self._taken:
@@ -256,7 +256,7 @@ class GrowingCapture:
         return moved
 
     def again(self, source: Source) -> Iterator[Arrival]:
-        """All frames that came in and can still be read, one by one."""
+        """Yields all frames that came in and can still be read, one by one."""
         for index, key in enumerate(_keys(source)):
             if key not in self._taken:
                 continue
@@ -268,7 +268,7 @@ class GrowingCapture:
 
 
 def subset(source: Source, indices: list[int]) -> Source:
-    """Some of the frames of a capture."""
+    """Returns some of the frames of a capture."""
     return dataclasses.replace(
         source,
         poses=source.poses[indices],
@@ -279,7 +279,7 @@ def subset(source: Source, indices: list[int]) -> Source:
 
 
 def _keys(source: Source) -> list[str]:
-    """Names of all frames; equal ones get numbers."""
+    """Returns names of all frames; equal ones get numbers."""
     count: Counter[str] = Counter()
     keys: list[str] = []
     for label in source.labels:

@@ -129,7 +129,7 @@ class GuidePage:
         )
 
     def _advice(self) -> dict[str, Any]:
-        """The way from the latest frame to the target, in words."""
+        """Returns the way from the latest frame to the target, in words."""
         target = self._target
         if not target:
             return {"next": "Keep on scanning ...", "note": "looking for the best view",
@@ -151,7 +151,7 @@ class GuidePage:
 
 
 def _from_above(pose: np.ndarray, camera: Camera) -> dict[str, float]:
-    """Place, azimuth and half the field of view of a camera."""
+    """Returns the place, azimuth and half the field of view of a camera."""
     forward = pose[:3, 2]
     level = float(np.hypot(*forward[:2]))
     half = float(np.arctan(0.5 * camera.width / float(camera.fx)))
@@ -295,7 +295,7 @@ def mean_value(state: MapState, camera: Camera, places: np.ndarray) -> np.ndarra
 def _plan(
     planner: Planner, value: np.ndarray, places: np.ndarray
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """The place from above, cut to what is known; and its extent."""
+    """Returns the place from above, cut to what is known; and its extent."""
     height = float(np.median(places[:, 2]))
     picture, (left, right, bottom, _) = floor_picture(planner.map_state, planner.grid, height)
     pixel = (right - left) / picture.shape[1]

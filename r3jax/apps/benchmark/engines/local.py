@@ -117,7 +117,7 @@ class _Worker:
         self.pipe.send((cell, root))
 
     def receive(self) -> Any:
-        """The next event of its cell; a process that died makes it a failure."""
+        """Returns the next event of its cell; a process that died makes it a failure."""
         assert self.pipe is not None
         assert self.cell is not None
         cell = self.cell
@@ -149,7 +149,7 @@ def _death(exit_code: int) -> str:
 
 
 def in_words(error: BaseException) -> str:
-    """An error in one line."""
+    """Returns an error in one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
@@ -207,7 +207,7 @@ def _die_with_parent() -> None:
 
 
 def worker_environments(count: int) -> list[dict[str, str]]:
-    """The environment of each of `count` workers: its GPU and its share of memory or cores.
+    """Returns the environment of each of `count` workers: its GPU and its share of memory or cores.
 
     What the user has set is left alone.
     """
@@ -229,7 +229,7 @@ def worker_environments(count: int) -> list[dict[str, str]]:
 
 
 def visible_gpus() -> list[str]:
-    """What CUDA_VISIBLE_DEVICES may hold for one GPU each; empty without any.
+    """Returns what CUDA_VISIBLE_DEVICES may hold for one GPU each; empty without any.
 
     JAX is not asked: it would take the memory of all of them.
     """

@@ -36,7 +36,7 @@ _PATIENCE = 60.0
 
 
 def ended_jobs(job_ids: Iterable[str]) -> dict[str, str]:
-    """Jobs that have ended, with their state and its reason in words.
+    """Returns jobs that have ended, with their state and its reason in words.
 
     Args:
         job_ids: as submitit has them: `12`, or `12_3` of an array.
@@ -66,7 +66,7 @@ def ended_jobs(job_ids: Iterable[str]) -> dict[str, str]:
 
 
 def read_queue(job_ids: Iterable[str], listing: str) -> dict[str, str]:
-    """The jobs of `job_ids` that have ended, by lines `id|state|reason` of the queue.
+    """Returns the jobs of `job_ids` that have ended, by lines `id|state|reason` of the queue.
 
     A job that is not listed ended so long ago that Slurm forgot it (its MinJobAge).
     """
@@ -107,7 +107,7 @@ class CellJob:
         return ""
 
     def checkpoint(self, cell: Cell, root: Path) -> Any:
-        """What goes back into the queue: the same, since the folder knows how far it is."""
+        """Returns what goes back into the queue: the same, since the folder knows how far it is."""
         return _submitit().helpers.DelayedSubmission(self, cell, root)
 
 

@@ -53,7 +53,7 @@ class Known:
     """Frames that were shown, in order."""
 
     def shown(self, frame: Frame) -> "Known":
-        """The same with one frame more."""
+        """Returns the same with one frame more."""
         config = self.config
         grid = _integrate_depth(self.grid, frame, config.max_range)
         return replace(
@@ -64,7 +64,7 @@ class Known:
         )
 
     def situation(self, memory: Any, *, known_cells: bool = False) -> Situation:
-        """What a policy is asked with.
+        """Returns what a policy is asked with.
 
         Args:
             memory: what it keeps beside the map.
@@ -81,7 +81,7 @@ class Known:
 def nothing_known(
     camera: Camera, bounds: np.ndarray, poses: np.ndarray, config: ExplorationConfig
 ) -> Known:
-    """What is known before the first frame.
+    """Returns what is known before the first frame.
 
     Args:
         camera: that candidates are scored with.

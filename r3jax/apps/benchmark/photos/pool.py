@@ -47,7 +47,7 @@ class PhotoPool:
     """Numbers of the photos that judge, ascending."""
 
     def frame(self, number: int) -> Frame:
-        """A photo at its full size, for the map."""
+        """Returns a photo at its full size, for the map."""
         source = self.capture.source
         return source.frame(source.rows[number].step if isinstance(source, Run) else number)
 

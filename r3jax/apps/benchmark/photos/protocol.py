@@ -82,11 +82,11 @@ class PhotoTerms:
         return self.gaussians // (self.first + self.choose)
 
     def mapping(self) -> ExplorationConfig:
-        """Settings of the map."""
+        """Returns settings of the map."""
         return ExplorationConfig(voxel_size=self.voxel_size, max_range=self.max_range)
 
     def train_config(self, seed: int) -> TrainConfig:
-        """Settings of the one training."""
+        """Returns settings of the one training."""
         return TrainConfig(
             iterations=self.choose * self.every + self.iterations,
             num_gaussians=self.first * self.per_photo,
@@ -195,7 +195,7 @@ class _Choice:
         return Addition(self.views(step), newborn)
 
     def views(self, step: int) -> Views:
-        """The photos for the steps up to the next choice, one a step.
+        """Returns the photos for the steps up to the next choice, one a step.
 
         As many as there are steps, so that nothing is recompiled when a photo joins; every photo
         is shown as often as any other, or once more.
@@ -211,7 +211,7 @@ class _Choice:
         self.memory = self.chooser.observe(self.memory, self.known, frame)
 
     def _as_trained(self, scene: GaussianScene, step: int) -> GaussianScene:
-        """The scene with the harmonics that are in training at a step.
+        """Returns the scene with the harmonics that are in training at a step.
 
         The others are 0 and would get no gradient; but by how a pixel would move with them they
         would count as what is known least.

@@ -28,7 +28,7 @@ Record = dict[str, Any]
 
 
 def record_path(root: Path, pool: PhotoPool, chooser: str, seed: int) -> Path:
-    """Where the record of a run is kept."""
+    """Returns where the record of a run is kept."""
     return root / "photos" / f"{pool.name}-{chooser}-seed{seed}.json"
 
 
@@ -42,7 +42,7 @@ def kept_or_made(
     lpips: ImageMetric | None = None,
     on_stage: OnStage = lambda stage: None,
 ) -> Record:
-    """The record on equal terms that is there; otherwise runs the protocol and writes it.
+    """Returns the record on equal terms that is there; otherwise runs the protocol and writes it.
 
     Args:
         root: folder of the benchmark.
@@ -85,7 +85,7 @@ def kept_or_made(
 
 
 def _fields(outcome: Outcome) -> Record:
-    """What a run has come to, as plain numbers."""
+    """Returns what a run has come to, as plain numbers."""
     found = {summary.metric.name: summary for summary in summarize(outcome.rows)}
     return {
         "chosen": outcome.chosen,
@@ -129,7 +129,7 @@ def table_rows(records: Sequence[Record]) -> list[dict[str, str]]:
 
 
 def _lead(own: Sequence[Record], records: Sequence[Record]) -> str:
-    """What a chooser has over `random` on the same photos that judge [dB]."""
+    """Returns what a chooser has over `random` on the same photos that judge [dB]."""
     floor = [record for record in records if record["chooser"] == "random"]
     runs = lambda part: sorted((record["capture"], record["seed"]) for record in part)
     if runs(floor) != runs(own):
@@ -138,7 +138,7 @@ def _lead(own: Sequence[Record], records: Sequence[Record]) -> str:
 
 
 def _scores(records: Sequence[Record], metric: str) -> dict[str, np.ndarray]:
-    """One metric by capture, [seeds, photos that judge]."""
+    """Returns one metric by capture, [seeds, photos that judge]."""
     captures = dict.fromkeys(record["capture"] for record in records)
     return {
         capture: np.array(

@@ -11,7 +11,7 @@ COMMAND = "exec:"
 
 
 def words_of(command: str) -> list[str]:
-    """Program and arguments of a command, split as a shell does.
+    """Returns the program and arguments of a command, split as a shell does.
 
     Raises:
         ValueError: there is no such program, or a quotation mark is open.

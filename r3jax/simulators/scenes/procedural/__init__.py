@@ -29,7 +29,7 @@ _SCENES = {
 
 
 def names() -> tuple[str, ...]:
-    """The nine names, from the demo's scene on."""
+    """Returns the nine names, from the demo's scene on."""
     return tuple(_SCENES)
 
 
@@ -50,7 +50,7 @@ def build(name: str) -> World:
 
 
 def rooms(name: str) -> dict[str, tuple[float, float, float, float]]:
-    """The rooms of the scene of that name: free rectangles (x0, y0, x1, y1) [m].
+    """Returns the rooms of the scene of that name: free rectangles (x0, y0, x1, y1) [m].
 
     Raises:
         ValueError: no scene has that name.
@@ -62,7 +62,7 @@ def rooms(name: str) -> dict[str, tuple[float, float, float, float]]:
 
 
 def describe(name: str) -> str:
-    """One line about the scene of that name.
+    """Returns one line about the scene of that name.
 
     Raises:
         ValueError: no scene has that name.

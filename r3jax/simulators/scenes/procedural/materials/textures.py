@@ -47,7 +47,7 @@ def cloud(
     stretch_x: Real = 1.0,
     lowest: Real = 1.0,
 ) -> np.ndarray:
-    """A periodic random field with the amplitude spectrum 1 / f ** slope.
+    """Returns a periodic random field with the amplitude spectrum 1 / f ** slope.
 
     Fields are drawn from a small pool and shifted by the seed: a Fourier transform per field
     would make a scene take seconds, and a shifted field under another color looks new.
@@ -71,7 +71,7 @@ def cloud(
 
 
 def ridge(num: int, seed: int, slope: Real = 1.5) -> np.ndarray:
-    """A periodic one-dimensional skyline, [num] float32, mean 0, standard deviation 1."""
+    """Returns a periodic one-dimensional skyline, [num] float32, mean 0, standard deviation 1."""
     rng = np.random.default_rng(seed)
     spectrum = np.fft.rfft(rng.standard_normal(num))
     frequency = np.arange(len(spectrum))
@@ -81,7 +81,7 @@ def ridge(num: int, seed: int, slope: Real = 1.5) -> np.ndarray:
 
 
 def smoothstep(low: Real, high: Real, x: np.ndarray) -> np.ndarray:
-    """0 below `low`, 1 above `high`, a smooth ramp between."""
+    """Returns 0 below `low`, 1 above `high`, a smooth ramp between."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
@@ -124,7 +124,7 @@ def plaster(color: Color, seed: int, strength: Real = 1.0, size: int = 768) -> n
 
 @functools.cache
 def concrete(color: Color, seed: int, size: int = 768) -> np.ndarray:
-    """Cast concrete: clouds, pits, the seams and tie holes of its formwork."""
+    """Returns the cast concrete: clouds, pits, the seams and tie holes of its formwork."""
     broad, fine = cloud(size, size, seed, 1.5), cloud(size, size, seed + 1, 0.4, 1.0, 30.0)
     pits = smoothstep(2.1, 2.6, cloud(size, size, seed + 2, 0.9, 1.0, 24.0))
     row, column = np.mgrid[0:size, 0:size] / size
@@ -135,7 +135,7 @@ def concrete(color: Color, seed: int, size: int = 768) -> np.ndarray:
 
 
 def _grain(color: Color, seed: int, height: int, width: int, rings: Real) -> np.ndarray:
-    """Wood cut along the grain, [h, w, 3] float32."""
+    """Returns the wood cut along the grain, [h, w, 3] float32."""
     warp = cloud(height, width, seed, 2.1, 7.0)
     fibre = cloud(height, width, seed + 1, 0.7, 24.0, 6.0)
     row = np.arange(height, dtype=np.float32)[:, None] / height
@@ -150,7 +150,7 @@ def _grain(color: Color, seed: int, height: int, width: int, rings: Real) -> np.
 
 @functools.cache
 def wood(color: Color, seed: int, rings: Real = 11.0, size: int = 512) -> np.ndarray:
-    """Furniture wood, grain along the rows."""
+    """Returns the furniture wood, grain along the rows."""
     return texels(_grain(color, seed, size, size, rings))
 
 
@@ -158,7 +158,7 @@ def wood(color: Color, seed: int, rings: Real = 11.0, size: int = 512) -> np.nda
 def planks(
     color: Color, seed: int, rows: int = 14, contrast: Real = 0.16, size: int = 768
 ) -> np.ndarray:
-    """A floor of staggered planks, each cut from another place of the wood."""
+    """Returns a floor of staggered planks, each cut from another place of the wood."""
     rng = np.random.default_rng(seed)
     base = _grain(color, seed, size, size, 17.0)
     image = np.empty_like(base)
@@ -238,7 +238,7 @@ def tiles(
 
 @functools.cache
 def brick(seed: int, color: Color = (0.62, 0.33, 0.25), size: int = 768) -> np.ndarray:
-    """A brick wall in running bond with rough mortar."""
+    """Returns a brick wall in running bond with rough mortar."""
     tone = (0.72, 0.55, 0.45)
     colors = tuple(
         tuple(float(c * k + 0.12 * t * (k < 0.9)) for c, t in zip(color, tone, strict=True))
@@ -263,7 +263,7 @@ def marble(color: Color, vein: Color, seed: int, size: int = 768) -> np.ndarray:
 
 @functools.cache
 def terrazzo(color: Color, chips: tuple[Color, ...], seed: int, size: int = 768) -> np.ndarray:
-    """Terrazzo: angular chips of several sizes in cement."""
+    """Returns the terrazzo: angular chips of several sizes in cement."""
     rng = np.random.default_rng(seed)
     image = Image.new("RGB", (size, size), tuple(int(255 * c) for c in color))
     draw = ImageDraw.Draw(image)
@@ -290,7 +290,7 @@ def metal(color: Color, seed: int, size: int = 384) -> np.ndarray:
 
 @functools.cache
 def enamel(color: Color, seed: int, size: int = 384) -> np.ndarray:
-    """Lacquer, ceramic, plastic: nearly even, with wear, dust and scratches."""
+    """Returns the lacquer, ceramic, plastic: nearly even, with wear, dust and scratches."""
     broad, fine = cloud(size, size, seed, 1.7), cloud(size, size, seed + 1, 0.5, 1.0, 20.0)
     scratch = smoothstep(2.2, 3.2, cloud(size, size, seed + 2, 0.8, 12.0, 10.0))
     shade = 1.0 + 0.05 * broad + 0.035 * fine - 0.12 * scratch
