@@ -271,7 +271,10 @@ def track_of(path) -> TransformTree:
 def corrected(
     frames: list[KeyFrame], before: TransformTree, after: TransformTree
 ) -> list[KeyFrame]:
-    """Key frames moved as the robot's place at their time was; the latest as its last place."""
+    """Returns the key frames moved as the robot's place at their time was.
+
+    The latest as its last place.
+    """
     if not before.edges or not after.edges:
         return frames
     times = np.array([frame.stamp for frame in frames], dtype=np.int64)

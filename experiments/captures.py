@@ -294,7 +294,10 @@ def run_in_turn(cells: Sequence[Cell], root: Path, options: Options) -> None:
 
 
 def _flight(cell: Cell) -> str:
-    """What the exploration depends on: the same for cells that differ in their training only."""
+    """Returns what the exploration depends on.
+
+    The same for cells that differ in their training only.
+    """
     conditions = replace(
         cell.conditions, train_resolution=16, iterations=1, gaussians=1, capacity=1, trainer={}
     )
@@ -376,7 +379,10 @@ def _amount(snapshot: str) -> str:
 
 
 def frames_figure(records: Records) -> Figure:
-    """PSNR against the frames taken, a panel per scene; what a row does looks like a setting."""
+    """Returns PSNR against the frames taken, a panel per scene.
+
+    What a row does looks like a setting.
+    """
     named = [{**record, "policy": _as_method(record["policy"])} for record in records]
     figure = curve_figure(named, "views", "psnr")
     for axes in figure.axes:

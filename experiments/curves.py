@@ -116,7 +116,9 @@ def area_under(
     start: float | None = None,
     end: float | None = None,
 ) -> float:
-    """Mean height of a curve between two budgets: its area over the range, in quality's unit.
+    """Returns the mean height of a curve between two budgets.
+
+    Its area over the range, in quality's unit.
 
     The curve is piecewise linear (trapezoids); it is cut at `start` and `end` and never continued
     beyond its own ends. Curves with different ends are comparable only on `common_range`.

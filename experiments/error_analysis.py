@@ -186,7 +186,10 @@ def snapshots_of_models(models: SceneModels) -> list[str]:
 
 
 def correlation_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
-    """Every number of a scene with its interval: a line for each, for tables of one's own."""
+    """Yields every number of a scene with its interval.
+
+    A line for each, for tables of one's own.
+    """
     for snapshot in ("", *snapshots_of_models(models)):
         for error in models.errors():
             for predictor in PREDICTORS:

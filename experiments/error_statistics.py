@@ -84,7 +84,10 @@ def _known(weights: np.ndarray, columns: Sequence[np.ndarray]) -> tuple[np.ndarr
 
 
 def ranks(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Rank of every view in every draw, [D, V]: ties, and views drawn twice, share their mean."""
+    """Returns the rank of every view in every draw, [D, V].
+
+    Ties, and views drawn twice, share their mean.
+    """
     _, level = np.unique(values, return_inverse=True)
     order = np.argsort(level, kind="stable")
     starts = np.flatnonzero(np.diff(level[order], prepend=-1))

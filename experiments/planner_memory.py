@@ -86,7 +86,10 @@ def held(row: dict[str, Any]) -> int:
 
 
 def growth(record: dict[str, Any], row: dict[str, Any]) -> int | None:
-    """Memory that the process has taken since before the first view [bytes]; None: not known."""
+    """Returns the memory that the process has taken since before the first view [bytes]; None.
+
+    Not known.
+    """
     before, now = record["process_bytes_before"], row["process_bytes"]
     return None if before is None or now is None else now - before
 

@@ -211,7 +211,10 @@ def size_of(tree: Any) -> int:
 
 
 def process_memory() -> int | None:
-    """Resident memory of this process [bytes]; None where the system does not say (not Linux)."""
+    """Returns the resident memory of this process [bytes].
+
+    None where the system does not say (not Linux).
+    """
     try:
         resident = Path("/proc/self/statm").read_text().split()[1]
     except OSError:
@@ -220,7 +223,10 @@ def process_memory() -> int | None:
 
 
 def compiled_memory() -> int | None:
-    """What the process gives back when JAX forgets its programs [bytes]; None where unknown."""
+    """Returns what the process gives back when JAX forgets its programs [bytes].
+
+    None where unknown.
+    """
     before = _memory_in_use()
     jax.clear_caches()
     after = _memory_in_use()

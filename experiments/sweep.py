@@ -144,7 +144,10 @@ def print_settings(options: Options) -> None:
 
 
 def request_for(options: Options) -> Request:
-    """The benchmark without anything varied: the conditions of the tables of the same size."""
+    """Returns the benchmark without anything varied.
+
+    The conditions of the tables of the same size.
+    """
     size = _SIZES[options.size]
     scenes, budget = options.scenes or size.scenes, options.budget or size.budget
     suite = SuiteOptions(size=options.size, scenes=scenes, policies=(options.policy,))
@@ -179,7 +182,10 @@ def cells_of(plain: tuple[Cell, ...], points: tuple[Point, ...]) -> list[list[Ce
 
 
 def in_rounds(cells: list[list[Cell]]) -> list[Cell]:
-    """All points with the first seed, then with the next: cut short, it is a sweep of fewer."""
+    """Returns all points with the first seed, then with the next.
+
+    Cut short, it is a sweep of fewer.
+    """
     return sorted((cell for own in cells for cell in own), key=lambda cell: cell.seed)
 
 

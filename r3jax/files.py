@@ -247,7 +247,10 @@ def make_folder(folder: Path) -> None:
 
 
 def _workshop(path: Path) -> Path:
-    """Where a file is written before it gets its name: beside the marker of the folder it is in."""
+    """Returns where a file is written before it gets its name.
+
+    Beside the marker of the folder it is in.
+    """
     marked = _marked(path.absolute().parent)
     return marked[0] / MARKER if marked else path.parent
 

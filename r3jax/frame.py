@@ -51,7 +51,10 @@ def _as_image(image: ArrayLike) -> Array:
 
 
 def _as_pose(pose: ArrayLike) -> Array:
-    """Single precision; under jit, where it cannot be refused, a pose that is not rigid is NaN."""
+    """Returns the single precision.
+
+    Under jit, where it cannot be refused, a pose that is not rigid is NaN.
+    """
     T = jnp.asarray(pose, dtype=jnp.float32)
     # A wrong shape is refused by `_check_structure`, a known value by `_check_values`.
     if T.shape != (4, 4) or not is_traced(T):

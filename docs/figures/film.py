@@ -60,7 +60,10 @@ def main(
 
 
 def pictures_of(run: Run, model: r3jax.GaussianScene, num_orbit: int) -> Iterator[np.ndarray]:
-    """All pictures, [H, W, 3] uint8: one for each view of the run, then the orbit of the splats."""
+    """Yields all pictures, [H, W, 3] uint8.
+
+    One for each view of the run, then the orbit of the splats.
+    """
     timeline, config = Timeline(run), scoring_of(run.header)
     last = known_at(timeline.at(len(run.rows) - 1), run.camera, config, 400_000)
     cut = cut_height(run.rows, last.blocks.centers)

@@ -43,7 +43,10 @@ def save(notebook: nbformat.NotebookNode, path: Path) -> None:
 
 
 def _small(output: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """An output with its picture in 256 colors, rare ones among them: those of a color scale."""
+    """Returns an output with its picture in 256 colors, rare ones among them.
+
+    Those of a color scale.
+    """
     picture = output.get("data", {}).get("image/png")
     if picture:
         image = Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB")

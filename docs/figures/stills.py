@@ -147,7 +147,10 @@ def _covered(middle: np.ndarray, half: np.ndarray, size: int) -> tuple[np.ndarra
 
 
 def _light(depth: np.ndarray, is_hit: np.ndarray, strength: float) -> np.ndarray:
-    """How much light each pixel keeps, [H, W] in (0, 1]: less where its neighbors are nearer."""
+    """Returns how much light each pixel keeps, [H, W] in (0, 1].
+
+    Less where its neighbors are nearer.
+    """
     level = np.where(is_hit, np.log2(np.where(is_hit, depth, 1.0)), 1e3).astype(np.float32)
     hidden = np.zeros(level.shape, np.float32)
     height, width = level.shape

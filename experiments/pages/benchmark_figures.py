@@ -30,7 +30,9 @@ _PANELS_PER_LINE = 4
 
 
 def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Figure:
-    """One quantity against another along the snapshots: a panel per scene, a line per method.
+    """Returns one quantity against another along the snapshots.
+
+    A panel per scene, a line per method.
 
     The line joins the means over seeds of both quantities at each snapshot that all seeds of the
     method have; the band spans the lowest and the highest seed. Where x differs between seeds
@@ -88,7 +90,9 @@ def sweep_figure(
     y_label: str,
     chosen: object = None,
 ) -> Figure:
-    """What a setting is good for: a line per group (scene, snapshot) with its band of seeds.
+    """Returns what a setting is good for.
+
+    A line per group (scene, snapshot) with its band of seeds.
 
     Args:
         setting: its name, on the axis.

@@ -38,7 +38,9 @@ def density(values: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 
 def ridge_figure(cells: Sequence[Cell], metric: str = "psnr") -> Figure:
-    """Distribution of a metric over all test views: a panel per snapshot, a ridge per method.
+    """Returns the distribution of a metric over all test views.
+
+    A panel per snapshot, a ridge per method.
 
     Views of all scenes and seeds are pooled. All ridges have one scale (equal areas). A tick marks
     the median, a dot the 5th percentile (LPIPS: 95th).

@@ -51,7 +51,9 @@ def budget_colors(models: SceneModels) -> dict[str, str]:
 
 
 def scatter_figure(models: SceneModels) -> Figure:
-    """A point per view and model: R above, coverage below, against each error of whole images.
+    """Returns a point per view and model.
+
+    R above, coverage below, against each error of whole images.
 
     Lines join the medians of eighths of each budget's points.
     """
@@ -101,7 +103,9 @@ def _draw_points(axes: Axes, models: SceneModels, predictor: str, error: str) ->
 
 
 def distribution_figure(scenes: Sequence[SceneModels]) -> Figure:
-    """How R, coverage and PSNR spread over views and models: a line per scene, a color per budget.
+    """Returns how R, coverage and PSNR spread over views and models.
+
+    A line per scene, a color per budget.
 
     Histograms, as a smoothed density would reach beyond 0 and 1; a line marks each median.
     """
@@ -140,7 +144,10 @@ def _draw_histograms(axes: Axes, models: SceneModels, name: str, edges: np.ndarr
 
 
 def term_figure(models: SceneModels) -> Figure:
-    """How well each term, product and rival predicts: dots with intervals, in three questions."""
+    """Returns how well each term, product and rival predicts.
+
+    Dots with intervals, in three questions.
+    """
     names = (COVERAGE, COVER, *PRODUCTS)
     questions = {
         "PSNR of all pixels": ("spearman", "psnr", ""),
@@ -195,7 +202,9 @@ def _draw_estimate(axes: Axes, found: Estimate, place: float, look: tuple[str, s
 
 
 def model_figure(scenes: Sequence[SceneModels]) -> Figure:
-    """A point per model: how good predictions are where little was seen, and between models.
+    """Returns a point per model.
+
+    How good predictions are where little was seen, and between models.
 
     Left: Spearman within the model, against its coverage. Right: does its mean R tell its PSNR?
     """

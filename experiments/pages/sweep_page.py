@@ -102,7 +102,10 @@ def point_rows(sweep: Sweep, choice: Choice) -> list[dict[str, Any]]:
 
 
 def csv_rows(sweep: Sweep, choice: Choice) -> list[dict[str, Any]]:
-    """A line per point, scene and seed, with every digit; the point's own numbers beside them."""
+    """Returns a line per point, scene and seed, with every digit.
+
+    The point's own numbers beside them.
+    """
     rows = []
     for trial, mean, gain in zip(sweep.trials, choice.means, choice.gains, strict=True):
         of_point = {

@@ -129,7 +129,10 @@ STAGES = (LatticeStage(1.0, (1.75,), 5), LatticeStage(0.5, (1.0, 2.5), 15))
 
 
 def floor_layer(free: np.ndarray) -> int:
-    """The lowest layer of free cells [X, Y, Z], their lowest 2 % left out; 0 if there is none."""
+    """Returns the lowest layer of free cells [X, Y, Z], their lowest 2 % left out.
+
+    0 if there is none.
+    """
     layers = np.nonzero(free)[2]
     return int(np.quantile(layers, _BELOW_FLOOR, method="higher")) if len(layers) else 0
 
@@ -257,7 +260,10 @@ def empty_share(view: PixelView) -> Float[Array, ""]:
 
 
 def score_of(gain: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """(1 - softmax(d)) g / sum(g) of gains and distances [m], [C] each; 0 if all gains are 0."""
+    """Returns (1 - softmax(d)) g / sum(g) of gains and distances [m], [C] each.
+
+    0 if all gains are 0.
+    """
     # Shifted by the largest: exp of a hundred meters would overflow.
     far = np.exp(distance - distance.max())
     return (1.0 - far / far.sum()) * gain / (gain.sum() or 1.0)
@@ -276,7 +282,10 @@ class ActiveGamer(GreedyPolicy):
         return empty_pools(grid.log_odds.shape, float(grid.cell_size))
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """The pool's candidates, noted where they stand in it; any nearby view if there is none."""
+        """Returns the pool's candidates, noted where they stand in it.
+
+        Any nearby view if there is none.
+        """
         num = self.config.num_candidates
         pools, found = draw_candidates(situation.memory, situation.travel, num, situation.limits)
         if found is None:
@@ -327,7 +336,10 @@ class ActiveGamer(GreedyPolicy):
         return replace(pools, of_stage=tuple(of_stage))
 
     def scoring_for(self, grid: OccupancyGrid) -> ScoringConfig:
-        """The settings of the score: what the map holds counts at any distance within the box."""
+        """Returns the settings of the score.
+
+        What the map holds counts at any distance within the box.
+        """
         # The diagonal of the box: nothing within it is out of range.
         extent = np.linalg.norm(grid.log_odds.shape) * float(grid.cell_size)
         return replace(self.config.scoring, max_range=extent)

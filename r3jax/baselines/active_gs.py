@@ -195,7 +195,10 @@ def _draw(
 
 
 def _draw_directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Random unit vectors within 60 degrees of normals [R, 3], or anywhere: [R, _DRAWS, 3]."""
+    """Returns the random unit vectors within 60 degrees of normals [R, 3], or anywhere.
+
+    [R, _DRAWS, 3].
+    """
 
     def unit(x: np.ndarray) -> np.ndarray:
         return x / np.maximum(np.linalg.norm(x, axis=2, keepdims=True), 1e-12)

@@ -72,7 +72,9 @@ def no_sightings(capacity: int = 2) -> Sightings:
 
 
 def aligned(seen: Sightings, state: MapState) -> Sightings:
-    """The same sightings, row by row those of the map's voxels. Outside jit: shapes may change.
+    """Returns the same sightings, row by row those of the map's voxels. Outside jit.
+
+    Shapes may change.
 
     A map never moves its rows but to grow. Voxels that the map does not have are forgotten.
     """

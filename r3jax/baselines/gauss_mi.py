@@ -78,7 +78,10 @@ def reliability(marks: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
 def evidence(
     seen: Seen, rgb: Float[Array, "h w 3"], depth: Float[Array, "h w"]
 ) -> Float[Array, "h w"]:
-    """-ln l of every pixel: l = 1.7 (0.95 color error + 0.05 depth error), at least 1e-4."""
+    """Returns -ln l of every pixel.
+
+    L = 1.7 (0.95 color error + 0.05 depth error), at least 1e-4.
+    """
     # By the photo, whatever the map shows there: where it shows nothing it is wrong.
     has_color, has_depth = rgb.sum(axis=-1) > 0.01, depth > 0.01
     color = jnp.where(has_color, jnp.mean(jnp.abs(seen.rgb - rgb), axis=-1), 0.0)

@@ -195,7 +195,9 @@ def unexplored_before(
     max_range: Float[Array, ""],
     num_steps: int,
 ) -> Float[Array, "h w"]:
-    """Lengths of rays in unexplored cells, in edges of a cell: one sample per edge (midpoint rule).
+    """Returns lengths of rays in unexplored cells, in edges of a cell.
+
+    One sample per edge (midpoint rule).
 
     Args:
         depth: z-depth at which the rays end [m].

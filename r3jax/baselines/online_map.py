@@ -633,6 +633,9 @@ def _pruned(online: OnlineMap, settings: MapSettings) -> OnlineMap:
 
 
 def colored(scene: GaussianScene, values: Float[Array, " n"]) -> GaussianScene:
-    """The scene with a gray of any value >= 0 per Gaussian: rendering composites the values."""
+    """Returns the scene with a gray of any value >= 0 per Gaussian.
+
+    Rendering composites the values.
+    """
     sh = jnp.broadcast_to(((values - 0.5) / C0)[:, None, None], scene.sh.shape)
     return eqx.tree_at(lambda s: s.sh, scene, sh)

@@ -66,7 +66,10 @@ def score_by_pixels(
     rows: Any = (),
     reach: float | None = None,
 ) -> list[np.ndarray]:
-    """`score_pixels` of a situation: each number that `value` gives of a view, [C] float64."""
+    """Returns `score_pixels` of a situation.
+
+    Each number that `value` gives of a view, [C] float64.
+    """
     numbers = score_pixels(
         value,
         situation.map_state,

@@ -80,7 +80,10 @@ class OnlinePolicy(GreedyPolicy):
         return super().weigh(utilities)
 
     def score_camera(self, camera: Camera) -> Camera:
-        """The camera that candidates are scored with: the same field of view, fewer pixels."""
+        """Returns the camera that candidates are scored with.
+
+        The same field of view, fewer pixels.
+        """
         return camera.resized(*fitted_size(camera.width, camera.height, self.config.score_width))
 
 

@@ -142,7 +142,9 @@ def _look_round(
     cell_weight: Float[Array, ""],
     places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
 ) -> tuple[Float[Array, "C 3"], *tuple[Float[Array, " C"], ...]]:
-    """Of each position: best axis, its cone's sum, visible cells, sum of (1 - R), visible voxels.
+    """Returns the of each position.
+
+    Best axis, its cone's sum, visible cells, sum of (1 - R), visible voxels.
 
     Cells are the unexplored ones, and all but the second are of all directions.
     """

@@ -84,7 +84,9 @@ def up_of(name: str) -> np.ndarray:
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation [3, 3] that takes a unit vector [3] to z; from -z, half a turn about x.
+    """Returns the smallest rotation [3, 3] that takes a unit vector [3] to z.
+
+    From -z, half a turn about x.
 
     Rodrigues: with v = up x z and c = <up, z>, R = I + [v] + [v]^2 / (1 + c).
     """

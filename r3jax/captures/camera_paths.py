@@ -50,7 +50,10 @@ class CameraPath:
 
 
 def is_camera_path(path: Path) -> bool:
-    """True for a JSON file with a `camera_path`; False for whatever cannot be read as one."""
+    """Returns True for a JSON file with a `camera_path`.
+
+    False for whatever cannot be read as one.
+    """
     if path.suffix != ".json" or not path.is_file():
         return False
     try:
@@ -99,7 +102,10 @@ def _matrix(index: int, entry: dict[str, Any]) -> np.ndarray:
 
 
 def _lens(index: int, entry: dict[str, Any], size: tuple[int, int]) -> Lens:
-    """`fov` is the vertical angle of view [deg]; `aspect` makes no difference to square pixels."""
+    """Returns `fov` is the vertical angle of view [deg].
+
+    `aspect` makes no difference to square pixels.
+    """
     check_type(f"camera_path[{index}].fov", entry["fov"], float)
     if not _LEAST_ANGLE <= entry["fov"] < 180.0:
         raise ForeignFileError(

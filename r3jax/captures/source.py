@@ -50,7 +50,10 @@ class SamplingTable(NamedTuple):
     """False where the image has no such pixel, [h, w]."""
 
     def take(self, image: np.ndarray) -> np.ndarray:
-        """The thinned image [h, w, ...] of an image [H, W, ...]; 0 where there is no pixel."""
+        """Returns the thinned image [h, w, ...] of an image [H, W, ...].
+
+        0 where there is no pixel.
+        """
         taken = image[self.row, self.column]
         taken[~self.is_there] = 0
         return taken

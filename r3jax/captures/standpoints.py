@@ -30,7 +30,9 @@ _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 def standpoints_of(
     state: MapState, grid: OccupancyGrid, cameras: np.ndarray, num: int, is_dense: bool
 ) -> np.ndarray:
-    """Places where somebody could stand, spread; where no space is known to be free, the cameras.
+    """Returns places where somebody could stand, spread.
+
+    Where no space is known to be free, the cameras.
 
     Args:
         state: the map of the capture.
@@ -54,7 +56,10 @@ def standpoints_of(
 
 
 def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:
-    """Which places [c, 3] lie in a cell known to be free, [c] bool; outside of the grid none do."""
+    """Returns which places [c, 3] lie in a cell known to be free, [c] bool.
+
+    Outside of the grid none do.
+    """
     shape = np.array(grid.log_odds.shape)
     cells = np.floor((places - np.asarray(grid.origin)) / float(grid.cell_size)).astype(np.int64)
     is_inside = np.all((cells >= 0) & (cells < shape), axis=1)

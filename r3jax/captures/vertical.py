@@ -201,7 +201,10 @@ def _thinned(seen: Sequence[Normals]) -> Normals:
 
 
 def _distinct(directions: np.ndarray, weight: np.ndarray) -> float:
-    """Effective number of different directions [k, 3]: the exponential of their entropy."""
+    """Returns the effective number of different directions [k, 3].
+
+    The exponential of their entropy.
+    """
     bins = fibonacci_lattice(_BINS)
     share = np.bincount(np.argmax(directions @ bins.T, axis=1), weight) / weight.sum()
     share = share[share > 0.0]

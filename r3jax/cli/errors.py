@@ -48,7 +48,10 @@ def one_line(error: BaseException) -> str:
 
 
 def printable(text: str) -> str:
-    """Text whose control characters are spelled out: a name may hold what moves the cursor."""
+    """Returns the text whose control characters are spelled out.
+
+    A name may hold what moves the cursor.
+    """
     return "".join(c if c.isprintable() or c in _BLANKS else _spelled(c) for c in text)
 
 

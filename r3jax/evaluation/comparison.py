@@ -182,7 +182,10 @@ def snapshots_of(cells: Sequence[Cell]) -> list[str]:
 
 
 def view_values(cell: Cell, metric: str) -> np.ndarray | None:
-    """One column of the record's test views, [V]; NaN for null, None if the column is null."""
+    """Returns one column of the record's test views, [V].
+
+    NaN for null, None if the column is null.
+    """
     column = cell["views"].get(metric)
     return None if column is None else np.array(column, dtype=np.float64)
 

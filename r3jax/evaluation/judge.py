@@ -131,7 +131,9 @@ def _overlap(numbers: list[int], seen: list[int] | None) -> int | None:
 
 
 def mapped_views(model: TrainedModel, test: TestSet, capture: Capture) -> list[int]:
-    """Views of the capture for the map: those trained on; none if the capture is other data.
+    """Returns views of the capture for the map: those trained on.
+
+    None if the capture is other data.
 
     Without a train.json all views but the tested ones, as a model of them most likely saw them.
     """

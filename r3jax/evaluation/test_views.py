@@ -254,7 +254,9 @@ _AGAIN = "delete the file and it is computed again"
 
 
 def _evenly(positions: np.ndarray, spacing: Sequence[float | int], count: int) -> np.ndarray:
-    """Indices of `count` of the positions [P, 3], in order: evenly spaced along a Morton curve.
+    """Returns indices of `count` of the positions [P, 3], in order.
+
+    Evenly spaced along a Morton curve.
 
     Neighbors along the curve are neighbors in space, so that each region keeps its share.
     """

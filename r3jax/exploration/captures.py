@@ -62,14 +62,20 @@ class CaptureSettings:
         return self.motion.speed or self.config.speed
 
     def flight(self, decision: Decision) -> float:
-        """Seconds to the chosen view: the policy's own account of its motion, if it has one."""
+        """Returns seconds to the chosen view.
+
+        The policy's own account of its motion, if it has one.
+        """
         if decision.seconds is not None:
             return decision.seconds
         return decision.length / self.config.speed
 
 
 def scoring_on_the_way(config: ExplorationConfig) -> ScoringConfig:
-    """Settings of the utility of a frame captured while moving: the same for every policy."""
+    """Returns settings of the utility of a frame captured while moving.
+
+    The same for every policy.
+    """
     return ScoringConfig(max_range=jnp.asarray(config.max_range, jnp.float32))
 
 

@@ -183,7 +183,10 @@ class ExplorationConfig(MappingConfig):
         return self.capture_every is not None or self.capture_rate is not None
 
     def piece_at(self, speed: float) -> float:
-        """Longest piece of a path between two frames at a speed [m/s], [m]; inf: no captures."""
+        """Returns the longest piece of a path between two frames at a speed [m/s], [m]; inf.
+
+        No captures.
+        """
         if self.capture_rate is not None:
             return max(speed / self.capture_rate, LEAST_PIECE)
         return math.inf if self.capture_every is None else self.capture_every

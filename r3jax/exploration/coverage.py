@@ -54,7 +54,9 @@ def _probe_sequence(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple
 
 
 def probe_poses(grid: OccupancyGrid, num: int) -> np.ndarray:
-    """The probe views of a grid: the first `num` of a fixed sequence that lie in free space.
+    """Returns the probe views of a grid.
+
+    The first `num` of a fixed sequence that lie in free space.
 
     The sequence covers the whole box and does not depend on the run. A probe counts once its
     cell and all the cells round it are known to be free, so the set grows into every new room

@@ -61,7 +61,10 @@ class RecordedViews(Protocol):
         ...
 
     def newest_state(self, start: LoopState) -> LoopState:
-        """The newest stored state that can be used; `start`, the first one, if there is none."""
+        """Returns the newest stored state that can be used.
+
+        `start`, the first one, if there is none.
+        """
         ...
 
 
@@ -159,7 +162,9 @@ def explore(
 def _continued(
     run: RecordedViews, mission: Mission, start: LoopState, *, decided_from: int
 ) -> LoopState:
-    """The state after the last recorded view: of the newest stored state, and the views since.
+    """Returns the state after the last recorded view.
+
+    Of the newest stored state, and the views since.
 
     Rows and frames alone rebuild the state, from the first view if need be; a stored state saves
     the time. So one that is missing, damaged or of another version costs time, not the run.

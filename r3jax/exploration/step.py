@@ -339,7 +339,9 @@ def _render(mission: Mission, view: int, T_world_camera: np.ndarray) -> Frame:
 def relive(
     state: LoopState, mission: Mission, row: StepRow, frame: Frame, *, decides: bool = True
 ) -> tuple[LoopState, Decision | None]:
-    """The state after a frame that was recorded: as `step` leaves it, without the simulator.
+    """Returns the state after a frame that was recorded.
+
+    As `step` leaves it, without the simulator.
 
     Args:
         state: before the frame.

@@ -132,7 +132,10 @@ def unit_of(rows: Iterable[StepRow]) -> str:
 
 
 def name_of(row: StepRow, rows: Iterable[StepRow]) -> str:
-    """Names a row by its number: `view 3`, or `frame 12` in runs with frames between views."""
+    """Returns names a row by its number.
+
+    `view 3`, or `frame 12` in runs with frames between views.
+    """
     return f"{unit_of(rows)[:-1]} {row.step + 1}"
 
 

@@ -52,7 +52,10 @@ class DepthUnit:
     """Units of the capture per 1.0 where the numbers are floats."""
 
     def depth(self, steps: np.ndarray) -> np.ndarray:
-        """z-depth [h, w] float32 of stored numbers; 0 no measurement, inf beyond the range."""
+        """Returns z-depth [h, w] float32 of stored numbers.
+
+        0 no measurement, inf beyond the range.
+        """
         if steps.dtype.kind == "f":
             return (steps * self.metres_per_unit).astype(np.float32)
         depth = (steps.astype(np.float64) * self.metres_per_step).astype(np.float32)
@@ -173,7 +176,10 @@ def resample_depth(depth: np.ndarray, lens: Lens, depth_lens: Lens | None = None
 def _along(
     count: int, focal: float, center: float, focal_depth: float, center_depth: float
 ) -> np.ndarray:
-    """Pixels of the depth image along one axis, [count] int64; -1 and beyond: outside of it."""
+    """Returns pixels of the depth image along one axis, [count] int64; -1 and beyond.
+
+    Outside of it.
+    """
     slope = (np.arange(count) + 0.5 - center) / focal
     return np.floor(focal_depth * slope + center_depth).clip(-1, 1 << 30).astype(np.int64)
 

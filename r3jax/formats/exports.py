@@ -142,7 +142,9 @@ def posed_model(
 
 
 def model_of(run: Run, xyz: np.ndarray, rgb: np.ndarray) -> ColmapModel:
-    """The model of a run: its views, its one camera, and points that no view is known to see.
+    """Returns the model of a run.
+
+    Its views, its one camera, and points that no view is known to see.
 
     Args:
         run: a run.

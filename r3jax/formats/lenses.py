@@ -129,7 +129,10 @@ class Lens:
         return self.model in _PINHOLE_WITHOUT_DISTORTION and not any(self.distortion.values())
 
     def has_shape(self, width: int, height: int) -> bool:
-        """True if images of this size may be its own, scaled: each side rounded to a pixel."""
+        """Returns True if images of this size may be its own, scaled.
+
+        Each side rounded to a pixel.
+        """
         off = abs(width * self.height - height * self.width)
         return min(width, height) > 0 and off <= self.width + self.height
 

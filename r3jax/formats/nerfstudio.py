@@ -157,7 +157,10 @@ def _smaller_copies(folder: Path, images: list[Path]) -> list[Path]:
 
 
 def find_transforms(path: Path) -> Path | None:
-    """The file in a folder: transforms.json, else the training views of a split data set."""
+    """Returns the file in a folder.
+
+    Transforms.json, else the training views of a split data set.
+    """
     found = (path / name for name in NAMES if path.is_dir())
     return next((file for file in found if file.exists()), None)
 
@@ -179,7 +182,9 @@ def _depth(folder: Path, index: int, frame: _Fields) -> Path | None:
 
 
 def _depth_unit(content: _Fields) -> DepthUnit:
-    """The unit by nerfstudio's key or instant-ngp's; without one millimeters, and meters of floats.
+    """Returns the unit by nerfstudio's key or instant-ngp's.
+
+    Without one millimeters, and meters of floats.
 
     nerfstudio itself takes floats without a key for millimeters, but users store meters.
     """
@@ -300,7 +305,10 @@ def _lens_of(fields: _Fields, width: int, height: int) -> Lens:
 
 
 def _focal_lengths(fields: _Fields, width: int, height: int) -> tuple[float, float]:
-    """From `fl_x` and `fl_y`, else from the angles of view; one of them serves both axes."""
+    """Returns the from `fl_x` and `fl_y`, else from the angles of view.
+
+    One of them serves both axes.
+    """
     sides = {"x": width, "y": height}
     found: list[float] = []
     for axis, side in sides.items():

@@ -66,7 +66,9 @@ class _Vertices:
 
 
 def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [n, 3] float64 and colors [n, 3] uint8 of the vertices; gray where there are none.
+    """Returns positions [n, 3] float64 and colors [n, 3] uint8 of the vertices.
+
+    Gray where there are none.
 
     The file may be binary of either byte order or text. Other properties are skipped, and other
     elements behind the vertices too.

@@ -156,7 +156,9 @@ def nearest(times: np.ndarray, others: np.ndarray, max_gap: float) -> np.ndarray
 
 
 def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """The rotation matrix [3, 3] of a quaternion w x y z [4]; rounding of its length is mended.
+    """Returns the rotation matrix [3, 3] of a quaternion w x y z [4].
+
+    Rounding of its length is mended.
 
     Raises:
         ForeignFileError: not finite, or not of unit length.

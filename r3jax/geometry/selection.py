@@ -24,7 +24,9 @@ SPARE = 64
 
 
 def spare_places(size: int, num: int) -> Int[Array, " n"]:
-    """Where to scatter what shall be dropped: `num` indices of the places behind `size` others.
+    """Returns where to scatter what shall be dropped.
+
+    `num` indices of the places behind `size` others.
 
     On CPUs XLA bounds-checks every element; where the outcome is random, half of the branches are
     mispredicted, which costs more than the write. A write that is always in bounds costs nothing,

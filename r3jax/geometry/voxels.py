@@ -39,7 +39,10 @@ def check_near_origin(name: str, points: np.ndarray, limit: float = MAX_COORDINA
 def voxel_index(
     coordinates: Float[Array, "..."], voxel_size: Float[Array, ""]
 ) -> Int[Array, "..."]:
-    """Index of the voxel along each coordinate: floor(p / size), voxel 0 spanning [0, size)."""
+    """Returns the index of the voxel along each coordinate.
+
+    Floor(p / size), voxel 0 spanning [0, size).
+    """
     # Truncation would make the voxel at 0 twice as wide, reaching to both sides.
     index = jnp.floor(coordinates / voxel_size)
     limit = float(INDEX_LIMIT)

@@ -92,7 +92,10 @@ def find_or_insert(
 def _claim(
     is_empty: Bool[Array, " N"], hashed: UInt32[Array, " n"], wants: Bool[Array, " n"]
 ) -> Int[Array, " n"]:
-    """An empty slot for each wanting item, along its probe sequence; N where there is none."""
+    """Returns an empty slot for each wanting item, along its probe sequence.
+
+    N where there is none.
+    """
     capacity, num_items = is_empty.shape[0], hashed.shape[0]
     item = jnp.arange(num_items, dtype=jnp.int32)
 

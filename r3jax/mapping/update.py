@@ -318,7 +318,9 @@ def integrate_points(
     *,
     valid: ArrayLike | None = None,
 ) -> MapState:
-    """Points seen by one camera, or by a scanner, join the map: like `integrate`, from points.
+    """Returns points seen by one camera, or by a scanner, join the map.
+
+    Like `integrate`, from points.
 
     One call is one look: a voxel gets one observation, however many points fall into it. A LiDAR
     has rays instead of pixels: its `focal` is one over the angle between neighboring rays [1/rad],

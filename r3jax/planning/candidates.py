@@ -99,7 +99,10 @@ def candidates_at(positions: np.ndarray) -> Candidates:
 
 
 def host_generator(key: Array) -> np.random.Generator:
-    """NumPy's generator, seeded by a JAX key: host code draws many small arrays of odd sizes."""
+    """Returns NumPy's generator, seeded by a JAX key.
+
+    Host code draws many small arrays of odd sizes.
+    """
     # Both kinds of JAX keys are welcome, old arrays of words and typed ones.
     is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     return np.random.default_rng(np.asarray(jax.random.key_data(key) if is_typed else key))

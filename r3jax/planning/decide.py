@@ -339,7 +339,10 @@ def explain_path(
 
 
 def best_of(planned: Decision) -> tuple[Candidates, np.ndarray]:
-    """The best candidates of an earlier decision, and their totals; one shape, to compile once."""
+    """Returns the best candidates of an earlier decision, and their totals.
+
+    One shape, to compile once.
+    """
     finite = np.isfinite(planned.utilities["path"])
     total = np.where(finite, planned.utilities["total"], -np.inf)
     # A policy that ranks fewer (`r3-ahead`: where its best paths begin) fills up with the first

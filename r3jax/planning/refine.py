@@ -136,7 +136,10 @@ def _climb(
     lowest: Float[Array, "K 5"],
     highest: Float[Array, "K 5"],
 ) -> Float[Array, "K 5"]:
-    """Where climbs from poses end: positions [m], azimuths and elevations [rad], within bounds."""
+    """Returns where climbs from poses end.
+
+    Positions [m], azimuths and elevations [rad], within bounds.
+    """
 
     def pose_at(numbers: Float[Array, " 5"]) -> Float[Array, "4 4"]:
         azimuth, elevation = numbers[3], numbers[4]
@@ -167,7 +170,9 @@ def _climb(
 
 
 def _best(candidates: Candidates, total: np.ndarray, num: int) -> np.ndarray:
-    """Indices of the `num` best, no view twice while there are others; none if none can be reached.
+    """Returns indices of the `num` best, no view twice while there are others.
+
+    None if none can be reached.
 
     A robot that cannot move draws its own place again and again.
     """

@@ -69,7 +69,10 @@ class Turning:
         return in_time & (turn(directions, self.end) <= self.allowed[piece + 1 :].sum() + _SAME)
 
     def nearest(self, piece: int, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """The feasible direction nearest to a wanted one, [2]; to the spacing of a lattice."""
+        """Returns the feasible direction nearest to a wanted one, [2].
+
+        To the spacing of a lattice.
+        """
         wanted = np.array([wanted[0], np.clip(wanted[1], *self.elevations)])
         allowed = self.allowed[piece]
         own = np.stack([wanted, _towards(now, wanted, allowed), _towards(now, self.end, allowed)])
@@ -79,7 +82,9 @@ class Turning:
     def best(
         self, piece: int, now: np.ndarray, directions: np.ndarray, scores: np.ndarray
     ) -> np.ndarray:
-        """The feasible direction with the greatest score; if there is none, on towards the end.
+        """Returns the feasible direction with the greatest score.
+
+        If there is none, on towards the end.
 
         Args:
             piece: number of the piece.
@@ -125,7 +130,10 @@ def pose_towards(position: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def along(offset: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """The direction [2] of an offset [3]; of one that is vertical or nothing the azimuth stays."""
+    """Returns the direction [2] of an offset [3].
+
+    Of one that is vertical or nothing the azimuth stays.
+    """
     level = float(np.hypot(offset[0], offset[1]))
     azimuth = now[0] if level < 1e-6 else np.arctan2(offset[1], offset[0])
     return np.array([azimuth, np.arctan2(offset[2], level)])
@@ -168,7 +176,10 @@ def worthwhile_grid(
 
 
 def exhausted_cells(policy_state: Any) -> np.ndarray | None:
-    """Cells that enough views failed to show, [X, Y, Z] bool; None if the policy does not count."""
+    """Returns cells that enough views failed to show, [X, Y, Z] bool.
+
+    None if the policy does not count.
+    """
     if not isinstance(policy_state, PlannerState):
         return None
     return np.asarray(policy_state.looks) >= MAX_FAILED_LOOKS
@@ -200,7 +211,10 @@ def panorama_scores(
     position: np.ndarray,
     scoring: ScoringConfig,
 ) -> np.ndarray:
-    """What a view in the direction of each axis of a panorama would add, [B]: one depth buffer."""
+    """Returns what a view in the direction of each axis of a panorama would add, [B].
+
+    One depth buffer.
+    """
     place = np.asarray(position, dtype=np.float32)[None]
     return np.asarray(
         score_positions(map_state, grid, camera, place, scoring).direction_scores[0], np.float64

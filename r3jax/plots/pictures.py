@@ -191,7 +191,10 @@ _NEVER_SEEN = "#9ca3af"
 
 
 def panorama_figure(picture: PanoramaPicture) -> Figure:
-    """All directions from one position: what the map knows, and how well it would render."""
+    """Returns all directions from one position.
+
+    What the map knows, and how well it would render.
+    """
     figure = style.new_figure(10.0, 9.6)
     upper, lower = figure.subplots(2, 1)
     extent = (180.0, -180.0, -90.0, 90.0)

@@ -121,7 +121,10 @@ PNG_MARK = b"tEXtSoftware\x00r3jax"
 
 
 def to_png(figure: Figure) -> bytes:
-    """The figure as PNG bytes. Dollar signs in names are no formulas; log axes write theirs so."""
+    """Returns the figure as PNG bytes. Dollar signs in names are no formulas.
+
+    Log axes write theirs so.
+    """
     numbers = {label for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
     for text in figure.findobj(Text):
         text.set_parse_math(text in numbers)

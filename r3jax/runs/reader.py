@@ -111,7 +111,10 @@ class Run:
         return load_checkpoint(self.path / "checkpoints", step)
 
     def newest_state(self, start: LoopState) -> LoopState:
-        """The newest stored state of the loop that can be used; `start`, the first, if none is."""
+        """Returns the newest stored state of the loop that can be used.
+
+        `start`, the first, if none is.
+        """
         return newest_state(self.path / "checkpoints", self.rows, start)
 
 

@@ -46,7 +46,9 @@ def rebuild(
 
 
 def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    """The map and the grid of a team after its last meeting: all frames, in the clock's order.
+    """Returns the map and the grid of a team after its last meeting.
+
+    All frames, in the clock's order.
 
     Raises:
         RunError: the runs do not fit together, or a frame is missing or broken.

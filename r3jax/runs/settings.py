@@ -57,7 +57,9 @@ def config_of(run: Run) -> ExplorationConfig:
 
 
 def policy_key(run: Run) -> str:
-    """What `make_policy` knows a run's policy by: its name, or its class if it is a plug-in.
+    """Returns what `make_policy` knows a run's policy by.
+
+    Its name, or its class if it is a plug-in.
 
     Raises:
         KeyError: the header does not say.
@@ -67,7 +69,10 @@ def policy_key(run: Run) -> str:
 
 
 def _config_class(run: Run) -> type[PlannerConfig]:
-    """The settings of a run's policy; those that all share if the policy is not to be had."""
+    """Returns the settings of a run's policy.
+
+    Those that all share if the policy is not to be had.
+    """
     try:
         return config_class(policy_key(run))
     except ValueError:  # retired, or of a package that is not installed here

@@ -291,7 +291,10 @@ def _name(path: tuple[Any, ...]) -> str:
 
 
 def _like(leaf: Any, array: np.ndarray, name: str) -> Any:
-    """The array as the kind of thing that the leaf is: a device array, NumPy, or a number."""
+    """Returns the array as the kind of thing that the leaf is.
+
+    A device array, NumPy, or a number.
+    """
     wanted = np.asarray(leaf)
     # Sizes may differ, as tables double; a type or an axis may not, as compiled code rests on them.
     if array.dtype != wanted.dtype or array.ndim != wanted.ndim:

@@ -65,7 +65,9 @@ def _seen_directions_jvp(
 def nearest_seen(
     visited: UInt32[Array, "W ..."], direction: Float[Array, "3 ..."], num_bins: int
 ) -> Float[Array, "..."]:
-    """The cosine alone: max_k <q_k, r> over the visited bins, in [-1, 1]; -1 where there is none.
+    """Returns the cosine alone: max_k <q_k, r> over the visited bins, in [-1, 1].
+
+    -1 where there is none.
 
     Args:
         visited: as in `seen_directions`.

@@ -166,7 +166,10 @@ def sum_by_direction(
     position: Float[Array, " 3"],
     num_bins: int,
 ) -> Float[Array, " B"]:
-    """Sums weights into the bins in which points lie, seen from a position; 1 bin sums all."""
+    """Returns sums weights into the bins in which points lie, seen from a position.
+
+    1 bin sums all.
+    """
     if num_bins == 1:
         return jnp.sum(weight, keepdims=True)
     # The choice of the bin is piecewise constant: no derivative passes through it.

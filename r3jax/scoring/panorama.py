@@ -107,7 +107,10 @@ def panorama_of_bins(
 
 
 def bins_in_view(camera: Camera, num_bins: int) -> Float[Array, "B B"]:
-    """1 where bin j lies in the roll-free, rectangular field of view with axis q_k: N(k)."""
+    """Returns 1 where bin j lies in the roll-free, rectangular field of view with axis q_k.
+
+    N(k).
+    """
     lattice = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)
     R = jax.vmap(lambda q: pose_along(jnp.zeros(3, dtype=jnp.float32), q)[:3, :3])(lattice)
     x, y, z = jnp.einsum("kij,bi->jkb", R, lattice)

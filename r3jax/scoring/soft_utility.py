@@ -180,7 +180,9 @@ def _widened(camera: Camera) -> Camera:
 
 
 def _sample(chosen: Bool[Array, " n"], most: int) -> tuple[Int[Array, " m"], Float[Array, " m"]]:
-    """Numbers of at most `most` of the chosen, evenly, and how many each stands for; 0: padding.
+    """Returns numbers of at most `most` of the chosen, evenly, and how many each stands for; 0.
+
+    Padding.
 
     Voxels lie in the order of a hash table: a sample by number is one by chance.
     """

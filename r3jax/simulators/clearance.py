@@ -33,7 +33,10 @@ class SurfaceDistance:
         self._tree = KDTree(centers)
 
     def __call__(self, points: np.ndarray, limit: float = np.inf) -> np.ndarray:
-        """Distances [n] of `points` [n, 3] to the mesh [m]; `inf` where beyond the limit."""
+        """Returns distances [n] of `points` [n, 3] to the mesh [m].
+
+        `inf` where beyond the limit.
+        """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         found = np.full(len(points), np.inf)
         near = np.arange(len(points))

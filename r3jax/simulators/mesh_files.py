@@ -224,7 +224,9 @@ def _affine(settings: dict[str, Any]) -> np.ndarray:
 
 
 def read_tree(path: Path) -> dict[str, Any]:
-    """The JSON of a `.glb` or `.gltf` file; of a GLB it is the first chunk, behind 20 bytes.
+    """Returns the JSON of a `.glb` or `.gltf` file.
+
+    Of a GLB it is the first chunk, behind 20 bytes.
 
     Raises:
         ForeignFileError: a chunk that is longer than the file; no JSON, or none of a glTF file.
@@ -322,7 +324,9 @@ class MeshFile:
         self._check_repeats()
 
     def texture(self, image: Any) -> np.ndarray:
-        """The texels of one of its images, [h, w, 3] uint8; unpacked once, however often asked.
+        """Returns the texels of one of its images, [h, w, 3] uint8.
+
+        Unpacked once, however often asked.
 
         Raises:
             ForeignFileError: not an image of a usual format, damaged, or far too large.

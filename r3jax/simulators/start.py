@@ -75,7 +75,9 @@ def start_problem(
 def find_start(
     bounds: np.ndarray, scene: TriangleScene, distance: SurfaceDistance, seed: int = 0
 ) -> np.ndarray | None:
-    """The roomiest place at eye height: a pose [4, 4], or None where nothing is free enough.
+    """Returns the roomiest place at eye height.
+
+    A pose [4, 4], or None where nothing is free enough.
 
     Candidates stand 1.4 m above whatever is below a random point (lower under a low ceiling).
     Best are places with walls and a ceiling all round whose faces are seen from the front; then

@@ -71,7 +71,9 @@ def pixel_tallies(
     least_weight: float = 0.0,
     source: Source = "auto",
 ) -> tuple[Float[Array, "n 2"], Int[Array, ""]]:
-    """Sums over the pixels of a view, for each Gaussian: its weight times `value`, and `counts`.
+    """Returns sums over the pixels of a view, for each Gaussian.
+
+    Its weight times `value`, and `counts`.
 
     Args:
         scene: the Gaussians.

@@ -113,7 +113,10 @@ def find_model(
 
 
 def newest_name(models: Path) -> str | None:
-    """Names the model that is meant without a name: `last`, or else the newest, or else none."""
+    """Returns names the model that is meant without a name.
+
+    `last`, or else the newest, or else none.
+    """
     found = sorted(models.glob("*/scene.ply"), key=lambda path: path.stat().st_mtime)
     names = [path.parent.name for path in found]
     return "last" if "last" in names else next(reversed(names), None)

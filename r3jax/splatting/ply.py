@@ -279,7 +279,10 @@ def _read_text(
 
 
 def _words(file: BinaryIO) -> Iterator[list[bytes]]:
-    """What stands between white space, block by block: as a whole it takes 20 times the file."""
+    """Yields what stands between white space, block by block.
+
+    As a whole it takes 20 times the file.
+    """
     rest = b""
     while block := file.read(_BLOCK):
         words = (rest + block).split()

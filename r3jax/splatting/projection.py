@@ -155,7 +155,9 @@ def rotation_rows(quats: Float[Array, "n 4"]) -> list[list[Array]]:
 def _reach(
     camera: Camera, center: Array, xx: Array, yy: Array, opacity: Array, valid: Array
 ) -> Float[Array, "2 n"]:
-    """The exact box of the ellipse on which alpha = 1/255: o exp(-s) = 1/255, s = d^T conic d / 2.
+    """Returns the exact box of the ellipse on which alpha = 1/255.
+
+    O exp(-s) = 1/255, s = d^T conic d / 2.
 
     The largest |dx| on the ellipse s = s_max is sqrt(2 s_max cov_xx).
     """

@@ -144,7 +144,9 @@ def fitted_size(width: int, height: int, resolution: int | None) -> tuple[int, i
 
 
 def split_views(count: int, every: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """Indices for training and for testing: every 8th view is held out, beginning with the first.
+    """Returns indices for training and for testing.
+
+    Every 8th view is held out, beginning with the first.
 
     Args:
         count: number of views.
@@ -198,7 +200,10 @@ def area_average(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _overlaps(long: int, short: int) -> np.ndarray:
-    """Share of each new pixel that each old one covers, [short, long]; rows sum to 1."""
+    """Returns the share of each new pixel that each old one covers, [short, long].
+
+    Rows sum to 1.
+    """
     edges = np.arange(short + 1) * (long / short)
     old = np.arange(long)
     upper = np.minimum(edges[1:, None], old[None, :] + 1)

@@ -174,7 +174,10 @@ def _colors(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _eight_bits(gray: np.ndarray) -> np.ndarray:
-    """Gray values of 16 bits [H, W] as 8; Pillow itself would clip them, so that all are white."""
+    """Returns the gray values of 16 bits [H, W] as 8.
+
+    Pillow itself would clip them, so that all are white.
+    """
     if gray.dtype.kind == "f" or gray.min() < 0 or gray.max() > _WHITE:
         raise ForeignFileError(
             "the colors are numbers of 32 bits, which do not say what white is: save the image "

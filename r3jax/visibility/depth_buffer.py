@@ -122,7 +122,10 @@ def sees_points(points: Float[Array, "3 m"], view: View, buffer: DepthBuffer) ->
 
 
 def depth_margin(view: View, place: Placement, limit: Float[Array, "h w"]) -> Float[Array, " n"]:
-    """How far before `limit` points lie at their pixel [m]; negative: something hides them."""
+    """Returns how far before `limit` points lie at their pixel [m]; negative.
+
+    Something hides them.
+    """
     return _at_pixel(limit, place.column, place.row, wraps=view.wraps) - place.distance
 
 
@@ -301,7 +304,9 @@ def surface_limit(
 def _slope(
     distance: Float[Array, "h w"], padded: Float[Array, "hp wp"], step: int, axis: int
 ) -> Float[Array, "h w"]:
-    """Change per pixel on the flatter side of each pixel [m/px]; 0 where the sides disagree.
+    """Returns the change per pixel on the flatter side of each pixel [m/px].
+
+    0 where the sides disagree.
 
     So neither a silhouette nor a ragged edge counts as a slope.
     """

@@ -248,7 +248,10 @@ def panorama_view(position: Float[Array, " 3"], config: VisibilityConfig) -> Pan
 def wrap(
     row: Int[Array, " n"], column: Int[Array, " n"], size: Int[Array, " n"]
 ) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
-    """Pixels one step outside the octahedral map: its borders are glued to themselves, turned."""
+    """Returns pixels one step outside the octahedral map.
+
+    Its borders are glued to themselves, turned.
+    """
     crosses_column = (column < 0) | (column >= size)
     crosses_row = (row < 0) | (row >= size)
     # Crossing one border mirrors the other coordinate: the square's edges are folded in half.

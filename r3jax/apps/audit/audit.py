@@ -259,7 +259,10 @@ def _evaluated_frames(
     step: Callable[[], None],
     on_progress: Progress,
 ) -> Iterator[EvaluatedFrame]:
-    """The frames of the path; the capture's own are evaluated without the fold that they are in."""
+    """Yields the frames of the path.
+
+    The capture's own are evaluated without the fold that they are in.
+    """
     known = None if source.is_complete else known_rows(seen.state, is_complete=False)
     if path is not None:
         on_progress("evaluating frames", len(path.poses))
@@ -298,7 +301,10 @@ def _blank_regions(
 def _open_grid(
     source: Source, survey: Survey, seen: Seen, cameras: np.ndarray, config: ScoringConfig
 ) -> OccupancyGrid:
-    """The grid in which only edges are unexplored: where free space ends in what could be seen."""
+    """Returns the grid in which only edges are unexplored.
+
+    Where free space ends in what could be seen.
+    """
     grid = seen.grid
     if not source.is_dense:
         return grid.ignoring(grid.unexplored)

@@ -35,7 +35,10 @@ _EMPTY = 0.93
 
 
 def frames_figure(audit: Audit) -> Figure:
-    """Renderability of every frame along the path, colored by what costs most; its histogram."""
+    """Returns the renderability of every frame along the path, colored by what costs most.
+
+    Its histogram.
+    """
     figure = style.new_figure(10.0, 3.2)
     left, right = figure.subplots(1, 2, width_ratios=[2.6, 1.0], sharey=True)
     value = audit.renderability

@@ -112,7 +112,10 @@ def _cards(audit: Audit) -> dict[str, str]:
 
 
 def picture_faults(audit: Audit) -> dict[str, Any]:
-    """What is wrong with single pictures: findings, remarks where there are none, and notes."""
+    """Returns what is wrong with single pictures.
+
+    Findings, remarks where there are none, and notes.
+    """
     faults = audit.faults
     findings = [_finding(audit, finding) for finding in faults.findings]
     remarks = [] if findings or not faults.fits else [_nothing_found(audit)]
@@ -230,7 +233,10 @@ def _shows(view: Suggestion, region: Region) -> bool:
 
 
 def _views(audit: Audit) -> list[dict[str, Any]]:
-    """Every suggested view: the way to it, why it is suggested, where it is, what it shows."""
+    """Returns every suggested view.
+
+    The way to it, why it is suggested, where it is, what it shows.
+    """
     described: list[dict[str, Any]] = []
     figures = audit_figures.view_figures(audit)
     regions = audit.all_regions

@@ -322,7 +322,9 @@ def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diag
 
 
 def cause_of(value: np.ndarray, costs: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Index into `CAUSES` of each voxel, [N]: the dearest term, where the product is not fine.
+    """Returns the index into `CAUSES` of each voxel, [N].
+
+    The dearest term, where the product is not fine.
 
     A low bias of a voxel that hardly any image has measured is called rare; of others, angle.
 

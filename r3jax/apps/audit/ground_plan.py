@@ -134,7 +134,10 @@ def axis_name(alignment: Alignment, axis: int) -> str | None:
 
 
 def _used(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """The rectangle that holds nearly all surfaces, and all cameras: [2] each [audit units]."""
+    """Returns the rectangle that holds nearly all surfaces, and all cameras.
+
+    [2] each [audit units].
+    """
     centers = _below(audit, height)[0][:, :2]
     marks = [np.stack([frame.pose[:2, 3] for frame in audit.frames])]
     marks += [view.pose[None, :2, 3] for view in audit.plan.views]
@@ -154,7 +157,10 @@ def _below(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Mean renderability of the columns of voxels, [x, y], NaN without any; and its extent."""
+    """Returns the mean renderability of the columns of voxels, [x, y], NaN without any.
+
+    And its extent.
+    """
     centers, values = _below(audit, height)
     low, high = np.percentile(centers[:, :2], [0.2, 99.8], axis=0)
     size = max(audit.survey.voxel_size, float((high - low).max()) / _MOST_PIXELS)
@@ -214,7 +220,10 @@ def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
 
 
 def _labels(regions: tuple[Region, ...]) -> list[tuple[np.ndarray, str, str]]:
-    """Where to write which letters in which color: regions above each other share a place."""
+    """Returns where to write which letters in which color.
+
+    Regions above each other share a place.
+    """
     places: list[tuple[np.ndarray, str, str]] = []
     for number, region in enumerate(regions):
         center = region.center[:2]

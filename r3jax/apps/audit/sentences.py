@@ -112,7 +112,10 @@ def verdict(audit: Audit) -> list[str]:
 
 
 def _surfaces(audit: Audit) -> str:
-    """How much of what was seen renders well; of pictures from one place that is not known."""
+    """Returns how much of what was seen renders well.
+
+    Of pictures from one place that is not known.
+    """
     survey = audit.survey
     if survey.is_one_place:
         return (

@@ -92,7 +92,10 @@ def view_gains(
 def view_coverage(
     state: MapState, camera: Camera, poses: np.ndarray, config: ScoringConfig
 ) -> np.ndarray:
-    """Share of the pixels of every view that show a voxel, [C]; arguments as in `view_gains`."""
+    """Returns the share of the pixels of every view that show a voxel, [C].
+
+    Arguments as in `view_gains`.
+    """
     T = jnp.asarray(poses, dtype=jnp.float32)
     return np.asarray(
         map_over_devices(functools.partial(_coverage, state, camera, config), T), np.float64

@@ -105,7 +105,9 @@ def full_title(metric: Metric) -> str:
 
 
 def ranked(values: Sequence[float | None], metric: Metric) -> list[Entry]:
-    """Entries of one column: all that *read* the same as the best are best, second likewise.
+    """Returns entries of one column.
+
+    All that *read* the same as the best are best, second likewise.
 
     With one value there is nothing to compare, so nothing is marked.
     """

@@ -83,7 +83,10 @@ def free_space_views(grid: OccupancyGrid, num: int) -> np.ndarray:
 
 @functools.cache
 def _sequence() -> np.ndarray:
-    """Positions and directions in the unit cube, evenly spread, [n, 4]; the same for every run."""
+    """Returns positions and directions in the unit cube, evenly spread, [n, 4].
+
+    The same for every run.
+    """
     return qmc.Sobol(d=4, scramble=False).random(_NUM_DRAWN)
 
 
@@ -105,7 +108,10 @@ class Forecast:
     calibration: Calibration
 
     def value(self, name: str) -> float:
-        """The forecast of a statistic, `mean` or `p10` [dB]; -inf where there is no view."""
+        """Returns the forecast of a statistic, `mean` or `p10` [dB].
+
+        -inf where there is no view.
+        """
         return statistic(self.mixture, name) if self.mixture.size else -np.inf
 
     def interval(self, name: str, level: float = 0.8) -> tuple[float, float]:

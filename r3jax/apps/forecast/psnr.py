@@ -76,7 +76,9 @@ class PsnrModel:
 
 
 def fit(coverage: np.ndarray, renderability: np.ndarray, psnr: np.ndarray) -> PsnrModel:
-    """The model of views whose PSNR is known: weighted least squares, location and scale in turn.
+    """Returns the model of views whose PSNR is known.
+
+    Weighted least squares, location and scale in turn.
 
     Args:
         coverage: of each view, [V] in [0, 1].

@@ -255,13 +255,18 @@ def utility_by_cause(
 
 
 def shares_of(utility: np.ndarray) -> np.ndarray:
-    """Shares of each view's utility, [views, 4]; 0 where it promised nothing, NaN where unknown."""
+    """Returns shares of each view's utility, [views, 4].
+
+    0 where it promised nothing, NaN where unknown.
+    """
     total = utility.sum(axis=1, keepdims=True)
     return np.where(total == 0.0, 0.0, utility / np.where(total == 0.0, 1.0, total))
 
 
 def reasons_figure(utility: np.ndarray) -> Figure:
-    """The utility of each chosen view by cause: shares, and below how much on a logarithmic axis.
+    """Returns the utility of each chosen view by cause.
+
+    Shares, and below how much on a logarithmic axis.
 
     Where much is unexplored, that hides the other causes in the shares. Only chosen views count:
     the start and the frames captured while moving are left out.

@@ -160,7 +160,10 @@ def training_figure(history: dict[str, np.ndarray]) -> Figure:
 
 
 def quality_rows(evaluation: dict[str, Any]) -> list[list[str]]:
-    """The metrics as a table: name, mean, interval, median, tail, worst, share of poor ones."""
+    """Returns the metrics as a table.
+
+    Name, mean, interval, median, tail, worst, share of poor ones.
+    """
     rows: list[list[str]] = []
     for name, metric in evaluation["metrics"].items():
         title, digits = _TITLES.get(name, (name, 3))

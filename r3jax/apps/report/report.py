@@ -142,7 +142,10 @@ def _saved(path: Path, figure: Figure) -> bytes:
 
 
 def _reasons(run: Run, outlook: Outlook, on_progress: Progress) -> Figure | str:
-    """What the views were chosen for, or why that is not known; the outlook sees the maps too."""
+    """Returns what the views were chosen for, or why that is not known.
+
+    The outlook sees the maps too.
+    """
     on_progress("looking back at the views", len(run.rows) - 1)  # nothing was chosen after the last
     states = outlook.watch(_counted(states_of(run), on_progress))
     try:

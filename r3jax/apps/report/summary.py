@@ -114,6 +114,9 @@ def summary(run: Run) -> dict[str, str]:
 
 
 def map_row_bytes(run: Run) -> int:
-    """Bytes of one row of the map: two words of key, the bins, count, color, m2, resolution."""
+    """Returns bytes of one row of the map.
+
+    Two words of key, the bins, count, color, m2, resolution.
+    """
     num_words = -(-int(run.header.config.get("num_bins", 64)) // 32)
     return 4 * (2 + num_words + 1 + 3 + 1 + 1)

@@ -332,7 +332,10 @@ def _fly(
 
 
 def _meet(flying: list[_Flying], common: Common, until: float, views: list[TeamView]) -> Common:
-    """All frames up to a time become common; every member receives them; adds to `views`."""
+    """Returns all frames up to a time become common; every member receives them.
+
+    Adds to `views`.
+    """
     mission = flying[0].mission
     common, shared = share(common, until, mission.config, repeat_compiled=mission.clock.measures)
     for me in flying:
@@ -391,7 +394,10 @@ def _promised_to(me: _Flying, common: Common) -> tuple[PromisedView, ...]:
 
 
 def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Observation | None]:
-    """One view of one member, or its end; a view that was recorded is lived through again."""
+    """Returns one view of one member, or its end.
+
+    A view that was recorded is lived through again.
+    """
     mission, state = me.mission, me.state
     if promised:
         scoring = ScoringConfig(max_range=jnp.asarray(mission.config.max_range, jnp.float32))

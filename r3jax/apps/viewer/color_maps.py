@@ -58,7 +58,10 @@ def paint(values: np.ndarray, name: str = SCORES) -> np.ndarray:
 
 
 def linear_light(encoded: np.ndarray) -> np.ndarray:
-    """Light of sRGB-encoded colors, both [..., 3] in [0, 1]: what some renderers ask for."""
+    """Returns the light of sRGB-encoded colors, both [..., 3] in [0, 1].
+
+    What some renderers ask for.
+    """
     low = encoded / 12.92
     return np.where(encoded <= 0.04045, low, ((encoded + 0.055) / 1.055) ** 2.4)
 
@@ -69,7 +72,10 @@ def css_color(color: np.ndarray | tuple[int, int, int]) -> str:
 
 
 def spread(values: np.ndarray) -> np.ndarray:
-    """Numbers shifted and scaled to [0, 1]; equal ones become 0.5, what is not finite NaN."""
+    """Returns numbers shifted and scaled to [0, 1].
+
+    Equal ones become 0.5, what is not finite NaN.
+    """
     values = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(values)
     if not finite.any():

@@ -122,7 +122,9 @@ LAYERS = (
 
 
 def menu_of(surfaces: tuple[str, ...], *, with_causes: bool) -> tuple[Layer, ...]:
-    """The entries of a menu, the first to be opened on: splats if there are any, else colors.
+    """Returns the entries of a menu, the first to be opened on.
+
+    Splats if there are any, else colors.
 
     Args:
         surfaces: what there is to draw.
@@ -402,5 +404,8 @@ def _bar(name: str, low: str, high: str, hint: str) -> dict[str, Any]:
 
 
 def busy_html(text: str, legend: str) -> str:
-    """What is being computed, above the legend of what is drawn until then; "": nothing is yet."""
+    """Returns what is being computed, above the legend of what is drawn until then; "".
+
+    Nothing is yet.
+    """
     return _part("busy", text=text, until_then=legend)

@@ -195,7 +195,10 @@ class PlaceLayer:
         return self._blocks(blocks, colors, settings.cut, self._after(moment.step), detail)
 
     def _causes(self, cut: float, moment: Moment, reason: Reason | str) -> _Drawing:
-        """The map that a view was chosen on, by what the view was after; gray if unknown."""
+        """Returns the map that a view was chosen on, by what the view was after.
+
+        Gray if unknown.
+        """
         is_known = isinstance(reason, Reason)
         before = self._story.moment(moment.step - 1) if is_known else moment
         known = self._known_at(before, with_terms=False)
@@ -416,7 +419,10 @@ class QueryHandler:
                 self._ask_again()
 
     def work(self, question: Query) -> Iterator[Show]:
-        """The parts of the answer to a question; what is quick, and what is looked at, first."""
+        """Yields the parts of the answer to a question.
+
+        What is quick, and what is looked at, first.
+        """
         settings, pose = question.settings, question.T_world_camera
         step = min(settings.step, len(self._story.rows) - 1)
         reason = self._story.reason(step)

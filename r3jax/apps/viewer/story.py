@@ -258,7 +258,10 @@ class Timeline:
 
 
 def _stored(run: Run, grid: OccupancyGrid) -> Moment | None:
-    """The last view's state from its checkpoint, so that it is there at once; None: replay."""
+    """Returns the last view's state from its checkpoint, so that it is there at once; None.
+
+    Replay.
+    """
     try:
         step, map_state, stored_grid = run.checkpoint()
     except RunError:
@@ -388,7 +391,10 @@ class RecordedStory:
         return True
 
     def _explain(self) -> Iterator[Reason | None]:
-        """The reasons of all views, in order; nothing but the replay where others had a say."""
+        """Returns the reasons of all views, in order.
+
+        Nothing but the replay where others had a say.
+        """
         moments = self._timeline.follow()
         if self._run.header.is_merged:
             self._problem = "merged from runs that decided each on a map of its own"
@@ -404,7 +410,10 @@ class RecordedStory:
         return None
 
     def reason(self, step: int) -> Reason | str:
-        """What a view promised when it was chosen; known once the views before are replayed."""
+        """Returns what a view promised when it was chosen.
+
+        Known once the views before are replayed.
+        """
         if self._run.rows[step].choice is None:
             return why_no_choice(self._run.rows[step])
         reason = self._reasons[step] if step < len(self._reasons) else None

@@ -92,7 +92,10 @@ many blocks."""
 def _leveled(
     images: Sequence[BlockImage], pairs: Sequence[Overlap], ratios_of: _Ratios, columns: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs that could be compared [k, 2], in how many blocks [k]; levels of every frame [n, c]."""
+    """Returns pairs that could be compared [k, 2], in how many blocks [k].
+
+    Levels of every frame [n, c].
+    """
     found = [(o.first, o.second, *ratios_of(images, o)) for o in pairs]
     found = [row for row in found if np.isfinite(row[2]).all()]
     linked = np.array([row[:2] for row in found], dtype=np.int64).reshape(-1, 2)
@@ -103,7 +106,9 @@ def _leveled(
 
 
 def _detail_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndarray, int]:
-    """Median log-ratios of detail, all directions together and each, [5]; and of how many blocks.
+    """Returns the median log-ratios of detail, all directions together and each, [5].
+
+    And of how many blocks.
 
     NaN where too few blocks can be compared.
     """
@@ -191,7 +196,10 @@ def light(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Light:
 
 
 def _light_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndarray, int]:
-    """Median log-ratios of brightness, red over green and blue over green, [3]; of how many."""
+    """Returns the median log-ratios of brightness, red over green and blue over green, [3].
+
+    Of how many.
+    """
     own, other = pair.own[pair.agrees], pair.other[pair.agrees]
     a, b = images[pair.first].color[own], images[pair.second].color[other]
     known = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])

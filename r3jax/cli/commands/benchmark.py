@@ -124,7 +124,10 @@ def _write_site(console: Console, root: Path, folder: Path) -> int:
 
 
 def _read(options: BenchmarkOptions, path: Path) -> Submission:
-    """A submission, its scene where the user has it: a mesh lies elsewhere on every machine."""
+    """Returns a submission, its scene where the user has it.
+
+    A mesh lies elsewhere on every machine.
+    """
     submission = read_submission(path)
     if options.scenes == BenchmarkOptions.scenes:
         return submission

@@ -118,6 +118,9 @@ def pose_of(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def colmap_pose(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """COLMAP's quaternion [4] and translation [3] of a pose [4, 4]: inverse of `pose_of`."""
+    """Returns COLMAP's quaternion [4] and translation [3] of a pose [4, 4].
+
+    Inverse of `pose_of`.
+    """
     quaternion = quaternion_of(T_world_camera[:3, :3].T)
     return quaternion, -rotation_of(quaternion) @ T_world_camera[:3, 3].astype(np.float64)

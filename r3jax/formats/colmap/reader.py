@@ -145,7 +145,10 @@ def _left_out(
 
 
 def _odd_lenses(model: ColmapModel) -> list[str]:
-    """Says which lens cannot be true: then the poses and points, fitted with it, are not either."""
+    """Returns says which lens cannot be true.
+
+    Then the poses and points, fitted with it, are not either.
+    """
     odd = [
         f"camera {number} (focal length {max(lens.intrinsics[:2]):.0f} px, distortion "
         f"{max(map(abs, lens.distortion.values()), default=0.0):.3g})"

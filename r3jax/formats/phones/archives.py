@@ -184,7 +184,10 @@ def find_archive(path: Path, *marks: str) -> Archive | None:
 
 
 def _tops(zipped: zipfile.ZipFile, mark: str) -> set[str]:
-    """Where in an archive a file or a folder of this name is: at its top, or in a folder there."""
+    """Returns where in an archive a file or a folder of this name is.
+
+    At its top, or in a folder there.
+    """
     found: set[str] = set()
     for name in zipped.NameToInfo:
         first, slash, rest = name.partition("/")

@@ -198,7 +198,9 @@ def _video(archive: Archive) -> Video:
 
 
 def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
-    """The columns of odometry.csv: frame and pose [n, 8], and intrinsics [n, 4]; NaN: not known.
+    """Returns the columns of odometry.csv: frame and pose [n, 8], and intrinsics [n, 4]; NaN.
+
+    Not known.
 
     Raises:
         ForeignFileError: no such columns, no rows, or a field that is no number.

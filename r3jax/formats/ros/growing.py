@@ -319,7 +319,9 @@ class GrowingBag:
 
 
 def growing_files(path: Path) -> list[Path]:
-    """The files of a bag that may be being recorded, in their order; none: it is no such bag.
+    """Returns the files of a bag that may be being recorded, in their order; none.
+
+    It is no such bag.
 
     Args:
         path: an MCAP, or a folder with its parts.

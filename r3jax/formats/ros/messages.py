@@ -70,7 +70,10 @@ _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 
 
 def stamp_of(message: Any, otherwise: int = 0) -> int:
-    """When a message was taken, by its header [ns]; `otherwise` where it is not filled in."""
+    """Returns when a message was taken, by its header [ns].
+
+    `otherwise` where it is not filled in.
+    """
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or otherwise
 
@@ -141,7 +144,10 @@ def rgb_of(message: Any) -> np.ndarray:
 
 
 def _levels(message: Any, encoding: str, channels: int) -> np.ndarray:
-    """Rows of 8 bits a value, [height, width * channels] uint8; of 16 bits the upper half."""
+    """Returns rows of 8 bits a value, [height, width * channels] uint8.
+
+    Of 16 bits the upper half.
+    """
     if "16" not in encoding:
         return _rows(message, np.dtype("u1"), channels)
     order = ">" if message.is_bigendian else "<"
@@ -163,7 +169,10 @@ def _from_bayer(raw: np.ndarray, channels: tuple[int, ...]) -> np.ndarray:
 
 
 def _tent(image: np.ndarray) -> np.ndarray:
-    """The image [H, W] under the weights 1 2 1, up and down and to the sides; zero outside."""
+    """Returns the image [H, W] under the weights 1 2 1, up and down and to the sides.
+
+    Zero outside.
+    """
     for axis in (0, 1):
         padded = np.pad(image, [(1, 1) if axis == one else (0, 0) for one in (0, 1)])
         before, here, after = (np.moveaxis(padded, axis, 0)[i : i + image.shape[axis]] for i in
@@ -184,7 +193,9 @@ def _from_yuv(rows: np.ndarray, first: int) -> np.ndarray:
 
 
 def depth_of(message: Any) -> np.ndarray:
-    """z-depth of an image, [h, w] float32 [m]; 0 no measurement, inf beyond the sensor's range.
+    """Returns z-depth of an image, [h, w] float32 [m].
+
+    0 no measurement, inf beyond the sensor's range.
 
     Args:
         message: sensor_msgs/Image of 16UC1 (millimeters) or 32FC1 (meters), or CompressedImage of

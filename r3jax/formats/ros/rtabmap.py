@@ -167,7 +167,10 @@ def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
 
 
 def _optimized(path: Path) -> dict[int, np.ndarray] | None:
-    """Poses of the robot by the node's id, [4, 4]; None where the graph was never optimized."""
+    """Returns poses of the robot by the node's id, [4, 4].
+
+    None where the graph was never optimized.
+    """
     columns = {row[1] for row in _query(path, "PRAGMA table_info(Admin)")}
     if not {"opt_ids", "opt_poses"} <= columns:
         return None
@@ -267,7 +270,10 @@ def _depth(path: Path, node: _Node, *, has_confidence: bool) -> np.ndarray:
 
 
 def _confidence(data: bytes) -> np.ndarray:
-    """Confidence [h, w] uint8: a PNG, or rows by zlib with their number, length and type behind."""
+    """Returns the confidence [h, w] uint8.
+
+    A PNG, or rows by zlib with their number, length and type behind.
+    """
     if data.startswith(_PNG):
         wanted = "confidence must be an 8-bit PNG"
         return image_pixels(data, ("PNG",), None, ("L",), wanted)

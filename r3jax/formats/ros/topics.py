@@ -59,7 +59,9 @@ class ImageTopic:
 
 
 def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
-    """Color and depth: the named ones, else those that look most like a registered pair.
+    """Returns the color and depth.
+
+    The named ones, else those that look most like a registered pair.
 
     Raises:
         FormatError: there is no color or no depth; says what there is and what to do.

@@ -105,7 +105,9 @@ class TransformTree:
         edge.rotations.append(xyzw)
 
     def chain(self, frame: str, world: str | None = None) -> list[str]:
-        """Frames from `frame` up to the world, both with it; up to the root where none is named.
+        """Returns frames from `frame` up to the world, both with it.
+
+        Up to the root where none is named.
 
         Returns:
             What there is of it: it ends elsewhere where no transform leads on.
@@ -129,7 +131,10 @@ class TransformTree:
         return any(np.ptp(np.stack(part), axis=0).max() > _STILL for part in samples)
 
     def latest(self, chain: list[str]) -> int:
-        """Time up to which all edges of a chain have samples [ns]; later poses may yet change."""
+        """Returns the time up to which all edges of a chain have samples [ns].
+
+        Later poses may yet change.
+        """
         times = [max(self.edges[frame].times) for frame in chain[:-1] if self.edges[frame].times]
         return min(times, default=0)
 

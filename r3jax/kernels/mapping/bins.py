@@ -66,7 +66,10 @@ def _cosine(x, y, z, bin, lattice):
 
 @inlined_fused
 def nearest_bin(x, y, z, cell, table, lattice):
-    """Bin of a direction (`geometry.sphere.nearest_bin`): the best of the few in its cell."""
+    """Returns the bin of a direction (`geometry.sphere.nearest_bin`).
+
+    The best of the few in its cell.
+    """
     cell, width = np.uint32(cell), table.shape[1]
     # The first two are compared without a branch: most cells have one or two, unpredictably.
     chosen, second = table[cell, 0], table[cell, min(width - 1, 1)]

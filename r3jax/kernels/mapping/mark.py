@@ -39,7 +39,10 @@ def _along(T, axis, center):
 
 @inlined_fused
 def _farthest_around(depth, row, column):
-    """Largest depth of a pixel and its neighbors: on a slope it changes within a pixel."""
+    """Returns the largest depth of a pixel and its neighbors.
+
+    On a slope it changes within a pixel.
+    """
     farthest = _ZERO
     for i in range(max(row - 1, 0), min(row + 2, depth.shape[0])):
         for j in range(max(column - 1, 0), min(column + 2, depth.shape[1])):

@@ -98,7 +98,10 @@ def whole(typingctx, value):
 
 @intrinsic
 def middle_of(typingctx, word, other):
-    """The middle bits of two words: bits 21 to 31 of the first, then 0 to 9 of the second."""
+    """Returns the middle bits of two words.
+
+    Bits 21 to 31 of the first, then 0 to 9 of the second.
+    """
 
     def codegen(context, builder, sig, args):
         low = builder.lshr(args[0], _int(21))
@@ -203,7 +206,10 @@ def _add_bits(typingctx, value, other):
 
 @intrinsic
 def key_of(typingctx, distance, row):
-    """An int64 that sorts by distance >= 0 first, then by row: what is nearest has the least."""
+    """Returns an int64 that sorts by distance >= 0 first, then by row.
+
+    What is nearest has the least.
+    """
     long = ir.IntType(64)
 
     def codegen(context, builder, sig, args):

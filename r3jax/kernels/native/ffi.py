@@ -85,7 +85,9 @@ def _write_int32(typingctx, address, value):
 
 @inlined
 def answers_metadata(frame):
-    """XLA asks first which version of the interface a handler speaks; True if this is that call.
+    """Returns XLA asks first which version of the interface a handler speaks.
+
+    True if this is that call.
 
     The major version is ours; within it all fields that are read lie where they were (`structs`),
     so any minor one, that is, the caller's, will do.

@@ -100,7 +100,10 @@ def _value_of(row, view, rows, forms, lattice, bits):
 
 @kernel
 def _mean_of(keys, layout, view, rows, forms, lattice, bits):
-    """Mean of R over the pixels; 0 where a pixel shows nothing. Neighbors often show the same."""
+    """Returns the mean of R over the pixels.
+
+    0 where a pixel shows nothing. Neighbors often show the same.
+    """
     total, last, value = 0.0, np.int64(-1), np.float32(0.0)
     side = side_of((layout.height, layout.width))
     for r in range(layout.height):

@@ -335,7 +335,10 @@ def _sorted_cells(cells):
 
 @kernel
 def _near_cells(cells, views, is_sound, layout, voxel_size, workers):
-    """The unexplored cells that few views may show, in order: a brick for each thread's share."""
+    """Returns the unexplored cells that few views may show, in order.
+
+    A brick for each thread's share.
+    """
     num = cells.unexplored.shape[0]
     empty = Empty(np.empty((3, num), np.float32), np.empty(num, np.int32))
     begins, ends = np.empty(workers, np.int64), np.empty(workers, np.int64)

@@ -146,7 +146,10 @@ def _gather(slots, bricks, rows, forms, workers, voxels):
 
 @kernel
 def near_voxels(rows, views, is_sound, layout, forms, workers):
-    """The same of few views, in the order of the map: a brick for each thread's share of it."""
+    """Returns the same of few views, in the order of the map.
+
+    A brick for each thread's share of it.
+    """
     capacity = rows.counts.shape[0]
     voxels = empty_voxels(capacity, rows.visited.shape[0])
     begins, ends = np.empty(workers, np.int64), np.empty(workers, np.int64)

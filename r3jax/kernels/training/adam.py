@@ -27,7 +27,9 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 @inlined
 def _patterns(rates, num_harmonics, num_open):
-    """Learning rates and shares of the gradient [5, p]: p floats are whole vectors and rows.
+    """Returns the learning rates and shares of the gradient [5, p].
+
+    P floats are whole vectors and rows.
 
     Args:
         rates: of the five arrays, and of the harmonics above the constant one [6].
@@ -78,7 +80,10 @@ def _steps(first, last, x, g, m, v, rate, share, corrections):
 
 @kernel
 def _squares(first, last, x, g):
-    """Sum of the squares of a range of numbers and their gradients; infinite if it overflows."""
+    """Returns the sum of the squares of a range of numbers and their gradients.
+
+    Infinite if it overflows.
+    """
     total, whole = splat(_ZERO), first + (last - first) // 16 * 16
     for k in range(first, whole, 16):
         a, b = load(x, k), load(g, k)
@@ -94,7 +99,10 @@ def _squares(first, last, x, g):
 
 @inlined
 def _chunk(number, arrays):
-    """Which array the chunk of a number is of, and its range; a kind beyond all behind the last."""
+    """Returns which array the chunk of a number is of, and its range.
+
+    A kind beyond all behind the last.
+    """
     kind = 0
     while kind < KINDS:
         size = arrays[kind].shape[0]

@@ -55,7 +55,10 @@ def _clipped(value):
 
 @kernel
 def box_of(views, is_sound, voxel_size):
-    """Indices of the voxels that bound what the views may see: [2, 3], the upper ones included."""
+    """Returns indices of the voxels that bound what the views may see.
+
+    [2, 3], the upper ones included.
+    """
     box = np.empty((2, 3), np.int64)
     box[0], box[1] = _LIMIT, -_LIMIT
     for view in range(is_sound.shape[0]):
@@ -107,7 +110,9 @@ def count_rows(key, count, box, shift, dims, bricks, counts):
 
 @kernel
 def begin_bricks(counts, starts, bricks):
-    """Where bricks begin, and where each share of the rows writes; empty bricks are left out.
+    """Returns where bricks begin, and where each share of the rows writes.
+
+    Empty bricks are left out.
 
     Returns:
         The number of bricks that hold something; `bricks` has their numbers.

@@ -49,7 +49,9 @@ def compact(marks, count, chosen):
 
 @kernel
 def bricks_of_shares(begins, ends, num):
-    """Bricks of arrays that shares have filled from `begins` to `ends`: any view may see them.
+    """Returns bricks of arrays that shares have filled from `begins` to `ends`.
+
+    Any view may see them.
 
     Between two of them there is one of what is not filled, which no view sees.
     """

@@ -59,7 +59,10 @@ def pyramid_size(side):
 
 @inlined
 def shape_of(shape, level):
-    """Height and width of a level: rounded up, so that every finer pixel has a parent."""
+    """Returns the height and width of a level.
+
+    Rounded up, so that every finer pixel has a parent.
+    """
     above = (1 << level) - 1
     return (shape[0] + above) >> level, (shape[1] + above) >> level
 

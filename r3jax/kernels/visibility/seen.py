@@ -25,7 +25,10 @@ _ZERO, _ONE, _INFINITE = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
 
 @inlined_fused
 def _pixel_at(column, row, begin, stride, height, width):
-    """Place of the pixel at continuous coordinates; far outside, or no number: in the ring."""
+    """Returns the place of the pixel at continuous coordinates; far outside, or no number.
+
+    In the ring.
+    """
     c = column if column > -_ONE else -_ONE
     r = row if row > -_ONE else -_ONE
     c, r = floor(c if c < width else width), floor(r if r < height else height)

@@ -37,7 +37,10 @@ _ONE, _TWO, _LEAST = np.float32(1.0), np.float32(2.0), np.float32(1e-6)
 
 @inlined_fused
 def _first_of(middle, edge):
-    """The first of the two pixels round a coordinate; far outside, or no number: in the ring."""
+    """Returns the first of the two pixels round a coordinate; far outside, or no number.
+
+    In the ring.
+    """
     low = middle - _HALF
     low = low if low > -_RING else -_RING
     return floor(low if low < edge else edge)
@@ -45,7 +48,9 @@ def _first_of(middle, edge):
 
 @inlined_fused
 def _covers(down, right, reach, slants):
-    """Whether a voxel covers a pixel center so far from its own: the octagon round the cube.
+    """Returns whether a voxel covers a pixel center so far from its own.
+
+    The octagon round the cube.
 
     A far voxel may reach no center at all, and shows in its own pixel still.
     """

@@ -53,7 +53,9 @@ class Frontier(GreedyPolicy):
         return np.zeros(grid.log_odds.shape, dtype=bool)
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Views of the nearest frontier cells not looked at yet; if there is none, any nearby.
+        """Returns views of the nearest frontier cells not looked at yet.
+
+        If there is none, any nearby.
 
         The notes are True where views of the frontier were found.
         """

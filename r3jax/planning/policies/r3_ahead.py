@@ -113,7 +113,10 @@ class R3Ahead(GreedyPolicy):
     Config = AheadConfig
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Positions of `r3`, and some spread over all reachable space; no directions yet."""
+        """Returns positions of `r3`, and some spread over all reachable space.
+
+        No directions yet.
+        """
         travel = situation.travel
         num = self.config.num_candidates
         # One at least is drawn as `r3` draws it: settings with fewer would be refused.
@@ -134,7 +137,9 @@ class R3Ahead(GreedyPolicy):
         return Drawn(drawn.padded(num), situation.memory)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Every position's best direction and its worth; `ahead`, the rate of its best path.
+        """Returns every position's best direction and its worth.
+
+        `ahead`, the rate of its best path.
 
         A position from which no path of the beam begins has no rate: -inf.
         """

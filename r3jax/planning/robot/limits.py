@@ -49,7 +49,9 @@ class Limits:
         return allowed
 
     def nearness(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Cosine between each unit direction and the nearest one allowed; 1: it is allowed.
+        """Returns the cosine between each unit direction and the nearest one allowed; 1.
+
+        It is allowed.
 
         Args:
             positions: [C, 1, 3] or [C, 3] [m].
@@ -75,7 +77,10 @@ class Limits:
         return nearness >= np.minimum(cap, nearness.max(axis=1, keepdims=True))
 
     def may_turn(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Where the path is long enough for the turn, elevation clipped; as `nearness` [bool]."""
+        """Returns where the path is long enough for the turn, elevation clipped.
+
+        As `nearness` [bool].
+        """
         # The elevation is clipped first: a tilt that stops short is no turn cut short.
         azimuth, elevation = self.clipped(*angles_along(directions))
         turned = self._turned(positions, azimuth, elevation)
@@ -97,7 +102,10 @@ class Limits:
         return lengths + self.motion.speed * seconds
 
     def seconds(self, length: float, direction: np.ndarray) -> float | None:
-        """Time for a path of `length` [m] and a turn to a direction [3]; None: no speed is set."""
+        """Returns the time for a path of `length` [m] and a turn to a direction [3]; None.
+
+        No speed is set.
+        """
         return self.motion.seconds(length, float(self.turns(direction[None])[0]))
 
     def turns(self, directions: np.ndarray) -> np.ndarray:

@@ -117,7 +117,10 @@ class Motion:
         return base + self.heights[0], base + self.heights[1]
 
     def seconds(self, length: float, angle: float) -> float | None:
-        """Time for a way of `length` [m] and a turn by `angle` [rad]; None: the motion has none."""
+        """Returns the time for a way of `length` [m] and a turn by `angle` [rad]; None.
+
+        The motion has none.
+        """
         if self.speed is None:
             return None
         return length / self.speed + self.turning(angle)

@@ -96,13 +96,19 @@ class Travel:
         return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
 
     def stops(self, cells: np.ndarray) -> np.ndarray:
-        """Where the camera stands in cells given by index, [n, 3] [m]: at an allowed height."""
+        """Returns where the camera stands in cells given by index, [n, 3] [m].
+
+        At an allowed height.
+        """
         places = self.centers(cells)
         places[..., 2] = np.clip(places[..., 2], *self.heights)
         return places
 
     def distance(self, cell: np.ndarray | tuple[int, int, int]) -> float:
-        """Length of the path from the robot to its stop in a cell [m]; inf if there is none."""
+        """Returns the length of the path from the robot to its stop in a cell [m].
+
+        Inf if there is none.
+        """
         x, y, z = (int(i) for i in np.asarray(cell))
         if not self.contains((x, y, z)):
             return float("inf")

@@ -45,7 +45,10 @@ _PACKETS_PER_BLOCK = 16
 
 @functools.cache
 def library() -> CDLL | None:
-    """Version 4 of embree as `embreex` brings it; None where the package holds no such library."""
+    """Returns the version 4 of embree as `embreex` brings it.
+
+    None where the package holds no such library.
+    """
     import embreex
 
     package = Path(embreex.__file__).parent

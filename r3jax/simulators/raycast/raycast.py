@@ -134,7 +134,10 @@ class RaycastSimulator:
         return other
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Distances [n] of `points` [n, 3] to the mesh [m]. For tests: the loop never has it."""
+        """Returns distances [n] of `points` [n, 3] to the mesh [m]. For tests.
+
+        The loop never has it.
+        """
         return self._distance(np.asarray(points, dtype=np.float64))
 
     def segment_is_clear(self, a: np.ndarray, b: np.ndarray) -> bool:
@@ -192,7 +195,10 @@ class RaycastSimulator:
         return np.ascontiguousarray(grid.reshape(-1, 3), dtype=np.float32)
 
     def _given_start(self, start_pose: np.ndarray | None) -> np.ndarray | None:
-        """The start that the caller or the world asks for, checked; None: search for one."""
+        """Returns the start that the caller or the world asks for, checked; None.
+
+        Search for one.
+        """
         if start_pose is not None:
             pose = np.array(start_pose, dtype=np.float64)
             problem = rigid_error(pose)

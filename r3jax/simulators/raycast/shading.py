@@ -172,7 +172,10 @@ _LANES = 16
 
 @inlined_fused
 def dot(a, b):
-    """Scalar product of two vectors, fused in one order: the same bits wherever it is inlined."""
+    """Returns the scalar product of two vectors, fused in one order.
+
+    The same bits wherever it is inlined.
+    """
     return fused(a[2], b[2], fused(a[0], b[0], a[1] * b[1]))
 
 

@@ -132,7 +132,9 @@ def open_scene(
 
 
 def scene_hash(simulator: Simulator) -> str:
-    """SHA-256 of what a simulator from `open_scene` shows: geometry, colors, lamps, by whom.
+    """Returns SHA-256 of what a simulator from `open_scene` shows.
+
+    Geometry, colors, lamps, by whom.
 
     Raises:
         ValueError: the simulator does not come from `open_scene`.

@@ -144,7 +144,10 @@ def near_to_far(depth: Float[Array, " n"], is_drawn: Bool[Array, " n"]) -> Int[A
 def _running_total(
     count: Int[Array, " n"], num_tiles: int
 ) -> tuple[Int[Array, " n"], Int[Array, ""]]:
-    """The sum of the counts up to each, and of all; both saturate instead of wrapping around."""
+    """Returns the sum of the counts up to each, and of all.
+
+    Both saturate instead of wrapping around.
+    """
     end = jnp.cumsum(count)
     if count.shape[0] * num_tiles > MOST:
         approximate = jnp.cumsum(count.astype(jnp.float32))
@@ -153,7 +156,10 @@ def _running_total(
 
 
 def _sizes(budget: int) -> list[int]:
-    """Numbers of slots to sort, falling: sorting the whole budget would often be a waste."""
+    """Returns numbers of slots to sort, falling.
+
+    Sorting the whole budget would often be a waste.
+    """
     sizes = [budget]
     while sizes[-1] > 1 << 15 and len(sizes) < 5:
         sizes.append(-(-sizes[-1] // 2))

@@ -135,7 +135,10 @@ def _unproject(camera: Camera, pose: np.ndarray, depth: np.ndarray, chosen: np.n
 
 
 def _on_edge(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels beside a step in depth, [H, W]; holes are no neighbors, what is beyond range is."""
+    """Returns pixels beside a step in depth, [H, W].
+
+    Holes are no neighbors, what is beyond range is.
+    """
     share = max(_EDGE_STEP, _STEEPEST / float(camera.focal))
     capped = np.minimum(depth, np.float32(1e6))  # differences stay finite
     on_edge = np.zeros(depth.shape, dtype=bool)
@@ -176,7 +179,10 @@ def fitting_voxel_size(points: np.ndarray, num_gaussians: int) -> float:
 
 
 def _voxel_keys(points: np.ndarray, voxel_size: float) -> np.ndarray:
-    """One number for all points in a voxel, [m] int64; neighbors along z follow each other."""
+    """Returns one number for all points in a voxel, [m] int64.
+
+    Neighbors along z follow each other.
+    """
     key = np.zeros(len(points), dtype=np.int64)
     num_cells = 1
     for axis in range(3):

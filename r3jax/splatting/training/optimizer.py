@@ -98,7 +98,10 @@ def _by_formulas(
 
 
 def _squared_size(scene: GaussianScene) -> Float[Array, ""]:
-    """Sum of all squares: not finite if any entry is not, or would overflow Adam's moments."""
+    """Returns the sum of all squares.
+
+    Not finite if any entry is not, or would overflow Adam's moments.
+    """
     return jnp.asarray(sum(jnp.vdot(x, x) for x in jax.tree.leaves(scene)))
 
 

@@ -93,7 +93,10 @@ class Guide:
         self._thread = threading.Thread(target=self._decide, name="guide", daemon=True)
 
     def needs_anew(self, source: Source) -> bool:
-        """True if what was mapped must be mapped again: the vertical or the space has changed."""
+        """Returns True if what was mapped must be mapped again.
+
+        The vertical or the space has changed.
+        """
         if self._planner is None:
             return False
         old = self._alignment.rotation[2]

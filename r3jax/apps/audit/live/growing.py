@@ -289,7 +289,10 @@ def _keys(source: Source) -> list[str]:
 
 
 def _signature(path: Path) -> object:
-    """What changes when a frame comes in: times of the folders, and of the texts in them."""
+    """Returns what changes when a frame comes in.
+
+    Times of the folders, and of the texts in them.
+    """
     try:
         found = path.stat()
         if not stat.S_ISDIR(found.st_mode):

@@ -278,7 +278,9 @@ def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanP
 
 
 def mean_value(state: MapState, camera: Camera, places: np.ndarray) -> np.ndarray:
-    """Mean renderability of every voxel from some of the places within 5 m of it, [N]; NaN: none.
+    """Returns the mean renderability of every voxel from some of the places within 5 m of it, [N].
+
+    NaN: none.
 
     Whether something stands between is not asked: that would take a depth buffer for each place.
     """

@@ -93,7 +93,9 @@ def _check_depth(capture: Capture) -> None:
 
 
 def first_photos(pool: PhotoPool, num: int, seed: int) -> list[int]:
-    """The photos that every choice begins with: drawn by the seed, the same for all choosers.
+    """Returns the photos that every choice begins with.
+
+    Drawn by the seed, the same for all choosers.
 
     Raises:
         PhotosError: fewer are on offer.

@@ -179,7 +179,10 @@ class _Choice:
             self._take(number)
 
     def add(self, step: int, scene: GaussianScene) -> Addition:
-        """What the training goes on with after a step: one photo more, until all are chosen."""
+        """Returns what the training goes on with after a step.
+
+        One photo more, until all are chosen.
+        """
         newborn = None
         if len(self.chosen) < self.terms.first + self.terms.choose:
             candidates = nearest_photos(self.pool, self.chosen, self.terms.nearest)

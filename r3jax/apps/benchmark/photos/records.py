@@ -102,7 +102,9 @@ def _fields(outcome: Outcome) -> Record:
 
 
 def table_rows(records: Sequence[Record]) -> list[dict[str, str]]:
-    """A line per chooser, the best first: means with intervals, and what it has over `random`.
+    """Returns a line per chooser, the best first.
+
+    Means with intervals, and what it has over `random`.
 
     Args:
         records: of the same captures and seeds for all choosers.

@@ -31,7 +31,10 @@ def words_of(command: str) -> list[str]:
 
 
 def short_name(name: str) -> str:
-    """What folders call a policy: the class of `package.module:Class`, the script of a command."""
+    """Returns what folders call a policy.
+
+    The class of `package.module:Class`, the script of a command.
+    """
     if not name.startswith(COMMAND):
         return name.rpartition(":")[2]
     words = [word for word in words_of(name.removeprefix(COMMAND)) if not word.startswith("-")]

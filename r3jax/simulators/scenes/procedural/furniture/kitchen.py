@@ -40,7 +40,10 @@ def _front(model: Model, x0: Real, x1: Real, z0: Real, z1: Real, y: Real, finish
 def kitchen_run(
     width: Real, front: Finish, top: Finish, splash: Finish, seed: int, uppers: bool = True
 ) -> Model:
-    """A kitchen along a wall: units, worktop, sink, hob and oven, splashback, wall cupboards."""
+    """Returns a kitchen along a wall.
+
+    Units, worktop, sink, hob and oven, splashback, wall cupboards.
+    """
     w, model = width / 2, Model()
     model.add(box((-w, 0, 0.1), (w, 0.56, 0.87)), front)
     model.add(box((-w + 0.02, 0.02, 0), (w - 0.02, 0.5, 0.1)), f.enamel(f.CHARCOAL, 1))

@@ -151,7 +151,10 @@ def monitor(seed: int, width: Real = 0.55) -> Model:
 
 
 def desk(width: Real, wood: Finish, seed: int, monitors: int = 1) -> Model:
-    """A desk against a wall: monitors, keyboard, papers, pots, a drawer block. 0.75 m deep."""
+    """Returns a desk against a wall.
+
+    Monitors, keyboard, papers, pots, a drawer block. 0.75 m deep.
+    """
     w, rng = width / 2, np.random.default_rng(seed)
     model = Model().add(box((-w, 0, 0.71), (w, 0.75, 0.74), step=0.4), wood)
     steel = f.metal((0.4, 0.41, 0.43), 3, 0.05)

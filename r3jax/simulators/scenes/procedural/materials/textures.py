@@ -19,7 +19,10 @@ Real = float | int
 
 @functools.lru_cache(maxsize=8)
 def _spectrum(height: int, width: int, seed: int) -> np.ndarray:
-    """Fourier transform of white noise, [h, w // 2 + 1]: many fields are shaped from one."""
+    """Returns the fourier transform of white noise, [h, w // 2 + 1].
+
+    Many fields are shaped from one.
+    """
     noise = np.random.default_rng(seed).standard_normal((height, width), dtype=np.float32)
     return np.fft.rfft2(noise)
 
