@@ -1,7 +1,8 @@
 """Finds words that read translated: `python docs/hooks/words.py`, a part of `make lint`.
 
 Looks at Markdown, at docstrings and comments of Python, and at the messages of the package. A line
-that ends in `words: ok` is let through.
+that ends in `words: ok` is let through. Docstrings of public functions must begin with a verb: an
+article, a question word or `True` is refused; properties and fields are named by nouns.
 """
 
 import ast
@@ -39,9 +40,42 @@ _PATTERN = re.compile(rf"\b(?:{'|'.join(INSTEAD)})\b", re.IGNORECASE)
 _EXCEPTED = "words: ok"
 
 
+_NO_VERB = frozenset(
+    [
+        "The",
+        "A",
+        "An",
+        "What",
+        "Which",
+        "Who",
+        "How",
+        "Where",
+        "Why",
+        "True",
+        "False",
+        "Whether",
+        "All",
+        "Every",
+        "One",
+        "Some",
+        "Each",
+        "Something",
+        "Nothing",
+        "No",
+        "Those",
+        "That",
+    ]
+)
+"""First words of docstrings that describe a value in place of the function."""
+
+
 def main() -> int:
     """Prints every finding; 1 if there are any."""
     found = 0
+    for path in sorted(_files()):
+        for number, word in _nouns(path):
+            found += 1
+            print(f"{path.relative_to(ROOT)}:{number}: {word!r}: begin with a verb")
     for path in sorted(_files()):
         for number, line in _prose(path):
             for match in _PATTERN.finditer(line):
@@ -86,6 +120,19 @@ def _prose_of(text: str, path: Path) -> set[int]:
         if " " in node.value and (has_messages or "\n" in node.value or _is_docstring(node, text)):
             numbers |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     return numbers
+
+
+def _nouns(path: Path) -> Iterator[tuple[int, str]]:
+    """Yields docstrings of public functions of the package that begin with no verb."""
+    if path.suffix != ".py" or (ROOT / "r3jax") not in path.parents:
+        return
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
+            continue
+        is_property = any("property" in ast.unparse(mark) for mark in node.decorator_list)
+        first = (ast.get_docstring(node) or "").partition(" ")[0]
+        if first in _NO_VERB and not is_property:
+            yield node.body[0].lineno, first
 
 
 def _is_docstring(node: ast.Constant, text: str) -> bool:

@@ -94,7 +94,7 @@ class LatticeStage:
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def places(self, travel: Travel) -> tuple[np.ndarray, np.ndarray]:
-        """The cell [P, 3] in which each place's candidates stand now, and where there is one [P].
+        """Finds the cell [P, 3] of each place's candidates, and where there is one [P].
 
         Places are ordered by column, then by level. The levels share a column's cells out among
         them, so that no two places ever mean the same cell.
@@ -213,7 +213,7 @@ def dismiss(pool: Pool, draw: Draw, gain: np.ndarray, best: int) -> Pool:
 def draw_candidates(
     pools: Pools, travel: Travel, num: int, limits: Limits = UNBOUND
 ) -> tuple[Pools, Draw | None]:
-    """The pools as they are now, and up to `num` candidates of the first stage that has any.
+    """Updates the pools, and draws up to `num` candidates of the first stage that has any.
 
     Those for which the camera cannot turn far enough on the way from here sit out, too.
     """

@@ -286,7 +286,7 @@ class ActiveGS(GreedyPolicy):
     source = "Active-GS, Jin et al., RA-L 2025"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
-        """No voxel was seen yet."""
+        """Begins with no voxel seen."""
         del camera, grid
         return no_sightings()
 

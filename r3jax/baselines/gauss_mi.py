@@ -102,7 +102,7 @@ def _tallied(
 def believe(
     marks: Float[Array, "n 4"], weights: Float[Array, "n 4"], tallies: Float[Array, "n 2"]
 ) -> Float[Array, "n 4"]:
-    """The log-odds after a frame, from each Gaussian's summed evidence and touched pixels."""
+    """Updates the log-odds by a frame: each Gaussian's summed evidence and touched pixels."""
     is_touched = tallies[:, 1] >= LEAST_PIXELS
     change = jnp.clip(GAIN * weights * tallies[:, :1], -LIMIT, LIMIT)
     return jnp.clip(marks + jnp.where(is_touched[:, None], change, 0.0), -LIMIT, LIMIT)

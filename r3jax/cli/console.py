@@ -160,7 +160,7 @@ class RunProgress(Bar):
         self._task = self._bar.add_task("starting", total=1.0, facts="")
 
     def on_stage(self, stage: str) -> None:
-        """A stage begins."""
+        """Begins a stage."""
         check_interrupt()
         what = _STAGES.get(stage, stage)
         if self._views < 2 and stage in ("plan", "map", "measure"):
@@ -169,7 +169,7 @@ class RunProgress(Bar):
         self._bar.update(self._task, description=f"view {self._views + 1}{total}: {what}")
 
     def on_row(self, row: StepRow) -> None:
-        """A view is done."""
+        """Reports a view that is done."""
         self._captured += row.captured
         self._views = row.step + 1 - self._captured
         share = self._budget.spent_share(
@@ -246,7 +246,7 @@ class TrainProgress(Bar):
         self._task = self._bar.add_task("", total=iterations, facts="compiling on first use")
 
     def on_progress(self, progress: "train.Progress") -> None:
-        """Some steps are done."""
+        """Counts steps as done."""
         facts = (
             f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, "
             f"{progress.num_gaussians} Gaussians, {progress.seconds_left:.0f} s left"

@@ -98,7 +98,7 @@ def check_equal_terms(cells: Sequence[Cell], *, one_snapshot: bool = True) -> No
 
 
 def terms_of(cell: Cell) -> dict[str, object]:
-    """The terms of a record that all of a table must share, by the names that errors give them."""
+    """Lists the terms of a record that a table's must share, by the names that errors use."""
     sensing, training = (dict(sorted(cell[name].items())) for name in ("sensing", "training"))
     training.pop("seed", None)
     return {

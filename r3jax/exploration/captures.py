@@ -198,7 +198,7 @@ def elevations_of(motion: Motion) -> tuple[float, float]:
 
 
 def points_along(waypoints: np.ndarray, num: int) -> np.ndarray:
-    """The ends of `num` pieces of equal length of the path over waypoints [K, 3], [num, 3]."""
+    """Divides the path over waypoints [K, 3] into `num` equal pieces; their ends, [num, 3]."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     done = np.concatenate([[0.0], np.cumsum(lengths)])
     at = done[-1] * np.arange(1, num + 1) / num

@@ -130,7 +130,7 @@ class GuardedSimulator:
         return self._start_pose.copy()
 
     def commit(self, view: int, T_world_camera: np.ndarray) -> None:
-        """The camera has arrived: the next image is taken from here.
+        """Marks the camera as arrived: the next image is taken from here.
 
         Args:
             view: its number. Images are counted, so that none is taken behind the loop's back.

@@ -134,7 +134,7 @@ class PosedImages:
         return dataclasses.replace(self, depth_paths=found, depth_unit=unit)
 
     def fitted(self) -> "PosedImages":
-        """The same images with lenses of the size that their files have, where only that differs.
+        """Fits the lenses to the size of the image files, where only that differs.
 
         Images are often reduced after their cameras were found. Of each lens the size of most of
         the first images that are there counts.
@@ -160,7 +160,7 @@ class PosedImages:
         )
 
     def frame(self, index: int) -> Frame:
-        """One image with its depth. A depth image of another size is sampled at its nearest pixels.
+        """Reads one image and its depth, which is sampled at its nearest pixels if sizes differ.
 
         Raises:
             FormatError: the image has distortion (undistort it first), there is no depth image,

@@ -66,7 +66,7 @@ class Camera(eqx.Module):
 
     @staticmethod
     def from_fov(width: int, height: int, horizontal_fov_deg: float | int = 60.0) -> "Camera":
-        """A camera with square pixels, centered, with the given horizontal field of view [deg]."""
+        """Makes a camera with square pixels, centered, from its horizontal field of view [deg]."""
         if not 0.0 < horizontal_fov_deg < 180.0:
             raise InputError(
                 f"horizontal_fov_deg must lie between 0 and 180, got {horizontal_fov_deg}"

@@ -119,7 +119,7 @@ class GreedyPolicy(ABC):
     """Its settings."""
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
-        """What the policy keeps beside the map, before the first frame: nothing."""
+        """Returns the policy's memory before the first frame: none."""
         del camera, grid
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
@@ -129,7 +129,7 @@ class GreedyPolicy(ABC):
 
     @abstractmethod
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """The candidates, turned if the policy turns them, and `utility` [C] among others."""
+        """Returns the candidates, turned if the policy does so, and `utility` [C] among others."""
 
     def score_again(
         self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array

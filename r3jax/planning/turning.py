@@ -122,7 +122,7 @@ def direction_of(T_world_camera: np.ndarray) -> np.ndarray:
 
 
 def pose_towards(position: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """The pose without roll at a position [3] that looks in a direction [2], [4, 4] float64."""
+    """Makes the pose [4, 4] without roll at a position [3] that looks in a direction [2]."""
     pose = np.eye(4)
     pose[:3, :3] = rotations(*np.asarray(direction, dtype=np.float64)[:, None])[0]
     pose[:3, 3] = position
@@ -193,7 +193,7 @@ def count_look(
     T_world_camera: Float[Array, "4 4"],
     scoring: ScoringConfig,
 ) -> Any:
-    """The policy's memory with the cells counted that a frame in map and grid failed to show.
+    """Counts the cells that a frame in map and grid failed to show in the policy's memory.
 
     What `look_round` does for the view that a decision is made from.
     """

@@ -148,7 +148,7 @@ def check_decided_alone(run: Run) -> None:
 
 
 def is_decided_apart(run: Run) -> bool:
-    """True for a fork of which some views were decided on another map than its frames give."""
+    """Returns True for a fork with views that were decided on another map than its frames give."""
     return bool((run.header.parent or {}).get("decided_apart", False))
 
 

@@ -54,7 +54,7 @@ class RasterConfig(eqx.Module):
 
 
 def fitting_budget(needed: int, headroom: float = 1.25) -> int:
-    """A budget somewhat above what is needed, from few distinct numbers, so that few compile."""
+    """Rounds a budget up to one of a few distinct numbers, so that few compile."""
     wanted = max(int(headroom * needed), 1 << 10)
     step = 1 << (wanted.bit_length() - 3)
     return -(-wanted // step) * step

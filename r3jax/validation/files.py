@@ -123,7 +123,7 @@ def check_relative(name: str) -> PurePosixPath:
 
 
 def below(folder: Path, name: str) -> Path:
-    """The path of a file in `folder`, as the computer that wrote its name may have spelled it.
+    """Finds a file in `folder` as the computer that wrote its name may have spelled it.
 
     Where there is no such file, backslashes count as slashes, an ending may be of the other case
     (.PNG for .png), and of an absolute path that part counts which leads to a file in the folder.

@@ -136,7 +136,7 @@ def worst_frames(audit: Audit, count: int = 4) -> list[EvaluatedFrame]:
 
 
 def worst_figure(audit: Audit, count: int = 4) -> Figure:
-    """The worst frames: the image (or the map, where there is none) above its renderability."""
+    """Draws the worst frames: the image, or else the map, above its renderability."""
     fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
     frames = worst_frames(audit, count)
     pictures: list[tuple[np.ndarray, np.ndarray]] = []
@@ -162,7 +162,7 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
 
 
 def likest_picture(audit: Audit, view: Suggestion) -> tuple[int, float]:
-    """The image with most of what a view shows, and how far away it was taken [audit units].
+    """Finds the image with most of what a view shows, and how far away it was taken.
 
     What hides it is not asked. A radian between the two axes and a unit between the two places
     cost a tenth of the view each.

@@ -257,7 +257,7 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
 
 
 def directions(audit: Audit, view: Suggestion, like: int) -> str:
-    """The way from an image of the capture to a suggested view, as a person would follow it."""
+    """Describes the path from an image to a suggested view, as a person would follow it."""
     here = audit.survey.alignment.poses(audit.source.poses[[like]])[0]
     way = steps_between(here, view.pose, lambda value: length(audit, value))
     parts = [f"Stand where {audit.source.labels[like]} was taken", *way]

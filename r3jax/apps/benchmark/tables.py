@@ -146,7 +146,7 @@ def seed_texts(cells: Sequence[Cell]) -> dict[str, str]:
 
 
 def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
-    """The terms that all records share, how many seeds, who made them, and what is not there.
+    """Lists the terms that all records share, seeds, authors, and missing cells.
 
     Args:
         cells: of the whole table, with their full names.
@@ -240,7 +240,7 @@ def _mean(scores: Scores) -> float:
 
 
 def on_equal_terms(first: Cell, second: Cell) -> bool:
-    """True if two records of one scene were made on equal terms, whatever they are called."""
+    """Returns True if two records of one scene were made on equal terms."""
     return not (
         differing(terms_of(first), terms_of(second))
         or differing(terms_in_scene(first), terms_in_scene(second))
@@ -248,7 +248,7 @@ def on_equal_terms(first: Cell, second: Cell) -> bool:
 
 
 def headed_groups(records: Sequence[Cell]) -> list[tuple[str, list[Cell]]]:
-    """All records in groups that may share a table, snapshot by snapshot, each with a heading."""
+    """Groups records that may share a table, snapshot by snapshot, each with a heading."""
     found: list[tuple[str, list[Cell]]] = []
     for snapshot in snapshots_of(records):
         groups = groups_on_equal_terms([r for r in records if r["snapshot"] == snapshot])

@@ -115,7 +115,7 @@ class Forecast:
         return statistic(self.mixture, name) if self.mixture.size else -np.inf
 
     def interval(self, name: str, level: float = 0.8) -> tuple[float, float]:
-        """Where the truth lies with that probability [dB], by the errors in unknown scenes."""
+        """Returns the interval of that probability [dB], by the errors in unknown scenes."""
         value, width = self.value(name), self.calibration.half_width(name, level)
         return value - width, value + width
 

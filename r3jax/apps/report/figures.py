@@ -213,7 +213,7 @@ def outlook_figure(outlook: Outlook) -> Figure:
 
 
 def outlook_lines(outlook: Outlook) -> list[str]:
-    """The forecast after the last view, and what one more decibel would take, a line each."""
+    """Describes the last forecast, and the views that one more decibel would take, a line each."""
     last = outlook.forecasts[-1]
     if not last.mixture.size:
         return ["No view of free space can be named yet, so nothing is forecast."]

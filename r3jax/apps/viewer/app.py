@@ -239,7 +239,7 @@ class App:
             self.worker.ask(question, mark)
 
     def grow(self) -> None:
-        """The story has a new view."""
+        """Updates the page for a new view of the story."""
         num_views = len(self.story.rows)
         self._add_views()
         if self._asked is None:

@@ -150,15 +150,15 @@ class Canvas:
         )
 
     def paint_camera(self, color: Color) -> None:
-        """The color of the dragged camera's frustum."""
+        """Sets the color of the dragged camera's frustum."""
         self._body.color = color
 
     def fill_camera(self, image: np.ndarray) -> None:
-        """The picture in the dragged camera's frustum, [H, W, 3] uint8."""
+        """Shows the picture in the dragged camera's frustum, [H, W, 3] uint8."""
         self._body.image = image
 
     def mark_camera_stale(self) -> None:
-        """Nothing is known of the dragged camera's pose yet."""
+        """Forgets the dragged camera's pose."""
         self.hide_suggestion()
         self._body.color, self._body.image = _STALE_COLOR, None
 
@@ -171,7 +171,7 @@ class Canvas:
         *,
         small: bool = False,
     ) -> None:
-        """A view along the path, with its picture [H, W, 3] uint8; it can be clicked."""
+        """Adds a view along the path with its picture [H, W, 3] uint8; it can be clicked."""
         scale = 0.05 if small else 0.1
         handle = self._add_frustum(
             f"/views/{step:06d}", T_world_camera, scale, 0.004, _VIEW_COLOR, thumbnail
@@ -186,13 +186,13 @@ class Canvas:
         handle.on_click(click)
 
     def show_views(self, before: int) -> None:
-        """Those before one of them; 0 shows none."""
+        """Shows those before one of them; 0 shows none."""
         self._shown_before = before
         for step, handle in list(self._views.items()):
             handle.visible = step < before
 
     def show_view(self, T_world_camera: np.ndarray, image: np.ndarray) -> None:
-        """The view on the slider, larger than the others."""
+        """Marks the view on the slider, larger than the others."""
         self._add_frustum("/view", T_world_camera, 0.26, 0.012, _NOW_COLOR, image)
 
     def _add_frustum(
@@ -251,7 +251,7 @@ class Canvas:
         self._server.scene.add_gaussian_splats(name, *arrays)
 
     def show_mesh(self, name: str, glb: bytes) -> None:
-        """The scene's own triangles."""
+        """Shows the scene's own triangles."""
         self._server.scene.add_glb(name, glb, cast_shadow=False, receive_shadow=False)
 
     def show_only(self, name: str, names: Sequence[str], *, is_splats: bool = False) -> None:
@@ -264,7 +264,7 @@ class Canvas:
                 handle.visible = other == name
 
     def show_suggestion(self, position: np.ndarray, direction: np.ndarray) -> None:
-        """An arrow from a position [m] along a direction."""
+        """Shows an arrow from a position [m] along a direction."""
         self._server.scene.add_arrows(
             "/suggestion",
             np.stack([position, position + 0.9 * direction])[None].astype(np.float32),

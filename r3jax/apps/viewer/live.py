@@ -73,7 +73,7 @@ class LiveFeed:
         self._thread.start()
 
     def on_view(self, view: TakenView, planner: Planner) -> None:
-        """A view is done, as `explore` tells it: into the queue it goes."""
+        """Puts a view that `explore` reports into the queue."""
         self._queue.put((view, planner))
 
     def settle(self, timeout: float) -> bool:

@@ -44,7 +44,7 @@ def path_segments(rows: Sequence[StepRow], num_views: int) -> tuple[np.ndarray, 
 
 
 def frustum_corners(camera: Camera, T_world_camera: np.ndarray, depth: float) -> np.ndarray:
-    """The corners of the image at a distance ahead of the camera, in order round it, [4, 3] [m]."""
+    """Returns the image's corners at a distance ahead of the camera, in order, [4, 3] [m]."""
     columns = np.array([0.0, camera.width, camera.width, 0.0])
     rows = np.array([0.0, 0.0, camera.height, camera.height])
     x = (columns - float(camera.cx)) / float(camera.fx)
@@ -54,7 +54,7 @@ def frustum_corners(camera: Camera, T_world_camera: np.ndarray, depth: float) ->
 
 
 def frustum_segments(camera: Camera, T_world_camera: np.ndarray, depth: float) -> np.ndarray:
-    """The edges of a camera's pyramid, and a tick on its upper side, [9, 2, 3] float32 [m]."""
+    """Returns a camera's pyramid, its edges and a tick on its upper side, [9, 2, 3] float32 [m]."""
     corners = frustum_corners(camera, T_world_camera, depth)
     apex = np.repeat(T_world_camera[None, :3, 3], 4, axis=0)
     sides = np.stack([apex, corners], axis=1)

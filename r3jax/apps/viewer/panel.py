@@ -115,11 +115,11 @@ class _Section:
         return self._handle.content
 
     def show(self, content: str) -> None:
-        """What belongs to the newest question."""
+        """Marks the content as that of the newest question."""
         self._shown, self._handle.content = content, content
 
     def mark(self, text: str) -> None:
-        """What is shown belongs to an older question; says what is being done."""
+        """Marks the content as that of an older question; says what is being done."""
         stale = stale_html(self._shown, text)
         if self._handle.content != stale:
             self._handle.content = stale
@@ -160,7 +160,7 @@ class Controls:
         self._place.visible = self._layers[names[0]].has_score
 
     def _add_view(self, gui: viser.GuiApi, menu: Menu) -> None:
-        """The view on the slider."""
+        """Shows the view on the slider."""
         last, is_live = max(menu.num_views, 1), menu.is_live
         self._step = gui.add_slider("view", 1, max(last, 2), 1, last, hint=_VIEW_HINT)
         self._follow = gui.add_checkbox(
@@ -249,19 +249,19 @@ class Controls:
         self._step.value = step + 1
 
     def show_view(self, content: str) -> None:
-        """The view on the slider."""
+        """Shows the view on the slider."""
         self._facts.show(content)
 
     def show_numbers(self, content: str) -> None:
-        """The dragged camera's numbers."""
+        """Shows the dragged camera's numbers."""
         self._numbers.show(content)
 
     def show_pictures(self, content: str) -> None:
-        """The dragged camera's pictures."""
+        """Shows the dragged camera's pictures."""
         self._pictures.show(content)
 
     def mark_camera_stale(self) -> None:
-        """What stands beside the dragged camera belongs to another pose or moment."""
+        """Marks the dragged camera's numbers as those of another pose or moment."""
         self._numbers.mark("")
         self._pictures.mark("being computed …")
 
@@ -270,13 +270,13 @@ class Controls:
         self._facts.mark(f"opening view {step + 1} …")
 
     def show_busy(self, text: str, share: float) -> None:
-        """What is being computed, and which share of it is done; the scene shows the old yet."""
+        """Shows what is being computed, and the share that is done."""
         with self._server.atomic():
             self._legend.content = busy_html(text, self._caption)
             self._bar.value, self._bar.visible = 100.0 * share, True
 
     def show_legend(self, content: str) -> None:
-        """What is drawn from now on."""
+        """Describes the drawing from now on."""
         self._caption = content
         with self._server.atomic():
             self._legend.content, self._bar.visible = content, False
@@ -286,6 +286,6 @@ class Controls:
         self.show_legend(self._caption)
 
     def show_note(self, text: str) -> None:
-        """What went wrong or is missing; nothing: takes the line away."""
+        """Shows a problem; an empty text takes the line away."""
         with self._server.atomic():
             self._note.content, self._note.visible = note_html(text), bool(text)

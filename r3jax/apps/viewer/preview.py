@@ -212,7 +212,7 @@ def quick_preview_image(glance: QuickPreview, term: str) -> np.ndarray:
 def preview_pictures(
     look: CameraPreview, term: str = "renderability"
 ) -> list[tuple[str, np.ndarray]]:
-    """The view as R (or a term) sees it, as the splats show it, and as it is, as far as known.
+    """Draws the view as R (or a term), as the splats show it, and as it is, as far as known.
 
     Returns:
         Names and pictures, [H, W, 3] uint8 each.

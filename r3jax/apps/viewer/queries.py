@@ -559,7 +559,7 @@ class QueryHandler:
         return show
 
     def forget_view(self) -> None:
-        """What is shown of the view on the slider belongs to another one."""
+        """Forgets what is shown of the view on the slider: it belongs to another one."""
         self._view = None  # shown again even if the slider comes back
         self._canvas.show_lines("/candidates", np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), 0.0)
         self._candidates = None

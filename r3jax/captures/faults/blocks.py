@@ -235,7 +235,7 @@ def overlap(images: Sequence[BlockImage], first: int, second: int) -> Overlap:
 
 
 def overlaps(images: Sequence[BlockImage]) -> list[Overlap]:
-    """All pairs of neighbors that have enough in common to be compared, each in one order."""
+    """Lists the pairs of neighbors with enough in common to be compared, each in one order."""
     found = [overlap(images, *pair) for pair in neighbor_pairs(images).tolist()]
     return [pair for pair in found if len(pair.own) >= FEWEST]
 

@@ -319,7 +319,7 @@ class BenchmarkProgress(Bar):
         )
 
     def on_event(self, event: Event) -> None:
-        """Something happened to a cell."""
+        """Reports an event of a cell."""
         check_interrupt()
         name = event.cell.name
         if event.kind == "started":

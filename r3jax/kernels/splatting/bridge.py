@@ -122,6 +122,6 @@ def register() -> None:
 
 
 def register_per_gaussian() -> None:
-    """The same for what is summed up per Gaussian: who only renders does not wait for it."""
+    """Compiles the sums per Gaussian separately: rendering alone does not wait for them."""
     register()
     register_handlers({SQUARES: _squares, TALLIES: _tallies})

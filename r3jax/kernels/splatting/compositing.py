@@ -109,7 +109,7 @@ def tile_is_finished(state):
 
 @inlined
 def clear_tile(left, top, width, height, state):
-    """An empty tile: light passes the pixels of the image, and none beside it."""
+    """Clears a tile: light passes the pixels of the image, and none beside it."""
     state[:] = _ZERO
     for y in range(min(TILE, height - top)):
         state[TILE * y : TILE * y + min(TILE, width - left)] = _ONE

@@ -116,7 +116,7 @@ def _chunk(number, arrays):
 
 @parallel_kernel
 def adam_pass(scene, gradient, means, squares, rates, corrections, options, applied):
-    """One step, unless a number or its gradient is not finite, or the square of one is not.
+    """Takes one step, unless a number or its gradient is not finite, or the square of one is not.
 
     Args:
         scene: the five arrays, each flat; written.

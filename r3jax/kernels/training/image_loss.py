@@ -204,7 +204,7 @@ def _gradient_of_band(first, last, rgb, target, weights, slopes, gradient):
 
 @parallel_kernel
 def loss_pass(rgb, target, weight, workers, results, gradient):
-    """The loss, the mean squared error of the clipped image, and the gradient of the loss.
+    """Computes the loss, the mean squared error of the clipped image, and the gradient.
 
     Args:
         rgb: [H, W * 3].

@@ -141,7 +141,7 @@ class RaycastSimulator:
         return self._distance(np.asarray(points, dtype=np.float64))
 
     def segment_is_clear(self, a: np.ndarray, b: np.ndarray) -> bool:
-        """True if no surface lies on the straight line between the points `a` and `b` [3] [m]."""
+        """Returns True if no surface lies between the points `a` and `b` [3] [m]."""
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
         if np.array_equal(a, b):
             return True

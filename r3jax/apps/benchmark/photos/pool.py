@@ -109,7 +109,7 @@ def first_photos(pool: PhotoPool, num: int, seed: int) -> list[int]:
 
 
 def nearest_photos(pool: PhotoPool, chosen: list[int], num: int) -> np.ndarray:
-    """The `num` photos on offer, not chosen yet, that were taken nearest to the last chosen one.
+    """Lists the `num` photos on offer, not chosen yet, nearest to the last chosen one.
 
     Nearest by the distance between the cameras; of those at one place the one that is turned
     least, and then the first.

@@ -42,7 +42,7 @@ class Shape:
         return Shape(self.corners + np.array([x, y, z]), self.uv)
 
     def turned(self, degrees: Real, axis: str = "z") -> "Shape":
-        """The shape turned about a coordinate axis through the origin [deg], right-handed."""
+        """Turns the shape about a coordinate axis through the origin [deg], right-handed."""
         return Shape(self.corners @ rotation(degrees, axis).T, self.uv)
 
 
@@ -240,7 +240,7 @@ def curtain(width: Real, z0: Real, z1: Real, folds: int, depth: Real = 0.05) -> 
 
 
 def drape(low: Point, high: Point, hang: Real, ripple: Real = 0.015) -> Shape:
-    """A cloth that lies on the top of a box and hangs over three sides (not y = low) [m]."""
+    """Makes a cloth that covers the top of a box and hangs over three sides (not y = low) [m]."""
     (x0, y0, _), (x1, y1, top) = low, high
     width = x1 - x0
     across = np.linspace(-hang, width + hang, 25)

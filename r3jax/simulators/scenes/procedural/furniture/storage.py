@@ -12,7 +12,7 @@ from r3jax.simulators.scenes.procedural.shapes import box, combine, cylinder, pa
 def bookshelf(
     width: Real, height: Real, wood: Finish, seed: int, depth: Real = 0.3, thickness: Real = 1.0
 ) -> Model:
-    """An open shelf full of books (`thickness` 2: of binders), with objects between them."""
+    """Builds an open shelf full of books (`thickness` 2: binders), with objects in between."""
     rng = np.random.default_rng(seed)
     w, t = width / 2, 0.022
     floors = max(2, round(height / 0.36))
