@@ -40,32 +40,10 @@ _PATTERN = re.compile(rf"\b(?:{'|'.join(INSTEAD)})\b", re.IGNORECASE)
 _EXCEPTED = "words: ok"
 
 
-_NO_VERB = frozenset(
-    [
-        "The",
-        "A",
-        "An",
-        "What",
-        "Which",
-        "Who",
-        "How",
-        "Where",
-        "Why",
-        "True",
-        "False",
-        "Whether",
-        "All",
-        "Every",
-        "One",
-        "Some",
-        "Each",
-        "Something",
-        "Nothing",
-        "No",
-        "Those",
-        "That",
-    ]
-)
+_NO_VERB = {
+    *("The", "A", "An", "What", "Which", "Who", "How", "Where", "Why", "True", "False", "Whether"),
+    *("All", "Every", "One", "Some", "Each", "Something", "Nothing", "No", "Those", "That"),
+}
 """First words of docstrings that describe a value in place of the function."""
 
 
