@@ -1,17 +1,21 @@
-"""Where somebody could stand in a captured place, to take an image or to look at the result.
+"""Where somebody could hold a camera in a captured place, to take an image or to look around.
 
 With depth images the places lie in known free space, a margin from everything that is not known to
 be free, connected to where the camera was, at heights at which it was held. Without, they lie
 within the hull of the camera's positions and a margin round it, a margin from every voxel, and
-where a camera was or a ray to a point passed: not inside of walls.
+where a camera was or a ray to a point passed: not inside of walls. Where the floor is known,
+somebody must be able to stand there, or to reach there with an arm.
 
-Shape symbols: n cameras; m voxels; c places.
+Shape symbols: n cameras; m voxels; c places; p places that are chosen.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import Delaunay, KDTree
 
+from r3jax.captures.ground import ground_of
 from r3jax.captures.survey import MARGIN
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
@@ -27,12 +31,42 @@ _MOST_LATTICE = 40_000
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
 
-def standpoints_of(
-    state: MapState, grid: OccupancyGrid, cameras: np.ndarray, num: int, is_dense: bool
-) -> np.ndarray:
-    """Returns places where somebody could stand, spread.
+_OVER = 4
+"""At most one place in this many is only reached with an arm."""
 
-    Where no space is known to be free, the cameras.
+
+@dataclass(frozen=True)
+class Places:
+    """Where views are looked for, each far from those before it; standing room first."""
+
+    eyes: np.ndarray
+    """Positions of the camera, [p, 3] [audit units]."""
+
+    feet: np.ndarray
+    """Where one stands to hold it there, [p, 3] [audit units]; NaN: not known."""
+
+    num_standing: int
+    """As many, the first ones, are over one's feet; the others are reached with an arm."""
+
+    is_checked: bool
+    """False if the floor is not known: then nothing is said of standing."""
+
+    @property
+    def standing(self) -> np.ndarray:
+        """Places over one's feet, [q, 3]; all of them where the floor is not known."""
+        return self.eyes[: self.num_standing]
+
+
+def places_of(
+    state: MapState,
+    grid: OccupancyGrid,
+    cameras: np.ndarray,
+    num: int,
+    *,
+    is_dense: bool,
+    meter: float | None,
+) -> Places:
+    """Spreads places where somebody could hold a camera.
 
     Args:
         state: the map of the capture.
@@ -40,19 +74,32 @@ def standpoints_of(
         cameras: where the camera was, [n, 3] [audit units].
         num: places at most.
         is_dense: True if depth images say where space is free.
+        meter: a meter [audit units]; None: the capture's unit is not known.
 
     Returns:
-        Up to `num` places [p, 3], each far from those before it.
+        Places in known free space; where there is none, places of the cameras.
     """
+    voxels = np.asarray(state.center, np.float64).T[np.asarray(state.occupied)]
     if is_dense:
-        places = places_in_free_space(grid, cameras)
+        found = places_in_free_space(grid, cameras)
     else:
-        centers = np.asarray(state.center, np.float64).T[np.asarray(state.occupied)]
-        places = places_in_hull(cameras, centers)
-        places = places[is_free_at(grid, places)]
-    if not len(places):
-        places = cameras
-    return places[spread(places, num)]
+        found = places_in_hull(cameras, voxels)
+        found = found[is_free_at(grid, found)]
+    if not len(found):
+        found = cameras
+    ground = ground_of(grid, voxels, cameras, meter) if is_dense else None
+    footing = None if ground is None else ground.footing(found)
+    if footing is None or footing.is_over.all():
+        eyes = found[spread(found, num)]
+        return Places(eyes, np.full_like(eyes, np.nan), len(eyes), is_checked=False)
+    standing = np.flatnonzero(~footing.is_over)
+    reached = np.flatnonzero(footing.is_over & footing.is_reached)
+    few = min(num // _OVER, len(reached))
+    standing = standing[spread(found[standing], num - few)]
+    if few:
+        reached = reached[spread(found[reached], few)]
+    rows = np.concatenate([standing, reached[:few]])
+    return Places(found[rows], footing.feet[rows], len(standing), is_checked=True)
 
 
 def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ from r3jax.captures.camera_paths import CameraPath
 from r3jax.captures.capture_maps import Seen, see
 from r3jax.captures.faults.faults import Faults, find_faults, stray_finding
 from r3jax.captures.source import Source, thinned
-from r3jax.captures.standpoints import standpoints_of
+from r3jax.captures.standpoints import Places, places_of
 from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.errors import InputError
 from r3jax.formats.lenses import Lens
@@ -86,11 +86,11 @@ class Audit:
     lens: Lens
     """Lens of the suggested views: that of most images."""
 
-    places: np.ndarray
-    """Where views were looked for, [p, 3] [audit units]."""
+    places: Places
+    """Where views were looked for."""
 
     standpoints: np.ndarray
-    """From where surfaces were evaluated, the first of the places, [q, 3] [audit units]."""
+    """From where surfaces were evaluated, the first places to stand, [q, 3] [audit units]."""
 
     frames: tuple[EvaluatedFrame, ...]
     """The path."""
@@ -218,8 +218,15 @@ def audit(
     lens = Counter(source.lenses).most_common(1)[0][0]
     camera = thinned(lens.camera, source.stride)
     cameras = survey.alignment.points(source.poses[survey.chosen, :3, 3])
-    places = standpoints_of(seen.state, seen.grid, cameras, settings.num_places, source.is_dense)
-    standpoints = places[: settings.num_standpoints]
+    places = places_of(
+        seen.state,
+        seen.grid,
+        cameras,
+        settings.num_places,
+        is_dense=source.is_dense,
+        meter=survey.alignment.scale if source.is_metric else None,
+    )
+    standpoints = places.standing[: settings.num_standpoints]
     on_progress("evaluating frames", 0)
     frames = tuple(_evaluated_frames(source, survey, seen, config, path, step, on_progress))
     open_grid = _open_grid(source, survey, seen, cameras, config)
@@ -228,7 +235,14 @@ def audit(
     known = jnp.asarray(known_rows(seen.state, source.is_complete))
     task = Task(camera, Demand(demand.position, demand.visible & known[None]), config)
     plan = suggest(
-        seen.state, open_grid, task, places, settings.views, seed=settings.seed, on_view=step
+        seen.state,
+        open_grid,
+        task,
+        places,
+        settings.views,
+        start=cameras[-1],
+        seed=settings.seed,
+        on_view=step,
     )
     edges = np.asarray(open_grid.unexplored)
     return Audit(

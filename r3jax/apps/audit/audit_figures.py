@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
@@ -11,7 +12,9 @@ from matplotlib.patches import Circle
 from r3jax.apps.audit.audit import Audit, EvaluatedFrame
 from r3jax.apps.audit.bad_regions import BLOCK, Region
 from r3jax.apps.audit.diagnosis import known_rows
-from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, region_label
+from r3jax.apps.audit.directions import Way, likest_picture
+from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE
+from r3jax.apps.audit.sentences import region_letter
 from r3jax.apps.audit.suggest import Suggestion
 from r3jax.captures.source import projected
 from r3jax.mapping.state import MapState
@@ -19,13 +22,18 @@ from r3jax.plots import style
 from r3jax.plots.pictures import empty_directions, panorama_picture, show_renderability
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
-from r3jax.scoring.simulated import simulate_view
 
 _FINE_BUFFER = 320
 """Pixels along the longer side of images of the map."""
 
-_SAMPLED = 500
-"""Voxels of a view that are looked for in other images."""
+_SIDE = 2.4
+"""Width of a picture beside a view [inch]."""
+
+_SHOWS = 0.3
+"""An image that shows less of a view than this share does not help to find it."""
+
+_FILLED = 0.4
+"""A view of which the map shows less than this share of the pixels looks like nothing."""
 
 _NEAREST = 0.1
 """What is nearer to a camera is not in its image [audit units]."""
@@ -72,9 +80,15 @@ def gain_figure(audit: Audit) -> Figure:
         figure.subplots(), "What the views promise", "views taken", "mean R of the surfaces"
     )
     start = audit.diagnosis.mean
-    chosen = [start, *(view.mean_after for view in audit.plan.views)]
+    chosen = [start, *(view.mean_after for view in audit.plan.ranked)]
     drawn = [start, *audit.plan.random_mean]
-    axes.plot(chosen, color=style.ACCENT, linewidth=2.0, marker="o", label="suggested, in order")
+    axes.plot(
+        chosen,
+        color=style.ACCENT,
+        linewidth=2.0,
+        marker="o",
+        label="suggested, the most useful first",
+    )
     axes.plot(drawn, color="#9ca3af", linewidth=1.5, marker="o", markersize=3,
               label="at random places and directions")  # fmt: skip
     axes.set_xticks(range(len(chosen)))
@@ -108,25 +122,76 @@ def panorama_strip(audit: Audit, count: int = 3) -> Figure:
     return figure
 
 
-def view_figures(audit: Audit) -> list[Figure]:
-    """Draws the nearest image, the map, and R before and after for each suggested view."""
+def view_pictures(audit: Audit, view: Suggestion, way: Way) -> list[tuple[Figure, str]]:
+    """Draws what helps to find a view, each with its caption.
+
+    The picture where one stands, with an arrow to where to turn; the one that shows most of what
+    is to be taken, with a ring round it; and the map from there, where it shows enough.
+    """
+    labels = audit.source.labels
+    pictures: list[tuple[Figure, str]] = []
+    like, share = likest_picture(audit.source, audit.survey, audit.seen, view)
+    if audit.source.has_images:
+        start = _photo(audit, way.start)
+        _draw_turn(start.axes[0], way.turn)
+        pictures.append((start, f"stand where {labels[way.start]} was taken"))
+        if share >= _SHOWS:
+            target = _photo(audit, like)
+            _draw_target(target.axes[0], audit, view, like)
+            pictures.append((target, f"take this (here in {labels[like]})"))
     fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
-    figures: list[Figure] = []
-    state = audit.seen.state
-    for view in audit.plan.views:
-        pose = jnp.asarray(view.pose, dtype=jnp.float32)
-        after, _ = simulate_view(state, audit.camera, pose, audit.config)
-        colors, before = _pictures(state, audit, view.pose, fine)
-        _, later = _pictures(after, audit, view.pose, fine)
-        like, _ = likest_picture(audit, view)
-        photo, _ = audit.source.read(like)
-        named = f"most similar so far: {_short(audit.source.labels[like])}"
-        figures.append(
-            _row((named, photo), ("the map from here", colors), ("R now", before),
-                 ("R once it is taken", later))
+    colors, value = _pictures(audit.seen.state, audit, view.pose, fine)
+    if float(np.isfinite(value).mean()) >= _FILLED:
+        pictures.append((_picture(colors), "what is known of it, seen from there"))
+        pictures.append((_picture(value), "how well that was seen: red to green"))
+    return pictures
+
+
+def _photo(audit: Audit, index: int) -> Figure:
+    """An image of the capture."""
+    return _picture(audit.source.read(index)[0])
+
+
+def _picture(picture: np.ndarray) -> Figure:
+    """One image, as colors or as renderability, without anything round it."""
+    figure = style.new_figure(_SIDE, _SIDE * picture.shape[0] / picture.shape[1])
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.axis("off")
+    if picture.ndim == 2:
+        figure.set_facecolor("#e5e7eb")
+        axes.imshow(picture, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0, aspect="auto")
+    else:
+        axes.imshow(picture, aspect="auto")
+    return figure
+
+
+def _draw_turn(axes: Axes, turn: float) -> None:
+    """An arrow to the side to which to turn [deg], longer for a larger turn."""
+    if abs(turn) < 10.0:
+        return
+    reach = 0.12 + 0.3 * min(abs(turn), 180.0) / 180.0
+    end = 0.5 - reach if turn > 0 else 0.5 + reach
+    for width, color in ((7.0, "white"), (4.0, "#0284c7")):
+        axes.annotate(
+            "", (end, 0.5), (0.5, 0.5), xycoords="axes fraction", textcoords="axes fraction",
+            arrowprops={"arrowstyle": "-|>", "linewidth": width, "color": color,
+                        "mutation_scale": 18},
         )  # fmt: skip
-        state = after
-    return figures
+
+
+def _draw_target(axes: Axes, audit: Audit, view: Suggestion, index: int) -> None:
+    """A ring round the middle of what a view shows, in an image of the capture."""
+    pose = audit.survey.alignment.poses(audit.source.poses[[index]])[0]
+    centers = np.asarray(audit.seen.state.center, np.float64).T[view.shown]
+    found = projected(audit.source.camera(index), pose, centers, _NEAREST)
+    column, row = (np.median(values[found.is_in]) for values in (found.column, found.row))
+    height, width = audit.source.read(index)[0].shape[:2]
+    for thick, color in ((5.0, "white"), (2.6, "#0284c7")):
+        axes.add_patch(
+            Circle((float(column), float(row)), 0.22 * min(height, width), fill=False,
+                   edgecolor=color, linewidth=thick)
+        )  # fmt: skip
 
 
 def worst_frames(audit: Audit, count: int = 4) -> list[EvaluatedFrame]:
@@ -161,25 +226,6 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
     return figure
 
 
-def likest_picture(audit: Audit, view: Suggestion) -> tuple[int, float]:
-    """Finds the image with most of what a view shows, and how far away it was taken.
-
-    What hides it is not asked. A radian between the two axes and a unit between the two places
-    cost a tenth of the view each.
-    """
-    poses = audit.survey.alignment.poses(audit.source.poses[audit.survey.chosen])
-    distance = np.linalg.norm(poses[:, :3, 3] - view.pose[:3, 3], axis=1)
-    angle = np.arccos(np.clip(poses[:, :3, 2] @ view.pose[:3, 2], -1.0, 1.0))
-    centers = np.asarray(audit.seen.state.center, np.float64).T[view.shown]
-    centers = centers[:: max(1, len(centers) // _SAMPLED)]
-    shares: list[float] = []
-    for index, pose in zip(audit.survey.chosen.tolist(), poses, strict=True):
-        found = projected(audit.source.camera(index), pose, centers, _NEAREST)
-        shares.append(float(found.is_in.mean()) if len(centers) else 0.0)
-    best = int(np.argmax(np.asarray(shares) - 0.1 * (distance + angle)))
-    return int(audit.survey.chosen[best]), float(distance[best])
-
-
 def _pictures(
     state: MapState, audit: Audit, pose: np.ndarray, config: ScoringConfig
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -191,20 +237,6 @@ def _pictures(
     is_hit &= known_rows(audit.seen.state, audit.source.is_complete)[row]
     colors = np.where(is_hit[..., None], np.asarray(state.mean).T[row], _EMPTY)
     return colors, np.where(is_hit, np.asarray(seen.value), np.nan)
-
-
-def _row(*pictures: tuple[str, np.ndarray]) -> Figure:
-    """Images side by side, each under its name; those without colors are renderability."""
-    aspect = max(picture.shape[0] / picture.shape[1] for _, picture in pictures)
-    figure, (line,) = style.picture_grid(1, len(pictures), aspect, 0.25)
-    for axes, (name, picture) in zip(line, pictures, strict=True):
-        style.caption(axes, name)
-        if picture.ndim == 2:
-            axes.set_facecolor("#e5e7eb")
-            axes.imshow(picture, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
-        else:
-            axes.imshow(picture)
-    return figure
 
 
 def _short(name: str) -> str:
@@ -297,7 +329,7 @@ def region_figure(audit: Audit) -> Figure | None:
         axes.set_xlim(0, photo.shape[1])
         axes.set_ylim(photo.shape[0], 0)
         axes.set_title(
-            f"{region_label(number)}: {region.cause}", fontsize=9, color=color, loc="left", pad=2,
+            f"{region_letter(number)}: {region.cause}", fontsize=9, color=color, loc="left", pad=2,
             fontweight="bold",
         )  # fmt: skip
     return figure

@@ -10,7 +10,8 @@ from r3jax.apps.audit import audit_figures, sentences
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import Region
 from r3jax.apps.audit.diagnosis import NOT_KNOWN
-from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, plan_figure, region_label
+from r3jax.apps.audit.directions import way_to
+from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, plan_figure, value_figure
 from r3jax.apps.audit.outputs import suggested_poses
 from r3jax.apps.audit.suggest import Suggestion
 from r3jax.captures.faults.faults import Finding
@@ -63,13 +64,19 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         "apps/audit/audit_page.html",
         kind="audit",
         title=f"Audit of {audit.source.name}",
-        lead=sentences.verdict(audit),
-        cards=_cards(audit),
+        lead=[],
+        cards={},
+        state=sentences.state(audit),
+        headline=sentences.headline(audit),
+        advice=sentences.advice(audit, TITLES),
+        verdict=sentences.verdict(audit),
+        numbers=_cards(audit),
         colors=COLOR_OF_CAUSE,
         is_complete=audit.source.is_complete,
         is_own_path=audit.is_own_path,
         pictures=picture_faults(audit),
         plan=to_png(plan_figure(audit)),
+        values=to_png(value_figure(audit)),
         causes=_causes(audit),
         block=sentences.length(audit, 1.0),
         region_pictures=None if region_figure is None else to_png(region_figure),
@@ -97,10 +104,10 @@ def _cards(audit: Audit) -> dict[str, str]:
     cards = {what: str(len(audit.survey.chosen))}
     if audit.source.is_complete:
         bad = (1.0 - found.fine_share) * found.is_seen.sum() * audit.survey.voxel_size**2
-        cards["of the surface renders well"] = fine
-        cards["of surface that needs more views"] = sentences.area(audit, float(bad))
+        cards["of the surface is seen well enough"] = fine
+        cards["of surface to mend, all sides counted"] = sentences.area(audit, float(bad))
     else:
-        cards["of what they show renders well"] = fine
+        cards["of what they show is seen well enough"] = fine
         cards["of it is not known"] = f"{100 * audit.shares[audit.unknown]:.0f} %"
     where = "" if audit.source.is_complete else ", where it is known"
     cards[f"mean R of the frames{where}"] = f"{audit.mean_renderability:.2f}"
@@ -213,7 +220,7 @@ def _regions(audit: Audit) -> list[dict[str, Any]]:
         center = audit.survey.alignment.points_back(region.center[None])[0]
         rows.append(
             {
-                "letter": region_label(number),
+                "letter": sentences.region_letter(number),
                 "cause": region.cause,
                 "area": sentences.area(audit, region.area),
                 "name": region.cause.replace("_", " "),
@@ -238,20 +245,23 @@ def _views(audit: Audit) -> list[dict[str, Any]]:
     The way to it, why it is suggested, where it is, what it shows.
     """
     described: list[dict[str, Any]] = []
-    figures = audit_figures.view_figures(audit)
     regions = audit.all_regions
-    for view, pose, figure in zip(audit.plan.views, suggested_poses(audit), figures, strict=True):
-        like, gap = audit_figures.likest_picture(audit, view)
-        letters = [region_label(i) for i, region in enumerate(regions) if _shows(view, region)]
+    for view, pose in zip(audit.plan.views, suggested_poses(audit), strict=True):
+        way = way_to(audit.source, audit.survey, audit.seen, view)
+        letters = [
+            sentences.region_letter(i) for i, region in enumerate(regions) if _shows(view, region)
+        ]
         described.append(
             {
-                "directions": sentences.directions(audit, view, like),
+                "directions": way.text,
                 "reason": sentences.reason(audit, view, letters),
-                "near": audit.source.labels[like],
-                "gap": sentences.length(audit, gap),
+                "rank": view.rank,
                 "position": sentences.point(pose[:3, 3]),
                 "ahead": sentences.point(pose[:3, 2]),
-                "png": to_png(figure),
+                "pictures": [
+                    {"png": to_png(figure), "caption": caption}
+                    for figure, caption in audit_figures.view_pictures(audit, view, way)
+                ],
             }
         )
     return described

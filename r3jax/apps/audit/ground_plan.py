@@ -13,6 +13,7 @@ from matplotlib.patheffects import withStroke
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import BLOCK, Region
 from r3jax.apps.audit.diagnosis import CAUSES, NOT_KNOWN, Diagnosis
+from r3jax.apps.audit.sentences import region_letter
 from r3jax.captures.alignment import Alignment
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture
@@ -51,6 +52,9 @@ def _rgb(color: str) -> tuple[int, int, int]:
     return value >> 16, (value >> 8) & 255, value & 255
 
 
+Extent = tuple[float, float, float, float]
+"""Left, right, bottom and top of a picture."""
+
 _HEADROOM = 0.35
 """As in `floor_picture`: what lies higher above the cameras is left out [audit units]."""
 
@@ -60,7 +64,13 @@ _WEDGE = 0.45
 _TOO_NEAR = 0.35
 """Letters nearer to each other than this would cover each other [audit units]."""
 
-_MARKER = 0.24
+_WIDTH = 4.2
+"""Width of a map [inch]: its letters can be read on a phone."""
+
+LETTERED, _DARK = 5, 3
+"""Regions, and places where the capture ends, that the plan names: more letters hide it."""
+
+_MARKER = 0.3
 """Width of a numbered marker [inch]."""
 
 _PUSHES = 200
@@ -74,48 +84,64 @@ _PALE = 0.55
 """How much white covers the colors below marks."""
 
 
-def region_label(number: int) -> str:
-    """Returns a, B, ... of the regions."""
-    return chr(ord("A") + number) if number < 26 else str(number + 1)
-
-
 def plan_figure(audit: Audit) -> Figure:
-    """Returns two maps: regions, frames and suggested views; and renderability of all surfaces."""
-    heights = np.array([frame.pose[2, 3] for frame in audit.frames])
-    height = float(np.median(heights))
+    """Map of regions, frames and suggested views, to be read on a phone."""
+    height = _height(audit)
     picture, extent = floor_picture(audit.seen.state, audit.seen.grid, height)
-    low, high = _used(audit, height)
-    size = high - low
-    is_wide = size[0] > 1.15 * size[1]
-    panel = 8.6 if is_wide else 4.3  # inches
-    height_of_all = (2.0 if is_wide else 1.0) * (panel * size[1] / size[0] + 0.55)
-    figure = style.new_figure(10.0, float(np.clip(height_of_all, 3.5, 16.0)))
-    panels = figure.subplots(*((2, 1) if is_wide else (1, 2)))
+    figure, axes, size = _map(audit, height)
     unit = 1.0 / audit.survey.alignment.scale
-    shown = tuple(unit * value for value in extent)
-    for axes, title in zip(
-        panels, ("What to mend, and from where", "Renderability of the surfaces"), strict=True
-    ):
-        labels = [ground_label(audit, axis) for axis in (0, 1)]
-        style.dress(axes, title, *labels).grid(visible=False)
-        axes.set_xlim(unit * low[0], unit * high[0])
-        axes.set_ylim(unit * low[1], unit * high[1])
-        axes.set_aspect("equal")
-    left, right = panels
     pale = _PALE + (1.0 - _PALE) * picture
-    left.imshow(pale, origin="lower", extent=shown, interpolation="nearest")
-    left.set_facecolor("#eef0f3")
-    _draw_path(left, audit, unit)
-    _draw_regions(left, audit, unit)
-    _draw_views(left, audit, unit, float(_MARKER * max(size) / panel))
+    axes.imshow(pale, origin="lower", extent=_scaled(extent, unit), interpolation="nearest")
+    # Coordinates are in the tables: a person needs to see how far it is.
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_xlabel("")
+    axes.set_ylabel("")
+    _draw_scale(axes, audit)
+    _draw_path(axes, audit, unit)
+    _draw_regions(axes, audit, unit)
+    _draw_views(axes, audit, unit, float(_MARKER * max(size) / _WIDTH))
+    return figure
+
+
+def value_figure(audit: Audit) -> Figure:
+    """Map of the renderability of all surfaces."""
+    height = _height(audit)
+    figure, axes, _ = _map(audit, height)
+    unit = 1.0 / audit.survey.alignment.scale
     values, where = _value_picture(audit, height)
-    right.set_facecolor("#eef0f3")
-    image = right.imshow(
-        values.T, origin="lower", extent=[unit * v for v in where], cmap=style.SCORE_MAP, vmin=0,
+    image = axes.imshow(
+        values.T, origin="lower", extent=_scaled(where, unit), cmap=style.SCORE_MAP, vmin=0,
         vmax=1, interpolation="nearest",
     )  # fmt: skip
-    style.color_bar(figure, image, panels, "renderability R")
+    style.color_bar(figure, image, [axes], "renderability R")
     return figure
+
+
+def _scaled(extent: Extent, unit: float) -> Extent:
+    left, right, bottom, top = extent
+    return unit * left, unit * right, unit * bottom, unit * top
+
+
+def _height(audit: Audit) -> float:
+    """Typical height of the cameras."""
+    return float(np.median([frame.pose[2, 3] for frame in audit.frames]))
+
+
+def _map(audit: Audit, height: float) -> tuple[Figure, Axes, np.ndarray]:
+    """An empty map of the place, and its size [2] [audit units]."""
+    low, high = _used(audit, height)
+    size = high - low
+    figure = style.new_figure(_WIDTH, float(np.clip(_WIDTH * size[1] / size[0] + 0.5, 3.0, 11.0)))
+    axes = figure.subplots()
+    labels = [ground_label(audit, axis) for axis in (0, 1)]
+    style.dress(axes, "", *labels).grid(visible=False)
+    unit = 1.0 / audit.survey.alignment.scale
+    axes.set_xlim(unit * low[0], unit * high[0])
+    axes.set_ylim(unit * low[1], unit * high[1])
+    axes.set_aspect("equal")
+    axes.set_facecolor("#eef0f3")
+    return figure, axes, size
 
 
 def ground_label(audit: Audit, axis: int) -> str:
@@ -156,11 +182,8 @@ def _below(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
     return centers[is_below], found.value[is_below]
 
 
-def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Returns the mean renderability of the columns of voxels, [x, y], NaN without any.
-
-    And its extent.
-    """
+def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, Extent]:
+    """Mean renderability of the columns of voxels, [x, y], NaN without any; and its extent."""
     centers, values = _below(audit, height)
     low, high = np.percentile(centers[:, :2], [0.2, 99.8], axis=0)
     size = max(audit.survey.voxel_size, float((high - low).max()) / _MOST_PIXELS)
@@ -175,6 +198,19 @@ def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, tuple[float
     mean = np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape)
     corner, end = low * size, (low + shape) * size
     return mean, (corner[0], end[0], corner[1], end[1])
+
+
+def _draw_scale(axes: Axes, audit: Audit) -> None:
+    """A bar as long as a unit of the capture, or a round number of them."""
+    left, right = axes.get_xlim()
+    bottom, top = axes.get_ylim()
+    length = 10.0 ** np.floor(np.log10(max(right - left, 1e-9) / 2.0))
+    x, y = left + 0.04 * (right - left), bottom + 0.04 * (top - bottom)
+    axes.plot([x, x + length], [y, y], color=style.INK, linewidth=3.0, solid_capstyle="butt")
+    axes.annotate(
+        f"{length:g} {audit.survey.unit}", (x + 0.5 * length, y), (0, 4), fontsize=10,
+        textcoords="offset points", ha="center", color=style.INK, path_effects=[_HALO],
+    )  # fmt: skip
 
 
 def _draw_path(axes: Axes, audit: Audit, unit: float) -> None:
@@ -195,8 +231,12 @@ def _draw_path(axes: Axes, audit: Audit, unit: float) -> None:
 
 def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
     """Bad regions as lettered circles in the color of their cause; unseen ones dotted."""
-    regions = audit.all_regions
-    for region in regions:
+    numbered = list(enumerate(audit.all_regions))
+    named = [
+        *[item for item in numbered if item[1].is_known][:LETTERED],
+        *[item for item in numbered if not item[1].is_known][:_DARK],
+    ]
+    for _, region in named:
         is_unseen = not region.is_known
         center, color = unit * region.center[:2], COLOR_OF_CAUSE[region.cause]
         radius = 0.5 * unit * BLOCK
@@ -212,27 +252,24 @@ def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
                 zorder=3,
             )
         )
-    for center, names, color in _labels(regions):
+    for center, names, color in _labels(named):
         axes.annotate(
-            names, tuple(unit * center), ha="center", va="center", fontsize=9,
+            names, tuple(unit * center), ha="center", va="center", fontsize=12,
             fontweight="bold", color=color, zorder=5, path_effects=[_HALO],
         )  # fmt: skip
 
 
-def _labels(regions: tuple[Region, ...]) -> list[tuple[np.ndarray, str, str]]:
-    """Returns where to write which letters in which color.
-
-    Regions above each other share a place.
-    """
+def _labels(regions: list[tuple[int, Region]]) -> list[tuple[np.ndarray, str, str]]:
+    """Where to write which letters in which color: regions above each other share a place."""
     places: list[tuple[np.ndarray, str, str]] = []
-    for number, region in enumerate(regions):
+    for number, region in regions:
         center = region.center[:2]
         for i, (place, names, color) in enumerate(places):
             if np.linalg.norm(place - center) < _TOO_NEAR:
-                places[i] = place, f"{names} {region_label(number)}", color
+                places[i] = place, f"{names} {region_letter(number)}", color
                 break
         else:
-            places.append((center, region_label(number), COLOR_OF_CAUSE[region.cause]))
+            places.append((center, region_letter(number), COLOR_OF_CAUSE[region.cause]))
     return places
 
 
@@ -276,7 +313,7 @@ def _draw_views(axes: Axes, audit: Audit, unit: float, least: float) -> None:
         )  # fmt: skip
         axes.annotate(
             str(number), tuple(unit * eye), tuple(unit * label), ha="center", va="center",
-            fontsize=8.5, fontweight="bold", color="white", zorder=7,
+            fontsize=11, fontweight="bold", color="white", zorder=7,
             arrowprops={"arrowstyle": "-", "color": "#075985", "linewidth": 0.8},
             bbox={"boxstyle": "circle,pad=0.18", "facecolor": "#075985", "edgecolor": "white",
                   "linewidth": 0.8},

@@ -161,6 +161,8 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "suggested": [
             {
                 "camera_to_world_opengl": (pose @ OPENGL_FROM_OPENCV).tolist(),
+                "rank": view.rank,
+                "held_out_over_something": view.is_over,
                 "gain_in_voxels": view.gain,
                 "unseen_cells": len(view.cells),
                 "voxels_shown": len(view.shown),

@@ -1,6 +1,6 @@
-"""What an audit says in words, on the page and on the console; the path to a view as directions."""
+"""The words of an audit, for the page and the console."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 from r3jax.captures.alignment import AXES
 
 MEANING = {
-    "fine": f"R ≥ {FINE:g} from where a person would stand",
+    "fine": f"seen well enough: R of at least {FINE:g} from where people stand",
     "angle": "seen, but only from directions far from those in which one would look at it",
-    "rare": f"seen in fewer than {FEW} pictures",
+    "rare": f"only {FEW - 1} pictures or fewer show it, none of them from where one would look",
     "distance": "only seen from farther away than one would look at it",
     "noise": "its color differs from picture to picture: reflections, exposure, poses that are off",
     "unseen": "free space ends there in something that no picture shows",
@@ -23,7 +23,7 @@ MEANING = {
 REMEDY = {
     "fine": "",
     "angle": "go round it: pictures from the missing sides",
-    "rare": "take more pictures of it, from several places",
+    "rare": "take a picture of it from where people would look at it",
     "distance": "go nearer",
     "noise": "lock exposure and white balance; avoid reflections; check the poses",
     "unseen": "look into it, if it belongs to the place",
@@ -31,12 +31,31 @@ REMEDY = {
 }
 """What one can do."""
 
-_SHORT = {
+SHORT = {
     "angle": "only from other angles",
     "rare": "too rarely",
     "distance": "only from too far away",
     "noise": "in contradictory colors",
 }
+"""How a surface was seen that suffers from a cause."""
+
+_DO = {
+    "angle": "Go round",
+    "rare": "Take more pictures",
+    "distance": "Go nearer",
+    "noise": "Keep the light even",
+}
+"""What to do against a cause, in a word or two."""
+
+GOOD, _AGAIN = 0.85, 0.3
+"""Shares seen well enough: from the first on a capture is good for splats; below the second hardly
+anything can be kept."""
+
+_SEVERE = ("pose", "scale", "ray", "camera", "stray")
+"""Faults that spoil a model, however much is seen."""
+
+_LEAST_TOLD, _THINGS = 0.03, 3
+"""Share from which on a cause is among the things to do; and how many of these there are."""
 
 _MOST_SAID = 4
 """Findings on single pictures that the summary repeats."""
@@ -126,16 +145,15 @@ def _surfaces(audit: Audit) -> str:
         )
     shares = {cause: cause_share(audit, cause) for cause in _ORDINARY}
     ordered = sorted(shares, key=lambda cause: -shares[cause])
-    parts = [f"{100 * shares[c]:.0f} % is seen {_SHORT[c]}" for c in ordered if shares[c] >= 0.005]
+    parts = [f"{100 * shares[c]:.0f} % is seen {SHORT[c]}" for c in ordered if shares[c] >= 0.005]
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
     if audit.source.is_complete:
-        start = f"{fine} of the visible surface"
+        start = f"{fine} of the surface that a person sees from where one can stand"
     else:
         start = f"{fine} of what the {'pictures' if audit.is_own_path else 'frames'} show"
-        unknown = f"{100 * audit.shares[NOT_KNOWN]:.0f} %"
-        parts.append(f"{unknown} is not known ({MEANING[NOT_KNOWN]})")
+        parts.append(f"{_unknown(audit)} is not known ({MEANING[NOT_KNOWN]})")
     well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
-    return f"{start} would render well ({well})" + (f"; {listed(parts)}." if parts else ".")
+    return f"{start} is seen well enough ({well})" + (f"; {listed(parts)}." if parts else ".")
 
 
 def _promises(audit: Audit) -> list[str]:
@@ -240,12 +258,16 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
     parts: list[str] = []
     total = sum(view.causes.values())
     if view.num_mended:
-        parts.append(f"makes about {area(audit, view.num_mended * face)} render well")
+        parts.append(f"about {area(audit, view.num_mended * face)} is then seen well enough")
     if total:
         named = sorted(view.causes, key=lambda cause: -view.causes[cause])
-        shares = [f"{100 * view.causes[c] / total:.0f} % {c}" for c in named]
+        shares = [
+            f"{100 * view.causes[c] / total:.0f} % {c}"
+            for c in named
+            if view.causes[c] >= 0.005 * total
+        ]
         parts.append(
-            f"of {area(audit, total * face)} in sight that do not yet: {', '.join(shares)}"
+            f"of {area(audit, total * face)} in sight that is not yet: {', '.join(shares)}"
         )
     if len(view.cells):
         cells = area(audit, len(view.cells) * audit.survey.cell_size**2)
@@ -254,14 +276,6 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
     if names:
         parts.append(f"regions {', '.join(names)}" if len(names) > 1 else f"region {names[0]}")
     return "; ".join(parts) or "adds a direction to what it shows"
-
-
-def directions(audit: Audit, view: Suggestion, like: int) -> str:
-    """Describes the path from an image to a suggested view, as a person would follow it."""
-    here = audit.survey.alignment.poses(audit.source.poses[[like]])[0]
-    way = steps_between(here, view.pose, lambda value: length(audit, value))
-    parts = [f"Stand where {audit.source.labels[like]} was taken", *way]
-    return f"{', '.join(parts[:-1])} and {parts[-1]}."
 
 
 def method(audit: Audit) -> list[str]:
@@ -284,10 +298,12 @@ def method(audit: Audit) -> list[str]:
         "Renderability R (arXiv 2601.07484) of a surface for a place to look from is bias × noise "
         "× resolution: the angle to the nearest direction it was seen from, the consistency of "
         "its color, and the best distance it was seen from.",
-        f"Surfaces: every voxel is asked from those of {len(audit.standpoints)} "
+        f"Surfaces: every voxel is scored from those of {len(audit.standpoints)} "
         "standpoints that see it, with the camera of most pictures; its numbers are the means. "
-        "Areas count a face of a voxel each; where depth is noisy, walls are several voxels thick, "
-        "and areas too large by that.",
+        "Areas count one face of each voxel: floor, walls, ceiling and all sides of the furniture, "
+        "so several times the floor; where depth is noisy, walls are several voxels thick, and "
+        "areas too large by that.",
+        _standing(audit),
     ]
     pixels = (
         "; one that shows no voxel counts 0"
@@ -314,8 +330,8 @@ def method(audit: Audit) -> list[str]:
         f"{length(audit, 0.3)} from every voxel, where a camera was or a ray to a point passed"
     )
     sentences.append(
-        f"Views: of {len(audit.places)} places {where}, {DIRECTIONS} directions each, those of "
-        f"which {100 * OVERLAP:.0f} % or more show what is known (or a picture could not be "
+        f"Views: of {len(audit.places.eyes)} places {where}, {DIRECTIONS} directions each, those "
+        f"of which {100 * OVERLAP:.0f} % or more show what is known (or a picture could not be "
         "registered); "
         "of all these the one that raises the renderability of all surfaces most is imagined as "
         "taken before the next one is chosen. Surfaces that were never seen, and "
@@ -330,6 +346,106 @@ def method(audit: Audit) -> list[str]:
     return sentences
 
 
+def _standing(audit: Audit) -> str:
+    """Says whether a person can stand where the audit looks from."""
+    if not audit.places.is_checked:
+        return (
+            "Whether a person could stand at these places is not known: the floor below the "
+            "cameras was not seen, or no one walked there."
+        )
+    over = len(audit.places.eyes) - audit.places.num_standing
+    return (
+        "A person can stand at these places: between the shin and the head nothing is in the way, "
+        f"as far as depth shows. At {over} more places a camera can be held with an arm; views are "
+        "looked for there, too."
+    )
+
+
+def state(audit: Audit) -> str:
+    """Returns the verdict in one word: `good` for splats, `gaps`, or start `again`."""
+    survey, faults = audit.survey, audit.faults
+    if survey.doubt is not None or survey.is_one_place or not faults.fits:
+        return "again"
+    fine = cause_share(audit, "fine")
+    if fine < _AGAIN:
+        return "again"
+    severe = any(finding.kind in _SEVERE for finding in faults.findings)
+    return "good" if fine >= GOOD and not severe else "gaps"
+
+
+def headline(audit: Audit) -> str:
+    """Returns the verdict in one line."""
+    words = {"good": "Good for splats", "gaps": "Gaps", "again": "Start again"}[state(audit)]
+    if audit.survey.doubt is not None or not audit.faults.fits:
+        return f"{words}: depth and cameras contradict each other."
+    if audit.survey.is_one_place:
+        return f"{words}: all pictures were taken from one place."
+    fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
+    if audit.source.is_complete:
+        return (
+            f"{words}: {fine} of what a person sees from where one can stand is seen well enough."
+        )
+    return (
+        f"{words}: {fine} of what the pictures show is seen well enough; of {_unknown(audit)} "
+        "nothing is known."
+    )
+
+
+def advice(audit: Audit, titles: dict[str, str]) -> list[tuple[str, str]]:
+    """Chooses up to three things to do, the most important first: in bold, and the rest.
+
+    Args:
+        audit: what was found.
+        titles: heading of each kind of finding.
+    """
+    survey, faults = audit.survey, audit.faults
+    if survey.doubt is not None or not faults.fits:
+        return [("Check the depth and the poses", survey.doubt or CONTRADICTED)]
+    if survey.is_one_place:
+        return [("Take pictures from other places", "A step apart, round all that matters.")]
+    looked = max(1, faults.looked_at)
+    found = [
+        (1.0 if f.kind in _SEVERE else len(f.frames) / looked, titles[f.kind], f.todo)
+        for f in faults.findings
+    ]
+    found += _about_surfaces(audit)
+    if not audit.source.is_complete and audit.shares[NOT_KNOWN] >= _LEAST_TOLD:
+        unknown = f"Of {_unknown(audit)} nothing is known: {MEANING[NOT_KNOWN]}."
+        found.append((audit.shares[NOT_KNOWN], "Let pictures overlap more", unknown))
+    if audit.unseen:
+        whole = float(audit.diagnosis.is_seen.sum()) * survey.voxel_size**2
+        dark = f"About {area(audit, audit.unseen_area)} that no picture shows (dotted on the plan)."
+        share = audit.unseen_area / max(audit.unseen_area + whole, 1e-9)
+        found.append((share, "Look into what is dark", dark))
+    found.sort(key=lambda item: -item[0])
+    return [(what, text) for _, what, text in found[:_THINGS]]
+
+
+def _about_surfaces(audit: Audit) -> list[tuple[float, str, str]]:
+    """The suggested pictures, always among the things to do; or what else helps, by cause."""
+    missing = {cause: cause_share(audit, cause) for cause in _ORDINARY}
+    told = sorted((c for c in missing if missing[c] >= _LEAST_TOLD), key=lambda c: -missing[c])
+    if not audit.plan.views:
+        what = lambda c: f"{100 * missing[c]:.0f} % is seen {SHORT[c]}: {REMEDY[c]}."
+        return [(missing[c], _DO[c], what(c)) for c in told]
+    count = len(audit.plan.views)
+    seen = [f"{100 * missing[cause]:.0f} % {SHORT[cause]}" for cause in told]
+    rest = f"What was seen {listed(seen)} is in sight there." if seen else "Little is missing."
+    return [
+        (1.0, "Take the picture below" if count == 1 else f"Take the {count} pictures below", rest)
+    ]
+
+
+def _unknown(audit: Audit) -> str:
+    """Share of what the frames show of which nothing is known."""
+    return f"{100 * audit.shares[NOT_KNOWN]:.0f} %"
+
+
+def region_letter(number: int) -> str:
+    """A, B, ... of the regions."""
+    return chr(ord("A") + number) if number < 26 else str(number + 1)
+
+
 def _ordinal(count: int) -> str:
     if 10 <= count % 100 <= 20:
         return f"{count}th"
@@ -341,42 +457,3 @@ def _up_name(up: np.ndarray) -> str:
     if abs(up[best]) > 0.9999:
         return ("-" if up[best] < 0.0 else "") + list(AXES)[best]
     return f"({point(up)})"
-
-
-def steps_between(here: np.ndarray, there: np.ndarray, length: Callable[[float], str]) -> list[str]:
-    """Returns what to do to get from one view to another: go, hold higher, turn, look up.
-
-    Forward and left are those of the view where one is, in the plane; a view that looks straight up
-    or down is faced as its upper edge.
-
-    Args:
-        here: `T_world_camera`, [4, 4], z up.
-        there: the same, of the view to take.
-        length: writes a length of that world.
-    """
-    axis = here[:3, 2] if np.hypot(*here[:2, 2]) > 0.05 else -here[:3, 1]
-    forward = axis[:2] / np.hypot(*axis[:2])
-    offset = there[:3, 3] - here[:3, 3]
-    ahead = float(offset[:2] @ forward)
-    left = float(forward[0] * offset[1] - forward[1] * offset[0])
-    moves = [
-        f"{length(abs(amount))} {forth if amount > 0 else back}"
-        for amount, forth, back in (
-            (ahead, "forward", "back"), (left, "to the left", "to the right"),
-        )
-        if abs(amount) >= 0.05
-    ]  # fmt: skip
-    parts = [f"go {' and '.join(moves)}"] if moves else []
-    if abs(offset[2]) >= 0.05:
-        higher = "higher" if offset[2] > 0 else "lower"
-        parts.append(f"hold the camera {length(abs(float(offset[2])))} {higher}")
-    looks = there[:3, 2]
-    elevation = np.degrees(np.arcsin(np.clip(looks[2], -1.0, 1.0)))
-    if abs(elevation) < 80.0:
-        turn = np.degrees(np.arctan2(forward[0] * looks[1] - forward[1] * looks[0],
-                                     forward @ looks[:2]))  # fmt: skip
-        side = "left" if turn > 0 else "right"
-        parts.append(f"turn {abs(turn):.0f}° {side}" if abs(turn) >= 5.0 else "do not turn")
-    way = "up" if elevation > 0 else "down"
-    parts.append("look level" if abs(elevation) < 5.0 else f"look {abs(elevation):.0f}° {way}")
-    return parts

@@ -42,6 +42,7 @@ from r3jax.apps.audit.diagnosis import (
     diagnose,
     score_from_standpoints,
 )
+from r3jax.captures.standpoints import Places
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.selection import for_selected
@@ -198,12 +199,22 @@ class Suggestion:
     fine_after: float
     """Share of the surfaces that are fine once it is taken."""
 
+    rank: int
+    """1 for the view that was chosen first; the numbers after it count those of lower rank."""
+
+    feet: np.ndarray
+    """Where one stands to take it, [3] [audit units]; NaN: not known."""
+
+    is_over: bool
+    """True if the camera is held out from there with an arm."""
+
 
 @dataclass(frozen=True)
 class SuggestedViews:
-    """The suggested views, in order, and what they promise."""
+    """The suggested views, and what they promise."""
 
     views: tuple[Suggestion, ...]
+    """In the order of a walk."""
 
     before: Diagnosis
     """Diagnosis of the capture as it is."""
@@ -213,6 +224,11 @@ class SuggestedViews:
 
     random_mean: tuple[float, ...]
     """Mean renderability of all surfaces after each of as many random views."""
+
+    @property
+    def ranked(self) -> tuple[Suggestion, ...]:
+        """The views in the order in which they were chosen: the most useful first."""
+        return tuple(sorted(self.views, key=lambda view: view.rank))
 
 
 @dataclass(frozen=True)
@@ -308,24 +324,26 @@ def suggest(
     state: MapState,
     grid: OccupancyGrid,
     task: Task,
-    places: np.ndarray,
+    places: Places,
     num: int,
     *,
+    start: np.ndarray,
     seed: int = 0,
     on_view: Callable[[], None] = lambda: None,
 ) -> SuggestedViews:
-    """Chooses up to `num` views.
+    """Chooses up to `num` views, and puts them in the order of a walk.
 
     Args:
         state: the map.
         grid: whose unexplored cells count: those that somebody could ever see.
         task: camera, standpoints, settings.
-        places: where a view may be taken, [p, 3] [audit units].
+        places: where a view may be taken.
         num: views wanted; fewer come where nothing is left to be gained.
+        start: where the walk begins, [3] [audit units].
         seed: of the random views.
         on_view: called after each view.
     """
-    greedy = LazyGreedy(task, candidate_poses(state, grid, task, places) if num else _NO_POSES)
+    greedy = LazyGreedy(task, candidate_poses(state, grid, task, places.eyes) if num else _NO_POSES)
     key = jax.random.key(seed)
     memory = greedy.init(task.camera, grid, key=key)
     planner = Planner(state, grid, memory, greedy, MappingConfig())
@@ -341,9 +359,29 @@ def suggest(
         on_view()
     diagnoses.append(task.evaluate(planner.map_state)[1])
     steps = zip(taken, diagnoses[:-1], diagnoses[1:], strict=True)
-    views = tuple(_suggestion(view, now, after) for view, now, after in steps)
-    random_mean = _random(state, task, places, len(views), seed)
-    return SuggestedViews(views, diagnoses[0], diagnoses[-1], random_mean)
+    views = [
+        _suggestion(rank, view, now, after, places)
+        for rank, (view, now, after) in enumerate(steps, start=1)
+    ]
+    random_mean = _random(state, task, places.eyes, len(views), seed)
+    eyes = np.array([view.pose[:3, 3] for view in views]).reshape(-1, 3)
+    walk = tuple(views[i] for i in walking_order(eyes, start))
+    return SuggestedViews(walk, diagnoses[0], diagnoses[-1], random_mean)
+
+
+def walking_order(eyes: np.ndarray, start: np.ndarray) -> list[int]:
+    """Orders views so that one walks little: always to the nearest one that is left.
+
+    Args:
+        eyes: positions, [k, 3].
+        start: where one is, [3].
+    """
+    left, here, order = list(range(len(eyes))), start, list[int]()
+    while left:
+        gaps = np.linalg.norm(eyes[left] - here, axis=1)
+        order.append(left.pop(int(np.argmin(gaps))))
+        here = eyes[order[-1]]
+    return order
 
 
 _NO_POSES = np.zeros((0, 4, 4))
@@ -426,8 +464,12 @@ def _imagine(planner: Planner, task: Task, decision: Decision) -> tuple[Planner,
     return imagined, _Taken(decision, rows, edges)
 
 
-def _suggestion(view: _Taken, now: Diagnosis, after: Diagnosis) -> Suggestion:
+def _suggestion(
+    rank: int, view: _Taken, now: Diagnosis, after: Diagnosis, places: Places
+) -> Suggestion:
     shown = view.shown
+    eye = view.decision.T_world_camera[:3, 3]
+    place = int(np.argmin(np.linalg.norm(places.eyes - eye, axis=1)))
     bad = shown[now.is_seen[shown] & (now.value[shown] < FINE)]
     counts = np.bincount(now.cause[bad], minlength=len(CAUSES))
     return Suggestion(
@@ -439,6 +481,9 @@ def _suggestion(view: _Taken, now: Diagnosis, after: Diagnosis) -> Suggestion:
         causes={name: int(n) for name, n in zip(CAUSES, counts, strict=True) if n},
         mean_after=after.mean,
         fine_after=after.fine_share,
+        rank=rank,
+        feet=places.feet[place],
+        is_over=place >= places.num_standing,
     )
 
 

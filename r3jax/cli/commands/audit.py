@@ -7,7 +7,7 @@ from pathlib import Path
 from r3jax.apps.audit import sentences
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.audit_page import write_report
-from r3jax.apps.audit.ground_plan import region_label
+from r3jax.apps.audit.ground_plan import region_letter
 from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.guide_page import open_guide
 from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_outputs
@@ -131,7 +131,7 @@ def _regions(found: Audit) -> Table:
     for number, region in enumerate(found.regions[:_SHOWN]):
         center = found.survey.alignment.points_back(region.center[None])[0]
         table.add_row(
-            region_label(number),
+            region_letter(number),
             region.cause,
             sentences.area(found, region.area),
             f"{region.renderability:.2f}",
@@ -142,15 +142,14 @@ def _regions(found: Audit) -> Table:
 
 def _views(found: Audit) -> Table:
     table = Table(title="Views to take", title_justify="left", title_style="bold", box=None)
-    for name in ("", "from (x, y, z)", "towards", "mean R then"):
+    for name in ("", "from (x, y, z)", "towards", "most useful"):
         table.add_column(name, justify="right")
-    table.add_row("0", "", "", f"{found.diagnosis.mean:.3f}")
     poses = suggested_poses(found)
     for number, (view, pose) in enumerate(zip(found.plan.views, poses, strict=True), start=1):
         table.add_row(
             str(number),
             sentences.point(pose[:3, 3]),
             sentences.point(pose[:3, 2]),
-            f"{view.mean_after:.3f}",
+            f"{view.rank}.",
         )
     return table

@@ -21,14 +21,12 @@ from r3jax.apps.audit.ground_plan import _value_picture
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
 from r3jax.apps.audit.sentences import (
     CONTRADICTED,
-    directions,
     method,
     saturation,
     verdict,
 )
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.captures import capture_maps
-from r3jax.captures.alignment import Alignment
 from r3jax.captures.camera_paths import CameraPath
 from r3jax.captures.source import Source, source_of
 from r3jax.captures.survey import MARGIN, survey_of
@@ -128,7 +126,7 @@ def test_the_capture_ends_behind_its_cameras(corner):
 
 
 def test_suggested_views_are_in_the_open_and_promise_more_than_random_ones(corner):
-    views = corner.plan.views
+    views = corner.plan.ranked
     assert len(views) == 3
     means = [corner.diagnosis.mean, *(view.mean_after for view in views)]
     assert (np.diff(means) >= -1e-6).all()  # an imagined view takes nothing away
@@ -169,7 +167,7 @@ def test_a_gain_is_what_all_surfaces_gain_together(corner):
     """Two ways to the same number: view by view, and standpoint by standpoint."""
     evaluated = corner.diagnosis.is_seen.sum()
     before = corner.diagnosis.mean
-    for view in corner.plan.views:
+    for view in corner.plan.ranked:
         surfaces = (view.mean_after - before) * evaluated
         cells = float(corner.config.lambda1) * len(view.cells)
         # Voxels that are nearly perfect are left out of gains.
@@ -385,33 +383,6 @@ def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
     assert len(record["path"]["frames"]) == 16
     assert record["surfaces"]["share"].keys() == {*CAUSES, NOT_KNOWN}
     assert record["up"] == [0.0, 0.0, 1.0]
-
-
-@pytest.mark.parametrize("tilt", [0.0, 30.0, -90.0])  # of the picture [degrees]
-def test_directions_lead_from_a_picture_to_the_view(corner, tilt):
-    """The view is put where the words say; a picture that looks straight down is no exception."""
-    heading = np.radians(25.0)
-    forward = np.array([np.cos(heading), np.sin(heading), 0.0])
-    axis = np.cos(np.radians(tilt)) * forward + [0.0, 0.0, np.sin(np.radians(tilt))]
-    eye = np.array([1.0, 1.0, 1.5])
-    here = np.eye(4) if tilt == -90.0 else pose_at(eye, eye + axis)
-    if tilt == -90.0:  # its upper edge shows where it faces
-        here[:3, :3] = np.stack([[forward[1], -forward[0], 0.0], -forward, [0, 0, -1]], axis=1)
-        here[:3, 3] = eye
-    turned = heading + np.radians(40.0)
-    looks = np.array([np.cos(turned), np.sin(turned), -np.tan(np.radians(10.0))])
-    left = np.array([-forward[1], forward[0], 0.0])
-    place = eye + 1.2 * forward - 0.4 * left + [0.0, 0.0, 0.3]
-    view = replace(corner.plan.views[0], pose=pose_at(place, place + looks))
-    back = np.stack([here] * len(corner.source.poses))
-    source = replace(corner.source, poses=back)
-    as_it_is = Alignment(np.eye(3), 1.0, np.zeros(3))
-    survey = replace(corner.survey, alignment=as_it_is)
-    audit = replace(corner, source=source, survey=survey)
-    assert directions(audit, view, 2) == (
-        f"Stand where {source.labels[2]} was taken, go 1.2 m forward and 0.4 m to the right, hold "
-        "the camera 0.3 m higher, turn 40° left and look 10° down."
-    )
 
 
 def one_picture(depth: np.ndarray) -> Source:

@@ -26,19 +26,20 @@ from urllib.parse import urlsplit
 import numpy as np
 from matplotlib import colormaps
 
-from r3jax.apps.audit.diagnosis import FINE
-from r3jax.apps.audit.sentences import steps_between
-from r3jax.captures.alignment import evenly_spaced
+from r3jax.apps.audit.diagnosis import CAUSES, demand_of, diagnose, score_from_standpoints
+from r3jax.apps.audit.directions import steps_between
+from r3jax.apps.audit.sentences import GOOD, SHORT, listed
+from r3jax.captures.standpoints import places_of
+from r3jax.captures.survey import RANGE
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.state import MapState
 from r3jax.network import LOOPBACK, check_free
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Decision
 from r3jax.plots import style
 from r3jax.plots.page import render
 from r3jax.plots.pictures import floor_picture, png, small_png
-from r3jax.scoring.renderability import voxel_renderability
+from r3jax.scoring.config import ScoringConfig
 
 _LATEST = 480
 """Longer side of the latest picture [px]."""
@@ -97,8 +98,7 @@ class GuidePage:
         with self._lock:
             self._pictures |= {"plan.png": png(done.plan), "latest.png": latest}
         self._tell(
-            done=f"{100 * done.fine_share:.0f} % of the {done.area:.0f} m² seen so far would "
-            f"render well; {len(self._path)} pictures.",
+            done=done.words(len(self._path)),
             fine_share=done.fine_share,
             extent=done.extent,
             path=[[float(x), float(y)] for x, y, _ in self._path],
@@ -134,7 +134,7 @@ class GuidePage:
         if not target:
             return {"next": "Keep on scanning ...", "note": "looking for the best view",
                     "is_current": False}  # fmt: skip
-        words = ", ".join(steps_between(self._pose, target[0], lambda x: f"{x:.1f} m"))
+        words = ", ".join(steps_between(self._pose, target[0], meter=1.0))
         note = "Seen from the latest picture. Go slowly; take pictures on the way."
         return {"next": f"{words[:1].upper()}{words[1:]}.", "note": note, "is_current": True}
 
@@ -227,8 +227,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Says nothing on the console."""
 
 
-_PLACES = 6
-"""Places where the camera was, spread over its path, from which surfaces are evaluated."""
+_PLACES = 8
+"""Places to stand from which surfaces are scored; an audit takes three times as many."""
 
 _HEADROOM = 0.35
 """As in `floor_picture` [m]."""
@@ -248,10 +248,13 @@ class ScanProgress:
     """What is done."""
 
     fine_share: float
-    """Share of the surfaces seen so far that would render well from where the camera was."""
+    """Share of what a person sees from where one can stand that is seen well enough."""
+
+    causes: dict[str, float]
+    """Share of the same of each other cause."""
 
     area: float
-    """Area of the surfaces seen so far, a voxel's face each [square meters]."""
+    """Area of all that, a voxel's face each [square meters]."""
 
     plan: np.ndarray
     """The place from above, surfaces from red to green, [h, w, 3] uint8; row 0 at the largest y."""
@@ -259,9 +262,24 @@ class ScanProgress:
     extent: tuple[float, float, float, float]
     """Left, right, bottom and top of the plan [m]."""
 
+    def words(self, pictures: int) -> str:
+        """Says how much is done, what is missing, and whether that is enough."""
+        parts = [
+            f"{100 * share:.0f} % {SHORT[cause]}"
+            for cause, share in sorted(self.causes.items(), key=lambda item: -item[1])
+            if share >= 0.01
+        ]
+        text = (
+            f"{100 * self.fine_share:.0f} % of what a person sees from where one can stand is seen "
+            f"well enough ({self.area:.0f} m² of surfaces, {pictures} pictures)"
+        )
+        rest = f"; seen {listed(parts)}." if parts else "."
+        end = " That is good for splats: you can stop here." if self.fine_share >= GOOD else ""
+        return text + rest + end
+
 
 def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanProgress:
-    """Evaluates what was seen.
+    """Scores what was seen by the question of an audit, from fewer places.
 
     Args:
         planner: map and grid.
@@ -269,29 +287,15 @@ def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanP
         places: where the camera was, [k, 3], k >= 1.
     """
     state = planner.map_state
-    value = mean_value(state, camera, places)
-    is_seen = np.isfinite(value)
-    share = float((value[is_seen] >= FINE).mean()) if is_seen.any() else 0.0
-    area = float(is_seen.sum()) * float(state.voxel_size) ** 2
+    config = ScoringConfig(max_range=RANGE)
+    stand = places_of(state, planner.grid, places, _PLACES, is_dense=True, meter=1.0).standing
+    demand = demand_of(state, stand, config)
+    found = diagnose(state, demand, score_from_standpoints(state, demand, camera.focal, config))
+    value = np.where(found.is_seen, found.value, np.nan)
+    causes = {name: found.share(name) for name in CAUSES if name != "fine"}
+    area = float(found.is_seen.sum()) * float(state.voxel_size) ** 2
     plan, extent = _plan(planner, value, places)
-    return ScanProgress(share, area, plan, extent)
-
-
-def mean_value(state: MapState, camera: Camera, places: np.ndarray) -> np.ndarray:
-    """Returns the mean renderability of every voxel from some of the places within 5 m of it, [N].
-
-    NaN: none.
-
-    Whether something stands between is not asked: that would take a depth buffer for each place.
-    """
-    center = np.asarray(state.center, np.float32).T
-    total, count = np.zeros(len(center)), np.zeros(len(center))
-    for place in places[evenly_spaced(len(places), _PLACES)].astype(np.float32):
-        near = np.sum((center - place) ** 2, axis=1) < _FARTHEST**2
-        total += near * np.asarray(voxel_renderability(state, place, camera.focal).value)
-        count += near
-    known = np.asarray(state.occupied) & (count > 0)
-    return np.where(known, total / np.maximum(count, 1), np.nan)
+    return ScanProgress(found.fine_share, causes, area, plan, extent)
 
 
 def _plan(

@@ -13,7 +13,7 @@ import pytest
 import r3jax
 from r3jax.apps.audit.live import follow as module
 from r3jax.apps.audit.live.follow import follow
-from r3jax.apps.audit.live.guide_page import mean_value, open_guide
+from r3jax.apps.audit.live.guide_page import open_guide, scan_progress
 from tests.apps.audit.room import LENS, SIZE, picture, round_poses, write_recording
 
 POSES = round_poses(10)
@@ -114,6 +114,7 @@ def test_surfaces_seen_from_all_sides_are_done_and_others_not():
         planner = r3jax.start(LENS.camera, BOUNDS, "random", config=config)
         for pose in POSES[:count]:
             planner = r3jax.observe(planner, frame_at(pose))
-        value = mean_value(planner.map_state, LENS.camera, POSES[:, :3, 3])
-        shares.append(np.nansum(value >= 0.5))
+        done = scan_progress(planner, LENS.camera, POSES[:, :3, 3])
+        assert done.fine_share + sum(done.causes.values()) == pytest.approx(1.0)
+        shares.append(done.fine_share * done.area)
     assert shares[1] > 3 * shares[0] > 0

@@ -35,7 +35,7 @@ def test_a_phone_shows_where_to_go_what_is_done_and_what_is_wrong():
         there = poses[2]
         way = np.stack([poses[1][:3, 3], there[:3, 3]])
         guide.decided(frame, r3jax.Decision(there, way, 1.0, 1.0, there[None]))
-        sync_api.expect(page.locator("#next")).to_contain_text("turn 90° left")
+        sync_api.expect(page.locator("#next")).to_contain_text("turn a quarter to the left")
         sync_api.expect(page.locator("#done")).to_contain_text("2 pictures")
         sync_api.expect(page.locator("#warn li")).to_have_text("Blurred <b>badly</b>")
         sync_api.expect(page.locator("#name")).to_contain_text("second <i>")

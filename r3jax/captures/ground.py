@@ -1,0 +1,201 @@
+"""The floor that somebody walked on, and who stands where to hold a camera at a place.
+
+Free space over a sofa is no place to stand. The floor is what lies under the cameras; somebody
+stands where a body's cylinder, from the shin to the head, meets nothing, and reaches from there
+with an arm. A capture that no one walked through (a drone, a turntable, a robot) is told apart:
+there the floor is out of sight or too far below, or most of its own cameras would stand in
+something, and nothing is said of standing.
+
+Shape symbols: n cameras; m voxels; c places; X Y Z cells of the coarse grid.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from r3jax.mapping.occupancy import OccupancyGrid
+
+_WALKED = (0.5, 2.3)
+"""Median height of the cameras over the floor in a capture that somebody walked through [m]."""
+
+_USUAL_HEIGHT = 1.5
+"""Taken as that height where the capture's unit is not known [m]."""
+
+_SHIN, _HEAD = 0.25, 1.8
+"""The body begins above the floor's own roughness, and ends at the head [m]."""
+
+_SHOULDERS = 0.25
+"""Radius of the body [m]."""
+
+_ARM = 0.6
+"""How far to the side of the feet a camera can be held [m]."""
+
+_NEAR_CAMERAS = 16
+"""Cameras round a place that tell its floor."""
+
+_FLOOR_PERCENTILE = 25.0
+"""Of what lies below these cameras: some were held over a table."""
+
+_KNOWN_BELOW = 0.2
+"""Share of the cameras below which something must be known."""
+
+_OWN_SHARE = 0.5
+"""Share of the capture's own cameras that must be where somebody could hold them."""
+
+_FREE_SHARE = 0.5
+"""Share of a body's cells that must be known to be free; of the rest nothing is known."""
+
+
+@dataclass(frozen=True)
+class Footing:
+    """Where somebody stands who holds the camera at each place."""
+
+    feet: np.ndarray
+    """Points on the floor, [c, 3] [audit units]; NaN where no one can hold a camera there."""
+
+    is_over: np.ndarray
+    """True where the camera is held out over something, or sideways from the feet, [c]."""
+
+    @property
+    def is_reached(self) -> np.ndarray:
+        """True where somebody can hold a camera, [c]."""
+        return np.isfinite(self.feet[:, 0])
+
+
+class Ground:
+    """The floor below a capture that somebody walked through."""
+
+    def __init__(self, grid: OccupancyGrid, cameras: np.ndarray, levels: np.ndarray, person: float):
+        """Takes what `ground_of` found.
+
+        Args:
+            grid: free and occupied space.
+            cameras: with something known below them, [n, 3] [audit units].
+            levels: height of what is below each, [n] [audit units].
+            person: a meter of a person's size [audit units].
+        """
+        self._cell, self._origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
+        self._occupied, self._free = (
+            np.concatenate(
+                [np.zeros((*mask.shape[:2], 1), np.int32), mask.cumsum(axis=2, dtype=np.int32)],
+                axis=2,
+            )
+            for mask in (np.asarray(grid.occupied), np.asarray(grid.free))
+        )
+        self._is_free = np.asarray(grid.free)
+        self._tree, self._levels, self._track = KDTree(cameras), levels, KDTree(cameras[:, :2])
+        self.person = person
+        """A meter of a person's size [audit units]."""
+
+    def floor(self, places: np.ndarray) -> np.ndarray:
+        """Height of the floor below each place, [c] [audit units]: that of the cameras round it."""
+        count = min(_NEAR_CAMERAS, self._tree.n)
+        near = np.asarray(self._tree.query(places, k=count)[1]).reshape(len(places), count)
+        return np.percentile(self._levels[near], _FLOOR_PERCENTILE, axis=1)
+
+    def footing(self, places: np.ndarray) -> Footing:
+        """Finds who stands where to hold the camera at each of the places [c, 3]."""
+        floor = self.floor(places)
+        stands = self._stands(places, floor)
+        feet = np.full((len(places), 3), np.nan)
+        feet[stands] = np.column_stack([places[stands, :2], floor[stands]])
+        for offset in self._arm_offsets():
+            left = np.flatnonzero(~np.isfinite(feet[:, 0]))
+            aside = places[left] + offset
+            held = self._free_at(aside) & self._free_at(places[left] + 0.5 * offset)
+            found = held & self._stands(aside, floor[left])
+            feet[left[found]] = np.column_stack([aside[found, :2], floor[left[found]]])
+        return Footing(feet, ~stands)
+
+    def _arm_offsets(self) -> list[np.ndarray]:
+        """Steps to the side within an arm's reach, the shortest first."""
+        reach = _ARM * self.person
+        most = int(reach / self._cell)
+        steps = self._cell * np.array(
+            [(x, y, 0) for x, y in itertools.product(range(-most, most + 1), repeat=2)], np.float64
+        )
+        length = np.linalg.norm(steps, axis=1)
+        order = np.argsort(length, kind="stable")
+        return [steps[i] for i in order.tolist() if 0.0 < length[i] <= reach + 1e-9]
+
+    def _stands(self, places: np.ndarray, floor: np.ndarray) -> np.ndarray:
+        """True where a body under the camera meets nothing, [c]."""
+        shape = np.array(self._is_free.shape)
+        low = np.rint((floor + _SHIN * self.person - self._origin[2]) / self._cell)
+        head = np.maximum(floor + _HEAD * self.person, places[:, 2])
+        high = np.floor((head - self._origin[2]) / self._cell)
+        low, high = (np.clip(k, 0, shape[2]).astype(np.int64) for k in (low, high))
+        high = np.maximum(high, low)
+        meets = np.zeros(len(places), dtype=bool)
+        free, cells = np.zeros(len(places)), np.zeros(len(places))
+        reach = _SHOULDERS * self.person
+        most = int(np.ceil(reach / self._cell))
+        for dx, dy in itertools.product(range(-most, most + 1), repeat=2):
+            if np.hypot(dx, dy) * self._cell > reach + 1e-9:
+                continue
+            x, y = (
+                np.floor((places[:, a] - self._origin[a]) / self._cell).astype(np.int64) + d
+                for a, d in ((0, dx), (1, dy))
+            )
+            inside = (x >= 0) & (x < shape[0]) & (y >= 0) & (y < shape[1])
+            x, y = x.clip(0, shape[0] - 1), y.clip(0, shape[1] - 1)
+            of = lambda total, x=x, y=y: total[x, y, high] - total[x, y, low]
+            meets |= inside & (of(self._occupied) > 0)
+            free += inside * of(self._free)
+            cells += high - low
+        walked = self._track.query(places[:, :2])[0] <= _SHOULDERS * self.person
+        return ~meets & (walked | (free >= _FREE_SHARE * cells))
+
+    def _free_at(self, points: np.ndarray) -> np.ndarray:
+        """True where a point lies in a cell known to be free, [c]."""
+        cell = np.floor((points - self._origin) / self._cell).astype(np.int64)
+        inside = np.all((cell >= 0) & (cell < self._is_free.shape), axis=1)
+        return inside & self._is_free[tuple(np.where(inside[:, None], cell, 0).T)]
+
+
+def ground_of(
+    grid: OccupancyGrid, voxels: np.ndarray, cameras: np.ndarray, meter: float | None
+) -> Ground | None:
+    """Finds the floor that somebody walked on; None: no one did, or it is not known.
+
+    Args:
+        grid: free and occupied space.
+        voxels: centers of all voxels, [m, 3] [audit units]: finer than the grid.
+        cameras: where the camera was, [n, 3] [audit units].
+        meter: a meter [audit units]; None: the capture's unit is not known.
+    """
+    cell, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
+    occupied = np.asarray(grid.occupied)
+    steps = np.arange(occupied.shape[2], dtype=np.int32)
+    top = np.maximum.accumulate(np.where(occupied, steps + 1, 0), axis=2)
+    cells = np.floor((cameras - origin) / cell).astype(np.int64)
+    cells = cells.clip(0, np.array(occupied.shape) - 1)
+    below = top[tuple(cells.T)]
+    is_known = below > 0
+    if is_known.sum() < max(3.0, _KNOWN_BELOW * len(cameras)):
+        return None
+    levels = _refined(origin[2] + cell * below[is_known], voxels, cameras[is_known], cell)
+    held = float(np.median(cameras[is_known, 2] - levels))
+    if meter is None:
+        meter = held / _USUAL_HEIGHT
+    if not _WALKED[0] <= held / meter <= _WALKED[1]:
+        return None
+    ground = Ground(grid, cameras[is_known], levels, meter)
+    return ground if ground.footing(cameras).is_reached.mean() >= _OWN_SHARE else None
+
+
+def _refined(tops: np.ndarray, voxels: np.ndarray, cameras: np.ndarray, cell: float) -> np.ndarray:
+    """Height of what lies below each camera, [n], from the voxels in the cells that end at `tops`.
+
+    A cell is as high as a step of a staircase; a floor that fills two of them lies in the lower.
+    """
+    found = tops.copy()
+    columns = KDTree(voxels[:, :2]).query_ball_point(cameras[:, :2], 1.5 * cell)
+    for i, rows in enumerate(columns):
+        height = voxels[rows, 2]
+        height = height[(height <= tops[i]) & (height > tops[i] - 2.0 * cell)]
+        if len(height):
+            found[i] = np.median(height)
+    return found

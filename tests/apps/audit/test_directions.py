@@ -1,0 +1,88 @@
+"""Directions lead to the view: what the words say is done, and the camera is where it should be."""
+
+import re
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r3jax.apps.audit.directions import spoken_length, steps_between
+from r3jax.apps.audit.suggest import walking_order
+from tests.apps.audit.room import pose_at
+
+NUMBER = r"([\d.]+) (cm|m)"
+
+
+def amount(text: str, what: str) -> float:
+    """The length that is said before a word; 0 if it is not said."""
+    found = re.search(f"{NUMBER} {what}", text)
+    return 0.0 if found is None else float(found[1]) * (0.01 if found[2] == "cm" else 1.0)
+
+
+def followed(here: np.ndarray, text: str) -> tuple[np.ndarray, float, float]:
+    """Where the camera is, its heading and its elevation [deg], for one who does as told."""
+    axis = here[:3, 2] if np.hypot(*here[:2, 2]) > 0.05 else -here[:3, 1]
+    forward = np.array([*axis[:2], 0.0]) / np.hypot(*axis[:2])
+    left = np.array([-forward[1], forward[0], 0.0])
+    place = here[:3, 3] + (amount(text, "forward") - amount(text, "back")) * forward
+    place = place + (amount(text, "to the left") - amount(text, "to the right")) * left
+    place = place + np.array([0.0, 0.0, amount(text, "higher") - amount(text, "lower")])
+    turn = re.search(r"turn (\d+)° to the (left|right)", text)
+    quarter = re.search(r"turn a quarter to the (left|right)", text)
+    angle = 180.0 if "turn round" in text else 0.0
+    if quarter is not None:
+        angle = 90.0 if quarter[1] == "left" else -90.0
+    elif turn is not None:
+        angle = float(turn[1]) * (1.0 if turn[2] == "left" else -1.0)
+    tilt = re.search(r"tilt it (\d+)° (up|down)", text)
+    elevation = 0.0 if tilt is None else float(tilt[1]) * (1.0 if tilt[2] == "up" else -1.0)
+    return place, np.degrees(np.arctan2(forward[1], forward[0])) + angle, elevation
+
+
+coordinate = st.floats(-3.0, 3.0)
+
+
+@given(
+    st.tuples(coordinate, coordinate, coordinate),
+    st.tuples(st.floats(-180, 180), st.floats(-75, 75), st.floats(-180, 180), st.floats(-70, 70)),
+)
+def test_who_does_as_told_is_there(offset, angles):
+    heading, tilt, wanted, elevation = np.radians(angles)
+    axis = lambda h, e: np.array([np.cos(h) * np.cos(e), np.sin(h) * np.cos(e), np.sin(e)])
+    eye = np.array([1.0, 2.0, 1.5])
+    here = pose_at(eye, eye + axis(heading, tilt))
+    there = pose_at(eye + offset, eye + offset + axis(wanted, elevation))
+    place, turned, tilted = followed(here, ", ".join(steps_between(here, there, 1.0)))
+    assert np.abs(place - there[:3, 3]).max() <= 0.05 + 1e-6
+    assert abs((turned - angles[2] + 180.0) % 360.0 - 180.0) <= 15.0 + 1e-6
+    assert abs(tilted - angles[3]) <= 5.0 + 1e-6
+
+
+def test_a_picture_that_looks_straight_down_faces_its_upper_edge():
+    here = np.eye(4)
+    here[:3, :3] = np.stack([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]], axis=1)
+    there = pose_at([1.0, 0.0, 0.0], [1.0, 1.0, 0.0])
+    place, heading, _ = followed(here, ", ".join(steps_between(here, there, 1.0)))
+    np.testing.assert_allclose(place, [1.0, 0.0, 0.0], atol=1e-9)
+    assert abs(heading - 90.0) < 1e-9
+
+
+def test_lengths_are_said_in_steps_of_a_person():
+    said = [spoken_length(x, "m") for x in (0.01, 0.34, 0.94, 0.97, 2.34)]
+    assert said == ["10 cm", "30 cm", "90 cm", "1.0 m", "2.3 m"]
+    assert spoken_length(0.0123, "u") == "0.012 u"
+
+
+@given(st.integers(0, 200))
+def test_a_walk_comes_to_each_view_once_and_to_the_nearest_first(seed):
+    rng = np.random.default_rng(seed)
+    eyes, start = rng.normal(size=(int(rng.integers(0, 9)), 3)), rng.normal(size=3)
+    order = walking_order(eyes, start)
+    assert sorted(order) == list(range(len(eyes)))
+    here = start
+    for place, index in enumerate(order):
+        rest = eyes[order[place:]]
+        assert (
+            np.linalg.norm(eyes[index] - here) <= np.linalg.norm(rest - here, axis=1).min() + 1e-9
+        )
+        here = eyes[index]
