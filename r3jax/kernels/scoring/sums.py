@@ -334,53 +334,24 @@ def _sorted_cells(cells):
 
 
 @kernel
-def _near_cells(cells, views, is_sound, layout, voxel_size, workers):
-    """Returns the unexplored cells that few views may show, in order.
-
-    A brick for each thread's share.
-    """
+def _near_cells(cells, views, is_sound, layout, voxel_size):
+    """Returns the unexplored cells that few views may show, in their order, in one brick."""
     num = cells.unexplored.shape[0]
     empty = Empty(np.empty((3, num), np.float32), np.empty(num, np.int32))
-    begins, ends = np.empty(workers, np.int64), np.empty(workers, np.int64)
-    _find_near_cells(cells, views, is_sound, layout, voxel_size, begins, ends, empty)
-    return bricks_of_shares(begins, ends, num), empty
-
-
-@parallel_kernel
-def _find_near_cells(cells, views, is_sound, layout, voxel_size, begins, ends, empty):
-    shares, num = begins.shape[0], cells.unexplored.shape[0]
-    for share in prange(shares):
-        begins[share] = num * share // shares
-        ends[share] = _find_share(
-            cells, views, is_sound, layout, voxel_size, begins[share], num * (share + 1) // shares,
-            empty,
-        )  # fmt: skip
-
-
-@kernel
-def _find_share(cells, views, is_sound, layout, voxel_size, begin, end, empty):
-    """Gathers the unexplored cells from `begin` to `end` that some view may show.
-
-    Returns:
-        Where they end; they begin where all of the cells do.
-    """
-    is_near, chosen, to = np.empty(CHUNK, np.int32), np.empty(CHUNK + 1, np.int32), begin
-    for first in range(begin, end, CHUNK):
-        count = min(CHUNK, end - first)
-        x, y, z = (
-            cells.x[first : first + count], cells.y[first : first + count],
-            cells.z[first : first + count],
-        )  # fmt: skip
+    is_near, chosen, to = np.empty(CHUNK, np.int32), np.empty(CHUNK + 1, np.int32), 0
+    for first in range(0, num, CHUNK):
+        end = min(first + CHUNK, num)
+        x, y, z = cells.x[first:end], cells.y[first:end], cells.z[first:end]
         mark_near(views, is_sound, layout, voxel_size, x, y, z, is_near)
-        for i in range(count):
+        for i in range(end - first):
             is_near[i] &= np.int32(cells.unexplored[first + i] != 0)
-        num = compact(is_near, count, chosen)
-        for j in range(num):
+        for j in range(compact(is_near, end - first, chosen)):
             i = np.int64(chosen[j])
-            empty.centers[X, to + j], empty.centers[Y, to + j] = x[i], y[i]
-            empty.centers[Z, to + j], empty.numbers[to + j] = z[i], first + i
-        to += num
-    return to
+            empty.centers[X, to], empty.centers[Y, to], empty.centers[Z, to] = x[i], y[i], z[i]
+            empty.numbers[to] = first + i
+            to += 1
+    begins, ends = np.zeros(1, np.int64), np.full(1, to, np.int64)
+    return bricks_of_shares(begins, ends, num), empty
 
 
 @kernel
@@ -445,7 +416,7 @@ def sums(rows, cells, views, layout, forms, tables, workers, results):
     is_sound = sound_views(views, rows.voxel_size)
     if is_sound.shape[0] <= MAX_VIEWS:
         bricks, voxels = near_voxels(rows, views, is_sound, layout, forms, workers)
-        cell_bricks, empty = _near_cells(cells, views, is_sound, layout, rows.voxel_size, workers)
+        cell_bricks, empty = _near_cells(cells, views, is_sound, layout, rows.voxel_size)
     else:
         bricks, voxels = sorted_voxels(rows, views, is_sound, forms, workers)
         cell_bricks, empty = _sorted_cells(cells)
