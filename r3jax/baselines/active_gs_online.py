@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from r3jax.baselines.active_gs import EXPLORATION_WEIGHT, LOW_CONFIDENCE, draw_views
+from r3jax.baselines.information import with_room
 from r3jax.baselines.online_map import DISCS, OnlineMap, Seen, colored, supported_by
 from r3jax.baselines.policy import OnlinePolicy, memory_of
 from r3jax.geometry.cameras import Camera, invert_pose, project, transform
@@ -31,7 +32,6 @@ from r3jax.planning.decide import Drawn
 from r3jax.planning.policy import Situation
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.config import RasterConfig
-from r3jax.splatting.information import with_room
 from r3jax.splatting.projection import rotation_rows
 from r3jax.splatting.scene import GaussianScene
 

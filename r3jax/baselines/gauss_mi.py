@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r3jax.baselines.information import on_cpu, pixel_tallies, with_room
 from r3jax.baselines.online_map import GAUSS_MI, OnlineMap, Seen, colored, show
 from r3jax.baselines.policy import OnlineConfig, OnlinePolicy, memory_of
 from r3jax.geometry.cameras import Camera, angle_between
@@ -32,7 +33,6 @@ from r3jax.planning.candidates import Candidates, draw_lots
 from r3jax.planning.policy import Situation
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.config import RasterConfig
-from r3jax.splatting.information import on_cpu, pixel_tallies, with_room
 from r3jax.splatting.scene import GaussianScene
 
 LIMIT = 10.0

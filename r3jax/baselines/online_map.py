@@ -20,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
+from r3jax.baselines.information import on_cpu, pixel_tallies, with_room
 from r3jax.baselines.normals import pixel_normals
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.constants import DILATION, FRUSTUM_MARGIN, NEAR_PLANE, SH0
 from r3jax.splatting.backend import find_backend
-from r3jax.splatting.config import DILATION, FRUSTUM_MARGIN, NEAR, RasterConfig
-from r3jax.splatting.harmonics import C0
-from r3jax.splatting.information import on_cpu, pixel_tallies, with_room
+from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene, empty_scene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.optimizer import Moments, adam_update, empty_moments
@@ -434,7 +434,7 @@ def _with_births(online: OnlineMap, settings: MapSettings, rng: np.random.Genera
     scene, rows = jax.tree.map(np.array, scene), slice(num, num + more)
     scene.means[rows], scene.quats[rows] = born.means, born.quats
     scene.log_scales[rows], scene.opacity_logits[rows] = born.log_scales, 0.0
-    scene.sh[rows, 0] = (born.colors - 0.5) / C0
+    scene.sh[rows, 0] = (born.colors - 0.5) / SH0
     return replace(online, scene=jax.tree.map(jnp.asarray, scene), marks=marks)
 
 
@@ -456,7 +456,7 @@ def rows_in_view(
     pose = np.asarray(T_world_camera, np.float32)
     x, y, z = ((means - pose[:3, 3]) @ pose[:3, :3]).T
     drift = np.sqrt(3.0) * _LONGEST_STEP * settings.rate_means * settings.steps
-    is_in = z > NEAR - drift
+    is_in = z > NEAR_PLANE - drift
     for along, focal, middle, size in (
         (x, float(camera.fx), float(camera.cx), camera.width),
         (y, float(camera.fy), float(camera.cy), camera.height),
@@ -592,8 +592,8 @@ def _stepped(
         rate_quats=settings.rate_quats,
         rate_log_scales=settings.rate_log_scales,
         rate_opacities=settings.rate_opacities,
-        # The color is 0.5 + C0 times the coefficient.
-        rate_sh=settings.rate_color / C0,
+        # The color is 0.5 + SH0 times the coefficient.
+        rate_sh=settings.rate_color / SH0,
     )
     rate = jnp.asarray(settings.rate_means)
     scene, moments = adam_update(scene, gradient, moments, rate, config, jnp.asarray(True))
@@ -637,5 +637,5 @@ def colored(scene: GaussianScene, values: Float[Array, " n"]) -> GaussianScene:
 
     Rendering composites the values.
     """
-    sh = jnp.broadcast_to(((values - 0.5) / C0)[:, None, None], scene.sh.shape)
+    sh = jnp.broadcast_to(((values - 0.5) / SH0)[:, None, None], scene.sh.shape)
     return eqx.tree_at(lambda s: s.sh, scene, sh)

@@ -9,18 +9,10 @@ from r3jax.files import make_folder, write_atomic
 
 def main(note: Path) -> None:
     """Compiles all kernels, and leaves a note."""
-    # Those of maps and scores first: they are needed first.
     from r3jax.kernels import bridge
 
     for name in bridge.HANDLERS:
         bridge.register(name)
-    from r3jax.kernels.splatting import bridge as splatting
-
-    splatting.register()
-    from r3jax.kernels.training import bridge as training
-
-    for name in (training.LOSS, training.ADAM):
-        training.register(name)
     make_folder(note.parent)
     write_atomic(note, b"")
 

@@ -3,12 +3,18 @@
 `calls` has them under the names below, `bridge` is how XLA reaches them, `native` how they are
 compiled. Each is held to its formula by a test.
 
-| kernel | formula | test |
+| kernel | formula | test, in `tests` |
 |---|---|---|
-| `map_add` | `mapping.update.integrate_pixels` | `tests/mapping/test_kernels.py` |
-| `map_mark` | `mapping.seen.rows_in_view`, `mark_rows` | `tests/mapping/test_kernels.py` |
-| `sums` | `scoring.formulas.sums_in_view` | `tests/scoring/test_backends.py` |
-| `changes` | `scoring.formulas.change_of_sums` | `tests/scoring/test_backends.py` |
-| `pixels` | `scoring.formulas.rows_in_pixels` | `tests/scoring/test_backends.py` |
-| `terms` | `scoring.terms.score_voxels` | `tests/scoring/test_backends.py` |
+| `map_add` | `mapping.update.integrate_pixels` | `mapping/test_kernels.py` |
+| `map_mark` | `mapping.seen.rows_in_view`, `mark_rows` | `mapping/test_kernels.py` |
+| `sums` | `scoring.formulas.sums_in_view` | `scoring/test_backends.py` |
+| `changes` | `scoring.formulas.change_of_sums` | `scoring/test_backends.py` |
+| `pixels` | `scoring.formulas.rows_in_pixels` | `scoring/test_backends.py` |
+| `terms` | `scoring.terms.score_voxels` | `scoring/test_backends.py` |
+| `composite` | `splatting.backends.reference.rasterize` | `splatting/backends/test_numba.py` |
+| `composite_gradient` | the same, by `jax.grad` | `splatting/backends/test_numba.py` |
+| `image_loss` | `splatting.training.loss.photometric_loss` | `splatting/training/test_kernels.py` |
+| `adam` | `splatting.training.optimizer.adam_update` | `splatting/training/test_kernels.py` |
+| `squares` | `baselines.information.pixel_squares` | `baselines/test_information.py` |
+| `tallies` | `baselines.information.pixel_tallies` | `baselines/test_information.py` |
 """

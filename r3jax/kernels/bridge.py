@@ -1,4 +1,4 @@
-"""The kernels of maps and scores as XLA's custom calls: each reads its arguments and runs."""
+"""The kernels as XLA's custom calls: each reads its arguments and runs."""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
@@ -21,6 +21,7 @@ from r3jax.kernels.native.ffi import (
     floats1,
     floats2,
     floats3,
+    floats_flat,
     ints1,
     ints2,
     register_handlers,
@@ -31,6 +32,11 @@ from r3jax.kernels.scoring.pixels import pixels
 from r3jax.kernels.scoring.rows import Terms, terms
 from r3jax.kernels.scoring.sums import Sums, Tables, sums
 from r3jax.kernels.scoring.terms import Choices
+from r3jax.kernels.splatting.passes import backward_pass, forward_pass
+from r3jax.kernels.splatting.squares import squares_pass
+from r3jax.kernels.splatting.tallies import tallies_pass
+from r3jax.kernels.training.adam import adam_pass
+from r3jax.kernels.training.image_loss import loss_pass
 
 # Places of arguments are literals, so that LLVM sees through all of this.
 
@@ -206,6 +212,139 @@ def _changes(frame):
     return 0
 
 
+# Plain tuples below: loops of several threads take no named ones within others.
+
+
+@inlined
+def _cloud(frame, kind):
+    """`calls.Cloud`, the first six arrays."""
+    return (
+        floats2(frame, kind, 0), floats2(frame, kind, 1), floats2(frame, kind, 2),
+        floats1(frame, kind, 3), floats2(frame, kind, 4), floats2(frame, kind, 5),
+    )  # fmt: skip
+
+
+@inlined
+def _images(frame, kind, first):
+    """`calls.Images`."""
+    return (
+        floats3(frame, kind, first), floats2(frame, kind, first + 1),
+        floats2(frame, kind, first + 2),
+    )  # fmt: skip
+
+
+@inlined
+def _lists(frame, kind, first):
+    """`calls.Drawn` but for the records."""
+    return (
+        ints1(frame, kind, first), ints1(frame, kind, first + 1), bytes1(frame, kind, first + 2),
+        ints1(frame, kind, first + 3), ints1(frame, kind, first + 4),
+    )  # fmt: skip
+
+
+def _composite(frame):
+    """Arguments: cloud (6), view, workers. Results: images (3), totals, drawn (6)."""
+    if answers_metadata(frame):
+        return 0
+    totals = ints1(frame, RESULTS, 3)
+    totals[0], totals[1] = 0, 1  # overflow, should the pass fail
+    forward_pass(
+        _cloud(frame, ARGUMENTS), floats1(frame, ARGUMENTS, 6),
+        np.int64(ints1(frame, ARGUMENTS, 7)[0]),
+        _images(frame, RESULTS, 0), totals, floats2(frame, RESULTS, 4),
+        _lists(frame, RESULTS, 5),
+    )  # fmt: skip
+    return 0
+
+
+def _composite_gradient(frame):
+    """Arguments: those of `_composite`, images (3), drawn (6), gradients of the images (3).
+
+    Results: gradients by the cloud (6) and by the view.
+    """
+    if answers_metadata(frame):
+        return 0
+    backward_pass(
+        _cloud(frame, ARGUMENTS), floats1(frame, ARGUMENTS, 6),
+        np.int64(ints1(frame, ARGUMENTS, 7)[0]),
+        _images(frame, ARGUMENTS, 8), floats2(frame, ARGUMENTS, 11),
+        _lists(frame, ARGUMENTS, 12), _images(frame, ARGUMENTS, 17),
+        _cloud(frame, RESULTS), floats1(frame, RESULTS, 6),
+    )  # fmt: skip
+    return 0
+
+
+def _squares(frame):
+    """Arguments: those of `_composite`, images (3), drawn (6), background. Results: squares (5)."""
+    if answers_metadata(frame):
+        return 0
+    squares_pass(
+        _cloud(frame, ARGUMENTS), floats1(frame, ARGUMENTS, 6),
+        np.int64(ints1(frame, ARGUMENTS, 7)[0]),
+        _images(frame, ARGUMENTS, 8), floats2(frame, ARGUMENTS, 11),
+        _lists(frame, ARGUMENTS, 12), floats1(frame, ARGUMENTS, 17)[0],
+        (
+            floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1), floats2(frame, RESULTS, 2),
+            floats1(frame, RESULTS, 3), floats2(frame, RESULTS, 4),
+        ),
+    )  # fmt: skip
+    return 0
+
+
+def _tallies(frame):
+    """Arguments: drawn (6), workers, value, counts, least. Result: the tallies."""
+    if answers_metadata(frame):
+        return 0
+    tallies_pass(
+        floats2(frame, ARGUMENTS, 0), _lists(frame, ARGUMENTS, 1),
+        np.int64(ints1(frame, ARGUMENTS, 6)[0]),
+        floats2(frame, ARGUMENTS, 7), floats2(frame, ARGUMENTS, 8), floats1(frame, ARGUMENTS, 9),
+        floats2(frame, RESULTS, 0),
+    )  # fmt: skip
+    return 0
+
+
+def _image_loss(frame):
+    """Arguments: image, target, weight, workers. Results: loss and error, gradient."""
+    if answers_metadata(frame):
+        return 0
+    loss_pass(
+        floats2(frame, ARGUMENTS, 0),
+        floats2(frame, ARGUMENTS, 1),
+        floats1(frame, ARGUMENTS, 2)[0],
+        np.int64(ints1(frame, ARGUMENTS, 3)[0]),
+        floats1(frame, RESULTS, 0),
+        floats2(frame, RESULTS, 1),
+    )
+    return 0
+
+
+@inlined
+def _scene(frame, kind, first):
+    """The five arrays of a scene, each flat."""
+    return (
+        floats_flat(frame, kind, first), floats_flat(frame, kind, first + 1),
+        floats_flat(frame, kind, first + 2), floats_flat(frame, kind, first + 3),
+        floats_flat(frame, kind, first + 4),
+    )  # fmt: skip
+
+
+def _adam(frame):
+    """Arguments: scene, both moments, gradient (5 each), rates, corrections, options.
+
+    Results: scene and moments, in the place of the arguments, and if the step was done.
+    """
+    if answers_metadata(frame):
+        return 0
+    adam_pass(
+        _scene(frame, RESULTS, 0), _scene(frame, ARGUMENTS, 15),
+        _scene(frame, RESULTS, 5), _scene(frame, RESULTS, 10),
+        floats1(frame, ARGUMENTS, 20), floats1(frame, ARGUMENTS, 21), ints1(frame, ARGUMENTS, 22),
+        ints1(frame, RESULTS, 15),
+    )  # fmt: skip
+    return 0
+
+
 # What takes longest and is waited for first comes first: who has a core to spare compiles in this
 # order (`native.ahead`).
 HANDLERS = {
@@ -215,6 +354,12 @@ HANDLERS = {
     "pixels": _pixels,
     "changes": _changes,
     "terms": _terms,
+    "composite": _composite,
+    "composite_gradient": _composite_gradient,
+    "image_loss": _image_loss,
+    "adam": _adam,
+    "squares": _squares,
+    "tallies": _tallies,
 }
 
 

@@ -4,7 +4,8 @@ Arguments are named structs. Here their fields are arrays of JAX; in the kernels
 numbers of Numba, which `kernels.bridge` reads out of a call in the order of the fields.
 
 Shape symbols: N rows of a map; W words of bins; P views; c cells; B bins of a panorama; h w pixels
-of a depth buffer; H W pixels of an image; p q bytes that hold a bit for every row and every cell.
+of a depth buffer; H W pixels of an image; p q bytes that hold a bit for every row and every cell;
+n Gaussians; K floats of their harmonics; E intersections that there is room for; T tiles.
 """
 
 import functools
@@ -16,6 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
 from r3jax.geometry.sphere import fibonacci_lattice, nearest_bin_table
+from r3jax.kernels.constants import TILE
+from r3jax.kernels.splatting import records
 
 
 class MapRows(NamedTuple):
@@ -143,6 +146,63 @@ class FrameArrays(NamedTuple):
 
     drops_edges: Float[Array, ""]
     """Above 0: pixels on depth edges are left out."""
+
+
+class Cloud(NamedTuple):
+    """Gaussians, and where their projected centers are moved to."""
+
+    means: Float[Array, "n 3"]
+    """Centers [m]."""
+
+    quats: Float[Array, "n 4"]
+    """Orientations, of any length."""
+
+    log_scales: Float[Array, "n 3"]
+    """Logarithms of standard deviations [m]."""
+
+    logits: Float[Array, " n"]
+    """Of opacities."""
+
+    sh: Float[Array, "n K"]
+    """Harmonics, the colors of each side by side."""
+
+    center_offsets: Float[Array, "n 2"]
+    """Added to the projected centers [px]."""
+
+
+class Images(NamedTuple):
+    """Gaussians composited on black, or a gradient by that."""
+
+    rgb: Float[Array, "H W 3"]
+    """Sum of weight x color."""
+
+    depth: Float[Array, "H W"]
+    """Sum of weight x z-depth [m]."""
+
+    alpha: Float[Array, "H W"]
+    """Sum of the weights."""
+
+
+class Drawn(NamedTuple):
+    """What compositing keeps for its gradient: projected Gaussians, and the lists of the tiles."""
+
+    records: Float[Array, "n 16"]
+    """See `kernels.splatting.records`."""
+
+    ids: Int[Array, " E"]
+    """Gaussians of the lists, one list after the other."""
+
+    slots: Int[Array, " E"]
+    """Places of the intersections in the order of the Gaussians."""
+
+    rows: UInt8[Array, " E"]
+    """First and last row of a tile that is touched, four bits each."""
+
+    starts: Int[Array, " T+1"]
+    """Where the list of each tile begins."""
+
+    ends: Int[Array, " T"]
+    """How far it was used."""
 
 
 def map_add(
@@ -291,6 +351,119 @@ def terms(
     term = jax.ShapeDtypeStruct((position.shape[0], rows.counts.shape[0]), jnp.float32)
     options = _options(*_choices(forms))
     return _call("terms", [term] * 6, (rows, position, focal, options, _lattice(voxel_bins)))
+
+
+def composite(
+    cloud: Cloud, view: Float[Array, " 19"], size: tuple[int, int], budget: int
+) -> tuple[Images, Int[Array, " 2"], Drawn]:
+    """Composites Gaussians on black: `splatting.backends.reference.rasterize`.
+
+    Args:
+        cloud: the Gaussians.
+        view: see `kernels.splatting.records.VIEW_SIZE`.
+        size: width and height of the image [px].
+        budget: intersections of a tile and a Gaussian that there is room for.
+
+    Returns:
+        The images, black if the room is too small; intersections needed, and how many exceed the
+        budget; and what the gradient needs.
+    """
+    width, height = size
+    tiles = -(-width // TILE) * -(-height // TILE)
+    floats = [(height, width, 3), (height, width), (height, width)]
+    shapes = [
+        *(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in floats),
+        jax.ShapeDtypeStruct((2,), jnp.int32),
+        jax.ShapeDtypeStruct((cloud.means.shape[0], records.SIZE), jnp.float32),
+        jax.ShapeDtypeStruct((budget,), jnp.int32),
+        jax.ShapeDtypeStruct((budget,), jnp.int32),
+        jax.ShapeDtypeStruct((budget,), jnp.uint8),
+        jax.ShapeDtypeStruct((tiles + 1,), jnp.int32),
+        jax.ShapeDtypeStruct((tiles,), jnp.int32),
+    ]
+    found = _call("composite", shapes, (cloud, view, _workers()), vmap_method="sequential")
+    return Images(*found[:3]), found[3], Drawn(*found[4:])
+
+
+def composite_gradient(
+    cloud: Cloud, view: Float[Array, " 19"], images: Images, drawn: Drawn, gradients: Images
+) -> tuple[Cloud, Float[Array, " 19"]]:
+    """Computes gradients by Gaussians and view, from those by the images of `composite`."""
+    arguments = (cloud, view, _workers(), images, drawn, gradients)
+    shapes = [*map(_like, (*cloud, view))]
+    *by_cloud, by_view = _call("composite_gradient", shapes, arguments, vmap_method="sequential")
+    return Cloud(*by_cloud), by_view
+
+
+def squares(
+    cloud: Cloud, view: Float[Array, " 19"], images: Images, drawn: Drawn, background: Array
+) -> tuple[Array, ...]:
+    """Sums squared gradients of pixels: `baselines.information.pixel_squares`.
+
+    Args:
+        cloud: the Gaussians.
+        view: of them.
+        images: of `composite`.
+        drawn: of `composite`.
+        background: sum of its channels [1].
+
+    Returns:
+        Sums by means, quats, log scales, logits and harmonics.
+    """
+    arguments = (cloud, view, _workers(), images, drawn, background)
+    return _call("squares", [*map(_like, cloud[:5])], arguments, vmap_method="sequential")
+
+
+def tallies(
+    drawn: Drawn, value: Float[Array, "H W"], counts: Float[Array, "H W"], least: Float[Array, " 2"]
+) -> Float[Array, "n 2"]:
+    """Sums weights of single Gaussians over pixels: `baselines.information.pixel_tallies`."""
+    shape = jax.ShapeDtypeStruct((drawn.records.shape[0], 2), jnp.float32)
+    arguments = (drawn, _workers(), value, counts, least)
+    return _call("tallies", [shape], arguments, vmap_method="sequential")[0]
+
+
+def image_loss(
+    rgb: Float[Array, "H W 3"], target: Float[Array, "H W 3"], weight: Float[Array, ""]
+) -> tuple[Float[Array, " 2"], Float[Array, "H W 3"]]:
+    """Computes `splatting.training.loss.loss_and_error`, and the gradient of the loss."""
+    height, width, _ = rgb.shape
+    flat = [image.reshape(height, 3 * width) for image in (rgb, target)]
+    shapes = [jax.ShapeDtypeStruct((2,), jnp.float32), _like(flat[0])]
+    arguments = (*flat, weight.reshape(1), _workers())
+    numbers, gradient = _call("image_loss", shapes, arguments, vmap_method="sequential")
+    return numbers, gradient.reshape(rgb.shape)
+
+
+def adam(
+    state: list[Array], gradient: list[Array], rates: Float[Array, " 6"],
+    corrections: Float[Array, " 2"], num_open: Int[Array, ""], is_wanted: Bool[Array, ""],
+) -> tuple[Array, ...]:  # fmt: skip
+    """Takes a step of Adam in place: `splatting.training.optimizer.adam_update`.
+
+    Args:
+        state: the five arrays of a scene, and their moments of first and second order.
+        gradient: by the five arrays.
+        rates: of means, quats, log scales, logits, the constant harmonic and the others.
+        corrections: factors of the moments.
+        num_open: harmonics that take part.
+        is_wanted: if not, or if a number or a gradient is not finite, nothing changes.
+
+    Returns:
+        The state after, and whether the step was done.
+    """
+    row = 3 * state[4].shape[1]
+    options = [jnp.int32(x) for x in (row, 3 * num_open, is_wanted, _workers()[0])]
+    # Not flat: XLA would copy what it has to view as another shape.
+    shapes = [*map(_like, state), jax.ShapeDtypeStruct((1,), jnp.int32)]
+    *after, applied = _call(
+        "adam",
+        shapes,
+        (state, gradient, rates, corrections, jnp.stack(options)),
+        input_output_aliases={i: i for i in range(len(state))},
+        vmap_method="sequential",
+    )
+    return (*after, applied[0] > 0)
 
 
 def _call(name: str, results: list[jax.ShapeDtypeStruct], arguments: Any, **options: Any) -> Any:

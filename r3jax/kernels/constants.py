@@ -1,5 +1,7 @@
 """Numbers that the formulas in plain JAX share with the kernels."""
 
+import numpy as np
+
 ON_EDGE = 1e-6
 """Tangent coordinates within this of 0 lie on the edge of kappa's box, which belongs to it."""
 
@@ -41,3 +43,54 @@ JOINED = 1 << 13
 MAX_PROBES = 192
 """A key that finds no place within this many probes counts as dropped: at a load of 0.7 the
 expected longest search is about 30."""
+
+TILE = 16
+"""Edge of a tile [px]."""
+
+NEAR_PLANE = 0.01
+"""Gaussians whose center is nearer than this are not drawn [m]."""
+
+DILATION = 0.3
+"""Added to the diagonal of every projected covariance [px^2], so that nothing is thinner than a
+pixel (Kerbl et al. 2023)."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""A Gaussian whose alpha at a pixel is below this is skipped there."""
+
+ALPHA_MAX = 0.99
+"""Alpha is cut off here, so that the transmittance never reaches 0."""
+
+TRANSMITTANCE_MIN = 1e-4
+"""Compositing stops before the transmittance would fall to this."""
+
+FRUSTUM_MARGIN = 0.3
+"""The Jacobian of the projection is taken at most this share of half the image outside it."""
+
+SH0 = 0.28209479177387814
+"""Factors of spherical harmonics of degree 0, and below of degree 1 to 3."""
+
+SH1 = 0.4886025119029199
+SH2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+SH3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
+
+WINDOW_RADIUS = 5
+"""The window of SSIM has 2 x 5 + 1 pixels a side."""
+
+WINDOW_SIGMA = 1.5
+"""Standard deviation of the window [px]."""
+
+_exponents = -0.5 * (np.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1) / WINDOW_SIGMA) ** 2
+TAPS = [float(w) for w in np.exp(_exponents) / np.exp(_exponents).sum()]
+"""The window along a row or a column."""
+
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+"""Stabilizers of SSIM for colors in [0, 1] (Wang et al. 2004)."""
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+"""Of Adam: decay of the moments of first and second order, and what keeps its step finite."""

@@ -6,8 +6,9 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from r3jax.errors import InputError
-from r3jax.geometry.arguments import one, or_none
+from r3jax.geometry.arguments import a_camera, a_pose, checked, one, or_none
 from r3jax.kernels.calls import Forms
+from r3jax.mapping.state import a_map
 from r3jax.visibility.config import VisibilityConfig, as_float32
 
 PAPER = Forms()
@@ -61,3 +62,6 @@ def scoring_config_of(settings: dict[str, Any]) -> ScoringConfig:
 
 
 scoring_settings = or_none(one(ScoringConfig, "None: its defaults"))
+
+checked_view = checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+"""Decorates a question about one view of a map with checks of its arguments."""

@@ -16,11 +16,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from r3jax.errors import InputError
-from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked
+from r3jax.geometry.arguments import a_point, checked
 from r3jax.geometry.cameras import Camera, is_traced, nan_unless_valid
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.backend import mean_in_pixels, rows_in_pixels, terms_of_rows
-from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
+from r3jax.scoring.config import Forms, ScoringConfig, checked_view
 from r3jax.scoring.formulas import voxels_of_rows
 from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.visibility.views import pinhole_view
@@ -86,7 +86,7 @@ class TermImages(eqx.Module):
     """gamma: the sharpness that it was seen with."""
 
 
-@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@checked_view
 @jax.jit
 def term_images(
     state: MapState,
@@ -111,7 +111,7 @@ def term_images(
     )
 
 
-@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@checked_view
 @jax.jit
 def renderability_image(
     state: MapState,
@@ -128,7 +128,7 @@ def renderability_image(
     return term_images(state, camera, T_world_camera, config).value
 
 
-@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@checked_view
 @jax.jit
 def renderability(
     state: MapState,

@@ -63,7 +63,7 @@ def find_backend(name: str) -> Rasterize:
     if name == "numba" and not can_call_kernels():
         name = "xla"
     if name == "numba":
-        from r3jax.kernels.splatting import rasterize
+        from r3jax.splatting.backends.numba import rasterize
     elif name == "xla":
         from r3jax.splatting.backends.xla import rasterize
     elif name == "splax":

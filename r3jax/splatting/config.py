@@ -1,30 +1,8 @@
-"""Settings of the rasterizer, and the constants that every backend shares."""
+"""Settings of the rasterizer."""
 
 from typing import Literal
 
 import equinox as eqx
-
-TILE = 16
-"""Edge of a tile [px]."""
-
-NEAR = 0.01
-"""Gaussians whose center is nearer than this are not drawn [m]."""
-
-DILATION = 0.3
-"""Added to the diagonal of every projected covariance [px^2], so that nothing is thinner than a
-pixel (Kerbl et al. 2023)."""
-
-ALPHA_MIN = 1.0 / 255.0
-"""A Gaussian whose alpha at a pixel is below this is skipped there."""
-
-ALPHA_MAX = 0.99
-"""Alpha is cut off here, so that the transmittance never reaches 0."""
-
-TRANSMITTANCE_MIN = 1e-4
-"""Compositing stops before the transmittance would fall to this."""
-
-FRUSTUM_MARGIN = 0.3
-"""The Jacobian of the projection is taken at most this share of half the image outside it."""
 
 Backend = Literal["auto", "numba", "xla", "splax", "reference"]
 

@@ -4,43 +4,34 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-C0 = 0.28209479177387814
-C1 = 0.4886025119029199
-C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-C3 = (
-    0.5900435899266435,
-    2.890611442640554,
-    0.4570457994644658,
-    0.3731763325901154,
-    1.445305721320277,
-)
+from r3jax.kernels.constants import SH0, SH1, SH2, SH3
 
 
 def harmonics(
     x: Float[Array, " n"], y: Float[Array, " n"], z: Float[Array, " n"], degree: int
 ) -> list[Float[Array, " n"]]:
     """Returns the basis functions at unit directions (x, y, z), (degree + 1)^2 of them."""
-    basis = [jnp.full_like(x, C0)]
+    basis = [jnp.full_like(x, SH0)]
     if degree >= 1:
-        basis += [-C1 * y, C1 * z, -C1 * x]
+        basis += [-SH1 * y, SH1 * z, -SH1 * x]
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
         basis += [
-            C2[0] * x * y,
-            -C2[0] * y * z,
-            C2[1] * (2.0 * zz - xx - yy),
-            -C2[0] * x * z,
-            C2[2] * (xx - yy),
+            SH2[0] * x * y,
+            -SH2[0] * y * z,
+            SH2[1] * (2.0 * zz - xx - yy),
+            -SH2[0] * x * z,
+            SH2[2] * (xx - yy),
         ]
         if degree >= 3:
             basis += [
-                -C3[0] * y * (3.0 * xx - yy),
-                C3[1] * x * y * z,
-                -C3[2] * y * (4.0 * zz - xx - yy),
-                C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-                -C3[2] * x * (4.0 * zz - xx - yy),
-                C3[4] * z * (xx - yy),
-                -C3[0] * x * (xx - 3.0 * yy),
+                -SH3[0] * y * (3.0 * xx - yy),
+                SH3[1] * x * y * z,
+                -SH3[2] * y * (4.0 * zz - xx - yy),
+                SH3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+                -SH3[2] * x * (4.0 * zz - xx - yy),
+                SH3[4] * z * (xx - yy),
+                -SH3[0] * x * (xx - 3.0 * yy),
             ]
     return basis
 

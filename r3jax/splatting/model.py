@@ -28,8 +28,8 @@ from r3jax.files import (
     own_folder,
     write_atomic,
 )
+from r3jax.kernels.constants import SH0
 from r3jax.splatting.errors import SceneFileError
-from r3jax.splatting.harmonics import C0
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
@@ -235,5 +235,5 @@ def _history_csv(history: History) -> bytes:
 def scene_points(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
     """Takes centers [m] and mean colors (uint8) of the Gaussians in use, [n, 3] each."""
     alive = np.asarray(scene.is_alive)
-    colors = np.clip(np.asarray(scene.sh)[alive, 0] * C0 + 0.5, 0.0, 1.0)
+    colors = np.clip(np.asarray(scene.sh)[alive, 0] * SH0 + 0.5, 0.0, 1.0)
     return np.asarray(scene.means)[alive], np.round(255.0 * colors).astype(np.uint8)

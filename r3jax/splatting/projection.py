@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera, invert_pose
-from r3jax.splatting.config import ALPHA_MIN, DILATION, FRUSTUM_MARGIN, NEAR
+from r3jax.kernels.constants import ALPHA_MIN, DILATION, FRUSTUM_MARGIN, NEAR_PLANE
 from r3jax.splatting.harmonics import view_colors
 from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
 
@@ -63,7 +63,7 @@ def project_gaussians(
     scene = without_nans(scene)
     T_camera_world = invert_pose(T_world_camera)
     x, y, z = _in_camera(scene.means, T_camera_world)
-    z_safe = jnp.where(z > NEAR, z, 1.0)
+    z_safe = jnp.where(z > NEAR_PLANE, z, 1.0)
     cov = _image_covariance(scene, camera, T_camera_world[:3, :3], x, y, z_safe)
     a, b, c = cov
     determinant = a * c - b * b
@@ -78,7 +78,7 @@ def project_gaussians(
     opacity = jax.nn.sigmoid(scene.opacity_logits)
     color = view_colors(scene.sh, scene.means, T_world_camera[:3, 3])
     has_color = jnp.isfinite(color).all(axis=0)
-    valid = (z > NEAR) & (determinant > 0.0) & has_color
+    valid = (z > NEAR_PLANE) & (determinant > 0.0) & has_color
     return ProjectedGaussians(
         center=center,
         conic=conic,

@@ -129,7 +129,7 @@ def test_an_unknown_backend_is_refused_by_name():
 def test_auto_takes_numba_on_a_cpu():
     if jax.default_backend() != "cpu":
         pytest.skip("needs a CPU as JAX's device")
-    from r3jax.kernels.splatting import rasterize
+    from r3jax.splatting.backends.numba import rasterize
 
     assert backend_module.find_backend("auto") is rasterize
 

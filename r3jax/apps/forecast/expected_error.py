@@ -23,11 +23,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from r3jax.apps.forecast.difficulty import difficulty_of_rows
-from r3jax.geometry.arguments import a_camera, a_pose, checked
 from r3jax.geometry.cameras import Camera, nan_unless_valid
-from r3jax.mapping.state import MapState, a_map
+from r3jax.mapping.state import MapState
 from r3jax.scoring.backend import rows_in_pixels
-from r3jax.scoring.config import ScoringConfig, scoring_settings
+from r3jax.scoring.config import ScoringConfig, checked_view
 from r3jax.scoring.formulas import voxels_of_rows
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import pinhole_view
@@ -98,7 +97,7 @@ class ExpectedError(eqx.Module):
     """One of ten views is better."""
 
 
-@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@checked_view
 @jax.jit
 def error_terms(
     state: MapState,
@@ -150,7 +149,7 @@ def mean_square_color(state: MapState) -> Float[Array, ""]:
     return (jnp.sum(squares) + _PRIOR_BRIGHTNESS) / (number + 1.0)
 
 
-@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@checked_view
 @jax.jit
 def expected_error_images(
     state: MapState,
@@ -167,7 +166,7 @@ def expected_error_images(
     return ErrorImages(_weighted(SQUARED, terms), _weighted(DISSIMILARITY, terms))
 
 
-@checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
+@checked_view
 @jax.jit
 def expected_error(
     state: MapState,

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from r3jax.apps.viewer.color_maps import ORDER, paint
 from r3jax.exploration.taken_views import StepRow
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.constants import SH0
 from r3jax.runs.reader import Run
 from r3jax.runs.rows import paths_to
-from r3jax.splatting.harmonics import C0
 from r3jax.splatting.scene import GaussianScene
 
 POINT_BUDGET = 200_000
@@ -119,7 +119,7 @@ def splat_arrays(
         best = np.sort(np.argsort(-opacity * area, kind="stable")[:budget])
         alive, opacity, scales = alive[best], opacity[best], scales[best]
     axes = _matrices(np.asarray(scene.quats, dtype=np.float64)[alive]) * scales[:, None, :]
-    rgb = np.asarray(scene.sh, dtype=np.float64)[alive, 0] * C0 + 0.5
+    rgb = np.asarray(scene.sh, dtype=np.float64)[alive, 0] * SH0 + 0.5
     arrays = (
         np.asarray(scene.means)[alive],
         axes @ axes.transpose(0, 2, 1),

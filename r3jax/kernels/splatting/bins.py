@@ -9,6 +9,7 @@ A Gaussian is listed in the tiles that its ellipse touches: its exact rows in ea
 import numpy as np
 from numba import prange
 
+from r3jax.kernels.constants import TILE
 from r3jax.kernels.native.compiled import claim, inlined, kernel, parallel_kernel
 from r3jax.kernels.splatting import records as at
 from r3jax.kernels.splatting.project import color_one, project_one
@@ -20,7 +21,6 @@ from r3jax.kernels.splatting.records import (
     TWO_S,
     VARIANCE,
 )
-from r3jax.splatting.config import TILE
 
 _SLACK = np.float32(2e-3)
 """Added to every extent [px], so that rounding never cuts off a pixel."""

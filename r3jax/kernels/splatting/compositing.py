@@ -16,6 +16,8 @@ forward pass's own.
 import numpy as np
 from numba import prange
 
+from r3jax.kernels import constants
+from r3jax.kernels.constants import TILE
 from r3jax.kernels.native.compiled import claim, inlined, kernel, parallel_kernel, prefetch
 from r3jax.kernels.splatting import records as at
 from r3jax.kernels.splatting.lanes import (
@@ -34,12 +36,10 @@ from r3jax.kernels.splatting.lanes import (
     store12,
     sums_of_10,
 )
-from r3jax.splatting import config
-from r3jax.splatting.config import TILE
 
 PIXELS = TILE * TILE
-ALPHA_MIN, ALPHA_MAX = np.float32(config.ALPHA_MIN), np.float32(config.ALPHA_MAX)
-TRANSMITTANCE_MIN = np.float32(config.TRANSMITTANCE_MIN)
+ALPHA_MIN, ALPHA_MAX = np.float32(constants.ALPHA_MIN), np.float32(constants.ALPHA_MAX)
+TRANSMITTANCE_MIN = np.float32(constants.TRANSMITTANCE_MIN)
 CHECK_EVERY = 16
 """Gaussians between two looks whether a tile is finished."""
 

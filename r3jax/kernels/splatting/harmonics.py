@@ -8,12 +8,12 @@ The same functions in the same order as `r3jax.splatting.harmonics`.
 
 import numpy as np
 
+from r3jax.kernels import constants
 from r3jax.kernels.native.compiled import inlined_fast
-from r3jax.splatting import harmonics as shared
 
-_C0, _C1 = np.float32(shared.C0), np.float32(shared.C1)
-_P, _Q, _R = (np.float32(c) for c in shared.C2)
-_S, _T, _U, _V, _W = (np.float32(c) for c in shared.C3)
+_C0, _C1 = np.float32(constants.SH0), np.float32(constants.SH1)
+_P, _Q, _R = (np.float32(c) for c in constants.SH2)
+_S, _T, _U, _V, _W = (np.float32(c) for c in constants.SH3)
 _2, _3, _4, _6, _8 = (np.float32(i) for i in (2, 3, 4, 6, 8))
 
 

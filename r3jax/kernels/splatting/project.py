@@ -5,15 +5,15 @@
 
 import numpy as np
 
+from r3jax.kernels import constants
 from r3jax.kernels.native.compiled import inlined_fast
 from r3jax.kernels.splatting import records as at
 from r3jax.kernels.splatting.harmonics import basis_at
-from r3jax.splatting import config
 
-NEAR = np.float32(config.NEAR)
-DILATION = np.float32(config.DILATION)
-ALPHA_MIN = np.float32(config.ALPHA_MIN)
-MARGIN = np.float32(0.5 * config.FRUSTUM_MARGIN)
+NEAR = np.float32(constants.NEAR_PLANE)
+DILATION = np.float32(constants.DILATION)
+ALPHA_MIN = np.float32(constants.ALPHA_MIN)
+MARGIN = np.float32(0.5 * constants.FRUSTUM_MARGIN)
 LOG2_E = np.float32(np.log2(np.e))
 HALF, ZERO, ONE, TWO = (np.float32(x) for x in (0.5, 0.0, 1.0, 2.0))
 _BALL_SLACK = np.float32(1.01)

@@ -18,6 +18,7 @@ backward pass, given one of the six numbers at a time.
 import numpy as np
 from numba import prange
 
+from r3jax.kernels.constants import TILE
 from r3jax.kernels.native.compiled import claim, inlined, kernel, parallel_kernel, prefetch
 from r3jax.kernels.splatting import records as at
 from r3jax.kernels.splatting.compositing import (
@@ -49,7 +50,6 @@ from r3jax.kernels.splatting.lanes import (
 )
 from r3jax.kernels.splatting.passes import expect_writes
 from r3jax.kernels.splatting.project import sigmoid
-from r3jax.splatting.config import TILE
 
 MOMENTS = 19
 """Different numbers in M: v^2 by the monomials 1, dx^2, dx^3, dx^4, dx dy, dx^2 dy, dx^3 dy, dy^2,

@@ -6,6 +6,7 @@
 import numpy as np
 from numba import prange
 
+from r3jax.kernels.constants import TILE
 from r3jax.kernels.native.compiled import claim, inlined, kernel, parallel_kernel, prefetch
 from r3jax.kernels.splatting import records as at
 from r3jax.kernels.splatting.compositing import (
@@ -28,7 +29,6 @@ from r3jax.kernels.splatting.lanes import (
     sums_of_10,
 )
 from r3jax.kernels.splatting.passes import expect_writes
-from r3jax.splatting.config import TILE
 
 _ZERO = np.float32(0.0)
 

@@ -10,9 +10,9 @@ yet, repeats: a pattern of whole vectors says it.
 import numpy as np
 from numba import prange
 
+from r3jax.kernels.constants import BETA1, BETA2, EPSILON
 from r3jax.kernels.native.compiled import claim, flush_denormals, inlined, kernel, parallel_kernel
 from r3jax.kernels.splatting.lanes import fma, load, quotient, root, splat, store
-from r3jax.splatting.training.optimizer import BETA1, BETA2, EPSILON
 
 CHUNK = 1 << 16
 """Floats that one thread takes at a time."""

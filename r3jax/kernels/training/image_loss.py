@@ -22,6 +22,7 @@ before and behind them, so that no tap asks where the image ends.
 import numpy as np
 from numba import prange
 
+from r3jax.kernels import constants
 from r3jax.kernels.native.compiled import claim, flush_denormals, inlined, kernel, parallel_kernel
 from r3jax.kernels.splatting.lanes import (
     fma,
@@ -33,7 +34,6 @@ from r3jax.kernels.splatting.lanes import (
     splat,
     store,
 )
-from r3jax.splatting.training import loss
 
 BORDER = 16
 """Zeros before and behind a row of floats: a vector, of which the window needs 15."""
@@ -42,9 +42,9 @@ BAND = 32
 """Rows that one thread takes at a time; sums are per band, so that they do not depend on the
 number of threads."""
 
-_RADIUS, _WIDTH = loss.RADIUS, 2 * loss.RADIUS + 1
-_TAPS = np.array(loss.TAPS, np.float32)
-_C1, _C2 = np.float32(loss.C1), np.float32(loss.C2)
+_RADIUS, _WIDTH = constants.WINDOW_RADIUS, 2 * constants.WINDOW_RADIUS + 1
+_TAPS = np.array(constants.TAPS, np.float32)
+_C1, _C2 = np.float32(constants.SSIM_C1), np.float32(constants.SSIM_C2)
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera, invert_pose
+from r3jax.kernels.constants import NEAR_PLANE
 from r3jax.splatting.backend import Composite
-from r3jax.splatting.config import NEAR, RasterConfig
+from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.harmonics import view_colors
 from r3jax.splatting.projection import without_nans
 from r3jax.splatting.scene import GaussianScene
@@ -57,7 +58,7 @@ def rasterize(
         img_shape=image_shape,
         f=(focal, focal),
         c=(0.5 * camera.width, 0.5 * camera.height),
-        clip_thresh=NEAR,
+        clip_thresh=NEAR_PLANE,
     )
     colors = view_colors(scene.sh, scene.means, T_world_camera[:3, 3]).T
     image, alpha = splax.rasterize_depth(

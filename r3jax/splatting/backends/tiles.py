@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.splatting.config import NEAR, TILE
+from r3jax.kernels.constants import NEAR_PLANE, TILE
 
 DEPTH_BITS = 28
 """Bits of a float32 depth counted from 0.01 m: exact to 4e7 m, for each power of two takes 23."""
@@ -127,8 +127,8 @@ def near_to_far(depth: Float[Array, " n"], is_drawn: Bool[Array, " n"]) -> Int[A
     order so far being the low bits of its keys.
     """
     n = depth.shape[0]
-    bits = jax.lax.bitcast_convert_type(jnp.maximum(depth, NEAR), jnp.uint32)
-    base = jax.lax.bitcast_convert_type(jnp.float32(NEAR), jnp.uint32)
+    bits = jax.lax.bitcast_convert_type(jnp.maximum(depth, NEAR_PLANE), jnp.uint32)
+    base = jax.lax.bitcast_convert_type(jnp.float32(NEAR_PLANE), jnp.uint32)
     last = jnp.uint32(2**DEPTH_BITS - 1)
     keys = jnp.where(is_drawn, jnp.minimum(bits - base, last - jnp.uint32(1)), last)
     place_bits = max((n - 1).bit_length(), 1)

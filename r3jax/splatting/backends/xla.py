@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Num
 
 from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.constants import TILE, TRANSMITTANCE_MIN
 from r3jax.splatting.backend import Composite
 from r3jax.splatting.backends.tiles import TileLists, grid_shape, list_tiles
 from r3jax.splatting.backends.xla_chunk import (
@@ -27,7 +28,7 @@ from r3jax.splatting.backends.xla_chunk import (
     see_chunk,
     stage,
 )
-from r3jax.splatting.config import TILE, TRANSMITTANCE_MIN, RasterConfig
+from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import project_gaussians
 from r3jax.splatting.scene import GaussianScene
 

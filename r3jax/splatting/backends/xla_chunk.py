@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from r3jax.splatting.config import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+from r3jax.kernels.constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 
 PIXELS = TILE * TILE
 

@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 
 from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels.constants import SH0
 from r3jax.splatting.errors import ViewsError
-from r3jax.splatting.harmonics import C0
 from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
 from r3jax.splatting.views import Views
 
@@ -267,7 +267,7 @@ def _as_scene(
     logits = np.full(capacity, DEAD_LOGIT, dtype=np.float32)
     logits[:n] = np.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))
     sh = np.zeros((capacity, (sh_degree + 1) ** 2, 3), dtype=np.float32)
-    sh[:n, 0] = (colors - 0.5) / C0
+    sh[:n, 0] = (colors - 0.5) / SH0
     return GaussianScene(
         means=jnp.asarray(means),
         quats=jnp.zeros((capacity, 4)).at[:, 0].set(1.0),

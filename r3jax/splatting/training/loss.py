@@ -5,22 +5,11 @@ Shape symbols: H, W image size; c planes.
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
+from r3jax.kernels import calls
+from r3jax.kernels.constants import SSIM_C1, SSIM_C2, TAPS, WINDOW_RADIUS
 from r3jax.kernels.native.platform import by_platform
-
-RADIUS = 5
-"""The window of SSIM has 2 x 5 + 1 pixels a side."""
-
-SIGMA = 1.5
-"""Standard deviation of the window [px]."""
-
-C1, C2 = 0.01**2, 0.03**2
-"""Stabilizers of SSIM for colors in [0, 1] (Wang et al. 2004)."""
-
-_exponents = -0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2
-TAPS = [float(w) for w in np.exp(_exponents) / np.exp(_exponents).sum()]
 
 
 def loss_and_error(
@@ -44,14 +33,33 @@ def _by_formulas(
     return photometric_loss(rgb, target, lambda_dssim), error
 
 
+@jax.custom_vjp
 def _by_kernels(
     rgb: Float[Array, "H W 3"],
     target: Float[Array, "H W 3"],
     lambda_dssim: Float[Array, ""] | float,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    from r3jax.kernels.training import image_loss
+    return _by_kernels_forward(rgb, target, lambda_dssim)[0]
 
-    return image_loss(rgb, target, lambda_dssim)
+
+def _by_kernels_forward(
+    rgb: Float[Array, "H W 3"],
+    target: Float[Array, "H W 3"],
+    lambda_dssim: Float[Array, ""] | float,
+) -> tuple[tuple[Float[Array, ""], Float[Array, ""]], tuple[Array, Array]]:
+    weight = jnp.asarray(lambda_dssim, dtype=jnp.float32)
+    numbers, gradient = calls.image_loss(rgb, target, weight)
+    return (numbers[0], numbers[1]), (gradient, weight)
+
+
+def _by_kernels_backward(
+    residuals: tuple[Array, Array], by_results: tuple[Float[Array, ""], Float[Array, ""]]
+) -> tuple[Array, Array, Array]:
+    gradient, weight = residuals
+    return by_results[0] * gradient, jnp.zeros_like(gradient), jnp.zeros_like(weight)
+
+
+_by_kernels.defvjp(_by_kernels_forward, _by_kernels_backward)
 
 
 def photometric_loss(
@@ -77,8 +85,8 @@ def structural_similarity(
     mean_x, mean_y, xx, yy, xy = (blurred[3 * i : 3 * i + 3] for i in range(5))
     variances = (xx - mean_x * mean_x) + (yy - mean_y * mean_y)
     covariance = xy - mean_x * mean_y
-    luminance = (2.0 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
-    return jnp.mean(luminance * (2.0 * covariance + C2) / (variances + C2))
+    luminance = (2.0 * mean_x * mean_y + SSIM_C1) / (mean_x * mean_x + mean_y * mean_y + SSIM_C1)
+    return jnp.mean(luminance * (2.0 * covariance + SSIM_C2) / (variances + SSIM_C2))
 
 
 @jax.custom_vjp
@@ -88,7 +96,9 @@ def blur(planes: Float[Array, "c H W"]) -> Float[Array, "c H W"]:
     Separable, as shifted sums: XLA's convolutions are 60 times slower on CPUs.
     """
     height, width = planes.shape[1:]
-    padded = jnp.pad(planes, [(0, 0), (RADIUS, RADIUS), (RADIUS, RADIUS)])
+    padded = jnp.pad(
+        planes, [(0, 0), (WINDOW_RADIUS, WINDOW_RADIUS), (WINDOW_RADIUS, WINDOW_RADIUS)]
+    )
     rows = jnp.asarray(sum(w * padded[:, :, i : i + width] for i, w in enumerate(TAPS)))
     return jnp.asarray(sum(w * rows[:, i : i + height] for i, w in enumerate(TAPS)))
 

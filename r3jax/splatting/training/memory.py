@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from r3jax.splatting.config import TILE
+from r3jax.kernels.constants import TILE
 from r3jax.splatting.errors import TooLargeError
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.views import Views

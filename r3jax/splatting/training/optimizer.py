@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
+from r3jax.kernels import calls
+from r3jax.kernels.constants import BETA1, BETA2, EPSILON
 from r3jax.kernels.native.platform import by_platform
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
-
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 # Optax types any tree as its own union of arrays and mappings.
 _optax: Any = optax
@@ -114,18 +114,19 @@ def _by_kernels(
     config: TrainConfig,
     is_wanted: Bool[Array, ""],
 ) -> tuple[GaussianScene, Moments, Bool[Array, ""]]:
-    from r3jax.kernels.training import adam_step
-
     rates = [rate_of_means, config.rate_quats, config.rate_log_scales, config.rate_opacities]
     rates += [config.rate_sh, config.rate_sh * _HIGHER_HARMONICS]
     count = (moments.count + 1).astype(jnp.float32)
-    (scene, mean, square), is_done = adam_step(
-        (scene, moments.mean, moments.square, gradient),
+    leaves, structure = jax.tree.flatten((scene, moments.mean, moments.square))
+    *after, is_done = calls.adam(
+        leaves,
+        jax.tree.leaves(gradient),
         jnp.stack([jnp.float32(rate) for rate in rates]),
         jnp.stack([1.0 / (1.0 - BETA1**count), 1.0 / (1.0 - BETA2**count)]),
         (degree + 1) ** 2,
         is_wanted,
     )
+    scene, mean, square = jax.tree.unflatten(structure, after)
     return scene, Moments(mean, square, moments.count + is_done.astype(jnp.int32)), is_done
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from r3jax.geometry.cameras import invert_pose, project, transform
-from r3jax.splatting.config import NEAR
+from r3jax.kernels.constants import NEAR_PLANE
 from r3jax.splatting.render import render
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training import density, mcmc
@@ -215,7 +215,7 @@ def _in_view(scene: GaussianScene, view: PosedImage) -> Bool[Array, " n"]:
     pixels, z = project(view.camera, transform(invert_pose(view.T_world_camera), scene.means))
     size = jnp.array([view.camera.width, view.camera.height], dtype=jnp.float32)
     inside = (pixels > 0.0) & (pixels < size[None, :])
-    return scene.is_alive & (z > NEAR) & inside.all(axis=1)
+    return scene.is_alive & (z > NEAR_PLANE) & inside.all(axis=1)
 
 
 def _background(config: TrainConfig, step: Int[Array, ""]) -> Float[Array, " 3"]:

@@ -11,15 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.geometry.cameras import Camera
-from r3jax.kernels import splatting
-from r3jax.splatting.backends import reference
+from r3jax.splatting.backends import numba, reference
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 from tests.tiers import quick_and_full
 
 COUNT, SIZE, BUDGET = 120, (50, 38), 1 << 12
-BACKENDS = {"numba": splatting.rasterize, "reference": reference.rasterize}
+BACKENDS = {"numba": numba.rasterize, "reference": reference.rasterize}
 
 
 def composite(backend: str, scene, camera, pose, offsets=None, budget: int = BUDGET):

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r3jax.baselines.information import pixel_squares, pixel_tallies
 from r3jax.geometry.cameras import invert_pose
+from r3jax.kernels.constants import ALPHA_MIN, TILE
 from r3jax.kernels.splatting import records
 from r3jax.splatting.backends import reference
-from r3jax.splatting.config import ALPHA_MIN, TILE, RasterConfig
-from r3jax.splatting.information import pixel_squares, pixel_tallies
+from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import project_gaussians
 from tests.plain_kernels import Modules, kernels_as_python, load
 from tests.splatting.clouds import random_cloud, safe_pixels, view

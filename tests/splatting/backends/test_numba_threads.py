@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.kernels import splatting
 from r3jax.kernels.native import ffi, platform
 from r3jax.splatting import backend
+from r3jax.splatting.backends import numba
 from r3jax.splatting.backends.xla import rasterize as xla_rasterize
 from r3jax.splatting.config import RasterConfig
 from tests.splatting.clouds import random_cloud, view
@@ -26,7 +26,7 @@ CONFIG = RasterConfig(backend="numba", max_intersections=1 << 14)
 
 
 def loss(scene, camera, pose):
-    result = splatting.rasterize(scene, camera, pose, jnp.zeros((COUNT, 2)), CONFIG)
+    result = numba.rasterize(scene, camera, pose, jnp.zeros((COUNT, 2)), CONFIG)
     ramp = jnp.arange(SIZE[0], dtype=jnp.float32)[None, :]
     return jnp.sum(result.rgb.sum(axis=-1) * ramp + result.depth_sum), result
 
@@ -53,7 +53,7 @@ def assert_same_bits(found, expected):
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 7])
 def test_any_number_of_workers_gives_the_same_bits(case, expected, monkeypatch, workers):
-    monkeypatch.setattr(splatting, "num_workers", lambda: workers)
+    monkeypatch.setattr(ffi, "num_workers", lambda: workers)
     for _ in range(3):
         assert_same_bits(eqx.filter_jit(value_and_gradients)(case), expected)
 

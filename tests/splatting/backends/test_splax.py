@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.cameras import invert_pose
+from r3jax.kernels.constants import DILATION, NEAR_PLANE
 from r3jax.splatting.backend import find_backend
 from r3jax.splatting.backends import reference, splax
-from r3jax.splatting.config import DILATION, NEAR, RasterConfig
+from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import ProjectedGaussians, rotation_rows
 from r3jax.splatting.scene import GaussianScene
 from tests.splatting.clouds import random_cloud, view
@@ -139,7 +140,7 @@ def test_the_view_matrix_gives_our_pixels():
     np.testing.assert_allclose(z, Z, rtol=1e-6)
     np.testing.assert_allclose(40 * x / z + 20, camera.fx * X / Z + camera.cx, rtol=1e-4)
     np.testing.assert_allclose(40 * y / z + 11, camera.fy * Y / Z + camera.cy, rtol=1e-4)
-    assert z.min() > NEAR
+    assert z.min() > NEAR_PLANE
 
 
 def test_without_the_package_the_error_names_the_extra(monkeypatch):

@@ -10,8 +10,8 @@ from scipy.spatial import KDTree
 
 from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import Camera, look_at, transform, unproject
+from r3jax.kernels.constants import SH0
 from r3jax.splatting.errors import ViewsError
-from r3jax.splatting.harmonics import C0
 from r3jax.splatting.training import initialize as initialize_module
 from r3jax.splatting.training.initialize import (
     fitting_voxel_size,
@@ -63,7 +63,7 @@ def test_surfaces() -> None:
     """Every Gaussian lies on its plane, in the plane's color, and no plane is left out."""
     views = room_views()
     scene = initialize_module.initialize(views, 900, 1000)
-    means, color = alive(scene, scene.means), 0.5 + C0 * alive(scene, scene.sh[:, 0])
+    means, color = alive(scene, scene.means), 0.5 + SH0 * alive(scene, scene.sh[:, 0])
     on_floor, on_wall = np.abs(means[:, 2]) < 2e-5, np.abs(means[:, 0] - 2.0) < 2e-5
     # A voxel in the corner holds points of both planes.
     mixed = ~on_floor & ~on_wall
@@ -235,7 +235,7 @@ def test_without_depth_only_a_key_helps():
         centers = np.asarray(views.T_world_camera[:, :3, 3])
         assert (means.min(0) < centers.min(0) + 0.3).all()
         assert means[:, 0].max() > 0.0  # ahead of the cameras, which look along x
-        color = 0.5 + C0 * alive(scene, scene.sh[:, 0])
+        color = 0.5 + SH0 * alive(scene, scene.sh[:, 0])
         mean = np.asarray(views.rgb).mean((0, 1, 2)) / 255.0
         np.testing.assert_allclose(color, np.broadcast_to(mean, color.shape), atol=1e-5)
 

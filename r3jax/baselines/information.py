@@ -17,7 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.cameras import Camera
+from r3jax.kernels import calls
+from r3jax.kernels.calls import Cloud, Drawn, Images
 from r3jax.kernels.native.platform import can_call_kernels
+from r3jax.splatting.backends.numba import arguments, composite_forward
 from r3jax.splatting.backends.reference import composite_pixel
 from r3jax.splatting.config import RasterConfig, fitting_budget
 from r3jax.splatting.projection import project_gaussians
@@ -53,9 +56,10 @@ def pixel_squares(
         all sums are 0 then.
     """
     if _is_compiled(source):
-        from r3jax.kernels.splatting import squared_gradients
-
-        return squared_gradients(scene, camera, T_world_camera, background, config)
+        composited, overflow = _composited(scene, camera, T_world_camera, config)
+        behind = jnp.sum(background).reshape(1).astype(jnp.float32)
+        *geometry, sh = calls.squares(*composited, behind)
+        return GaussianScene(*geometry, sh=sh.reshape(scene.sh.shape)), overflow
     return _dense_squares(scene, camera, T_world_camera, background), jnp.zeros((), jnp.int32)
 
 
@@ -91,11 +95,19 @@ def pixel_tallies(
     """
     least = jnp.array([least_through, least_weight], dtype=jnp.float32)
     if _is_compiled(source):
-        from r3jax.kernels.splatting import tallies
-
-        return tallies(scene, camera, T_world_camera, value, counts, least, config)
+        (*_, drawn), overflow = _composited(scene, camera, T_world_camera, config)
+        return calls.tallies(drawn, value, counts, least), overflow
     sums = _dense_tallies(scene, camera, T_world_camera, value, counts, least)
     return sums, jnp.zeros((), jnp.int32)
+
+
+def _composited(
+    scene: GaussianScene, camera: Camera, pose: Float[Array, "4 4"], config: RasterConfig
+) -> tuple[tuple[Cloud, Array, Images, Drawn], Int[Array, ""]]:
+    """What the kernels take: cloud, view, images and what is drawn of it; and the overflow."""
+    zeros = jnp.zeros((scene.capacity, 2))
+    (_, totals), found = composite_forward(*arguments(scene, camera, pose, zeros, config))
+    return found, totals[1]
 
 
 def with_room(

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from r3jax.baselines import information
+from r3jax.baselines.information import pixel_squares, pixel_tallies, with_room
 from r3jax.geometry.cameras import Camera
-from r3jax.splatting import harmonics, information
+from r3jax.splatting import harmonics
 from r3jax.splatting.config import RasterConfig
-from r3jax.splatting.information import pixel_squares, pixel_tallies, with_room
 from r3jax.splatting.render import render
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
