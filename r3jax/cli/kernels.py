@@ -8,11 +8,12 @@ from r3jax.files import make_folder, write_atomic
 
 
 def main(note: Path) -> None:
-    """Compiles all kernels, and leaves a note."""
+    """Compiles all kernels but rare ones, and leaves a note."""
     from r3jax.kernels import bridge
 
     for name in bridge.HANDLERS:
-        bridge.register(name)
+        if name not in bridge.RARE:
+            bridge.register(name)
     make_folder(note.parent)
     write_atomic(note, b"")
 

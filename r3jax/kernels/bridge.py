@@ -362,6 +362,9 @@ HANDLERS = {
     "tallies": _tallies,
 }
 
+RARE = ("squares", "tallies")
+"""Only policies of other papers need these: they are not compiled ahead."""
+
 
 def register(name: str) -> str:
     """Compiles a kernel (or takes it from the disk) and tells XLA of it, once; gives its target."""
